@@ -1,0 +1,187 @@
+"""Camera paths and perturbations for the demonstration scenes, as the Nerfstudio viewer writes paths."""
+
+from __future__ import annotations
+
+import json
+import os
+import tempfile
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ns_abstract.demo.airfield import TARGET
+
+FOV = 45.0  # vertical, degrees
+
+
+@dataclass(frozen=True)
+class View:
+    """A pinhole camera with square pixels and the principal point in the middle.
+
+    Attributes:
+        camera_to_world: [4, 4] float64, OpenGL axes (x right, y up, z back), normalised frame.
+        fov: Vertical field of view in degrees.
+        height: Pixels.
+        width: Pixels.
+    """
+
+    camera_to_world: NDArray[np.float64]
+    fov: float = FOV
+    height: int = 200
+    width: int = 200
+
+
+def look_at(eye: ArrayLike, target: ArrayLike, up: ArrayLike = (0.0, 0.0, 1.0)) -> NDArray[np.float64]:
+    """The camera-to-world matrix [4, 4] of a camera at ``eye`` that looks at ``target`` (OpenGL axes)."""
+    back = np.asarray(eye, np.float64) - np.asarray(target, np.float64)
+    back /= np.linalg.norm(back)
+    right = np.cross(np.asarray(up, np.float64), back)
+    right /= np.linalg.norm(right)
+    pose = np.eye(4)
+    pose[:3, :3] = np.stack([right, np.cross(back, right), back], axis=1)
+    pose[:3, 3] = eye
+    return pose
+
+
+def around(
+    target: ArrayLike,
+    azimuth: float,
+    elevation: float,
+    distance: float,
+    *,
+    height: int = 200,
+    width: int = 200,
+) -> View:
+    """A view of ``target`` from ``distance``; angles in degrees, azimuth from +x towards +y, z up."""
+    a, e = np.deg2rad([azimuth, elevation])
+    eye = np.asarray(target) + distance * np.array([np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)])
+    return View(look_at(eye, target), height=height, width=width)
+
+
+def path_json(
+    views: Sequence[View], *, seconds: float = 2.0, fps: int = 24, perturbation: dict[str, Any] | None = None
+) -> dict[str, Any]:
+    """A camera path with one frame and one keyframe per view.
+
+    Args:
+        views: At least one; all of the first one's size.
+        seconds: Duration that ns-render gives the video.
+        fps: Frame rate that the viewer shows.
+        perturbation: Stored under "perturbation" when given.
+    """
+    first = views[0]
+    if any((v.height, v.width) != (first.height, first.width) for v in views):
+        raise ValueError("views: all views of a path have one size")
+    aspect = first.width / first.height
+    matrices = [view.camera_to_world.flatten().tolist() for view in views]
+    path: dict[str, Any] = {
+        "default_fov": first.fov,
+        "default_transition_sec": seconds / max(1, len(views) - 1),
+        "keyframes": [
+            {
+                "matrix": matrix,
+                "fov": view.fov,
+                "aspect": aspect,
+                "override_transition_enabled": False,
+                "override_transition_sec": None,
+            }
+            for matrix, view in zip(matrices, views, strict=True)
+        ],
+        "camera_type": "perspective",
+        "render_height": first.height,
+        "render_width": first.width,
+        "fps": fps,
+        "seconds": seconds,
+        "is_cycle": False,
+        "smoothness_value": 0.5,
+        "camera_path": [
+            {"camera_to_world": matrix, "fov": view.fov, "aspect": aspect}
+            for matrix, view in zip(matrices, views, strict=True)
+        ],
+    }
+    if perturbation is not None:
+        path["perturbation"] = perturbation
+    return path
+
+
+def airfield_views(size: int = 200) -> list[View]:
+    """Five views of the airfield: from the aircraft's side round to the front, runway behind it."""
+    places = ((-62.0, 13.0), (-50.0, 14.0), (-37.0, 15.0), (-25.0, 16.0), (-12.0, 17.0))
+    return [around(TARGET, a, e, 1.0, height=size, width=size) for a, e in places]
+
+
+def dataset_views(count: int = 10, size: int = 200) -> list[View]:
+    """Views all around the airfield for the data set beside a run."""
+    return [
+        around(TARGET, 360.0 * k / count, 15.0 + 15.0 * (k % 2), 1.05, height=size, width=size)
+        for k in range(count)
+    ]
+
+
+def airfield_path(size: int = 200) -> dict[str, Any]:
+    """The five views of ``airfield_views`` as a camera path."""
+    return path_json(airfield_views(size))
+
+
+def airfield_perturbation() -> dict[str, Any]:
+    """A sideways shift of 0.02 scene units and a yaw of 0.01 radians, each either way."""
+    return {
+        "version": 1,
+        "frame": "camera",
+        "translation": {"x": 0.02},
+        "rotation": {"yaw": 0.01},
+        "sweep": "keyframes",
+    }
+
+
+def airfield_orbit(size: int = 32) -> dict[str, Any]:
+    """One view and the set of all its rotations about the vertical axis through the aircraft."""
+    perturbation = {
+        "version": 1,
+        "sweep": "keyframes",
+        "orbit": {"target": list(TARGET), "axis": [0.0, 0.0, 1.0], "azimuth": [0.0, 2.0 * np.pi]},
+    }
+    view = around(TARGET, -50.0, 24.0, 1.0, height=size, width=size)
+    return path_json([view], seconds=1.0, perturbation=perturbation)
+
+
+def write_airfield_paths(folder: str | Path) -> dict[str, Path]:
+    """Write ``camera_path.json``, ``camera_path_orbit.json`` and ``SPEC.json`` into ``folder``.
+
+    Returns:
+        The three files by the names "path", "orbit" and "spec".
+    """
+    folder = Path(folder)
+    files = {
+        "path": (folder / "camera_path.json", airfield_path()),
+        "orbit": (folder / "camera_path_orbit.json", airfield_orbit()),
+        "spec": (folder / "SPEC.json", airfield_perturbation()),
+    }
+    for file, value in files.values():
+        write_atomically(file, (json.dumps(value, indent=1) + "\n").encode())
+    return {name: file for name, (file, _) in files.items()}
+
+
+def write_atomically(file: Path, data: bytes, *, scratch: Path | None = None) -> None:
+    """Write ``data`` so that ``file`` is seen whole or not at all.
+
+    Args:
+        scratch: Folder on the same file system for the unfinished file; the file's own by default.
+    """
+    file.parent.mkdir(parents=True, exist_ok=True)
+    handle, name = tempfile.mkstemp(prefix=".unfinished-", dir=scratch or file.parent)
+    try:
+        with os.fdopen(handle, "wb") as stream:
+            stream.write(data)
+        # mkstemp files are private; give the usual permissions.
+        mask = os.umask(0)
+        os.umask(mask)
+        os.chmod(name, 0o666 & ~mask)
+        os.replace(name, file)
+    except BaseException:
+        Path(name).unlink(missing_ok=True)
+        raise

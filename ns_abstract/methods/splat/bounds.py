@@ -1,0 +1,168 @@
+"""Bounds of a splat scene's picture over one cell of camera poses."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numba import get_num_threads
+
+from ns_abstract.arithmetic.forms import Basis
+from ns_abstract.arithmetic.units import Arithmetic
+from ns_abstract.methods.splat.activate import Splats
+from ns_abstract.methods.splat.colors import BASIS_SIZE, BASIS_SLOPE, fixed_colors, moving_colors
+from ns_abstract.methods.splat.constants import Rasteriser
+from ns_abstract.methods.splat.gaussians import FORMS, gaussian_stage
+from ns_abstract.methods.splat.lists import depth_order, tile_lists
+from ns_abstract.methods.splat.pixels import pixel_stage
+from ns_abstract.methods.splat.render import WORK_TILE, camera_array, rules_array, tile_grid
+from ns_abstract.sets.path import Camera
+from ns_abstract.sets.poses import PoseForms
+
+#: Most pairs of layers whose depth order is examined in one block of pixels.
+PAIR_LIMIT = 20_000
+
+
+@dataclass
+class CellBounds:
+    """Bounds of some tiles over one cell.
+
+    Attributes:
+        wanted: [t] tile numbers, row-major.
+        lower, upper: [t, side, side, 3] float64 enclosures of every image of the cell.
+        visible: Scene indices of the Gaussians that some pose of the cell may show.
+        linear: [t, side, side, 3, m + 1] polynomial coefficients and radius, or None.
+        statistics: Blocks, layers, uncertain pairs, blocks that gave up on order, results that were
+            not numbers.
+    """
+
+    wanted: np.ndarray
+    lower: np.ndarray
+    upper: np.ndarray
+    visible: np.ndarray
+    linear: np.ndarray | None
+    statistics: np.ndarray
+
+
+class SplatBounds:
+    """Bounds the pictures of one scene.
+
+    Args:
+        splats: The activated scene.
+        rasteriser: The rules of the bounded program.
+        arithmetic: What that program computes with.
+    """
+
+    def __init__(self, splats: Splats, rasteriser: Rasteriser, arithmetic: Arithmetic) -> None:
+        self.splats = splats
+        self.rasteriser = rasteriser
+        self.arithmetic = arithmetic
+        self.rules = rules_array(rasteriser)
+        self.side = rasteriser.tile_size or WORK_TILE
+        a = arithmetic
+        self._errors = np.array([a.unit, a.flush, a.division, a.sqrt, a.rsqrt, a.exp])
+        self._color_radius = 8.0 * a.unit * float(np.abs(splats.sh).max(initial=1.0)) if splats.degree == 0 else 0.0
+
+    def cell(
+        self,
+        camera: Camera,
+        forms: PoseForms,
+        wanted: np.ndarray | None = None,
+        candidates: np.ndarray | None = None,
+        keep_linear: bool = False,
+    ) -> CellBounds:
+        """Bounds of the tiles ``wanted`` over the poses enclosed by ``forms``.
+
+        Args:
+            camera: Intrinsics and size.
+            forms: The cell's poses.
+            wanted: Tile numbers; all if None.
+            candidates: Scene indices that may be visible (from an enclosing cell); all if None.
+            keep_linear: Whether to return the linear sets.
+        """
+        splats = self.splats
+        basis: Basis = forms.rotation.basis
+        d, order, m = basis.dimensions, basis.order, basis.monomials
+        across, down = tile_grid(camera, self.side)
+        if wanted is None:
+            wanted = np.arange(across * down)
+        wanted = np.asarray(wanted, np.int64)
+        if candidates is None:
+            candidates = np.arange(splats.count, dtype=np.int32)
+        n = candidates.size
+        view = camera_array(camera)
+        rotation, offset = forms.rotation.data, forms.offset.data
+        low, high = forms.rotation.bounds()
+        rotation_reach = np.maximum(np.abs(low), np.abs(high)).ravel()
+        low, high = forms.position.bounds()
+        camera_reach = np.maximum(np.abs(low), np.abs(high))
+        count = 6 if splats.antialiased else 5
+        record = np.empty((n, FORMS + count * (m + 1)))
+        box = np.empty((n, 4))
+        tiles = np.empty((n, 8), np.int32)
+        depth = np.empty(n)
+        delta = np.empty((n, 3))
+        depth_error = np.empty(n)
+        state = np.empty(n, np.uint8)
+        gaussian_stage(
+            candidates, splats.means, splats.axes, splats.opacity, splats.opacity, np.empty((0, 3)),
+            rotation, offset, forms.origin, camera_reach, rotation_reach, view, self.rules, self._errors,
+            d, order, m, splats.antialiased, record, box, tiles, depth, delta, depth_error, state,
+        )  # fmt: skip
+        alive = np.flatnonzero(state)
+        colors = self._colors(forms, candidates, alive, n)
+        mask = np.zeros(across * down, np.uint8)
+        mask[wanted] = 1
+        offsets, entries = tile_lists(depth_order(alive, depth), _clip(tiles, box, self.side), mask, across)
+        lower = np.zeros((wanted.size, self.side, self.side, 3))
+        upper = np.zeros((wanted.size, self.side, self.side, 3))
+        linear = np.zeros((wanted.size if keep_linear else 0, self.side, self.side, 3, m + 1))
+        threads = get_num_threads()
+        statistics = np.zeros((threads, 5), np.int64)
+        negligible = self.rasteriser.alpha_negligible * splats.count
+        pixel_stage(
+            wanted, offsets, entries, record, box, tiles, depth, delta, depth_error, colors, self._color_radius,
+            np.ascontiguousarray(rotation[:, 6:9]), np.ascontiguousarray(rotation[0]), view, self.rules, self._errors,
+            splats.background, negligible, PAIR_LIMIT, d, order, m, splats.antialiased, threads,
+            lower, upper, linear, statistics,
+        )  # fmt: skip
+        return CellBounds(
+            wanted, lower, upper, candidates[alive], linear if keep_linear else None, statistics.sum(axis=0)
+        )
+
+    def _colors(self, forms: PoseForms, candidates: np.ndarray, alive: np.ndarray, n: int) -> np.ndarray:
+        """Colours of the visible Gaussians: [n, 3], [n, 6] (centre, radius) or forms."""
+        splats = self.splats
+        basis = forms.position.basis
+        if splats.degree == 0:
+            return np.ascontiguousarray(splats.sh[candidates, 0])
+        indices = np.stack([alive, candidates[alive]], axis=1).astype(np.int64)
+        unit = self.arithmetic.unit
+        low, high = forms.position.bounds()
+        # torch.inverse of the view matrix: 80 units of 1 + |T| (design.md, C3)
+        position_error = 80.0 * unit * (1.0 + float(np.maximum(np.abs(low), np.abs(high)).sum()))
+        if not np.any(forms.position.linear) and float(forms.position.radius.max()) < 1e-9:
+            colors = np.zeros((n, 6))
+            position_error += 2.0 * float(forms.position.radius.max())
+            fixed_colors(
+                indices, splats.means, splats.sh, splats.degree, forms.position.center, position_error, unit,
+                BASIS_SIZE, BASIS_SLOPE, colors,
+            )  # fmt: skip
+            return colors
+        colors = np.zeros((n, 3 * (basis.monomials + 1)))
+        moving_colors(
+            indices, splats.means, splats.sh, splats.degree, forms.position.data, forms.origin, position_error, unit,
+            BASIS_SIZE, BASIS_SLOPE, basis.dimensions, basis.order, basis.monomials, colors,
+        )  # fmt: skip
+        return colors
+
+
+def _clip(tiles: np.ndarray, box: np.ndarray, side: int) -> np.ndarray:
+    """Tile ranges cut down to where the pixel regions lie; the rest is sure not to reach the threshold."""
+    out = tiles[:, :4].copy()
+    with np.errstate(invalid="ignore"):
+        first = np.floor(np.clip((box[:, [0, 2]] - 0.5) / side, -1.0, 1e6))
+        past = np.floor(np.clip((box[:, [1, 3]] - 0.5) / side, -1.0, 1e6)) + 1.0
+    out[:, [0, 2]] = np.maximum(out[:, [0, 2]], first).astype(np.int32)
+    out[:, [1, 3]] = np.minimum(out[:, [1, 3]], past).astype(np.int32)
+    return out

@@ -1,0 +1,273 @@
+"""Colours of Gaussians: spherical harmonics, concretely and as forms (spherical_harmonics.cuh)."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit, prange
+
+from ns_abstract.arithmetic.forms import (
+    bounds,
+    clamp_below,
+    multiply,
+    reciprocal_square_root,
+    scale_add,
+    settle,
+    square,
+)
+from ns_abstract.arithmetic.units import UNIT64
+from ns_abstract.methods.splat.gaussians import LANES
+
+_COEFFICIENT = 8.0 * UNIT64
+_UP = 1.0 + 128.0 * UNIT64
+_CHUNK = 1024
+
+#: Largest change of each basis function per unit change of the direction, rounded up.
+BASIS_SLOPE = np.array(
+    [0.0]
+    + [0.489] * 3
+    + [1.093, 1.093, 1.893, 1.093, 1.093]
+    + [1.771, 2.891, 3.2, 3.8, 3.2, 2.891, 1.771]
+)
+#: Largest absolute value of each basis function, rounded up.
+BASIS_SIZE = np.array(
+    [0.283] + [0.489] * 3 + [0.547, 0.547, 0.631, 0.547, 0.547] + [0.591, 0.557, 0.64, 0.747, 0.64, 0.557, 0.591]
+)
+
+
+@njit(cache=True)
+def sh_basis(x, y, z, degree, out):
+    """Real spherical harmonics of the unit direction, bands 0 to ``degree``, in gsplat's order."""
+    out[0] = 0.2820947917738781
+    if degree >= 1:
+        out[1] = -0.48860251190292 * y
+        out[2] = 0.48860251190292 * z
+        out[3] = -0.48860251190292 * x
+    if degree >= 2:
+        z2 = z * z
+        c1 = x * x - y * y
+        s1 = 2.0 * x * y
+        out[4] = 0.5462742152960395 * s1
+        out[5] = -1.092548430592079 * z * y
+        out[6] = 0.9461746957575601 * z2 - 0.3153915652525201
+        out[7] = -1.092548430592079 * z * x
+        out[8] = 0.5462742152960395 * c1
+        if degree >= 3:
+            c2 = x * c1 - y * s1
+            s2 = x * s1 + y * c1
+            f = -2.285228997322329 * z2 + 0.4570457994644658
+            out[9] = -0.5900435899266435 * s2
+            out[10] = 1.445305721320277 * z * s1
+            out[11] = f * y
+            out[12] = z * (1.865881662950577 * z2 - 1.119528997770346)
+            out[13] = f * x
+            out[14] = 1.445305721320277 * z * c1
+            out[15] = -0.5900435899266435 * c2
+
+
+@njit(cache=True)
+def sh_color(sh, direction, degree, basis, out):
+    """``out[c] = max(0, 0.5 + sum_k basis_k sh[k, c])`` for an unnormalised ``direction`` [3]."""
+    length = math.sqrt(
+        direction[0] * direction[0] + direction[1] * direction[1] + direction[2] * direction[2]
+    )
+    sh_basis(direction[0] / length, direction[1] / length, direction[2] / length, degree, basis)
+    for c in range(3):
+        total = 0.0
+        for k in range((degree + 1) * (degree + 1)):
+            total += basis[k] * sh[k, c]
+        out[c] = max(0.0, total + 0.5)
+
+
+@njit(cache=True)
+def _color_error(sh, i, channel, count, unit, direction_error, sizes, slopes):
+    """Float error of one colour (design.md, C3)."""
+    error = unit
+    for k in range(count):
+        size = abs(sh[i, k, channel])
+        error += size * (40.0 * unit * sizes[k] + direction_error * slopes[k])
+    return error
+
+
+@njit(cache=True)
+def _direction_error(distance, position_error, mean_size, unit):
+    return (position_error + 2.0 * unit * mean_size) / distance + 16.0 * unit
+
+
+@njit(cache=True, parallel=True)
+def fixed_colors(indices, means, sh, degree, position, position_error, unit, sizes, slopes, colors):
+    """Colours seen from one camera position: centre and radius by Gaussian (design.md, C1, C3).
+
+    Args:
+        indices: [n] rows to fill, with ``colors`` [., 6] = (centre, radius) by channel, and the
+            Gaussian's number in the scene in the second column: [n, 2].
+        position: [3]; ``position_error`` bounds what float evaluation and the set add to it.
+    """
+    count = (degree + 1) * (degree + 1)
+    for chunk in prange((indices.shape[0] + _CHUNK - 1) // _CHUNK):
+        basis = np.empty(16)
+        color = np.empty(3)
+        direction = np.empty(3)
+        for row in range(chunk * _CHUNK, min(indices.shape[0], (chunk + 1) * _CHUNK)):
+            target = indices[row, 0]
+            i = indices[row, 1]
+            for k in range(3):
+                direction[k] = means[i, k] - position[k]
+            distance = math.sqrt(direction[0] ** 2 + direction[1] ** 2 + direction[2] ** 2) - position_error
+            sh_color(sh[i], direction, degree, basis, color)
+            mean_size = abs(means[i, 0]) + abs(means[i, 1]) + abs(means[i, 2])
+            error = _direction_error(distance, position_error, mean_size, unit) if distance > 0.0 else 2.0
+            for c in range(3):
+                colors[target, 2 * c] = color[c]
+                colors[target, 2 * c + 1] = _color_error(sh, i, c, count, unit, min(error, 2.0), sizes, slopes)
+
+
+@njit(cache=True)
+def _accumulate(target, form, weights, m):
+    """``target += weights[q] * form`` with lane-wise weights; `settle` must follow."""
+    for k in range(m):
+        for q in range(LANES):
+            target[k, q] += weights[q] * form[k, q]
+    for q in range(LANES):
+        w = abs(weights[q])
+        size = abs(form[0, q]) + form[m + 1, q] + form[m + 2, q]
+        total = abs(target[0, q]) + w * size
+        target[m, q] = (target[m, q] + w * form[m, q] + _COEFFICIENT * (w * size + total)) * _UP
+
+
+@njit(cache=True, parallel=True)
+def moving_colors(
+    indices, means, sh, degree, position, origin, position_error, unit, sizes, slopes, d, order, m, colors
+):
+    """Colours over a cell in which the camera moves, as forms (design.md, C2, C3).
+
+    Args:
+        indices: [n, 2] row of ``colors`` and number of the Gaussian in the scene.
+        position: [rows, 3] forms of the camera position, centred at ``origin`` [3].
+        position_error: Bound of the float error of the camera position.
+        colors: [., 3 (m + 1)] output: coefficients and radius by channel.
+    """
+    n = indices.shape[0]
+    count = (degree + 1) * (degree + 1)
+    for chunk in prange((n + _CHUNK - 1) // _CHUNK):
+        # 0-2 direction, 3 squared length, 4 spare, 5 inverse length, 6-8 x y z, 9 z^2, 10 c1, 11 s1,
+        # 12 c2, 13 s2, 14 basis, 15 spare, 16-18 channels
+        work = np.empty((19, m + 3, LANES))
+        scratch = np.empty((5, LANES))
+        weights = np.empty(LANES)
+        low = np.empty(LANES)
+        high = np.empty(LANES)
+        distance = np.empty(LANES)
+        for first in range(chunk * _CHUNK, min(n, (chunk + 1) * _CHUNK), LANES):
+            lanes = min(LANES, min(n, (chunk + 1) * _CHUNK) - first)
+            for axis in range(3):
+                form = work[axis]
+                for k in range(m):
+                    for q in range(LANES):
+                        form[k, q] = -position[k, axis]
+                for q in range(LANES):
+                    i = indices[first + min(q, lanes - 1), 1]
+                    form[0, q] = (means[i, axis] - origin[axis]) + (origin[axis] - position[0, axis])
+                    form[m, q] = position[m, axis] + _COEFFICIENT * (
+                        abs(means[i, axis] - origin[axis]) + abs(origin[axis] - position[0, axis])
+                    )
+                settle(form, d, order, m)
+            square(work[0], work[3], d, order, m)
+            for axis in range(1, 3):
+                square(work[axis], work[4], d, order, m)
+                scale_add(work[3], 1.0, work[4], 1.0, 0.0, work[3], d, order, m)
+            bounds(work[3], low, high, d, order, m)
+            for q in range(LANES):
+                distance[q] = math.sqrt(low[q]) * (1.0 - _COEFFICIENT) - position_error if low[q] > 0.0 else 0.0
+            reciprocal_square_root(work[3], scratch, work[5], d, order, m)
+            for axis in range(3):
+                multiply(work[axis], work[5], work[6 + axis], d, order, m)
+            for channel in range(3):
+                form = work[16 + channel]
+                for k in range(m + 3):
+                    for q in range(LANES):
+                        form[k, q] = 0.0
+                for q in range(LANES):
+                    i = indices[first + min(q, lanes - 1), 1]
+                    form[0, q] = 0.2820947917738781 * sh[i, 0, channel] + 0.5
+                    form[m, q] = _COEFFICIENT * (abs(sh[i, 0, channel]) + 1.0)
+            if degree >= 2:
+                square(work[8], work[9], d, order, m)
+                square(work[6], work[10], d, order, m)
+                square(work[7], work[4], d, order, m)
+                scale_add(work[10], 1.0, work[4], -1.0, 0.0, work[10], d, order, m)
+                multiply(work[6], work[7], work[4], d, order, m)
+                scale_add(work[4], 2.0, work[4], 0.0, 0.0, work[11], d, order, m)
+            if degree >= 3:
+                multiply(work[6], work[10], work[12], d, order, m)
+                multiply(work[7], work[11], work[4], d, order, m)
+                scale_add(work[12], 1.0, work[4], -1.0, 0.0, work[12], d, order, m)
+                multiply(work[6], work[11], work[13], d, order, m)
+                multiply(work[7], work[10], work[4], d, order, m)
+                scale_add(work[13], 1.0, work[4], 1.0, 0.0, work[13], d, order, m)
+            for k in range(1, count):
+                _basis_form(work, k, d, order, m)
+                for channel in range(3):
+                    for q in range(LANES):
+                        weights[q] = sh[indices[first + min(q, lanes - 1), 1], k, channel]
+                    _accumulate(work[16 + channel], work[14], weights, m)
+            for channel in range(3):
+                form = work[16 + channel]
+                settle(form, d, order, m)
+                for q in range(LANES):
+                    i = indices[first + min(q, lanes - 1), 1]
+                    mean_size = abs(means[i, 0]) + abs(means[i, 1]) + abs(means[i, 2])
+                    error = (
+                        _direction_error(distance[q], position_error, mean_size, unit) if distance[q] > 0.0 else 2.0
+                    )
+                    size = 0.0
+                    for k in range(count):
+                        size += abs(sh[i, k, channel]) * sizes[k]
+                    form[m, q] += _color_error(sh, i, channel, count, unit, min(error, 2.0), sizes, slopes)
+                    # a camera that may stand in the Gaussian's centre: any direction
+                    if not form[m, q] + form[m + 1, q] + form[m + 2, q] <= 2.0 * size + 1.0:
+                        for r in range(1, m + 3):
+                            form[r, q] = 0.0
+                        form[0, q] = 0.5
+                        form[m, q] = size * 1.01 + _color_error(sh, i, channel, count, unit, 2.0, sizes, slopes)
+                bounds(form, low, high, d, order, m)
+                clamp_below(form, 0.0, low, high, d, order, m)
+                for q in range(lanes):
+                    row = indices[first + q, 0]
+                    for k in range(m + 1):
+                        colors[row, channel * (m + 1) + k] = form[k, q]
+
+
+@njit(cache=True)
+def _basis_form(work, k, d, order, m):
+    """Basis function ``k`` >= 1 into slot 14, from the products kept by `moving_colors`."""
+    out = work[14]
+    if k == 1:
+        scale_add(work[7], -0.48860251190292, work[7], 0.0, 0.0, out, d, order, m)
+    elif k == 2:
+        scale_add(work[8], 0.48860251190292, work[8], 0.0, 0.0, out, d, order, m)
+    elif k == 3:
+        scale_add(work[6], -0.48860251190292, work[6], 0.0, 0.0, out, d, order, m)
+    elif k == 4:
+        scale_add(work[11], 0.5462742152960395, work[11], 0.0, 0.0, out, d, order, m)
+    elif k == 5 or k == 7:
+        multiply(work[8], work[7] if k == 5 else work[6], work[4], d, order, m)
+        scale_add(work[4], -1.092548430592079, work[4], 0.0, 0.0, out, d, order, m)
+    elif k == 6:
+        scale_add(work[9], 0.9461746957575601, work[9], 0.0, -0.3153915652525201, out, d, order, m)
+    elif k == 8:
+        scale_add(work[10], 0.5462742152960395, work[10], 0.0, 0.0, out, d, order, m)
+    elif k == 9:
+        scale_add(work[13], -0.5900435899266435, work[13], 0.0, 0.0, out, d, order, m)
+    elif k == 10 or k == 14:
+        multiply(work[8], work[11] if k == 10 else work[10], work[4], d, order, m)
+        scale_add(work[4], 1.445305721320277, work[4], 0.0, 0.0, out, d, order, m)
+    elif k == 11 or k == 13:
+        scale_add(work[9], -2.285228997322329, work[9], 0.0, 0.4570457994644658, work[4], d, order, m)
+        multiply(work[4], work[7] if k == 11 else work[6], out, d, order, m)
+    elif k == 12:
+        scale_add(work[9], 1.865881662950577, work[9], 0.0, -1.119528997770346, work[4], d, order, m)
+        multiply(work[8], work[4], out, d, order, m)
+    else:
+        scale_add(work[12], -0.5900435899266435, work[12], 0.0, 0.0, out, d, order, m)

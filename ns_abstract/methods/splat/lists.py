@@ -1,0 +1,111 @@
+"""Tile and block lists of Gaussians, front to back: shared by the renderer and the bounds."""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+#: Side of a block in pixels; a block is what one pass of the compiled pixel stages works on.
+BLOCK = 4
+#: Pixels of a block.
+PIXELS = BLOCK * BLOCK
+
+
+def depth_order(visible, depth):
+    """Indices ``visible`` sorted by ``depth[visible]``, equal depths by index."""
+    keys = depth[visible]
+    order = np.argsort(keys)
+    return _sort_ties(visible[order], keys[order])
+
+
+@njit(cache=True)
+def _sort_ties(order, keys):
+    start = 0
+    for k in range(1, order.size + 1):
+        if k == order.size or keys[k] != keys[start]:
+            if k - start > 1:
+                order[start:k] = np.sort(order[start:k])
+            start = k
+    return order
+
+
+@njit(cache=True)
+def tile_lists(order, tiles, wanted, tiles_x):
+    """Offsets [T + 1] and entries of the lists of the T tiles whose ``wanted`` is not 0.
+
+    ``tiles`` [n, >= 4] holds tile ranges x0, x1, y0, y1 (x1, y1 exclusive) by Gaussian.
+    """
+    count = wanted.size
+    offsets = np.zeros(count + 1, np.int64)
+    for k in range(order.size):
+        i = order[k]
+        for ty in range(tiles[i, 2], tiles[i, 3]):
+            for tx in range(tiles[i, 0], tiles[i, 1]):
+                t = ty * tiles_x + tx
+                if wanted[t]:
+                    offsets[t + 1] += 1
+    for t in range(count):
+        offsets[t + 1] += offsets[t]
+    entries = np.empty(offsets[count], np.int32)
+    position = offsets[:-1].copy()
+    for k in range(order.size):
+        i = order[k]
+        for ty in range(tiles[i, 2], tiles[i, 3]):
+            for tx in range(tiles[i, 0], tiles[i, 1]):
+                t = ty * tiles_x + tx
+                if wanted[t]:
+                    entries[position[t]] = i
+                    position[t] += 1
+    return offsets, entries
+
+
+@njit(cache=True)
+def block_lists(entries, box, x0, y0, tile, offsets, out):
+    """Distribute a tile's ``entries`` over its blocks by the pixel regions ``box`` [n, 4].
+
+    Args:
+        x0, y0: The tile's first pixel.
+        tile: The tile's side in pixels, a multiple of `BLOCK`.
+        offsets: Output [B^2 + 1] with B = tile / BLOCK.
+        out: Scratch for the entries; returned, enlarged where it was too small.
+    """
+    side = tile // BLOCK
+    offsets[:] = 0
+    for k in range(entries.size):
+        i = entries[k]
+        bx0, bx1 = _block_range(box[i, 0], box[i, 1], x0, side)
+        by0, by1 = _block_range(box[i, 2], box[i, 3], y0, side)
+        for by in range(by0, by1):
+            for bx in range(bx0, bx1):
+                offsets[by * side + bx + 1] += 1
+    for b in range(side * side):
+        offsets[b + 1] += offsets[b]
+    if out.size < offsets[side * side]:
+        out = np.empty(2 * offsets[side * side], np.int32)
+    position = offsets[:-1].copy()
+    for k in range(entries.size):
+        i = entries[k]
+        bx0, bx1 = _block_range(box[i, 0], box[i, 1], x0, side)
+        by0, by1 = _block_range(box[i, 2], box[i, 3], y0, side)
+        for by in range(by0, by1):
+            for bx in range(bx0, bx1):
+                b = by * side + bx
+                out[position[b]] = i
+                position[b] += 1
+    return out
+
+
+@njit(cache=True, inline="always")
+def _block_range(low, high, origin, side):
+    """Blocks [first, past) with a pixel centre in [low, high]; clipped to the tile."""
+    span = float(side * BLOCK)
+    a = min(max(low - 0.5 - origin, -1.0), span)
+    b = min(max(high - 0.5 - origin, -1.0), span)
+    # first pixel with centre >= low, last with centre <= high
+    first = int(np.ceil(a))
+    last = int(np.floor(b))
+    first = max(first, 0)
+    last = min(last, side * BLOCK - 1)
+    if last < first:
+        return 0, 0
+    return first // BLOCK, last // BLOCK + 1

@@ -1,0 +1,62 @@
+"""Boxes of named parameters, scaled to [-1, 1]^d for the bounds."""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+Float64Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class ParameterBox:
+    """A closed box. ``names`` and ``units`` label the axes; ``lower``, ``upper`` are [d]."""
+
+    names: tuple[str, ...]
+    units: tuple[str, ...]
+    lower: tuple[float, ...]
+    upper: tuple[float, ...]
+
+    @property
+    def dimensions(self) -> int:
+        """Number of parameters d."""
+        return len(self.names)
+
+    @property
+    def middle(self) -> Float64Array:
+        """[d] centre."""
+        return 0.5 * (np.array(self.lower) + np.array(self.upper))
+
+    def at(self, scaled: Float64Array) -> Float64Array:
+        """Parameter values [..., d] at ``scaled`` positions in [-1, 1]^d, clipped into the box."""
+        low, high = np.array(self.lower), np.array(self.upper)
+        weight = 0.5 * (np.asarray(scaled, np.float64) + 1.0)
+        return np.clip(low + weight * (high - low), low, high)
+
+    def contains(self, values: Float64Array) -> bool:
+        """Whether ``values`` [d] lie in the box, ends included."""
+        values = np.asarray(values, np.float64)
+        return bool(np.all((values >= np.array(self.lower)) & (values <= np.array(self.upper))))
+
+    def sample(self, count: int, generator: np.random.Generator) -> Float64Array:
+        """[count, d] values, uniform over the box."""
+        return self.at(generator.uniform(-1.0, 1.0, (count, self.dimensions)))
+
+    def corners(self) -> Float64Array:
+        """[2^d, d] corners."""
+        return np.array(list(itertools.product(*zip(self.lower, self.upper, strict=True)))).reshape(-1, self.dimensions)
+
+    def split(self, axis: int, parts: int = 2) -> list[ParameterBox]:
+        """``parts`` boxes of equal width along ``axis`` whose union is this box exactly."""
+        low, high = self.lower[axis], self.upper[axis]
+        ends = [low + (high - low) * (i / parts) for i in range(parts)] + [high]
+        return [self.replace(axis, ends[i], ends[i + 1]) for i in range(parts)]
+
+    def replace(self, axis: int, low: float, high: float) -> ParameterBox:
+        """The box with another interval along ``axis``."""
+        lower, upper = list(self.lower), list(self.upper)
+        lower[axis], upper[axis] = low, high
+        return ParameterBox(self.names, self.units, tuple(lower), tuple(upper))

@@ -1,0 +1,223 @@
+"""Sets of camera poses: concrete poses, and forms that enclose all poses of a box.
+
+Camera-to-world poses follow Nerfstudio (OpenGL axes); enclosures are of the world-to-camera
+transform that gsplat receives (OpenCV axes, splatfacto.py:128-143).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ns_abstract.arithmetic.forms import Basis, Float64Array, FormArray
+from ns_abstract.arithmetic.trigonometry import cos_sin
+from ns_abstract.arithmetic.units import UNIT64
+from ns_abstract.errors import InputError
+from ns_abstract.sets.box import ParameterBox
+from ns_abstract.sets.path import Camera
+from ns_abstract.sets.perturbation import ROTATIONS, TRANSLATIONS, Perturbation
+
+#: Elementary rotation axes of yaw, pitch and roll in camera axes.
+_CAMERA_AXES = {"yaw": (0.0, 1.0, 0.0), "pitch": (1.0, 0.0, 0.0), "roll": (0.0, 0.0, 1.0)}
+#: OpenGL to OpenCV camera axes.
+_FLIP = np.array([1.0, -1.0, -1.0])
+# Evaluating a pose in float64 takes fewer than 32 roundings of numbers of this size.
+_POSE_ROUNDING = 32.0 * UNIT64
+
+
+def _cross_matrix(axis: Float64Array) -> Float64Array:
+    x, y, z = axis
+    return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+
+
+def rotation_about(axis: Float64Array, angle: float) -> Float64Array:
+    """[3, 3] right-handed rotation by ``angle`` (radians) about the unit vector ``axis`` (Rodrigues)."""
+    k = _cross_matrix(np.asarray(axis, np.float64))
+    return np.eye(3) + np.sin(angle) * k + (1.0 - np.cos(angle)) * (k @ k)
+
+
+def _rotation_form(axis: Float64Array, angle: FormArray) -> FormArray:
+    """[3, 3] form of `rotation_about`."""
+    k = _cross_matrix(np.asarray(axis, np.float64))
+    cosine, sine = cos_sin(angle)
+    return sine * k + (1.0 - cosine) * (k @ k) + np.eye(3)
+
+
+def orthonormal(matrix: Float64Array) -> Float64Array:
+    """The rotation nearest to ``matrix`` [3, 3]."""
+    u, _, vt = np.linalg.svd(matrix)
+    return u @ np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ vt))]) @ vt
+
+
+def axis_angle(rotation: Float64Array) -> tuple[Float64Array, float]:
+    """Unit axis [3] and angle in [0, pi] of a rotation [3, 3]."""
+    vector = np.array(
+        [rotation[2, 1] - rotation[1, 2], rotation[0, 2] - rotation[2, 0], rotation[1, 0] - rotation[0, 1]]
+    )
+    angle = float(np.arctan2(np.linalg.norm(vector), np.trace(rotation) - 1.0))
+    # the symmetric part is accurate near a half turn, the antisymmetric one elsewhere
+    if np.linalg.norm(vector) > 1e-6:
+        return vector / np.linalg.norm(vector), angle
+    if angle < 1.0:
+        return np.array([0.0, 0.0, 1.0]), 0.0
+    values, vectors = np.linalg.eigh(0.5 * (rotation + rotation.T))
+    return vectors[:, int(np.argmax(values))], angle
+
+
+@dataclass(frozen=True)
+class PoseForms:
+    """Forms of the world-to-camera transform over one box of parameters.
+
+    ``x_camera = rotation (x_world - origin) + offset``; the camera stands at ``position``.
+
+    Attributes:
+        rotation: [3, 3] forms.
+        offset: [3] forms.
+        position: [3] forms, world.
+        origin: [3] the exact world point that coordinates are taken from.
+    """
+
+    rotation: FormArray
+    offset: FormArray
+    position: FormArray
+    origin: Float64Array
+
+
+@dataclass(frozen=True, eq=False)
+class PoseSet:
+    """The poses of one frame: a camera and a box of parameters around it.
+
+    Attributes:
+        camera: Intrinsics and image size; the pose of the first keyframe.
+        perturbation: What may vary.
+        box: Parameters of positive width, in the order x, y, z, yaw, pitch, roll, segment, azimuth.
+        fixed: Values of the parameters of zero width.
+        target_camera: End of the segment, where the sweep is over segments.
+    """
+
+    camera: Camera
+    perturbation: Perturbation
+    box: ParameterBox
+    fixed: dict[str, float]
+    target_camera: Camera | None = None
+
+    @classmethod
+    def around(cls, camera: Camera, perturbation: Perturbation, following: Camera | None = None) -> PoseSet:
+        """The set of one keyframe; ``following`` is the next one, used where the sweep is over segments.
+
+        Raises:
+            InputError: The two cameras of a segment differ in intrinsics.
+        """
+        ranges: dict[str, tuple[str, tuple[float, float]]] = {}
+        for name in TRANSLATIONS:
+            ranges[name] = ("normalised units", perturbation.translation.get(name, (0.0, 0.0)))
+        for name in ROTATIONS:
+            ranges[name] = ("rad", perturbation.rotation.get(name, (0.0, 0.0)))
+        segment = following if perturbation.sweep == "segments" else None
+        if segment is not None:
+            if (segment.fx, segment.fy) != (camera.fx, camera.fy):
+                raise InputError(
+                    "neighbouring keyframes have different fields of view",
+                    field="camera_path.fov",
+                    fix="use one fov for a path that is swept in segments",
+                )
+            ranges["segment"] = ("of the way", (0.0, 1.0))
+        if perturbation.orbit is not None:
+            ranges["azimuth"] = ("rad", perturbation.orbit.azimuth)
+        free = {name: entry for name, entry in ranges.items() if entry[1][0] < entry[1][1]}
+        box = ParameterBox(
+            tuple(free),
+            tuple(unit for unit, _ in free.values()),
+            tuple(low for _, (low, _) in free.values()),
+            tuple(high for _, (_, high) in free.values()),
+        )
+        fixed = {name: low for name, (_, (low, high)) in ranges.items() if low == high}
+        return cls(camera, perturbation, box, fixed, segment)
+
+    def _base(self) -> tuple[Float64Array, Float64Array, Float64Array, float, Float64Array]:
+        """Start rotation, start position, segment axis, segment angle, segment displacement."""
+        start = self.camera.camera_to_world
+        if self.target_camera is None:
+            return start[:, :3], start[:, 3], np.array([0.0, 0.0, 1.0]), 0.0, np.zeros(3)
+        end = self.target_camera.camera_to_world
+        first, last = orthonormal(start[:, :3]), orthonormal(end[:, :3])
+        axis, angle = axis_angle(first.T @ last)
+        return first, start[:, 3], axis, angle, end[:, 3] - start[:, 3]
+
+    def pose(self, values: Float64Array) -> Float64Array:
+        """Camera-to-world [3, 4] at parameter values [d] (physical units, in the order of ``box``)."""
+        p = dict(self.fixed) | dict(zip(self.box.names, np.asarray(values, np.float64).tolist(), strict=True))
+        rotation, position, axis, angle, displacement = self._base()
+        if self.target_camera is not None:
+            rotation = rotation @ rotation_about(axis, p["segment"] * angle)
+            position = position + p["segment"] * displacement
+        orbit = self.perturbation.orbit
+        if orbit is not None:
+            turn = rotation_about(np.array(orbit.axis) / np.linalg.norm(orbit.axis), p["azimuth"])
+            target = np.array(orbit.target)
+            rotation, position = turn @ rotation, target + turn @ (position - target)
+        shift = np.array([p[name] for name in TRANSLATIONS])
+        position = position + (rotation @ shift if self.perturbation.frame == "camera" else shift)
+        for name in ROTATIONS:
+            if p[name] != 0.0:
+                rotation = rotation @ rotation_about(np.array(_CAMERA_AXES[name]), p[name])
+        return np.concatenate([rotation, position[:, None]], axis=1)
+
+    def enclosure(self, box: ParameterBox, order: int = 1) -> PoseForms:
+        """Forms that enclose the transform of every pose of ``box`` (design.md, P1)."""
+        basis = Basis(self.box.dimensions, order)
+
+        def parameter(name: str) -> FormArray:
+            if name in self.fixed:
+                return FormArray.constant(basis, self.fixed[name])
+            index = box.names.index(name)
+            low, high = box.lower[index], box.upper[index]
+            middle = 0.5 * (low + high)
+            half = max(high - middle, middle - low) * (1.0 + 4.0 * UNIT64)
+            return FormArray.parameter(basis, index, middle, half)
+
+        first, start, axis, angle, displacement = self._base()
+        rotation = FormArray.constant(basis, first)
+        position = FormArray.constant(basis, start)
+        if self.target_camera is not None:
+            rotation = rotation @ _rotation_form(axis, parameter("segment") * angle)
+            position = position + parameter("segment") * displacement
+        orbit = self.perturbation.orbit
+        if orbit is not None:
+            turn = _rotation_form(np.array(orbit.axis) / np.linalg.norm(orbit.axis), parameter("azimuth"))
+            target = np.array(orbit.target)
+            rotation, position = turn @ rotation, turn @ (position - target) + target
+        moving = [name for name in TRANSLATIONS if name in box.names or self.fixed[name] != 0.0]
+        for name in moving:
+            shift = parameter(name)
+            k = TRANSLATIONS.index(name)
+            if self.perturbation.frame == "camera":
+                position = position + rotation[:, k] * shift
+            else:
+                position = position + shift * np.eye(3)[k]
+        for name in ROTATIONS:
+            if name in box.names or self.fixed[name] != 0.0:
+                rotation = rotation @ _rotation_form(np.array(_CAMERA_AXES[name]), parameter(name))
+        m = basis.monomials
+        # the concrete pose above is evaluated in float64 and must lie inside as well
+        rotation.data[m] += _POSE_ROUNDING
+        reach = sum(max(map(abs, limits)) for limits in self.perturbation.translation.values())
+        position.data[m] += _POSE_ROUNDING * (1.0 + reach + np.abs(start).max() + np.abs(displacement).max())
+        if orbit is not None:
+            position.data[m] += _POSE_ROUNDING * (1.0 + 2.0 * np.abs(orbit.target).max())
+        world_to_camera = rotation.transpose() * _FLIP[:, None]
+        origin = position.center.copy()
+        offset = world_to_camera @ (origin - position)
+        return PoseForms(world_to_camera, offset, position, origin)
+
+    def world_to_camera(self, values: Float64Array) -> tuple[Float64Array, Float64Array]:
+        """Rotation [3, 3] (OpenCV axes) and camera position [3] at parameter values [d]."""
+        pose = self.pose(values)
+        return np.ascontiguousarray(pose[:, :3].T * _FLIP[:, None]), pose[:, 3].copy()
+
+
+def translation_only(forms: PoseForms) -> bool:
+    """Whether the depth direction is the same for every pose, up to rounding: no depth order changes."""
+    row = forms.rotation[2]
+    return bool(np.all(row.linear == 0.0) and np.all(row.radius < 1e-12))
