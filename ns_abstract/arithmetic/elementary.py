@@ -55,24 +55,20 @@ def _double_of_bits(typingctx, bits):
     return types.float64(types.int64), codegen
 
 
-@njit(inline="always")
+@njit(inline="always", error_model="numpy")
 def exp_kernel(x):
     """exp(x) for ``EXP_LOWEST <= x <= EXP_HIGHEST``, relative error at most ``EXP_RELATIVE_ERROR``."""
     shifted = fma(x, _LOG2E, _ROUND_TO_INTEGER)
     k = shifted - _ROUND_TO_INTEGER
     r = fma(-k, _LN2_HIGH, x)
     r = fma(-k, _LN2_LOW, r)
-    p = fma(r, _C12, _C11)
-    p = fma(r, p, _C10)
-    p = fma(r, p, _C9)
-    p = fma(r, p, _C8)
-    p = fma(r, p, _C7)
-    p = fma(r, p, _C6)
-    p = fma(r, p, _C5)
-    p = fma(r, p, _C4)
-    p = fma(r, p, _C3)
-    p = fma(r, p, _C2)
-    p = fma(r, p, 1.0)
-    p = fma(r, p, 1.0)
+    # Estrin's scheme: short chains of dependent operations
+    r2 = r * r
+    r4 = r2 * r2
+    a = fma(r2, fma(r, _C3, _C2), r)
+    b = fma(r2, fma(r, _C7, _C6), fma(r, _C5, _C4))
+    c = fma(r2, fma(r, _C11, _C10), fma(r, _C9, _C8))
+    c = fma(r4, _C12, c)
+    p = 1.0 + fma(r4, fma(r4, c, b), a)
     # the low bits of `shifted` hold k; moved into the exponent field they make 2**k
     return p * _double_of_bits((_bits_of_double(shifted) + 1023) << 52)

@@ -72,7 +72,7 @@ class Basis:
         return self.monomials + 3
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def settle(out, d, order, m):
     """Recompute the rows ``sum |g|`` and ``sum |q|`` of ``out`` [rows, n]."""
     n = out.shape[1]
@@ -90,7 +90,7 @@ def settle(out, d, order, m):
         out[m + 2, q] *= _UP
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def scale_add(a, s, b, t, shift, out, d, order, m):
     """``out = s * a + t * b + shift`` for numbers ``s``, ``t``, ``shift``; ``out`` may be ``a`` or ``b``."""
     n = out.shape[1]
@@ -111,7 +111,7 @@ def scale_add(a, s, b, t, shift, out, d, order, m):
     settle(out, d, order, m)
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def multiply(a, b, out, d, order, m):
     """``out = a * b`` (design.md, A2). ``out`` must be another array than ``a`` and ``b``."""
     n = out.shape[1]
@@ -149,7 +149,7 @@ def multiply(a, b, out, d, order, m):
     settle(out, d, order, m)
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def compose(a, f0, f1, f2_low, f2_high, f3, out, d, order, m):
     """``out = f(a)`` from bounds of ``f`` over the range of ``a`` (design.md, A3).
 
@@ -205,7 +205,7 @@ def compose(a, f0, f1, f2_low, f2_high, f3, out, d, order, m):
     settle(out, d, order, m)
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def square(a, out, d, order, m):
     """``out = a * a``; for order 1 tighter than `multiply`, since ``(g.p)^2`` is never negative."""
     if order == 2:
@@ -226,7 +226,73 @@ def square(a, out, d, order, m):
     settle(out, d, order, m)
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
+def add_product(a, b, sign, out, d, order, m):
+    """``out += sign * a * b`` except for the rows ``sum |.|`` of ``out``; `settle` must follow.
+
+    ``sign`` is 1 or -1. Charges its own share of the rounding of up to three such additions.
+    """
+    n = out.shape[1]
+    for q in range(n):
+        out[m + 1, q] = abs(a[0, q]) + a[m + 1, q] + a[m + 2, q]
+    for q in range(n):
+        out[m + 2, q] = abs(b[0, q]) + b[m + 1, q] + b[m + 2, q]
+    for q in range(n):
+        pa = out[m + 1, q]
+        pb = out[m + 2, q]
+        out[m, q] += pa * b[m, q] + pb * a[m, q] + a[m, q] * b[m, q] + 4.0 * _COEFFICIENT * (pa * pb)
+    for q in range(n):
+        out[0, q] += sign * (a[0, q] * b[0, q])
+    for k in range(1, m):
+        for q in range(n):
+            out[k, q] += sign * (a[0, q] * b[k, q] + b[0, q] * a[k, q])
+    if order == 2:
+        row = d + 1
+        for k in range(1, d + 1):
+            for q in range(n):
+                out[row, q] += sign * (a[k, q] * b[k, q])
+            row += 1
+            for l in range(k + 1, d + 1):
+                for q in range(n):
+                    out[row, q] += sign * (a[k, q] * b[l, q] + a[l, q] * b[k, q])
+                row += 1
+        for q in range(n):
+            out[m, q] += a[m + 1, q] * b[m + 2, q] + a[m + 2, q] * (b[m + 1, q] + b[m + 2, q])
+    else:
+        for q in range(n):
+            out[m, q] += a[m + 1, q] * b[m + 1, q]
+        for k in range(1, d + 1):
+            for q in range(n):
+                out[m + 1, q] = 0.5 * (a[k, q] * b[k, q])
+            for q in range(n):
+                out[0, q] += sign * out[m + 1, q]
+            for q in range(n):
+                out[m, q] -= abs(out[m + 1, q])
+    for q in range(n):
+        out[m, q] = out[m, q] * _UP + _TINY
+
+
+@njit(cache=True, error_model="numpy")
+def add_square(a, out, d, order, m):
+    """``out += a * a`` except for the rows ``sum |.|`` of ``out``; `settle` must follow."""
+    if order == 2:
+        add_product(a, a, 1.0, out, d, order, m)
+        return
+    n = out.shape[1]
+    for q in range(n):
+        l = a[m + 1, q]
+        r = a[m, q]
+        half = 0.5 * (l * l)
+        p = abs(a[0, q]) + l
+        out[m, q] = (out[m, q] + (2.0 * p + r) * r + half + 4.0 * _COEFFICIENT * (p * p)) * _UP + _TINY
+    for q in range(n):
+        out[0, q] += a[0, q] * a[0, q] + 0.5 * (a[m + 1, q] * a[m + 1, q])
+    for k in range(1, m):
+        for q in range(n):
+            out[k, q] += 2.0 * (a[0, q] * a[k, q])
+
+
+@njit(cache=True, error_model="numpy")
 def bounds(a, low, high, d, order, m):
     """``low[q] <= x_q(p) <= high[q]`` over the box, rounded outward (design.md, A4)."""
     n = a.shape[1]
@@ -267,7 +333,7 @@ def bounds(a, low, high, d, order, m):
         high[q] += a[0, q]
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def reciprocal(a, work, out, d, order, m):
     """``out = 1 / a`` for ``a > 0``; ``work`` is [5, n] scratch."""
     for q in range(out.shape[1]):
@@ -288,7 +354,7 @@ def reciprocal(a, work, out, d, order, m):
     compose(a, work[0], work[1], work[2], work[3], work[4], out, d, order, m)
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def square_root(a, work, out, d, order, m):
     """``out = sqrt(a)`` for ``a > 0``; ``work`` is [5, n] scratch."""
     for q in range(out.shape[1]):
@@ -309,7 +375,7 @@ def square_root(a, work, out, d, order, m):
     compose(a, work[0], work[1], work[2], work[3], work[4], out, d, order, m)
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def reciprocal_square_root(a, work, out, d, order, m):
     """``out = 1 / sqrt(a)`` for ``a > 0``; ``work`` is [5, n] scratch."""
     for q in range(out.shape[1]):
@@ -331,7 +397,7 @@ def reciprocal_square_root(a, work, out, d, order, m):
     compose(a, work[0], work[1], work[2], work[3], work[4], out, d, order, m)
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def logarithm(a, work, out, d, order, m):
     """``out = log(a)`` for ``a > 0``; ``work`` is [5, n] scratch.
 
@@ -358,7 +424,7 @@ def logarithm(a, work, out, d, order, m):
         out[m, q] += _COEFFICIENT
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def clamp_below(a, floor, low, high, d, order, m):
     """Replace ``a`` by ``max(a, floor)`` given its bounds ``low``, ``high`` [n] (design.md, A5)."""
     n = a.shape[1]
@@ -385,7 +451,7 @@ def clamp_below(a, floor, low, high, d, order, m):
         a[m + 2, q] *= s * _UP
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def negate(a, m):
     """Replace ``a`` by ``-a``, exactly."""
     for k in range(m):

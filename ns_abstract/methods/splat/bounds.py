@@ -11,11 +11,11 @@ from ns_abstract.arithmetic.forms import Basis
 from ns_abstract.arithmetic.units import Arithmetic
 from ns_abstract.methods.splat.activate import Splats
 from ns_abstract.methods.splat.colors import BASIS_SIZE, BASIS_SLOPE, fixed_colors, moving_colors
-from ns_abstract.methods.splat.constants import Rasteriser
-from ns_abstract.methods.splat.gaussians import FORMS, gaussian_stage
+from ns_abstract.methods.splat.constants import Rasteriser, rules_array
+from ns_abstract.methods.splat.gaussians import FORMS, covariance_noise, gaussian_stage
 from ns_abstract.methods.splat.lists import depth_order, tile_lists
 from ns_abstract.methods.splat.pixels import pixel_stage
-from ns_abstract.methods.splat.render import WORK_TILE, camera_array, rules_array, tile_grid
+from ns_abstract.methods.splat.render import camera_array, tile_grid
 from ns_abstract.sets.path import Camera
 from ns_abstract.sets.poses import PoseForms
 
@@ -58,10 +58,20 @@ class SplatBounds:
         self.rasteriser = rasteriser
         self.arithmetic = arithmetic
         self.rules = rules_array(rasteriser)
-        self.side = rasteriser.tile_size or WORK_TILE
+        self.side = rasteriser.work_tile
         a = arithmetic
         self._errors = np.array([a.unit, a.flush, a.division, a.sqrt, a.rsqrt, a.exp])
+        self._buffers: dict[str, np.ndarray] = {}
+        self._noise = covariance_noise(splats.axes, a.unit, a.flush)
         self._color_radius = 8.0 * a.unit * float(np.abs(splats.sh).max(initial=1.0)) if splats.degree == 0 else 0.0
+
+    def _buffer(self, name: str, shape: tuple[int, ...], dtype: type = np.float64) -> np.ndarray:
+        """Uninitialised memory that is kept from call to call."""
+        size = int(np.prod(shape))
+        kept = self._buffers.get(name)
+        if kept is None or kept.size < size:
+            kept = self._buffers[name] = np.empty(size, dtype)
+        return kept[:size].reshape(shape)
 
     def cell(
         self,
@@ -97,15 +107,15 @@ class SplatBounds:
         low, high = forms.position.bounds()
         camera_reach = np.maximum(np.abs(low), np.abs(high))
         count = 6 if splats.antialiased else 5
-        record = np.empty((n, FORMS + count * (m + 1)))
-        box = np.empty((n, 4))
-        tiles = np.empty((n, 8), np.int32)
-        depth = np.empty(n)
-        delta = np.empty((n, 3))
-        depth_error = np.empty(n)
-        state = np.empty(n, np.uint8)
+        record = self._buffer("record", (n, FORMS + count * (m + 1)))
+        box = self._buffer("box", (n, 4))
+        tiles = self._buffer("tiles", (n, 8), np.int32)
+        depth = self._buffer("depth", (n,))
+        delta = self._buffer("delta", (n, 3))
+        depth_error = self._buffer("depth_error", (n,))
+        state = self._buffer("state", (n,), np.uint8)
         gaussian_stage(
-            candidates, splats.means, splats.axes, splats.opacity, splats.opacity, np.empty((0, 3)),
+            candidates, splats.means, splats.axes, self._noise, splats.opacity, splats.opacity, np.empty((0, 3)),
             rotation, offset, forms.origin, camera_reach, rotation_reach, view, self.rules, self._errors,
             d, order, m, splats.antialiased, record, box, tiles, depth, delta, depth_error, state,
         )  # fmt: skip
@@ -113,7 +123,10 @@ class SplatBounds:
         colors = self._colors(forms, candidates, alive, n)
         mask = np.zeros(across * down, np.uint8)
         mask[wanted] = 1
-        offsets, entries = tile_lists(depth_order(alive, depth), _clip(tiles, box, self.side), mask, across)
+        offsets, entries = tile_lists(depth_order(alive, depth), tiles, mask, across)
+        # the third row of the rotation; its float32 rounding is the same for every Gaussian
+        slope = np.ascontiguousarray(rotation[:, 6:9])
+        slope[m] += 4.0 * self.arithmetic.unit * rotation_reach[6:9]
         lower = np.zeros((wanted.size, self.side, self.side, 3))
         upper = np.zeros((wanted.size, self.side, self.side, 3))
         linear = np.zeros((wanted.size if keep_linear else 0, self.side, self.side, 3, m + 1))
@@ -122,7 +135,7 @@ class SplatBounds:
         negligible = self.rasteriser.alpha_negligible * splats.count
         pixel_stage(
             wanted, offsets, entries, record, box, tiles, depth, delta, depth_error, colors, self._color_radius,
-            np.ascontiguousarray(rotation[:, 6:9]), np.ascontiguousarray(rotation[0]), view, self.rules, self._errors,
+            slope, np.ascontiguousarray(rotation[0]), view, self.rules, self._errors,
             splats.background, negligible, PAIR_LIMIT, d, order, m, splats.antialiased, threads,
             lower, upper, linear, statistics,
         )  # fmt: skip
@@ -135,34 +148,26 @@ class SplatBounds:
         splats = self.splats
         basis = forms.position.basis
         if splats.degree == 0:
-            return np.ascontiguousarray(splats.sh[candidates, 0])
+            if n == splats.count:
+                return np.ascontiguousarray(splats.sh[:, 0])
+            return splats.sh[candidates, 0]
         indices = np.stack([alive, candidates[alive]], axis=1).astype(np.int64)
         unit = self.arithmetic.unit
         low, high = forms.position.bounds()
         # torch.inverse of the view matrix: 80 units of 1 + |T| (design.md, C3)
         position_error = 80.0 * unit * (1.0 + float(np.maximum(np.abs(low), np.abs(high)).sum()))
         if not np.any(forms.position.linear) and float(forms.position.radius.max()) < 1e-9:
-            colors = np.zeros((n, 6))
+            colors = self._buffer("colors", (n, 6))
             position_error += 2.0 * float(forms.position.radius.max())
             fixed_colors(
                 indices, splats.means, splats.sh, splats.degree, forms.position.center, position_error, unit,
                 BASIS_SIZE, BASIS_SLOPE, colors,
             )  # fmt: skip
             return colors
-        colors = np.zeros((n, 3 * (basis.monomials + 1)))
+        colors = self._buffer("colors", (n, 3 * (basis.monomials + 1)))
         moving_colors(
             indices, splats.means, splats.sh, splats.degree, forms.position.data, forms.origin, position_error, unit,
             BASIS_SIZE, BASIS_SLOPE, basis.dimensions, basis.order, basis.monomials, colors,
         )  # fmt: skip
         return colors
 
-
-def _clip(tiles: np.ndarray, box: np.ndarray, side: int) -> np.ndarray:
-    """Tile ranges cut down to where the pixel regions lie; the rest is sure not to reach the threshold."""
-    out = tiles[:, :4].copy()
-    with np.errstate(invalid="ignore"):
-        first = np.floor(np.clip((box[:, [0, 2]] - 0.5) / side, -1.0, 1e6))
-        past = np.floor(np.clip((box[:, [1, 3]] - 0.5) / side, -1.0, 1e6)) + 1.0
-    out[:, [0, 2]] = np.maximum(out[:, [0, 2]], first).astype(np.int32)
-    out[:, [1, 3]] = np.minimum(out[:, [1, 3]], past).astype(np.int32)
-    return out

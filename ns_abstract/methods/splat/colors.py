@@ -36,7 +36,7 @@ BASIS_SIZE = np.array(
 )
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def sh_basis(x, y, z, degree, out):
     """Real spherical harmonics of the unit direction, bands 0 to ``degree``, in gsplat's order."""
     out[0] = 0.2820947917738781
@@ -66,7 +66,7 @@ def sh_basis(x, y, z, degree, out):
             out[15] = -0.5900435899266435 * c2
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def sh_color(sh, direction, degree, basis, out):
     """``out[c] = max(0, 0.5 + sum_k basis_k sh[k, c])`` for an unnormalised ``direction`` [3]."""
     length = math.sqrt(
@@ -80,7 +80,7 @@ def sh_color(sh, direction, degree, basis, out):
         out[c] = max(0.0, total + 0.5)
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _color_error(sh, i, channel, count, unit, direction_error, sizes, slopes):
     """Float error of one colour (design.md, C3)."""
     error = unit
@@ -90,12 +90,12 @@ def _color_error(sh, i, channel, count, unit, direction_error, sizes, slopes):
     return error
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _direction_error(distance, position_error, mean_size, unit):
     return (position_error + 2.0 * unit * mean_size) / distance + 16.0 * unit
 
 
-@njit(cache=True, parallel=True)
+@njit(cache=True, parallel=True, error_model="numpy")
 def fixed_colors(indices, means, sh, degree, position, position_error, unit, sizes, slopes, colors):
     """Colours seen from one camera position: centre and radius by Gaussian (design.md, C1, C3).
 
@@ -123,7 +123,7 @@ def fixed_colors(indices, means, sh, degree, position, position_error, unit, siz
                 colors[target, 2 * c + 1] = _color_error(sh, i, c, count, unit, min(error, 2.0), sizes, slopes)
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _accumulate(target, form, weights, m):
     """``target += weights[q] * form`` with lane-wise weights; `settle` must follow."""
     for k in range(m):
@@ -136,7 +136,7 @@ def _accumulate(target, form, weights, m):
         target[m, q] = (target[m, q] + w * form[m, q] + _COEFFICIENT * (w * size + total)) * _UP
 
 
-@njit(cache=True, parallel=True)
+@njit(cache=True, parallel=True, error_model="numpy")
 def moving_colors(
     indices, means, sh, degree, position, origin, position_error, unit, sizes, slopes, d, order, m, colors
 ):
@@ -239,7 +239,7 @@ def moving_colors(
                         colors[row, channel * (m + 1) + k] = form[k, q]
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _basis_form(work, k, d, order, m):
     """Basis function ``k`` >= 1 into slot 14, from the products kept by `moving_colors`."""
     out = work[14]

@@ -4,6 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import numpy as np
+
+#: Tile side where the rasteriser itself has no tiles.
+WORK_TILE = 16
+
 
 @dataclass(frozen=True)
 class Rasteriser:
@@ -44,6 +49,11 @@ class Rasteriser:
     view_dependent: bool = True
     alpha_negligible: float = 0.0
 
+    @property
+    def work_tile(self) -> int:
+        """Side of the tiles that pictures are computed in."""
+        return self.tile_size or WORK_TILE
+
 
 #: What nerfstudio 1.1.5 pins (pyproject.toml, ``gsplat==1.4.0``).
 GSPLAT_1_4_0 = Rasteriser("gsplat", "1.4.0")
@@ -65,3 +75,15 @@ PAPER = Rasteriser(
 )
 
 RASTERISERS = {"gsplat": GSPLAT_1_4_0, "paper": PAPER}
+
+
+def rules_array(rasteriser: Rasteriser) -> np.ndarray:
+    """The rasteriser's constants in the order the kernels expect."""
+    r = rasteriser
+    alpha_min = r.alpha_min if r.alpha_min > 0.0 else r.alpha_negligible
+    return np.array(
+        [
+            r.near, r.far, r.eps2d, float(r.tile_size), r.radius_sigmas, r.discriminant_min, r.view_margin,
+            alpha_min, r.alpha_max, r.transmittance_min, float(r.work_tile),
+        ]
+    )  # fmt: skip

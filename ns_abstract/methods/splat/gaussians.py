@@ -20,7 +20,10 @@ import math
 import numpy as np
 from numba import njit, prange
 
+from ns_abstract.arithmetic.compiled import borrowed
 from ns_abstract.arithmetic.forms import (
+    add_product,
+    add_square,
     bounds,
     clamp_below,
     logarithm,
@@ -61,7 +64,34 @@ SLOTS = 34
 SCALARS = 17
 
 
-@njit(cache=True)
+def covariance_noise(axes: np.ndarray, unit: float, flush: float) -> np.ndarray:
+    """Float error of each world covariance and of the products made with it (design.md, G6).
+
+    Args:
+        axes: [N, 3, 3] scaled principal axes.
+        unit, flush: The arithmetic.
+
+    Returns:
+        [N, 12]: the error bounds and the absolute values of the entries 00, 11, 22, 01, 02, 12.
+    """
+    size = np.abs(axes)
+    scale = np.sqrt(np.sum(axes * axes, axis=1))  # [N, 3]
+    out = np.empty((axes.shape[0], 12))
+    # entries of R(q) carry 52 units: normalisation, products and sums of a quaternion
+    entry = 52.0 * unit
+    squares = np.sum(scale * scale, axis=1)
+    for k, (r, c) in enumerate(((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))):
+        covariance = np.abs(np.sum(axes[:, r] * axes[:, c], axis=1))
+        products = np.sum(size[:, r] * size[:, c], axis=1)
+        spread = np.sum(scale * (size[:, r] + size[:, c]), axis=1)
+        out[:, k] = (
+            entry * spread + entry * entry * squares + 5.0 * unit * products + 20.5 * unit * covariance + flush
+        )
+        out[:, 6 + k] = covariance * (1.0 + 64.0 * unit) + 8.0 * unit * products
+    return out
+
+
+@njit(cache=True, error_model="numpy")
 def _rotate(rotation, row, vectors, offset, out, d, order, m):
     """``out = rotation[row] . vectors (+ offset[row])`` for exact ``vectors`` [3, n].
 
@@ -99,7 +129,7 @@ def _rotate(rotation, row, vectors, offset, out, d, order, m):
     settle(out, d, order, m)
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _clamp_ratio(a, low, high, limit_low, limit_high, other, d, order, m):
     """Replace ``a`` by ``min(limit_high, max(-limit_low, a))`` and its bounds accordingly."""
     clamp_below(a, -limit_low, low, high, d, order, m)
@@ -116,13 +146,13 @@ def _clamp_ratio(a, low, high, limit_low, limit_high, other, d, order, m):
         high[q] = min(high[q], limit_high)
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _form_to_record(form, q, record, start, m):
     for k in range(m + 1):
         record[start + k] = form[k, q]
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _tile_range(low, high, size, count):
     """Tiles [first, past) that the interval of pixels [low, high] touches, clipped to the image."""
     first = math.floor(min(max(low / size, 0.0), float(count)))
@@ -130,9 +160,72 @@ def _tile_range(low, high, size, count):
     return int(first), int(past)
 
 
-@njit(cache=True, parallel=True)
+@njit(cache=True, error_model="numpy")
+def _stage_chunk(
+    chunk, candidates_, means_, axes_, noise_, opacity_low_, opacity_high_, mean_radius_,
+    rotation_, offset_, origin_, camera_reach_, rotation_reach_, camera_, rules_, errors_,
+    d, order, m, antialiased,
+    record_, box_, tiles_, depth_, delta_, depth_error_, state_,
+):  # fmt: skip
+    """One chunk of candidates; see `gaussian_stage`."""
+    candidates = borrowed(candidates_)
+    means = borrowed(means_)
+    axes = borrowed(axes_)
+    noise = borrowed(noise_)
+    opacity_low = borrowed(opacity_low_)
+    opacity_high = borrowed(opacity_high_)
+    mean_radius = borrowed(mean_radius_)
+    rotation = borrowed(rotation_)
+    offset = borrowed(offset_)
+    origin = borrowed(origin_)
+    camera_reach = borrowed(camera_reach_)
+    rotation_reach = borrowed(rotation_reach_)
+    camera = borrowed(camera_)
+    rules = borrowed(rules_)
+    errors = borrowed(errors_)
+    record = borrowed(record_)
+    box = borrowed(box_)
+    tiles = borrowed(tiles_)
+    depth = borrowed(depth_)
+    delta = borrowed(delta_)
+    depth_error = borrowed(depth_error_)
+    state = borrowed(state_)
+    n = candidates.shape[0]
+    work_ = np.empty((SLOTS, m + 3, LANES))
+    work = borrowed(work_)
+    scalars_ = np.empty((SCALARS, LANES))
+    scalars = borrowed(scalars_)
+    scratch_ = np.empty((5, LANES))
+    scratch = borrowed(scratch_)
+    vectors_ = np.empty((3, LANES))
+    vectors = borrowed(vectors_)
+    alive_ = np.empty(_CHUNK, np.int64)
+    alive = borrowed(alive_)
+    start = chunk * _CHUNK
+    stop = min(n, start + _CHUNK)
+    count = 0
+    for first in range(start, stop, LANES):
+        lanes = min(LANES, stop - first)
+        count = _cull_block(
+            candidates, first, lanes, means, axes, opacity_high, mean_radius, rotation, offset, origin,
+            camera_reach, rotation_reach, camera, rules, errors, d, order, m, work, scalars, vectors,
+            state, alive, count,
+        )  # fmt: skip
+    for first in range(0, count, LANES):
+        lanes = min(LANES, count - first)
+        _project_block(
+            candidates, alive[first : first + lanes], means, axes, noise, opacity_low, opacity_high, mean_radius,
+            rotation, offset, origin, camera_reach, rotation_reach, camera, rules, errors,
+            d, order, m, antialiased, work, scalars, scratch, vectors,
+            record, box, tiles, depth, delta, depth_error, state,
+        )  # fmt: skip
+    # the owners of the borrowed arrays live to here
+    return work_.size + scalars_.size + scratch_.size + vectors_.size + alive_.size
+
+
+@njit(cache=True, parallel=True, error_model="numpy")
 def gaussian_stage(
-    candidates, means, axes, opacity_low, opacity_high, mean_radius,
+    candidates, means, axes, noise, opacity_low, opacity_high, mean_radius,
     rotation, offset, origin, camera_reach, rotation_reach, camera, rules, errors,
     d, order, m, antialiased,
     record, box, tiles, depth, delta, depth_error, state,
@@ -142,6 +235,7 @@ def gaussian_stage(
     Args:
         candidates: [n] int32.
         means, axes: [N, 3], [N, 3, 3] of the scene.
+        noise: [N, 12] see `covariance_noise`.
         opacity_low, opacity_high: [N].
         mean_radius: [N, 3] half-widths of independent mean ranges, world axes, or [0, 3].
         rotation, offset: [rows, 9], [rows, 3] pose forms; see `PoseForms`.
@@ -149,40 +243,22 @@ def gaussian_stage(
         camera_reach: [3] upper bounds of the camera's coordinates.
         rotation_reach: [9] upper bounds of the rotation's absolute entries.
         camera: fx, fy, cx, cy, width, height.
-        rules: near, far, eps2d, tile_size, radius_sigmas, discriminant_min, view_margin, alpha_min.
+        rules: See `ns_abstract.methods.splat.constants.rules_array`.
         errors: unit, flush, division, sqrt, rsqrt, exp errors in units.
         record, box, tiles, depth, delta, depth_error, state: outputs, one row per candidate;
             ``box`` [n, 4] pixels x0, x1, y0, y1; ``tiles`` [n, 8] outer then inner tile ranges;
             ``depth`` [n] at the middle; ``delta`` [n, 3] mean minus origin; ``state`` [n] 1 if visible.
     """
-    n = candidates.shape[0]
-    for chunk in prange((n + _CHUNK - 1) // _CHUNK):
-        work = np.empty((SLOTS, m + 3, LANES))
-        scalars = np.empty((SCALARS, LANES))
-        scratch = np.empty((5, LANES))
-        vectors = np.empty((3, LANES))
-        alive = np.empty(_CHUNK, np.int64)
-        start = chunk * _CHUNK
-        stop = min(n, start + _CHUNK)
-        count = 0
-        for first in range(start, stop, LANES):
-            lanes = min(LANES, stop - first)
-            count = _cull_block(
-                candidates, first, lanes, means, axes, opacity_high, mean_radius, rotation, offset, origin,
-                camera_reach, rotation_reach, camera, rules, errors, d, order, m, work, scalars, vectors,
-                state, alive, count,
-            )  # fmt: skip
-        for first in range(0, count, LANES):
-            lanes = min(LANES, count - first)
-            _project_block(
-                candidates, alive[first : first + lanes], means, axes, opacity_low, opacity_high, mean_radius,
-                rotation, offset, origin, camera_reach, rotation_reach, camera, rules, errors,
-                d, order, m, antialiased, work, scalars, scratch, vectors,
-                record, box, tiles, depth, delta, depth_error, state,
-            )  # fmt: skip
+    for chunk in prange((candidates.shape[0] + _CHUNK - 1) // _CHUNK):
+        _stage_chunk(
+            chunk, candidates, means, axes, noise, opacity_low, opacity_high, mean_radius,
+            rotation, offset, origin, camera_reach, rotation_reach, camera, rules, errors,
+            d, order, m, antialiased,
+            record, box, tiles, depth, delta, depth_error, state,
+        )  # fmt: skip
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _coordinate_error(rotation_reach, camera_reach, means, i, row, unit):
     """Float error of one camera coordinate (design.md, G2): ten units of the sum of absolute products."""
     total = 0.0
@@ -191,7 +267,7 @@ def _coordinate_error(rotation_reach, camera_reach, means, i, row, unit):
     return 10.0 * unit * total * _UP
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _mean_spread(rotation_reach, mean_radius, i, row):
     total = 0.0
     if mean_radius.shape[0] > 0:
@@ -200,7 +276,7 @@ def _mean_spread(rotation_reach, mean_radius, i, row):
     return total * _UP
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _cull_block(
     candidates, first, lanes, means, axes, opacity_high, mean_radius, rotation, offset, origin,
     camera_reach, rotation_reach, camera, rules, errors, d, order, m, work, scalars, vectors,
@@ -248,6 +324,10 @@ def _cull_block(
             focal = fx if axis == 0 else fy
             center = cx if axis == 0 else cy
             extent = width if axis == 0 else height
+            middle = focal * work[_X + axis, 0, q]
+            if -center * work[_Z, 0, q] <= middle and middle <= (extent - center) * work[_Z, 0, q]:
+                # inside the image at the middle pose
+                continue
             error = focal * (
                 _coordinate_error(rotation_reach, camera_reach, means, i, axis, unit)
                 + _mean_spread(rotation_reach, mean_radius, i, axis)
@@ -265,7 +345,7 @@ def _cull_block(
     return count
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _linear_top(a, b, q, s, t, m):
     """Upper bound of ``s a + t b`` over the box."""
     top = s * a[0, q] + t * b[0, q] + abs(s) * a[m, q] + abs(t) * b[m, q]
@@ -277,15 +357,15 @@ def _linear_top(a, b, q, s, t, m):
     return top + 8.0 * _COEFFICIENT * magnitude
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _project_block(
-    candidates, block, means, axes, opacity_low, opacity_high, mean_radius,
+    candidates, block, means, axes, noise, opacity_low, opacity_high, mean_radius,
     rotation, offset, origin, camera_reach, rotation_reach, camera, rules, errors,
     d, order, m, antialiased, work, scalars, scratch, vectors,
     record, box, tiles, depth, delta, depth_error, state,
 ):  # fmt: skip
     """Records of up to `LANES` Gaussians (design.md, G4-G9)."""
-    eps2d, margin = rules[2], rules[6]
+    eps2d, margin, unit = rules[2], rules[6], errors[0]
     fx, fy, cx, cy, width, height = camera[0], camera[1], camera[2], camera[3], camera[4], camera[5]
     none = np.empty((0, 3))
     lanes = block.shape[0]
@@ -330,9 +410,17 @@ def _project_block(
         settle(target, d, order, m)
     for q in range(lanes):
         index = block[q]
+        i = candidates[index]
         record[index, MEAN_X] = scratch[0, q] + cx
         record[index, MEAN_Y] = scratch[1, q] + cy
         depth[index] = work[_Z, 0, q]
+        # G10: rounding of the depth against that of another Gaussian; what both share is in the slope
+        products = 0.0
+        for k in range(3):
+            products += rotation_reach[6 + k] * abs(means[i, k])
+        depth_error[index] = unit * (4.2 * products + 1.1 * max(abs(scalars[_ZLO, q]), abs(scalars[_ZHI, q]))) + (
+            _mean_spread(rotation_reach, mean_radius, i, 2)
+        )
         for k in range(3):
             delta[index, k] = vectors[k, q]
     # the Jacobian's clamped ratios
@@ -359,23 +447,26 @@ def _project_block(
         for row in range(3):
             _rotate(rotation, row, vectors, none, work[_W0 + 3 * row + column], d, order, m)
     for column in range(3):
-        multiply(work[_U], work[_W6 + column], work[_T0], d, order, m)
-        scale_add(work[_W0 + column], fx, work[_T0], -fx, 0.0, work[_N0 + column], d, order, m)
-        multiply(work[_V], work[_W6 + column], work[_T0], d, order, m)
-        scale_add(work[_W3 + column], fy, work[_T0], -fy, 0.0, work[_N3 + column], d, order, m)
-    # a' = |n0|^2 + eps z^2, c' = |n1|^2 + eps z^2, b' = n0.n1 (covariance times z^2)
+        _minus_product(work[_W0 + column], work[_U], work[_W6 + column], work[_N0 + column], d, order, m)
+        _minus_product(work[_W3 + column], work[_V], work[_W6 + column], work[_N3 + column], d, order, m)
+    # a' = fx^2 |n0|^2 + eps z^2, c' = fy^2 |n1|^2 + eps z^2, b' = fx fy n0.n1 (covariance times z^2)
     square(work[_Z], work[_T2], d, order, m)
     _dot3(work, _N0, _N0, _A, d, order, m)
     _dot3(work, _N3, _N3, _C, d, order, m)
     _dot3(work, _N0, _N3, _B, d, order, m)
-    # det' = |n0 x n1|^2 + eps z^2 (|n0|^2 + |n1|^2) + eps^2 z^4, sums of squares only
+    scale_add(work[_B], fx * fy, work[_B], 0.0, 0.0, work[_B], d, order, m)
+    # det' = fx^2 fy^2 |n0 x n1|^2 + eps z^2 (fx^2 |n0|^2 + fy^2 |n1|^2) + eps^2 z^4, sums of squares only
     _cross_square(work, _K, d, order, m)
-    scale_add(work[_A], 1.0, work[_C], 1.0, 0.0, work[_T0], d, order, m)
+    scale_add(work[_K], (fx * fy) * (fx * fy), work[_K], 0.0, 0.0, work[_K], d, order, m)
+    scale_add(work[_A], fx * fx, work[_C], fy * fy, 0.0, work[_T0], d, order, m)
     scale_add(work[_T0], eps2d, work[_T2], eps2d * eps2d, 0.0, work[_T1], d, order, m)
-    multiply(work[_T1], work[_T2], work[_T0], d, order, m)
-    scale_add(work[_K], 1.0, work[_T0], 1.0, 0.0, work[_DET], d, order, m)
-    scale_add(work[_A], 1.0, work[_T2], eps2d, 0.0, work[_A], d, order, m)
-    scale_add(work[_C], 1.0, work[_T2], eps2d, 0.0, work[_C], d, order, m)
+    for k in range(m + 3):
+        for q in range(LANES):
+            work[_DET, k, q] = work[_K, k, q]
+    add_product(work[_T1], work[_T2], 1.0, work[_DET], d, order, m)
+    settle(work[_DET], d, order, m)
+    scale_add(work[_A], fx * fx, work[_T2], eps2d, 0.0, work[_A], d, order, m)
+    scale_add(work[_C], fy * fy, work[_T2], eps2d, 0.0, work[_C], d, order, m)
     bounds(work[_A], scalars[_ALO], scalars[_AHI], d, order, m)
     bounds(work[_C], scalars[_CLO], scalars[_CHI], d, order, m)
     bounds(work[_B], scalars[_BLO], scalars[_BHI], d, order, m)
@@ -402,7 +493,7 @@ def _project_block(
         index = block[q]
         i = candidates[index]
         _finish(
-            index, i, q, means, axes, opacity_low, opacity_high, camera_reach, rotation_reach,
+            index, i, q, means, noise, opacity_low, opacity_high, camera_reach, rotation_reach,
             rules, camera, errors, m, antialiased, work, scalars, record, box, tiles, depth_error, state,
         )  # fmt: skip
     # P = P' z, Q = Q' z, S = S' z, W1 = P' X^ - Q' Y^, W2 = S' Y^
@@ -413,9 +504,10 @@ def _project_block(
         _form_to_record(work[_T0], q, record[block[q]], FORMS, m)
         _form_to_record(work[_T1], q, record[block[q]], FORMS + stride, m)
     multiply(work[_S], work[_Z], work[_T0], d, order, m)
-    multiply(work[_P], work[_DX], work[_T1], d, order, m)
-    multiply(work[_Q], work[_DY], work[_T2], d, order, m)
-    scale_add(work[_T1], 1.0, work[_T2], -1.0, 0.0, work[_T1], d, order, m)
+    _clear(work[_T1])
+    add_product(work[_P], work[_DX], 1.0, work[_T1], d, order, m)
+    add_product(work[_Q], work[_DY], -1.0, work[_T1], d, order, m)
+    settle(work[_T1], d, order, m)
     multiply(work[_S], work[_DY], work[_T2], d, order, m)
     for q in range(lanes):
         index = block[q]
@@ -434,45 +526,63 @@ def _project_block(
                     record[index, WILD] = 1.0
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
+def _clear(out):
+    for k in range(out.shape[0]):
+        for q in range(out.shape[1]):
+            out[k, q] = 0.0
+
+
+@njit(cache=True, error_model="numpy")
+def _minus_product(c, a, b, out, d, order, m):
+    """``out = c - a * b``."""
+    for k in range(m + 1):
+        for q in range(out.shape[1]):
+            out[k, q] = c[k, q]
+    add_product(a, b, -1.0, out, d, order, m)
+    # the subtraction's own rounding, for what `c` adds
+    for q in range(out.shape[1]):
+        out[m, q] += _COEFFICIENT * (abs(c[0, q]) + c[m + 1, q] + c[m + 2, q])
+    settle(out, d, order, m)
+
+
+@njit(cache=True, error_model="numpy")
 def _dot3(work, a, b, out, d, order, m):
-    """``work[out] = work[a..a+2] . work[b..b+2]``; uses slots _T0, _T1."""
+    """``work[out] = work[a..a+2] . work[b..b+2]``."""
+    _clear(work[out])
     for k in range(3):
-        target = work[out] if k == 0 else work[_T0]
         if a == b:
-            square(work[a + k], target, d, order, m)
+            add_square(work[a + k], work[out], d, order, m)
         else:
-            multiply(work[a + k], work[b + k], target, d, order, m)
-        if k > 0:
-            scale_add(work[out], 1.0, work[_T0], 1.0, 0.0, work[out], d, order, m)
+            add_product(work[a + k], work[b + k], 1.0, work[out], d, order, m)
+    settle(work[out], d, order, m)
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _cross_square(work, out, d, order, m):
-    """``work[out] = |n0 x n1|^2``; uses slots _T0, _T1."""
+    """``work[out] = |n0 x n1|^2``; uses slot _T0."""
+    _clear(work[out])
     for k in range(3):
         i, j = (0, 1) if k == 0 else ((0, 2) if k == 1 else (1, 2))
-        multiply(work[_N0 + i], work[_N3 + j], work[_T0], d, order, m)
-        multiply(work[_N0 + j], work[_N3 + i], work[_T1], d, order, m)
-        scale_add(work[_T0], 1.0, work[_T1], -1.0, 0.0, work[_T0], d, order, m)
-        if k == 0:
-            square(work[_T0], work[out], d, order, m)
-        else:
-            square(work[_T0], work[_T1], d, order, m)
-            scale_add(work[out], 1.0, work[_T1], 1.0, 0.0, work[out], d, order, m)
+        _clear(work[_T0])
+        add_product(work[_N0 + i], work[_N3 + j], 1.0, work[_T0], d, order, m)
+        add_product(work[_N0 + j], work[_N3 + i], -1.0, work[_T0], d, order, m)
+        settle(work[_T0], d, order, m)
+        add_square(work[_T0], work[out], d, order, m)
+    settle(work[out], d, order, m)
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _finish(
-    index, i, q, means, axes, opacity_low, opacity_high, camera_reach, rotation_reach,
+    index, i, q, means, noise, opacity_low, opacity_high, camera_reach, rotation_reach,
     rules, camera, errors, m, antialiased, work, scalars, record, box, tiles, depth_error, state,
 ):  # fmt: skip
     """Float errors, pixel region and tile ranges of one Gaussian (design.md, G5-G9)."""
-    near, tile, sigmas, discriminant_min, margin, alpha_min = (
-        rules[0], rules[3], rules[4], rules[5], rules[6], rules[7],
+    near, tile, sigmas, discriminant_min, margin, alpha_min, work_tile = (
+        rules[0], rules[3], rules[4], rules[5], rules[6], rules[7], rules[10],
     )  # fmt: skip
     fx, fy, cx, cy, width, height = camera[0], camera[1], camera[2], camera[3], camera[4], camera[5]
-    unit, flush, division, root = errors[0], errors[1], errors[2], errors[3]
+    unit, division, root = errors[0], errors[2], errors[3]
     stride = m + 1
     record[index, FORMS + 3 * stride + m] = 0.0
     record[index, KAPPA] = 0.0
@@ -481,8 +591,8 @@ def _finish(
     slack = 12.0 * unit
     record[index, OPACITY_LOW] = opacity_low[i] * (1.0 - slack)
     record[index, OPACITY_HIGH] = opacity_high[i] * (1.0 + slack)
-    tiles_x = int(math.ceil(width / tile)) if tile > 0.0 else 1
-    tiles_y = int(math.ceil(height / tile)) if tile > 0.0 else 1
+    tiles_x = int(math.ceil(width / (tile if tile > 0.0 else work_tile)))
+    tiles_y = int(math.ceil(height / (tile if tile > 0.0 else work_tile)))
     box[index, 0] = -np.inf
     box[index, 1] = np.inf
     box[index, 2] = -np.inf
@@ -496,7 +606,6 @@ def _finish(
     error_x = _coordinate_error(rotation_reach, camera_reach, means, i, 0, unit)
     error_y = _coordinate_error(rotation_reach, camera_reach, means, i, 1, unit)
     error_z = _coordinate_error(rotation_reach, camera_reach, means, i, 2, unit)
-    depth_error[index] = error_z
     z_low = scalars[_ZLO, q] - error_z
     z_high = scalars[_ZHI, q] + error_z
     if not (z_low >= near * (1.0 + 4.0 * unit) and z_high < np.inf):
@@ -526,48 +635,34 @@ def _finish(
     relative_j = relative_z + 2.0 * relative_rz + 8.0 * unit
     jx = fx / z_low
     jy = fy / z_low
-    error_a = 0.0
-    error_b = 0.0
-    error_c = 0.0
     depth_variance = 0.0
     for k in range(3):
         w = work[_W6 + k]
         reach = abs(w[0, q]) + w[m + 1, q] + w[m + 2, q] + w[m, q]
         depth_variance += reach * reach
-    s0 = math.sqrt(axes[i, 0, 0] ** 2 + axes[i, 1, 0] ** 2 + axes[i, 2, 0] ** 2)
-    s1 = math.sqrt(axes[i, 0, 1] ** 2 + axes[i, 1, 1] ** 2 + axes[i, 2, 1] ** 2)
-    s2 = math.sqrt(axes[i, 0, 2] ** 2 + axes[i, 1, 2] ** 2 + axes[i, 2, 2] ** 2)
-    entry = 52.0 * unit
-    for r in range(3):
-        gx_r = jx * (rotation_reach[r] + ratio_x * rotation_reach[6 + r])
-        gy_r = jy * (rotation_reach[3 + r] + ratio_y * rotation_reach[6 + r])
-        for c in range(3):
-            gx_c = jx * (rotation_reach[c] + ratio_x * rotation_reach[6 + c])
-            gy_c = jy * (rotation_reach[3 + c] + ratio_y * rotation_reach[6 + c])
-            covariance = abs(
-                axes[i, r, 0] * axes[i, c, 0] + axes[i, r, 1] * axes[i, c, 1] + axes[i, r, 2] * axes[i, c, 2]
-            )
-            products = (
-                abs(axes[i, r, 0] * axes[i, c, 0])
-                + abs(axes[i, r, 1] * axes[i, c, 1])
-                + abs(axes[i, r, 2] * axes[i, c, 2])
-            )
-            spread = (
-                s0 * (abs(axes[i, r, 0]) + abs(axes[i, c, 0]))
-                + s1 * (abs(axes[i, r, 1]) + abs(axes[i, c, 1]))
-                + s2 * (abs(axes[i, r, 2]) + abs(axes[i, c, 2]))
-            )
-            squares = s0 * s0 + s1 * s1 + s2 * s2
-            f = (
-                entry * spread
-                + entry * entry * squares
-                + 5.0 * unit * products
-                + (20.0 * unit + 2.0 * relative_j) * covariance * (1.0 + 64.0 * unit)
-                + flush
-            )
-            error_a += gx_r * gx_c * f
-            error_b += gx_r * gy_c * f
-            error_c += gy_r * gy_c * f
+    gx0 = jx * (rotation_reach[0] + ratio_x * rotation_reach[6])
+    gx1 = jx * (rotation_reach[1] + ratio_x * rotation_reach[7])
+    gx2 = jx * (rotation_reach[2] + ratio_x * rotation_reach[8])
+    gy0 = jy * (rotation_reach[3] + ratio_y * rotation_reach[6])
+    gy1 = jy * (rotation_reach[4] + ratio_y * rotation_reach[7])
+    gy2 = jy * (rotation_reach[5] + ratio_y * rotation_reach[8])
+    grow = 2.0 * relative_j
+    f00 = noise[i, 0] + grow * noise[i, 6]
+    f11 = noise[i, 1] + grow * noise[i, 7]
+    f22 = noise[i, 2] + grow * noise[i, 8]
+    f01 = noise[i, 3] + grow * noise[i, 9]
+    f02 = noise[i, 4] + grow * noise[i, 10]
+    f12 = noise[i, 5] + grow * noise[i, 11]
+    h0 = f00 * gx0 + f01 * gx1 + f02 * gx2
+    h1 = f01 * gx0 + f11 * gx1 + f12 * gx2
+    h2 = f02 * gx0 + f12 * gx1 + f22 * gx2
+    error_a = gx0 * h0 + gx1 * h1 + gx2 * h2
+    error_b = gy0 * h0 + gy1 * h1 + gy2 * h2
+    error_c = (
+        gy0 * (f00 * gy0 + f01 * gy1 + f02 * gy2)
+        + gy1 * (f01 * gy0 + f11 * gy1 + f12 * gy2)
+        + gy2 * (f02 * gy0 + f12 * gy1 + f22 * gy2)
+    )
     a = scalars[_AHI, q] / (z_low * z_low)
     c = scalars[_CHI, q] / (z_low * z_low)
     b = max(abs(scalars[_BLO, q]), abs(scalars[_BHI, q])) / (z_low * z_low)
@@ -689,3 +784,10 @@ def _finish(
     # no pixel centre inside
     if box[index, 1] < 0.5 or box[index, 0] > width - 0.5 or box[index, 3] < 0.5 or box[index, 2] > height - 0.5:
         state[index] = 0
+        return
+    # tiles without such pixels need not look at it
+    side = tile if tile > 0.0 else work_tile
+    tiles[index, 0] = max(tiles[index, 0], int(math.floor(max(box[index, 0] - 0.5, 0.0) / side)))
+    tiles[index, 1] = min(tiles[index, 1], int(math.floor(min(box[index, 1] - 0.5, width) / side)) + 1)
+    tiles[index, 2] = max(tiles[index, 2], int(math.floor(max(box[index, 2] - 0.5, 0.0) / side)))
+    tiles[index, 3] = min(tiles[index, 3], int(math.floor(min(box[index, 3] - 0.5, height) / side)) + 1)

@@ -6,7 +6,7 @@ import numpy as np
 from numba import njit
 
 #: Side of a block in pixels; a block is what one pass of the compiled pixel stages works on.
-BLOCK = 4
+BLOCK = 8
 #: Pixels of a block.
 PIXELS = BLOCK * BLOCK
 
@@ -18,7 +18,7 @@ def depth_order(visible, depth):
     return _sort_ties(visible[order], keys[order])
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _sort_ties(order, keys):
     start = 0
     for k in range(1, order.size + 1):
@@ -29,7 +29,7 @@ def _sort_ties(order, keys):
     return order
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def tile_lists(order, tiles, wanted, tiles_x):
     """Offsets [T + 1] and entries of the lists of the T tiles whose ``wanted`` is not 0.
 
@@ -59,7 +59,7 @@ def tile_lists(order, tiles, wanted, tiles_x):
     return offsets, entries
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def block_lists(entries, box, x0, y0, tile, offsets, out):
     """Distribute a tile's ``entries`` over its blocks by the pixel regions ``box`` [n, 4].
 

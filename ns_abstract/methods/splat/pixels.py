@@ -13,6 +13,7 @@ import math
 import numpy as np
 from numba import njit, prange
 
+from ns_abstract.arithmetic.compiled import borrowed
 from ns_abstract.arithmetic.elementary import EXP_RELATIVE_ERROR, exp_kernel
 from ns_abstract.arithmetic.units import UNIT64
 from ns_abstract.methods.splat.gaussians import (
@@ -32,116 +33,173 @@ _UP = 1.0 + 128.0 * UNIT64
 _FIT_LIMIT = 2.0
 #: Exponents are cut here; exp(-60) is far below any threshold.
 _EXPONENT_LIMIT = 60.0
+#: Reordering that moves no channel of a pixel by more is not examined beyond the swap bound.
+_REORDERING_MATTERS = 1e-4
+#: Lane loops run over multiples of this many lanes.
+_VECTOR = 16
 
-# rows of the lane scratch
+# Scratch is flat: row r holds its lanes at r * PIXELS .. r * PIXELS + PIXELS - 1. With constant
+# offsets the compiler sees that rows do not overlap. Lane loops run to a length taken from an array:
+# with a constant length they would be unrolled into scalar code, as it is they become vector code.
 (
-    _AX, _AY, _C1, _R1, _L1, _B1, _C2, _R2, _L2, _B2, _S0, _SR, _SL, _SB, _SLO, _SHI, _WEIGHT, _A0, _AR, _LO, _HI,
-    _TLO, _THI, _LIVE, _DROP, _CURVE,
-) = range(26)  # fmt: skip
-_LANE_ROWS = 26
+    _AX, _AY, _C1, _C2, _R1, _R2, _L1, _L2, _B1, _B2, _CC, _S0, _SR, _SL, _SB, _SLO, _SHI, _WEIGHT, _CURVE,
+    _A0, _AR, _LO, _HI, _TLO, _THI, _LIVE, _REACH, _RHO, _TMP, _MIN, _MAX, _BRIGHT, _LINEAR, _QUADRATIC,
+) = range(0, 34 * PIXELS, PIXELS)  # fmt: skip
+_ROWS = 34
 
 
-@njit(cache=True)
-def _spread(coefficients, first, last, out):
-    """``out[q] = sum over rows [first, last) of |coefficients|``."""
-    for q in range(PIXELS):
-        out[q] = 0.0
+@njit(cache=True, error_model="numpy", inline="always")
+def _spread(rows, first, last, n, s, out):
+    """``s[out + q] = sum over rows [first, last) of |rows|``; inlined so that ``out`` is a constant."""
+    for q in range(n):
+        s[out + q] = 0.0
     for k in range(first, last):
-        for q in range(PIXELS):
-            out[q] += abs(coefficients[k, q])
+        for q in range(n):
+            s[out + q] += abs(rows[k, q])
 
 
-@njit(cache=True)
-def _alpha_forms(record, lanes, y1, y2, poly, d, order, m, antialiased, sure, rules, errors, smooth):
-    """Alpha of one Gaussian on the lanes of a block: rows of ``poly``, bounds in ``lanes`` (design.md, B1-B4).
+@njit(cache=True, error_model="numpy")
+def _alpha_forms(record, i, n, s, y1, y2, poly, d, order, m, antialiased, sure, rules, errors):
+    """Alpha of one Gaussian on the lanes of a block (design.md, B1-B4).
 
-    ``record`` is the Gaussian's record; ``sure`` whether it surely belongs to the tile.
-    Returns the largest upper bound.
+    Takes the pixel offsets of ``n`` lanes from rows _AX, _AY of ``s``. Leaves the polynomial's
+    coefficients in ``poly`` [m, lanes] and the radius, lower and upper bound in rows _AR, _LO, _HI;
+    ``sure`` tells whether the Gaussian surely belongs to the tile. Returns False where alpha is
+    below the threshold on all lanes.
     """
     unit = errors[0]
-    stride = m + 1
     alpha_min = rules[7] * (1.0 - 2.0 * unit)
-    alpha_min_high = rules[7] * (1.0 + 2.0 * unit)
     alpha_max = rules[8]
-    opacity_low = record[OPACITY_LOW]
-    opacity_high = record[OPACITY_HIGH]
-    top = 0.0
-    if record[WILD] != 0.0:
+    opacity_low = record[i, OPACITY_LOW]
+    opacity_high = record[i, OPACITY_HIGH]
+    if record[i, WILD] != 0.0:
         high = min(opacity_high, alpha_max) * (1.0 + 2.0 * unit)
-        for k in range(m):
-            for q in range(PIXELS):
-                poly[k, q] = 0.0
-        for q in range(PIXELS):
+        poly[:] = 0.0
+        for q in range(n):
             poly[0, q] = 0.5 * high
-            lanes[_AR, q] = 0.5 * high * _UP
-            lanes[_LO, q] = 0.0
-            lanes[_HI, q] = high
-        return high
+            s[_AR + q] = 0.5 * high * _UP
+            s[_LO + q] = 0.0
+            s[_HI + q] = high
+        return high >= alpha_min
+    line = d == 1 and order == 2
+    if line:
+        _exponent_line(record, i, n, s, antialiased)
+    else:
+        _exponent(record, i, n, s, y1, y2, poly, d, order, m, antialiased)
+    kappa = record[i, KAPPA]
+    # nothing to do where the exponent keeps alpha below the threshold on every lane
+    sigma_max = math.log(opacity_high / alpha_min) * (1.0 + 2.0**-40) + 2.0**-40 if opacity_high > 0.0 else -1.0
+    sigma_max /= 1.0 - kappa
+    reachable = 0
+    for q in range(n):
+        reachable += 1 if s[_SLO + q] <= sigma_max else 0
+    if reachable == 0:
+        return False
+    _fit_exponential(
+        n, s, opacity_low, opacity_high, kappa, sigma_max, alpha_min, rules[7] * (1.0 + 2.0 * unit), alpha_max,
+        1.0 if sure else 0.0, unit, order,
+    )  # fmt: skip
+    if line:
+        for q in range(n):
+            poly[0, q] = s[_A0 + q]
+        for q in range(n):
+            poly[1, q] = s[_WEIGHT + q] * s[_LINEAR + q]
+        for q in range(n):
+            poly[2, q] = s[_WEIGHT + q] * s[_QUADRATIC + q] + s[_CURVE + q] * (s[_LINEAR + q] * s[_LINEAR + q])
+        return True
+    if order == 2:
+        # alpha_q = weight * sigma_q + curve * (linear part of sigma) squared, before sigma's rows are scaled
+        row = 1 + d
+        for k in range(1, d + 1):
+            for l in range(k, d + 1):
+                factor = 1.0 if l == k else 2.0
+                for q in range(n):
+                    poly[row, q] = s[_WEIGHT + q] * poly[row, q] + factor * s[_CURVE + q] * (poly[k, q] * poly[l, q])
+                row += 1
+    for k in range(1, 1 + d):
+        for q in range(n):
+            poly[k, q] *= s[_WEIGHT + q]
+    for q in range(n):
+        poly[0, q] = s[_A0 + q]
+    return True
+
+
+@njit(cache=True, error_model="numpy")
+def _exponent(record, i, n, s, y1, y2, poly, d, order, m, antialiased):
+    """sigma = (y1^2 + y2^2)/2 + K: coefficients into ``poly`` (row 0 unused), centre, radius and
+    bounds into rows _S0, _SR, _SLO, _SHI, sums of absolute coefficients into _SL, _SB (design.md, B1-B2)."""
+    stride = m + 1
     base = FORMS
     for k in range(m):
-        p = record[base + k]
-        c = record[base + stride + k]
-        s = record[base + 2 * stride + k]
-        w1 = record[base + 3 * stride + k]
-        w2 = record[base + 4 * stride + k]
-        for q in range(PIXELS):
-            y1[k, q] = p * lanes[_AX, q] - c * lanes[_AY, q] - w1
-            y2[k, q] = s * lanes[_AY, q] - w2
-    _spread(y1, 1, 1 + d, lanes[_L1])
-    _spread(y2, 1, 1 + d, lanes[_L2])
-    _spread(y1, 1 + d, m, lanes[_B1])
-    _spread(y2, 1 + d, m, lanes[_B2])
-    rp = record[base + m] + _ROUND * abs(record[base])
-    rc = record[base + stride + m] + _ROUND * abs(record[base + stride])
-    rs = record[base + 2 * stride + m] + _ROUND * abs(record[base + 2 * stride])
-    rw1 = record[base + 3 * stride + m]
-    rw2 = record[base + 4 * stride + m]
-    for q in range(PIXELS):
-        ax = abs(lanes[_AX, q])
-        ay = abs(lanes[_AY, q])
-        lanes[_R1, q] = rp * ax + rc * ay + rw1 + _ROUND * (lanes[_L1, q] + lanes[_B1, q])
-        lanes[_R2, q] = rs * ay + rw2 + _ROUND * (lanes[_L2, q] + lanes[_B2, q])
-    # sigma = (y1^2 + y2^2)/2 + K: coefficients into poly, radius into _SR
-    for k in range(m):
-        for q in range(PIXELS):
+        p = record[i, base + k]
+        c = record[i, base + stride + k]
+        g = record[i, base + 2 * stride + k]
+        w1 = record[i, base + 3 * stride + k]
+        w2 = record[i, base + 4 * stride + k]
+        for q in range(n):
+            y1[k, q] = p * s[_AX + q] - c * s[_AY + q] - w1
+        for q in range(n):
+            y2[k, q] = g * s[_AY + q] - w2
+    _spread(y1, 1, 1 + d, n, s, _L1)
+    _spread(y2, 1, 1 + d, n, s, _L2)
+    if order == 2:
+        _spread(y1, 1 + d, m, n, s, _B1)
+        _spread(y2, 1 + d, m, n, s, _B2)
+    rp = record[i, base + m] + _ROUND * abs(record[i, base])
+    rc = record[i, base + stride + m] + _ROUND * abs(record[i, base + stride])
+    rs = record[i, base + 2 * stride + m] + _ROUND * abs(record[i, base + 2 * stride])
+    rw1 = record[i, base + 3 * stride + m] + _ROUND * abs(record[i, base + 3 * stride])
+    rw2 = record[i, base + 4 * stride + m] + _ROUND * abs(record[i, base + 4 * stride])
+    for k in range(1, m):
+        for q in range(n):
             poly[k, q] = y1[0, q] * y1[k, q] + y2[0, q] * y2[k, q]
     if order == 2:
         row = 1 + d
         for k in range(1, d + 1):
-            for q in range(PIXELS):
+            for q in range(n):
                 poly[row, q] += 0.5 * (y1[k, q] * y1[k, q] + y2[k, q] * y2[k, q])
             row += 1
             for l in range(k + 1, d + 1):
-                for q in range(PIXELS):
+                for q in range(n):
                     poly[row, q] += y1[k, q] * y1[l, q] + y2[k, q] * y2[l, q]
                 row += 1
+    k_middle = 0.0
     k_radius = 0.0
     k_spread = 0.0
-    k_low = 0.0
-    k_middle = 0.0
     if antialiased:
-        k_middle = record[base + 5 * stride]
-        k_radius = record[base + 5 * stride + m]
+        k_middle = record[i, base + 5 * stride]
+        k_radius = record[i, base + 5 * stride + m]
         for k in range(1, m):
-            k_spread += abs(record[base + 5 * stride + k])
-            for q in range(PIXELS):
-                poly[k, q] += record[base + 5 * stride + k]
-        k_low = max(0.0, k_middle - k_spread - k_radius)
-    for q in range(PIXELS):
-        c1 = abs(y1[0, q])
-        c2 = abs(y2[0, q])
-        l1 = lanes[_L1, q]
-        l2 = lanes[_L2, q]
-        b1 = lanes[_B1, q]
-        b2 = lanes[_B2, q]
-        r1 = lanes[_R1, q]
-        r2 = lanes[_R2, q]
-        s0 = 0.5 * poly[0, q]
+            extra = record[i, base + 5 * stride + k]
+            k_spread += abs(extra)
+            for q in range(n):
+                poly[k, q] += extra
+    k_low = max(0.0, k_middle - k_spread - k_radius)
+    k_high = abs(k_middle) + k_spread + k_radius
+    curved = 1.0 if order == 2 else 0.0
+    affine = 1.0 - curved
+    for q in range(n):
+        s[_C1 + q] = abs(y1[0, q])
+    for q in range(n):
+        s[_C2 + q] = abs(y2[0, q])
+    for q in range(n):
+        ax = abs(s[_AX + q])
+        ay = abs(s[_AY + q])
+        c1 = s[_C1 + q]
+        c2 = s[_C2 + q]
+        l1 = s[_L1 + q]
+        l2 = s[_L2 + q]
+        b1 = curved * s[_B1 + q]
+        b2 = curved * s[_B2 + q]
+        r1 = rp * ax + rc * ay + rw1 + _ROUND * (l1 + b1)
+        r2 = rs * ay + rw2 + _ROUND * (l2 + b2)
+        s0 = 0.5 * (c1 * c1 + c2 * c2)
         # order 1 keeps (g.p)^2 / 2 in [0, l^2 / 2] as half centre, half radius
-        curve = 0.25 * (l1 * l1 + l2 * l2) if order == 1 else 0.0
+        curve = affine * (0.25 * (l1 * l1 + l2 * l2))
         e1 = l1 + b1 + r1
         e2 = l2 + b2 + r2
-        sr = (
+        s[_S0 + q] = s0 + curve + k_middle
+        s[_SR + q] = (
             c1 * r1
             + c2 * r2
             + l1 * b1
@@ -151,161 +209,215 @@ def _alpha_forms(record, lanes, y1, y2, poly, d, order, m, antialiased, sure, ru
             + r2 * (l2 + b2 + 0.5 * r2)
             + curve
             + k_radius
-            + _ROUND * (s0 + c1 * e1 + c2 * e2 + abs(k_middle) + k_spread)
+            + _ROUND * (s0 + c1 * e1 + c2 * e2 + k_high)
         ) * _UP
-        lanes[_S0, q] = s0 + curve + k_middle
-        lanes[_SR, q] = sr
         near1 = max(0.0, c1 - e1)
         near2 = max(0.0, c2 - e2)
         far1 = c1 + e1
         far2 = c2 + e2
-        lanes[_SLO, q] = (0.5 * (near1 * near1 + near2 * near2)) * (1.0 - _ROUND) + k_low
-        lanes[_SHI, q] = (0.5 * (far1 * far1 + far2 * far2) + abs(k_middle) + k_spread + k_radius) * _UP
-    _spread(poly, 1, 1 + d, lanes[_SL])
-    _spread(poly, 1 + d, m, lanes[_SB])
+        s[_SLO + q] = 0.5 * (near1 * near1 + near2 * near2) * (1.0 - _ROUND) + k_low
+        s[_SHI + q] = (0.5 * (far1 * far1 + far2 * far2) + k_high) * _UP
+    _spread(poly, 1, 1 + d, n, s, _SL)
+    if order == 1:
+        for q in range(n):
+            spread = (s[_SL + q] + s[_SR + q] + _ROUND * s[_S0 + q]) * _UP
+            s[_SHI + q] = min(s[_SHI + q], s[_S0 + q] + spread)
+            s[_SLO + q] = max(s[_SLO + q], s[_S0 + q] - spread)
+        for q in range(n):
+            s[_SB + q] = 0.0
+        return
+    _spread(poly, 1 + d, m, n, s, _SB)
     # range of the polynomial, exact in each p_k alone
-    if order == 2:
-        for q in range(PIXELS):
-            lanes[_A0, q] = 0.0
-            lanes[_WEIGHT, q] = 0.0
-        row = 1 + d
-        for k in range(1, d + 1):
-            for q in range(PIXELS):
-                g = abs(poly[k, q])
-                s = poly[row, q]
-                inside = g < 2.0 * abs(s)
-                vertex = -(g * g) / (4.0 * s) if inside else 0.0
-                lanes[_A0, q] += max(s + g, vertex)
-                lanes[_WEIGHT, q] += min(s - g, vertex) if inside else s - g
+    for q in range(n):
+        rounding = _ROUND * (s[_SL + q] + s[_SB + q] + s[_S0 + q])
+        s[_MIN + q] = s[_S0 + q] - s[_SR + q] - rounding
+        s[_MAX + q] = s[_S0 + q] + s[_SR + q] + rounding
+    _add_range(poly, d, n, s)
+    for q in range(n):
+        s[_SHI + q] = min(s[_SHI + q], s[_MAX + q])
+        s[_SLO + q] = max(s[_SLO + q], s[_MIN + q])
+
+
+@njit(cache=True, error_model="numpy")
+def _exponent_line(record, i, n, s, antialiased):
+    """`_exponent` for one parameter and order 2 in a single loop; coefficients into rows _LINEAR, _QUADRATIC."""
+    p0, p1, p2, pr = record[i, FORMS], record[i, FORMS + 1], record[i, FORMS + 2], record[i, FORMS + 3]
+    c0, c1, c2, cr = record[i, FORMS + 4], record[i, FORMS + 5], record[i, FORMS + 6], record[i, FORMS + 7]
+    g0, g1, g2, gr = record[i, FORMS + 8], record[i, FORMS + 9], record[i, FORMS + 10], record[i, FORMS + 11]
+    v0, v1, v2, vr = record[i, FORMS + 12], record[i, FORMS + 13], record[i, FORMS + 14], record[i, FORMS + 15]
+    w0, w1, w2, wr = record[i, FORMS + 16], record[i, FORMS + 17], record[i, FORMS + 18], record[i, FORMS + 19]
+    pr += _ROUND * abs(p0)
+    cr += _ROUND * abs(c0)
+    gr += _ROUND * abs(g0)
+    vr += _ROUND * abs(v0)
+    wr += _ROUND * abs(w0)
+    k0, k1, k2, kr = 0.0, 0.0, 0.0, 0.0
+    if antialiased:
+        k0, k1, k2, kr = record[i, FORMS + 20], record[i, FORMS + 21], record[i, FORMS + 22], record[i, FORMS + 23]
+    k_low = max(0.0, k0 - abs(k1) - abs(k2) - kr)
+    k_high = abs(k0) + abs(k1) + abs(k2) + kr
+    for q in range(n):
+        ax = s[_AX + q]
+        ay = s[_AY + q]
+        y1 = p0 * ax - c0 * ay - v0
+        l1 = p1 * ax - c1 * ay - v1
+        b1 = p2 * ax - c2 * ay - v2
+        y2 = g0 * ay - w0
+        l2 = g1 * ay - w1
+        b2 = g2 * ay - w2
+        linear = y1 * l1 + y2 * l2 + k1
+        quadratic = y1 * b1 + y2 * b2 + 0.5 * (l1 * l1 + l2 * l2) + k2
+        s0 = 0.5 * (y1 * y1 + y2 * y2)
+        l1 = abs(l1)
+        l2 = abs(l2)
+        b1 = abs(b1)
+        b2 = abs(b2)
+        y1 = abs(y1)
+        y2 = abs(y2)
+        r1 = pr * abs(ax) + cr * abs(ay) + vr + _ROUND * (l1 + b1)
+        r2 = gr * abs(ay) + wr + _ROUND * (l2 + b2)
+        e1 = l1 + b1 + r1
+        e2 = l2 + b2 + r2
+        radius = (
+            y1 * r1
+            + y2 * r2
+            + l1 * b1
+            + l2 * b2
+            + 0.5 * (b1 * b1 + b2 * b2)
+            + r1 * (l1 + b1 + 0.5 * r1)
+            + r2 * (l2 + b2 + 0.5 * r2)
+            + kr
+            + _ROUND * (s0 + y1 * e1 + y2 * e2 + k_high)
+        ) * _UP
+        near1 = max(0.0, y1 - e1)
+        near2 = max(0.0, y2 - e2)
+        far1 = y1 + e1
+        far2 = y2 + e2
+        s0 += k0
+        slope = abs(linear)
+        bend = abs(quadratic)
+        rounding = _ROUND * (slope + bend + abs(s0))
+        # the vertex of linear p + quadratic p^2 counts where it lies inside [-1, 1]
+        vertex = -0.25 * (slope * slope) / (quadratic if quadratic != 0.0 else 1.0)
+        inside = slope < 2.0 * bend
+        top = max(quadratic + slope, vertex) if inside else quadratic + slope
+        bottom = min(quadratic - slope, vertex) if inside else quadratic - slope
+        s[_S0 + q] = s0
+        s[_SR + q] = radius
+        s[_SL + q] = slope
+        s[_SB + q] = bend
+        s[_LINEAR + q] = linear
+        s[_QUADRATIC + q] = quadratic
+        s[_SLO + q] = max(
+            0.5 * (near1 * near1 + near2 * near2) * (1.0 - _ROUND) + k_low, s0 + bottom - radius - rounding
+        )
+        s[_SHI + q] = min((0.5 * (far1 * far1 + far2 * far2) + k_high) * _UP, s0 + top + radius + rounding)
+
+
+@njit(cache=True, error_model="numpy")
+def _add_range(poly, d, n, s):
+    """Add the range of the order-2 polynomial's non-constant part to rows _MIN and _MAX (design.md, A4)."""
+    row = 1 + d
+    for k in range(1, d + 1):
+        for q in range(n):
+            g = abs(poly[k, q])
+            c = poly[row, q]
+            # the vertex of g p + c p^2 counts where it lies inside [-1, 1]
+            divisor = c if c != 0.0 else 1.0
+            vertex = -0.25 * (g * g) / divisor
+            inside = g < 2.0 * abs(c)
+            top = c + g
+            bottom = c - g
+            s[_MAX + q] += max(top, vertex) if inside else top
+            s[_MIN + q] += min(bottom, vertex) if inside else bottom
+        row += 1
+        for _ in range(k + 1, d + 1):
+            for q in range(n):
+                c = abs(poly[row, q])
+                s[_MAX + q] += c
+                s[_MIN + q] -= c
             row += 1
-            for _ in range(k + 1, d + 1):
-                for q in range(PIXELS):
-                    lanes[_A0, q] += abs(poly[row, q])
-                    lanes[_WEIGHT, q] -= abs(poly[row, q])
-                row += 1
-        for q in range(PIXELS):
-            rounding = _ROUND * (lanes[_SL, q] + lanes[_SB, q] + lanes[_S0, q])
-            lanes[_SHI, q] = min(lanes[_SHI, q], lanes[_S0, q] + lanes[_A0, q] + lanes[_SR, q] + rounding)
-            lanes[_SLO, q] = max(lanes[_SLO, q], lanes[_S0, q] + lanes[_WEIGHT, q] - lanes[_SR, q] - rounding)
-    else:
-        for q in range(PIXELS):
-            spread = (lanes[_SL, q] + lanes[_SR, q] + _ROUND * lanes[_S0, q]) * _UP
-            lanes[_SHI, q] = min(lanes[_SHI, q], lanes[_S0, q] + spread)
-            lanes[_SLO, q] = max(lanes[_SLO, q], lanes[_S0, q] - spread)
-    kappa = record[KAPPA]
-    sigma_max = math.log(opacity_high / alpha_min) + 2.0**-20 if opacity_high > 0.0 else -1.0
+
+
+@njit(cache=True, error_model="numpy")
+def _fit_exponential(
+    n, s, opacity_low, opacity_high, kappa, sigma_max, alpha_min, alpha_min_high, alpha_max, sure, unit, order
+):
+    """alpha = opacity exp(-sigma) with its thresholds: centre _A0, radius _AR, bounds _LO, _HI, and the
+    factors _WEIGHT, _CURVE that turn sigma's coefficients into alpha's (design.md, B3-B4)."""
     opacity = 0.5 * (opacity_low + opacity_high)
     opacity_spread = 0.5 * (opacity_high - opacity_low) * _UP + _ROUND * opacity
-    for q in range(PIXELS):
-        low = max(0.0, lanes[_SLO, q] * (1.0 - kappa))
-        high = max(low, lanes[_SHI, q]) * (1.0 + kappa)
-        # the polynomial describes the exact exponent; float evaluation moves it by kappa
-        lanes[_SR, q] += kappa * high
-        half = min(0.5 * (high - low) * _UP, _FIT_LIMIT)
-        fits = half < _FIT_LIMIT
-        middle = 0.5 * (low + high)
-        e_low = exp_kernel(-min(low, _EXPONENT_LIMIT))
+    quadratic = 1.0 if order == 2 else 0.0
+    for q in range(n):
+        low = min(max(0.0, s[_SLO + q] * (1.0 - kappa)), _EXPONENT_LIMIT)
+        high = max(low, s[_SHI + q] * (1.0 + kappa))
+        # float evaluation moves the exponent by kappa
+        sr = s[_SR + q] + kappa * min(high, 4.0 * _EXPONENT_LIMIT)
+        width = 0.5 * (high - low) * _UP
+        half = min(width, _FIT_LIMIT)
+        fits = 1.0 if width < _FIT_LIMIT else 0.0
+        e_low = exp_kernel(-low)
         e_half = exp_kernel(-half)
-        slack = (30.0 + 3.0 * min(low, _EXPONENT_LIMIT) + 6.0 * half) * unit + 4.0 * EXP_RELATIVE_ERROR
+        slack = (30.0 + 3.0 * low + 6.0 * half) * unit + 4.0 * EXP_RELATIVE_ERROR
         a_high = opacity_high * e_low * (1.0 + slack)
-        a_low = opacity_low * e_low * (e_half * e_half) * (1.0 - slack)
-        if not fits or low >= _EXPONENT_LIMIT:
-            a_low = 0.0
-        e_middle = e_low * e_half
+        a_low = fits * (opacity_low * e_low * (e_half * e_half) * (1.0 - slack))
         # exp(-t) = k0 - k1 t + k2 t^2 +- fit over |t| <= half (design.md, B3)
         h = 0.5 * half
         x = h * h
+        x2 = x * x
         i0 = 1.0 + x * (1.0 + x * (0.25 + x * (1.0 / 36.0 + x * (1.0 / 576.0))))
         k1 = 1.0 + x * (0.5 + x * (1.0 / 12.0 + x * (1.0 / 144.0 + x * (1.0 / 2880.0))))
         j2 = 0.5 + x * (1.0 / 6.0 + x * (1.0 / 48.0 + x * (1.0 / 720.0 + x * (1.0 / 17280.0))))
-        x2 = x * x
         fit = (h * x) * (1.0 / 3.0) * (1.0 + 0.25 * x + x2 * (1.0 / 24.0)) * (1.0 + 0.25 * h + x * (1.0 / 15.0))
-        fit += 1.2e-4 * x * x2 * x2
-        t0 = lanes[_S0, q] - middle
-        sr = lanes[_SR, q]
-        l = lanes[_SL, q]
-        b = lanes[_SB, q]
-        scale = opacity * e_middle
-        if order == 2:
-            k0 = i0 - 2.0 * x * j2
-            k2 = j2
-            curve = 2.0 * l * b + b * b + sr * (2.0 * (l + b) + sr)
-        else:
-            k0 = i0
-            k2 = 0.0
-            fit += 2.0 * x * j2
-            curve = 0.0
+        fit += 1.2e-4 * x * x2 * x2 + (1.0 - quadratic) * (2.0 * x * j2)
+        k0 = i0 - quadratic * (2.0 * x * j2)
+        k2 = quadratic * j2
+        t0 = s[_S0 + q] - (low + half)
+        l = s[_SL + q]
+        b = s[_SB + q]
+        scale = opacity * (e_low * e_half)
         weight = 2.0 * k2 * t0 - k1
-        center = scale * (k0 - k1 * t0 + k2 * t0 * t0)
-        size = 4.0 + abs(t0) * (4.0 + abs(t0)) + l + b + k2 * l * l
-        radius = scale * (fit + abs(weight) * sr + k2 * curve + (_ROUND + 2.0 * EXP_RELATIVE_ERROR) * size)
+        spread = sr + l + b
+        size = 4.0 + abs(t0) * (4.0 + abs(t0)) + spread * (1.0 + spread)
+        radius = scale * (
+            fit
+            + abs(weight) * sr
+            + k2 * (2.0 * l * b + b * b + sr * (2.0 * (l + b) + sr))
+            + (_ROUND + 2.0 * EXP_RELATIVE_ERROR) * size
+        )
         radius += (opacity_spread * e_low + opacity_high * e_low * slack) * 1.01
-        lanes[_WEIGHT, q] = scale * weight
-        lanes[_CURVE, q] = scale * k2
+        center = scale * (k0 - k1 * t0 + k2 * t0 * t0)
         # alpha_max
         excess = max(0.0, a_high - alpha_max)
-        center -= 0.5 * excess
-        radius += 0.5 * excess
         a_high = min(a_high, alpha_max * (1.0 + 2.0 * unit))
         a_low = min(a_low, alpha_max * (1.0 - 2.0 * unit))
         # alpha_min: below it the layer is skipped
         skips = a_low < alpha_min_high
-        jump = min(alpha_min_high, a_high)
-        if skips:
-            center -= 0.5 * jump
-            radius += 0.5 * jump
-            a_low = 0.0
-        if not sure:
-            a_low = 0.0
-        radius *= _UP
+        jump = min(alpha_min_high, a_high) if skips else 0.0
+        center -= 0.5 * (excess + jump)
+        radius = (radius + 0.5 * (excess + jump)) * _UP
+        a_low = 0.0 if skips else sure * a_low
+        # gone where it cannot reach the threshold
+        gone = a_high < alpha_min or low > sigma_max
+        a_high = 0.0 if gone else a_high
+        a_low = 0.0 if gone else a_low
         flat = 0.5 * (a_high - a_low)
-        constant = not fits or not sure or radius >= flat
-        if a_high < alpha_min or low > sigma_max:
-            a_high = 0.0
-            a_low = 0.0
-            flat = 0.0
-            constant = True
-        if constant:
-            center = 0.5 * (a_high + a_low)
-            radius = flat * _UP
-            lanes[_WEIGHT, q] = 0.0
-            lanes[_CURVE, q] = 0.0
-        lanes[_A0, q] = center
-        lanes[_AR, q] = radius
-        lanes[_LO, q] = a_low
-        lanes[_HI, q] = a_high
-        top = max(top, a_high)
-    if order == 2:
-        # alpha_q = weight * sigma_q + curve * (linear part of sigma) squared, before sigma's rows are scaled
-        row = 1 + d
-        for k in range(1, d + 1):
-            for l_ in range(k, d + 1):
-                factor = 1.0 if l_ == k else 2.0
-                for q in range(PIXELS):
-                    poly[row, q] = lanes[_WEIGHT, q] * poly[row, q] + factor * lanes[_CURVE, q] * (
-                        poly[k, q] * poly[l_, q]
-                    )
-                row += 1
-    for k in range(1, 1 + d):
-        for q in range(PIXELS):
-            poly[k, q] *= lanes[_WEIGHT, q]
-    for q in range(PIXELS):
-        poly[0, q] = lanes[_A0, q]
-    return top
+        keep = fits * sure
+        keep = keep if radius < flat else 0.0
+        s[_A0 + q] = center if keep == 1.0 else 0.5 * (a_high + a_low)
+        s[_AR + q] = radius if keep == 1.0 else flat * _UP
+        s[_LO + q] = a_low
+        s[_HI + q] = a_high
+        s[_WEIGHT + q] = keep * (scale * weight)
+        s[_CURVE + q] = keep * (scale * k2)
 
 
-# state of the blend, one row of lanes each, per channel: polynomial rows 0..m-1, then these
-_P_RADIUS, _P_LOW, _P_HIGH = range(3)
+# what a block may answer in place of a number of pairs
+_GIVE_UP = -1
+_GROW = -2
 
 
-@njit(cache=True)
-def _grow(buffer, rows):
-    larger = np.empty((rows, buffer.shape[1], buffer.shape[2]), buffer.dtype)
-    larger[: buffer.shape[0]] = buffer
-    return larger
-
-
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _uncertain(i, j, depth, delta, depth_error, slope, m):
     """Whether the depth order of Gaussians i and j is not the same over the whole cell (design.md, O1).
 
@@ -326,22 +438,20 @@ def _uncertain(i, j, depth, delta, depth_error, slope, m):
     return not (abs(center) > (spread + radius) * _UP + rounding + depth_error[i] + depth_error[j])
 
 
-@njit(cache=True)
-def _windows(entries, depth, delta, depth_error, slope, ray, m, limit, first, last):
-    """Smallest and largest list position whose order against each entry is uncertain.
+@njit(cache=True, error_model="numpy")
+def _depth_reach(entries, depth, delta, depth_error, slope, ray, m, reach):
+    """How far in depth each entry may move against the block's central ray (design.md, O1).
 
-    ``first[k] <= k <= last[k]``. ``ray`` [3] is the block's central ray, scaled to unit depth at the
-    middle pose. Returns the number of uncertain pairs, or -1 if more than ``limit`` pairs had to be
-    looked at; then every pair counts as uncertain.
+    Entries i, j keep their order where ``room |depth_i - depth_j| > reach_i + reach_j``. Returns
+    ``room`` (not positive where nothing can be said) and the largest reach of all but a few entries.
+    ``ray`` [3] is the ray scaled to unit depth at the middle pose.
     """
     count = entries.size
     along = 0.0
     for k in range(1, m):
         along += abs(slope[k, 0] * ray[0] + slope[k, 1] * ray[1] + slope[k, 2] * ray[2])
     along += slope[m, 0] * abs(ray[0]) + slope[m, 1] * abs(ray[1]) + slope[m, 2] * abs(ray[2])
-    room = (1.0 - along) * (1.0 - 2.0**-30)
-    reach = np.empty(count)
-    largest = 0.0
+    total = 0.0
     for k in range(count):
         i = entries[k]
         # offset from the central ray: what a rotation moves in depth relative to the ray
@@ -353,213 +463,368 @@ def _windows(entries, depth, delta, depth_error, slope, ray, m, limit, first, la
             e += abs(slope[row, 0] * x + slope[row, 1] * y + slope[row, 2] * z)
         size = abs(delta[i, 0]) + abs(delta[i, 1]) + abs(delta[i, 2]) + abs(depth[i]) * (1.0 + along)
         reach[k] = e * _UP + 4.0 * _ROUND * size + depth_error[i]
-        if not reach[k] <= largest:
-            largest = reach[k]
-        first[k] = k
-        last[k] = k
-    pairs = 0
-    looked = 0
+        total += reach[k]
+    room = (1.0 - along) * (1.0 - 2.0**-30)
+    if not total < np.inf:
+        room = -1.0
+    # few entries reach far: they are compared with all, the others within a window
+    typical = 4.0 * total / max(count, 1)
+    largest = 0.0
     for k in range(count):
-        i = entries[k]
-        for other in range(k + 1, count):
-            j = entries[other]
-            gap = (depth[j] - depth[i]) * room
-            if room > 0.0 and gap > reach[k] + largest:
-                break
-            looked += 1
-            if looked > limit:
-                for p in range(count):
-                    first[p] = 0
-                    last[p] = count - 1
+        if reach[k] <= typical:
+            largest = max(largest, reach[k])
+    return room, largest
+
+
+@njit(cache=True, error_model="numpy")
+def _find_pairs(
+    k, entries, depth, delta, depth_error, slope, m, reach, room, largest, farthest, far, far_count, first, last, pairs, count
+):
+    """Append the pairs (k, later entry) of uncertain order to ``pairs`` and widen ``first``, ``last``.
+
+    Returns their number, or -1 where ``pairs`` is full.
+    """
+    i = entries[k]
+    window = reach[k] + largest
+    beyond = entries.size
+    for other in range(k + 1, entries.size):
+        gap = (depth[entries[other]] - depth[i]) * room
+        if gap > window:
+            beyond = other
+            break
+        if gap <= reach[k] + reach[other] and _uncertain(
+            i, entries[other], depth, delta, depth_error, slope, m
+        ):
+            if count >= pairs.shape[0]:
                 return -1
-            if not (room > 0.0 and gap > reach[k] + reach[other]) and _uncertain(
-                i, j, depth, delta, depth_error, slope, m
-            ):
-                pairs += 1
-                last[k] = other
-                if first[other] > k:
-                    first[other] = k
-    return pairs
+            pairs[count, 0] = k
+            pairs[count, 1] = other
+            last[k] = max(last[k], other)
+            first[other] = min(first[other], k)
+            count += 1
+    for f in range(far_count):
+        other = far[f]
+        if other < beyond:
+            continue
+        gap = (depth[entries[other]] - depth[i]) * room
+        if gap > reach[k] + farthest:
+            break
+        if gap <= reach[k] + reach[other] and _uncertain(
+            i, entries[other], depth, delta, depth_error, slope, m
+        ):
+            if count >= pairs.shape[0]:
+                return -1
+            pairs[count, 0] = k
+            pairs[count, 1] = other
+            last[k] = max(last[k], other)
+            first[other] = min(first[other], k)
+            count += 1
+    return count
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
+def _any_live(s, row):
+    """Whether some pixel of a block's row still takes light."""
+    for q in range(row * BLOCK, (row + 1) * BLOCK):
+        if s[_LIVE + q] != 0.0:
+            return True
+    return False
+
+
+@njit(cache=True, error_model="numpy")
 def _forward(
-    entries, record, tiles, tile_x, tile_y, colors, lanes, y1, y2, poly, layers, sources, lengths, first, last, ordered,
+    entries, record, box, tiles, tile_x, tile_y, colors, depth, delta, depth_error, slope, ray,
+    s, y1, y2, poly, pixels, layers, sources, lengths, reach, far, first, last, slots, heights, pairs,
     x0, y0, d, order, m, antialiased, rules, errors,
 ):  # fmt: skip
-    """Collect the layers of every lane, nearest first (design.md, B5-B6). Returns the buffers.
+    """Collect the layers of every lane, nearest first (design.md, B5-B6).
 
-    ``ordered`` tells that the depth order is certain: then layers behind the stop are settled here.
-    Otherwise they are kept, with the transmittances needed to settle them later.
+    ``first[k] <= k <= last[k]`` become the list positions whose depth order against entry k is
+    uncertain, ``pairs`` [., 2] all such pairs, ``slots[k]`` the row of ``heights`` that holds the
+    upper alphas of an entry that takes part in one (-1: none). Returns the number of pairs and of
+    slots; or _GIVE_UP where more pairs are uncertain than ``pairs`` may hold, or _GROW where another
+    buffer is too small.
+
+    Row _RHO of ``s`` receives how much transmittance may be lost to a stop that the kept layers ignore.
     """
     unit = errors[0]
     alpha_min = rules[7] * (1.0 - 2.0 * unit)
     stop = rules[9]
-    width = m + 5
+    stop_low = stop * (1.0 - 8.0 * unit)
+    stop_high = stop * (1.0 + 8.0 * unit)
+    colored = m + 5
     channels = colors.shape[1]
     for q in range(PIXELS):
-        lanes[_TLO, q] = 1.0
-        lanes[_THI, q] = 1.0
-        lanes[_LIVE, q] = 1.0
+        s[_TLO + q] = 1.0
+        s[_THI + q] = 1.0
+        s[_LIVE + q] = 1.0
+        s[_REACH + q] = -1.0
+        s[_RHO + q] = 0.0
+        s[_TMP + q] = 0.0
         lengths[q] = 0
-        lanes[_DROP, q] = -1.0
+    room, largest = _depth_reach(entries, depth, delta, depth_error, slope, ray, m, reach)
+    if not room > 0.0:
+        return _GIVE_UP, 0
+    far_count = 0
+    farthest = 0.0
+    for k in range(entries.size):
+        first[k] = k
+        last[k] = k
+        slots[k] = -1
+        if reach[k] > largest:
+            far[far_count] = k
+            far_count += 1
+            farthest = max(farthest, reach[k])
+    pair_count = 0
+    slot_count = 0
+    live_first = 0
+    live_last = BLOCK - 1
     for k in range(entries.size):
         i = entries[k]
+        # only the pixels that the Gaussian may reach, in rows that still take light
+        left = int(math.ceil(min(max(box[i, 0] - 0.5 - x0, 0.0), float(BLOCK))))
+        right = int(math.floor(min(max(box[i, 1] - 0.5 - x0, -1.0), BLOCK - 1.0)))
+        top = max(live_first, int(math.ceil(min(max(box[i, 2] - 0.5 - y0, 0.0), float(BLOCK)))))
+        bottom = min(live_last, int(math.floor(min(max(box[i, 3] - 0.5 - y0, -1.0), BLOCK - 1.0))))
+        if top > bottom or left > right:
+            continue
         ox = x0 + 0.5 - record[i, MEAN_X]
         oy = y0 + 0.5 - record[i, MEAN_Y]
-        for q in range(PIXELS):
-            lanes[_AX, q] = ox + (q % BLOCK)
-            lanes[_AY, q] = oy + (q // BLOCK)
-        sure = (
-            tiles[i, 4] <= tile_x and tile_x < tiles[i, 5] and tiles[i, 6] <= tile_y and tile_y < tiles[i, 7]
-        )
-        top = _alpha_forms(record[i], lanes, y1, y2, poly, d, order, m, antialiased, sure, rules, errors, True)
-        if top < alpha_min:
+        n = 0
+        for row in range(top, bottom + 1):
+            for column in range(left, right + 1):
+                s[_AX + n] = ox + column
+                s[_AY + n] = oy + row
+                pixels[n] = row * BLOCK + column
+                n += 1
+        # vector code works on whole multiples; the lanes in excess repeat the last one
+        padded = -(-n // _VECTOR) * _VECTOR
+        for lane in range(n, padded):
+            s[_AX + lane] = s[_AX + n - 1]
+            s[_AY + lane] = s[_AY + n - 1]
+        sure = tiles[i, 4] <= tile_x and tile_x < tiles[i, 5] and tiles[i, 6] <= tile_y and tile_y < tiles[i, 7]
+        if not _alpha_forms(record, i, padded, s, y1, y2, poly, d, order, m, antialiased, sure, rules, errors):
             continue
-        alive = False
-        for q in range(PIXELS):
-            high = lanes[_HI, q]
-            if lanes[_LIVE, q] == 0.0 or high < alpha_min:
-                alive = alive or lanes[_LIVE, q] != 0.0
+        pair_count = _find_pairs(
+            k, entries, depth, delta, depth_error, slope, m, reach, room, largest, farthest, far, far_count,
+            first, last, pairs, pair_count,
+        )  # fmt: skip
+        if pair_count < 0:
+            return _GIVE_UP, 0
+        alone = first[k] == k and last[k] == k
+        if not alone:
+            if slot_count >= heights.shape[0]:
+                return _GROW, 0
+            slots[k] = slot_count
+            heights[slot_count] = 0.0
+            slot_count += 1
+        ended = False
+        for lane in range(n):
+            high = s[_HI + lane]
+            q = pixels[lane]
+            if s[_LIVE + q] == 0.0 or high < alpha_min:
                 continue
-            low = lanes[_LO, q]
-            # each product of the running transmittance is rounded once or twice
-            t_low = lanes[_TLO, q] * (1.0 - high) * (1.0 - 8.0 * unit)
-            t_high = lanes[_THI, q] * (1.0 - low) * (1.0 + 8.0 * unit)
-            if ordered and t_high <= stop * (1.0 - 8.0 * unit):
+            low = s[_LO + lane]
+            before = s[_THI + q]
+            # two roundings of the running transmittance
+            t_low = s[_TLO + q] * (1.0 - high) * (1.0 - 8.0 * unit)
+            t_high = before * (1.0 - low) * (1.0 + 8.0 * unit)
+            if alone and t_high <= stop_low:
                 # surely the stop: neither this layer nor any behind it is drawn
-                lanes[_LIVE, q] = 0.0
+                s[_LIVE + q] = 0.0
+                ended = True
                 continue
-            alive = True
-            n = lengths[q]
-            if n >= layers.shape[0]:
-                layers = _grow(layers, 2 * layers.shape[0])
-                sources = _grow(sources, 2 * sources.shape[0])
-            maybe_stop = ordered and t_low <= stop * (1.0 + 8.0 * unit)
-            if maybe_stop:
-                layers[n, 0, q] = 0.5 * high
+            count = lengths[q]
+            if count >= layers.shape[0]:
+                return _GROW, 0
+            dropped = False
+            if alone and t_low <= stop_high:
+                # s[_TMP] is the most that any stop so far may leave of the light
+                s[_TMP + q] = max(s[_TMP + q], min(before, stop_high / (1.0 - high)))
+                dropped = s[_TMP + q] >= before
+                if not dropped:
+                    s[_RHO + q] = s[_TMP + q]
+            if dropped:
+                layers[count, q, 0] = 0.5 * high
                 for r in range(1, m):
-                    layers[n, r, q] = 0.0
-                layers[n, m, q] = 0.5 * high * _UP
+                    layers[count, q, r] = 0.0
+                layers[count, q, m] = 0.5 * high * _UP
                 low = 0.0
             else:
                 for r in range(m):
-                    layers[n, r, q] = poly[r, q]
-                layers[n, m, q] = lanes[_AR, q]
-            layers[n, m + 1, q] = low
-            layers[n, m + 2, q] = high
+                    layers[count, q, r] = poly[r, lane]
+                layers[count, q, m] = s[_AR + lane]
+            layers[count, q, m + 1] = low
+            layers[count, q, m + 2] = high
             # transmittance after this layer at its least, before it at its most
-            layers[n, m + 3, q] = t_low
-            layers[n, m + 4, q] = lanes[_THI, q]
+            layers[count, q, m + 3] = t_low
+            layers[count, q, m + 4] = before
             for c in range(channels):
-                layers[n, width + c, q] = colors[i, c]
-            sources[n, 0, q] = k
-            lengths[q] = n + 1
-            lanes[_TLO, q] = t_low
-            lanes[_THI, q] = t_high
-            if not ordered:
+                layers[count, q, colored + c] = colors[i, c]
+            sources[count, q] = k
+            lengths[q] = count + 1
+            s[_TLO + q] = t_low
+            s[_THI + q] = t_high
+            if not alone:
+                heights[slots[k], q] = high
                 # layers up to the last one whose order is uncertain may still come first
-                lanes[_DROP, q] = max(lanes[_DROP, q], float(last[k]))
-        if not ordered:
-            alive = False
-            for q in range(PIXELS):
-                if lanes[_LIVE, q] != 0.0 and lanes[_THI, q] <= stop * (1.0 - 8.0 * unit) and k >= lanes[_DROP, q]:
-                    lanes[_LIVE, q] = 0.0
-                alive = alive or lanes[_LIVE, q] != 0.0
-        if not alive:
-            break
-    return layers, sources
+                s[_REACH + q] = max(s[_REACH + q], float(last[k]))
+        if slot_count > 0:
+            for lane in range(n):
+                q = pixels[lane]
+                if s[_LIVE + q] != 0.0 and s[_THI + q] <= stop_low and s[_REACH + q] <= k:
+                    s[_LIVE + q] = 0.0
+                    ended = True
+        if ended:
+            while live_first <= live_last and not _any_live(s, live_first):
+                live_first += 1
+            while live_last >= live_first and not _any_live(s, live_last):
+                live_last -= 1
+            if live_first > live_last:
+                break
+    return pair_count, slot_count
 
 
-@njit(cache=True)
-def _settle_stops(layers, sources, lengths, first, last, m, stop, unit):
-    """Drop or weaken the layers that the stop may hide, where the depth order is uncertain (design.md, B6)."""
+@njit(cache=True, error_model="numpy")
+def _settle_stops(layers, sources, lengths, first, last, s, m, stop, unit):
+    """Drop or weaken the layers of uncertain depth order that the stop may hide (design.md, B6)."""
+    stop_low = stop * (1.0 - 8.0 * unit)
+    stop_high = stop * (1.0 + 8.0 * unit)
     for q in range(PIXELS):
         n = lengths[q]
+        hidden = 0.0
         for e in range(n):
-            k = sources[e, 0, q]
+            k = sources[e, q]
+            if first[k] == k and last[k] == k:
+                continue
             behind = e
-            while behind + 1 < n and sources[behind + 1, 0, q] <= last[k]:
+            while behind + 1 < n and sources[behind + 1, q] <= last[k]:
                 behind += 1
             before = e
-            while before > 0 and sources[before - 1, 0, q] >= first[k]:
+            while before > 0 and sources[before - 1, q] >= first[k]:
                 before -= 1
-            t_low = layers[behind, m + 3, q]
-            t_high = layers[before, m + 4, q] * (1.0 - layers[e, m + 1, q]) * (1.0 + 8.0 * unit)
-            if t_high <= stop * (1.0 - 8.0 * unit):
+            t_low = layers[behind, q, m + 3]
+            light = layers[before, q, m + 4]
+            t_high = light * (1.0 - layers[e, q, m + 1]) * (1.0 + 8.0 * unit)
+            if t_low > stop_high:
+                continue
+            # the most light that a stop at this layer may leave
+            high = layers[e, q, m + 2]
+            lost = min(light, stop_high / (1.0 - high))
+            if t_high <= stop_low:
+                hidden = max(hidden, lost)
                 for r in range(m + 3):
-                    layers[e, r, q] = 0.0
-            elif t_low <= stop * (1.0 + 8.0 * unit):
-                high = layers[e, m + 2, q]
-                layers[e, 0, q] = 0.5 * high
+                    layers[e, q, r] = 0.0
+            elif lost < light:
+                # kept; what the stop may leave of the light is added at the end
+                s[_RHO + q] = max(s[_RHO + q], lost, s[_TMP + q])
+            else:
+                hidden = max(hidden, lost)
+                layers[e, q, 0] = 0.5 * high
                 for r in range(1, m):
-                    layers[e, r, q] = 0.0
-                layers[e, m, q] = 0.5 * high * _UP
-                layers[e, m + 1, q] = 0.0
+                    layers[e, q, r] = 0.0
+                layers[e, q, m] = 0.5 * high * _UP
+                layers[e, q, m + 1] = 0.0
+        # a stop at a dropped or weakened layer also hides the kept layers behind it
+        if s[_RHO + q] > 0.0:
+            s[_RHO + q] = max(s[_RHO + q], hidden)
 
 
-@njit(cache=True)
-def _color_range(layers, e, q, channel, m, color_rows):
+@njit(cache=True, error_model="numpy")
+def _color_range(layer, channel, m, color_rows):
     """Bounds of one layer's colour."""
     start = m + 5 + channel * color_rows
     spread = 0.0
     for r in range(1, color_rows):
-        spread += abs(layers[e, start + r, q])
+        spread += abs(layer[start + r])
     spread *= _UP
-    return layers[e, start, q] - spread, layers[e, start, q] + spread
+    return layer[start] - spread, layer[start] + spread
 
 
-@njit(cache=True)
-def _swap_bounds(
-    layers, sources, lengths, entries, last, depth, delta, depth_error, slope, m, color_rows, every, extra
-):
-    """``extra[e, 2 c, q]``, ``extra[e, 2 c + 1, q]``: how much reordering may lower or raise channel c
-    when layer e joins the layers behind it (design.md, O2)."""
-    for q in range(PIXELS):
-        n = lengths[q]
-        for e in range(n):
-            for r in range(6):
-                extra[e, r, q] = 0.0
-            k = sources[e, 0, q]
-            if last[k] == k:
-                continue
-            for f in range(e + 1, n):
-                other = sources[f, 0, q]
-                if other > last[k]:
-                    break
-                if not every and not _uncertain(entries[k], entries[other], depth, delta, depth_error, slope, m):
+@njit(cache=True, error_model="numpy")
+def _gaussian_color_range(colors, i, channel, color_rows):
+    """Bounds of one Gaussian's colour over the cell."""
+    start = channel * color_rows
+    spread = 0.0
+    for r in range(1, color_rows):
+        spread += abs(colors[i, start + r])
+    spread *= _UP
+    return colors[i, start] - spread, colors[i, start] + spread
+
+
+@njit(cache=True, error_model="numpy")
+def _swap_bounds(pairs, pair_count, slots, slot_count, heights, entries, colors, color_rows, moves, most):
+    """``moves[slot, 2 c]`` and ``moves[slot, 2 c + 1]`` (rows of lanes): how much reordering may lower or
+    raise channel c when the slot's layer joins the layers behind it (design.md, O2)."""
+    moves[:slot_count] = 0.0
+    most[:slot_count] = 0.0
+    n = heights.shape[1]
+    for p in range(pair_count):
+        front = slots[pairs[p, 0]]
+        back = slots[pairs[p, 1]]
+        if front < 0 or back < 0:
+            continue
+        for channel in range(3):
+            low_e, high_e = _gaussian_color_range(colors, entries[pairs[p, 0]], channel, color_rows)
+            low_f, high_f = _gaussian_color_range(colors, entries[pairs[p, 1]], channel, color_rows)
+            for side in range(2):
+                change = max(0.0, high_e - low_f) if side == 0 else max(0.0, high_f - low_e)
+                if change == 0.0:
                     continue
-                high = layers[f, m + 2, q]
-                for channel in range(3):
-                    low_e, high_e = _color_range(layers, e, q, channel, m, color_rows)
-                    low_f, high_f = _color_range(layers, f, q, channel, m, color_rows)
-                    extra[e, 2 * channel, q] += high * max(0.0, high_e - low_f)
-                    extra[e, 2 * channel + 1, q] += high * max(0.0, high_f - low_e)
-            for r in range(6):
-                extra[e, r, q] *= layers[e, m + 2, q] * _UP
+                total = moves[front, 2 * channel + side]
+                single = most[front, 2 * channel + side]
+                alpha = heights[back]
+                for q in range(n):
+                    total[q] += alpha[q] * change
+                for q in range(n):
+                    single[q] = max(single[q], change if alpha[q] > 0.0 else 0.0)
+    for slot in range(slot_count):
+        alpha = heights[slot]
+        for r in range(6):
+            total = moves[slot, r]
+            single = most[slot, r]
+            # the weights of the layers it may move behind add up to at most one
+            for q in range(n):
+                total[q] = alpha[q] * min(total[q], single[q]) * _UP
 
 
-@njit(cache=True)
-def _interval_chain(layers, extra, low, high, start, stop, q, channel, m, color_rows, suffix_low, suffix_high):
+@njit(cache=True, error_model="numpy")
+def _collect_moves(moves, slots, sources, lengths, extra, moved):
+    """Move the swap bounds from slots to the lanes' layers; ``moved[e]`` tells whether row e has any."""
+    for q in range(PIXELS):
+        for e in range(lengths[q]):
+            slot = slots[sources[e, q]]
+            if slot >= 0:
+                if not moved[e]:
+                    moved[e] = True
+                    extra[e] = 0.0
+                for r in range(6):
+                    extra[e, r, q] = moves[slot, r, q]
+
+
+@njit(cache=True, error_model="numpy")
+def _interval_chain(layers, extra, moved, low, high, start, stop, q, channel, m, color_rows, suffix_low, suffix_high):
     """One step of the interval blend for layers [start, stop) whose order is uncertain (design.md, O2-O4).
 
-    Returns the tighter of the swap and hull bounds, and the antichain bound.
+    Returns the tighter of the swap, hull and antichain bounds, and the range of the colours so far.
     """
     behind_low, behind_high = low, high
     for e in range(stop - 1, start - 1, -1):
-        c_low, c_high = _color_range(layers, e, q, channel, m, color_rows)
-        a_low = layers[e, m + 1, q]
-        a_high = layers[e, m + 2, q]
+        layer = layers[e, q]
+        c_low, c_high = _color_range(layer, channel, m, color_rows)
+        a_low = layer[m + 1]
+        a_high = layer[m + 2]
         v = c_high - high
         front_high = high + (a_high if v > 0.0 else a_low) * v
         v = c_low - low
         front_low = low + (a_high if v < 0.0 else a_low) * v
-        lower, raise_ = extra[e, 2 * channel, q], extra[e, 2 * channel + 1, q]
+        lower = extra[e, 2 * channel, q] if moved[e] else 0.0
+        lift = extra[e, 2 * channel + 1, q] if moved[e] else 0.0
         # wherever it goes among the layers behind, it moves the colour by at most its alpha times
         # the distance to the darkest or brightest of what lies behind
         hull_high = max(front_high, high + a_high * max(0.0, c_high - suffix_low))
         hull_low = min(front_low, low + a_high * min(0.0, c_low - suffix_high))
-        high = min(front_high + raise_, hull_high) if raise_ > 0.0 else front_high
+        high = min(front_high + lift, hull_high) if lift > 0.0 else front_high
         low = max(front_low - lower, hull_low) if lower > 0.0 else front_low
         suffix_low = min(suffix_low, c_low)
         suffix_high = max(suffix_high, c_high)
@@ -567,19 +832,17 @@ def _interval_chain(layers, extra, low, high, start, stop, q, channel, m, color_
     keys = np.empty(count)
     for side in range(2):
         for e in range(count):
-            c_low, c_high = _color_range(layers, start + e, q, channel, m, color_rows)
+            c_low, c_high = _color_range(layers[start + e, q], channel, m, color_rows)
             keys[e] = c_low if side == 0 else -c_high
         order = np.argsort(keys)
         value = behind_low if side == 0 else behind_high
         # nearest first: darkest for the lower bound, brightest for the upper one
         for position in range(count - 1, -1, -1):
-            e = start + order[position]
+            layer = layers[start + order[position], q]
             color = keys[order[position]] if side == 0 else -keys[order[position]]
             v = color - value
-            grows = v > 0.0
-            if side == 0:
-                grows = not grows
-            value += (layers[e, m + 2, q] if grows else layers[e, m + 1, q]) * v
+            grows = v < 0.0 if side == 0 else v > 0.0
+            value += layer[m + 2 if grows else m + 1] * v
         if side == 0:
             low = max(low, value)
         else:
@@ -587,10 +850,24 @@ def _interval_chain(layers, extra, low, high, start, stop, q, channel, m, color_
     return low, high, suffix_low, suffix_high
 
 
-@njit(cache=True)
-def _interval_blend(layers, sources, lengths, extra, chain, background, m, color_rows, low, high):
-    """Interval blend of every lane where depth orders are uncertain; ``chain[k]`` numbers the groups."""
+@njit(cache=True, error_model="numpy")
+def _interval_blend(layers, sources, lengths, extra, moved, chain, background, m, color_rows, low, high):
+    """Sharpen the interval blend where depth orders are uncertain; ``chain[k]`` numbers the groups."""
+    size = np.zeros(chain.size + 2, np.int64)
+    for k in range(chain.size):
+        size[chain[k]] += 1
     for q in range(PIXELS):
+        # reordering that cannot move the colour by a ten-thousandth is left to the swap bound
+        weight = 0.0
+        for e in range(lengths[q]):
+            # of two layers alone the swap bound is exact
+            if moved[e] and size[chain[sources[e, q]]] > 2:
+                most = 0.0
+                for r in range(6):
+                    most = max(most, extra[e, r, q])
+                weight += most * layers[e, q, m + 4]
+        if not weight > _REORDERING_MATTERS:
+            continue
         for channel in range(3):
             value_low = background[channel]
             value_high = background[channel]
@@ -599,207 +876,453 @@ def _interval_blend(layers, sources, lengths, extra, chain, background, m, color
             stop = lengths[q]
             while stop > 0:
                 start = stop - 1
-                while start > 0 and chain[sources[start - 1, 0, q]] == chain[sources[stop - 1, 0, q]]:
+                while start > 0 and chain[sources[start - 1, q]] == chain[sources[stop - 1, q]]:
                     start -= 1
-                if stop - start > 1:
-                    value_low, value_high, suffix_low, suffix_high = _interval_chain(
-                        layers, extra, value_low, value_high, start, stop, q, channel, m, color_rows,
-                        suffix_low, suffix_high,
-                    )  # fmt: skip
-                else:
-                    c_low, c_high = _color_range(layers, start, q, channel, m, color_rows)
-                    v = c_high - value_high
-                    value_high += (layers[start, m + 2, q] if v > 0.0 else layers[start, m + 1, q]) * v
-                    v = c_low - value_low
-                    value_low += (layers[start, m + 2, q] if v < 0.0 else layers[start, m + 1, q]) * v
-                    suffix_low = min(suffix_low, c_low)
-                    suffix_high = max(suffix_high, c_high)
+                value_low, value_high, suffix_low, suffix_high = _interval_chain(
+                    layers, extra, moved, value_low, value_high, start, stop, q, channel, m, color_rows,
+                    suffix_low, suffix_high,
+                )  # fmt: skip
                 stop = start
-            low[channel, q] = value_low
-            high[channel, q] = value_high
+            low[channel, q] = max(low[channel, q], value_low)
+            high[channel, q] = min(high[channel, q], value_high)
 
 
-@njit(cache=True)
-def _blend(
-    layers, count, extra, ordered, background, d, order, m, color_rows, state, radius, low, high, color, value, brightest, lanes
-):  # fmt: skip
-    """Blend the layers back to front as forms, and as intervals where the order is certain (design.md, B7).
+@njit(cache=True, error_model="numpy")
+def _blend(layers, lengths, count, layer, extra, moved, background, d, order, m, color_rows, state, radius, low, high, value, s):
+    """Blend the layers back to front, as forms and as intervals (design.md, B7).
 
     ``state`` [3, m, lanes] and ``radius`` [3, lanes] receive the polynomial forms, ``low`` and
-    ``high`` [3, lanes] the intervals.
+    ``high`` [3, lanes] the intervals; rows _MIN, _MAX, _BRIGHT of ``s`` the range of all colours.
     """
-    alpha_spread = lanes[_L1]
-    alpha_curve = lanes[_B1]
-    spread = lanes[_L2]
-    curve = lanes[_B2]
-    cross = lanes[_S0]
-    for q in range(PIXELS):
-        brightest[q] = max(1.0, background[0], background[1], background[2])
+    n = value.shape[1]
+    for q in range(n):
+        s[_MIN + q] = min(background[0], background[1], background[2])
+        s[_MAX + q] = max(background[0], background[1], background[2])
+    state[:] = 0.0
+    radius[:] = 0.0
     for channel in range(3):
-        for k in range(m):
-            for q in range(PIXELS):
-                state[channel, k, q] = 0.0
-        for q in range(PIXELS):
+        for q in range(n):
             state[channel, 0, q] = background[channel]
-            radius[channel, q] = 0.0
-        if ordered:
-            for q in range(PIXELS):
-                low[channel, q] = background[channel]
-                high[channel, q] = background[channel]
+            low[channel, q] = background[channel]
+            high[channel, q] = background[channel]
+    moving = color_rows > 2
     for e in range(count - 1, -1, -1):
-        layer = layers[e]
-        _spread(layer, 1, 1 + d, alpha_spread)
-        _spread(layer, 1 + d, m, alpha_curve)
+        # lane by lane in memory, row by row for the arithmetic
+        for q in range(PIXELS):
+            if e < lengths[q]:
+                for r in range(layer.shape[0]):
+                    layer[r, q] = layers[e, q, r]
+            else:
+                for r in range(layer.shape[0]):
+                    layer[r, q] = 0.0
+        _spread(layer, 1, 1 + d, n, s, _L1)
+        if order == 2:
+            _spread(layer, 1 + d, m, n, s, _B1)
+        # rows that the loops below use often
+        for q in range(n):
+            s[_A0 + q] = layer[0, q]
+        for q in range(n):
+            s[_AR + q] = layer[m, q]
+        for q in range(n):
+            s[_LO + q] = layer[m + 1, q]
+        for q in range(n):
+            s[_HI + q] = layer[m + 2, q]
         for channel in range(3):
             start = m + 5 + channel * color_rows
             p = state[channel]
-            # value = colour - P, a form without radius
-            for q in range(PIXELS):
-                value[0, q] = layer[start, q] - p[0, q]
-                color[0, q] = 0.0
-                color[1, q] = 0.0
+            for q in range(n):
+                s[_C1 + q] = layer[start, q]
+                s[_CC + q] = 0.0
             for k in range(1, color_rows):
-                for q in range(PIXELS):
-                    color[0, q] += abs(layer[start + k, q])
-                    color[1, q] = layer[start + k, q]
-            moving = color_rows > 2
+                for q in range(n):
+                    s[_CC + q] += abs(layer[start + k, q])
+            if color_rows > 1:
+                for q in range(n):
+                    s[_C2 + q] = layer[start + color_rows - 1, q]
+            else:
+                for q in range(n):
+                    s[_C2 + q] = 0.0
+            # value = colour - P, a form without radius
+            for q in range(n):
+                value[0, q] = s[_C1 + q] - p[0, q]
             for k in range(1, m):
-                for q in range(PIXELS):
-                    value[k, q] = (layer[start + k, q] if moving else 0.0) - p[k, q]
-            for q in range(PIXELS):
-                brightest[q] = max(brightest[q], abs(layer[start, q]) + color[0, q])
-            _spread(value, 1, 1 + d, spread)
-            _spread(value, 1 + d, m, curve)
-            for q in range(PIXELS):
-                cross[q] = 0.0
-            for k in range(m):
-                for q in range(PIXELS):
-                    p[k, q] += layer[0, q] * value[k, q]
+                if moving:
+                    for q in range(n):
+                        value[k, q] = layer[start + k, q] - p[k, q]
+                else:
+                    for q in range(n):
+                        value[k, q] = -p[k, q]
+            _spread(value, 1, 1 + d, n, s, _L2)
+            for q in range(n):
+                p[0, q] += s[_A0 + q] * value[0, q]
             for k in range(1, m):
-                for q in range(PIXELS):
-                    p[k, q] += layer[k, q] * value[0, q]
+                for q in range(n):
+                    p[k, q] += s[_A0 + q] * value[k, q] + value[0, q] * layer[k, q]
             if order == 2:
+                _spread(value, 1 + d, m, n, s, _B2)
                 row = 1 + d
                 for k in range(1, d + 1):
-                    for q in range(PIXELS):
+                    for q in range(n):
                         p[row, q] += layer[k, q] * value[k, q]
                     row += 1
                     for l in range(k + 1, d + 1):
-                        for q in range(PIXELS):
+                        for q in range(n):
                             p[row, q] += layer[k, q] * value[l, q] + layer[l, q] * value[k, q]
                         row += 1
-                for q in range(PIXELS):
-                    cross[q] = alpha_spread[q] * curve[q] + alpha_curve[q] * (spread[q] + curve[q])
+                for q in range(n):
+                    s[_TMP + q] = s[_L1 + q] * s[_B2 + q] + s[_B1 + q] * (s[_L2 + q] + s[_B2 + q])
+                for q in range(n):
+                    s[_SL + q] = 1.0 + s[_L1 + q] + s[_B1 + q]
+                    s[_SB + q] = s[_L2 + q] + s[_B2 + q]
             else:
+                for q in range(n):
+                    s[_TMP + q] = s[_L1 + q] * s[_L2 + q]
                 for k in range(1, d + 1):
-                    for q in range(PIXELS):
-                        half = 0.5 * (layer[k, q] * value[k, q])
-                        p[0, q] += half
-                        cross[q] -= abs(half)
-                for q in range(PIXELS):
-                    cross[q] += alpha_spread[q] * spread[q]
-            for q in range(PIXELS):
-                size = abs(value[0, q]) + spread[q] + curve[q]
-                a_low = layer[m + 1, q]
-                a_high = layer[m + 2, q]
-                radius[channel, q] = (
-                    (1.0 - a_low) * radius[channel, q]
-                    + a_high * color[1, q]
-                    + layer[m, q] * size
-                    + cross[q]
-                    + _ROUND * (abs(p[0, q]) + size * (1.0 + alpha_spread[q] + alpha_curve[q]))
+                    for q in range(n):
+                        s[_CURVE + q] = 0.5 * (layer[k, q] * value[k, q])
+                    for q in range(n):
+                        p[0, q] += s[_CURVE + q]
+                    for q in range(n):
+                        s[_TMP + q] -= abs(s[_CURVE + q])
+                for q in range(n):
+                    s[_SL + q] = 1.0 + s[_L1 + q]
+                    s[_SB + q] = s[_L2 + q]
+            r, top, bottom = radius[channel], high[channel], low[channel]
+            for q in range(n):
+                s[_SR + q] = abs(value[0, q])
+            for q in range(n):
+                s[_S0 + q] = abs(p[0, q])
+            for q in range(n):
+                size = s[_SR + q] + s[_SB + q]
+                r[q] = (
+                    (1.0 - s[_LO + q]) * r[q]
+                    + s[_HI + q] * s[_C2 + q]
+                    + s[_AR + q] * size
+                    + s[_TMP + q]
+                    + _ROUND * (s[_S0 + q] + size * s[_SL + q])
                 ) * _UP
-            if ordered:
-                for q in range(PIXELS):
-                    center = layer[start, q]
-                    c_low = center - color[0, q] * _UP
-                    c_high = center + color[0, q] * _UP
-                    a_low = layer[m + 1, q]
-                    a_high = layer[m + 2, q]
-                    v = c_high - high[channel, q]
-                    high[channel, q] += (a_high if v > 0.0 else a_low) * v
-                    v = c_low - low[channel, q]
-                    low[channel, q] += (a_high if v < 0.0 else a_low) * v
+            for q in range(n):
+                c_high = s[_C1 + q] + s[_CC + q] * _UP
+                v = c_high - top[q]
+                top[q] += (s[_HI + q] if v > 0.0 else s[_LO + q]) * v
+                s[_MAX + q] = max(s[_MAX + q], c_high)
+            for q in range(n):
+                c_low = s[_C1 + q] - s[_CC + q] * _UP
+                v = c_low - bottom[q]
+                bottom[q] += (s[_HI + q] if v < 0.0 else s[_LO + q]) * v
+                s[_MIN + q] = min(s[_MIN + q], c_low)
+            if moved[e]:
+                lower = 2 * channel
+                lift = 2 * channel + 1
+                reorder = extra[e]
+                for q in range(n):
+                    p[0, q] += 0.5 * (reorder[lift, q] - reorder[lower, q])
+                for q in range(n):
+                    r[q] += 0.5 * (reorder[lift, q] + reorder[lower, q]) * _UP
+                for q in range(n):
+                    top[q] += reorder[lift, q]
+                for q in range(n):
+                    bottom[q] -= reorder[lower, q]
+    for q in range(n):
+        s[_BRIGHT + q] = max(1.0, s[_MAX + q], -s[_MIN + q])
+
+
+# rows of one channel of the one-parameter blend: coefficients, radius, interval, then the layer's colour
+_P0, _P1, _P2, _PR, _PLO, _PHI, _K0, _K1, _K2, _KR, _KS = range(0, 11 * PIXELS, PIXELS)
+_CHANNEL_ROWS = 11
+
+
+@njit(cache=True, error_model="numpy")
+def _blend_channel_line(n, s, t):
+    """Blend one layer (rows _A0, _LINEAR, _QUADRATIC, _AR, _LO, _HI of ``s``) into one channel's rows ``t``."""
+    for q in range(n):
+        a0 = s[_A0 + q]
+        a1 = s[_LINEAR + q]
+        a2 = s[_QUADRATIC + q]
+        low = s[_LO + q]
+        high = s[_HI + q]
+        p0 = t[_P0 + q]
+        p1 = t[_P1 + q]
+        p2 = t[_P2 + q]
+        # colour - P, a form without radius
+        v0 = t[_K0 + q] - p0
+        v1 = t[_K1 + q] - p1
+        v2 = t[_K2 + q] - p2
+        p0 += a0 * v0
+        t[_P0 + q] = p0
+        t[_P1 + q] = p1 + a0 * v1 + v0 * a1
+        t[_P2 + q] = p2 + a0 * v2 + v0 * a2 + a1 * v1
+        a1 = abs(a1)
+        a2 = abs(a2)
+        v1 = abs(v1)
+        v2 = abs(v2)
+        size = abs(v0) + v1 + v2
+        t[_PR + q] = (
+            (1.0 - low) * t[_PR + q]
+            + high * t[_KR + q]
+            + s[_AR + q] * size
+            + a1 * v2
+            + a2 * (v1 + v2)
+            + _ROUND * (abs(p0) + size * (1.0 + a1 + a2))
+        ) * _UP
+        c_high = t[_K0 + q] + t[_KS + q]
+        c_low = t[_K0 + q] - t[_KS + q]
+        v = c_high - t[_PHI + q]
+        t[_PHI + q] += (high if v > 0.0 else low) * v
+        v = c_low - t[_PLO + q]
+        t[_PLO + q] += (high if v < 0.0 else low) * v
+        s[_MAX + q] = max(s[_MAX + q], c_high)
+        s[_MIN + q] = min(s[_MIN + q], c_low)
+
+
+@njit(cache=True, error_model="numpy")
+def _blend_line(layers, lengths, count, extra, moved, background, color_rows, state, radius, low, high, red, green, blue, s):
+    """`_blend` for one parameter and order 2; ``red``, ``green``, ``blue`` are [_CHANNEL_ROWS * lanes] scratch."""
+    n = lengths.shape[0]
+    for q in range(n):
+        s[_MIN + q] = min(background[0], background[1], background[2])
+        s[_MAX + q] = max(background[0], background[1], background[2])
+    for channel in range(3):
+        t = red if channel == 0 else (green if channel == 1 else blue)
+        t[:] = 0.0
+        for q in range(n):
+            t[_P0 + q] = background[channel]
+            t[_PLO + q] = background[channel]
+            t[_PHI + q] = background[channel]
+    for e in range(count - 1, -1, -1):
+        # lane by lane in memory, row by row for the arithmetic
+        for q in range(n):
+            if e < lengths[q]:
+                s[_A0 + q] = layers[e, q, 0]
+                s[_LINEAR + q] = layers[e, q, 1]
+                s[_QUADRATIC + q] = layers[e, q, 2]
+                s[_AR + q] = layers[e, q, 3]
+                s[_LO + q] = layers[e, q, 4]
+                s[_HI + q] = layers[e, q, 5]
+                _load_color(layers, e, q, 0, color_rows, red)
+                _load_color(layers, e, q, 1, color_rows, green)
+                _load_color(layers, e, q, 2, color_rows, blue)
             else:
-                for q in range(PIXELS):
+                s[_A0 + q] = 0.0
+                s[_LINEAR + q] = 0.0
+                s[_QUADRATIC + q] = 0.0
+                s[_AR + q] = 0.0
+                s[_LO + q] = 0.0
+                s[_HI + q] = 0.0
+        _blend_channel_line(n, s, red)
+        _blend_channel_line(n, s, green)
+        _blend_channel_line(n, s, blue)
+        if moved[e]:
+            for channel in range(3):
+                t = red if channel == 0 else (green if channel == 1 else blue)
+                for q in range(n):
                     lower = extra[e, 2 * channel, q]
-                    raise_ = extra[e, 2 * channel + 1, q]
-                    p[0, q] += 0.5 * (raise_ - lower)
-                    radius[channel, q] += 0.5 * (raise_ + lower) * _UP
+                    lift = extra[e, 2 * channel + 1, q]
+                    t[_P0 + q] += 0.5 * (lift - lower)
+                    t[_PR + q] += 0.5 * (lift + lower) * _UP
+                    t[_PHI + q] += lift
+                    t[_PLO + q] -= lower
+    for q in range(n):
+        s[_BRIGHT + q] = max(1.0, s[_MAX + q], -s[_MIN + q])
+    for channel in range(3):
+        t = red if channel == 0 else (green if channel == 1 else blue)
+        for q in range(n):
+            state[channel, 0, q] = t[_P0 + q]
+            state[channel, 1, q] = t[_P1 + q]
+            state[channel, 2, q] = t[_P2 + q]
+            radius[channel, q] = t[_PR + q]
+            low[channel, q] = t[_PLO + q]
+            high[channel, q] = t[_PHI + q]
 
 
-@njit(cache=True)
-def _form_range(state, radius, channel, d, order, m, low, high):
-    """Range of the blended forms of one channel over the box."""
-    p = state[channel]
-    for q in range(PIXELS):
-        low[q] = p[0, q]
-        high[q] = p[0, q]
-    size = np.abs(p[0])
+@njit(cache=True, error_model="numpy", inline="always")
+def _load_color(layers, e, q, channel, color_rows, t):
+    """One lane's colour of one channel (rows 8 .. of a one-parameter layer) into ``t``."""
+    start = 8 + channel * color_rows
+    t[_K0 + q] = layers[e, q, start]
+    if color_rows == 2:
+        t[_KR + q] = layers[e, q, start + 1]
+        t[_KS + q] = t[_KR + q] * _UP
+    elif color_rows > 2:
+        t[_K1 + q] = layers[e, q, start + 1]
+        t[_K2 + q] = layers[e, q, start + 2]
+        t[_KR + q] = layers[e, q, start + 3]
+        t[_KS + q] = (abs(t[_K1 + q]) + abs(t[_K2 + q]) + t[_KR + q]) * _UP
+
+
+@njit(cache=True, error_model="numpy")
+def _form_range(p, d, order, m, s):
+    """Range over the box of one channel's polynomial into rows _SLO, _SHI, rounded outward."""
+    n = p.shape[1]
+    _spread(p, 1, m, n, s, _SL)
+    for q in range(n):
+        s[_MIN + q] = p[0, q]
+        s[_MAX + q] = p[0, q]
     if order == 1:
-        for k in range(1, m):
-            for q in range(PIXELS):
-                low[q] -= abs(p[k, q])
-                high[q] += abs(p[k, q])
-                size[q] += abs(p[k, q])
+        for q in range(n):
+            s[_MIN + q] -= s[_SL + q]
+            s[_MAX + q] += s[_SL + q]
     else:
-        row = 1 + d
-        for k in range(1, d + 1):
-            for q in range(PIXELS):
-                g = abs(p[k, q])
-                s = p[row, q]
-                inside = g < 2.0 * abs(s)
-                vertex = -(g * g) / (4.0 * s) if inside else 0.0
-                high[q] += max(s + g, vertex) if inside else s + g
-                low[q] += min(s - g, vertex) if inside else s - g
-                size[q] += g + abs(s)
-            row += 1
-            for _ in range(k + 1, d + 1):
-                for q in range(PIXELS):
-                    low[q] -= abs(p[row, q])
-                    high[q] += abs(p[row, q])
-                    size[q] += abs(p[row, q])
-                row += 1
+        _add_range(p, d, n, s)
+    for q in range(n):
+        rounding = 8.0 * _ROUND * (abs(p[0, q]) + s[_SL + q])
+        s[_SLO + q] = s[_MIN + q] - rounding
+        s[_SHI + q] = s[_MAX + q] + rounding
+
+
+@njit(cache=True, error_model="numpy")
+def _chains(last):
+    """Number of the group of each list position: no uncertain pair spans two groups."""
+    chain = np.empty(last.size, np.int64)
+    group = 0
+    reach = -1
+    for k in range(last.size):
+        if k > reach:
+            group += 1
+        chain[k] = group
+        reach = max(reach, last[k])
+    return chain
+
+
+@njit(cache=True, error_model="numpy")
+def _block(
+    listed, x0, y0, tile_x, tile_y, record, box, tiles, depth, delta, depth_error, colors, color_radius,
+    slope, direction, camera, rules, errors, background, negligible, d, order, m, antialiased,
+    s, y1, y2, poly, value, layer, pixels, layers, sources, lengths, reach, far, first, last, slots, heights,
+    pairs, moves, most, extra, moved, line, state, radius, low, high, ray, lower, upper, linear, statistics,
+):  # fmt: skip
+    """Bounds of one block of pixels whose first pixel is (x0, y0). Returns whether the buffers sufficed.
+
+    ``lower``, ``upper`` [side, side, 3] are the tile's, ``linear`` starts with the tile's or is empty;
+    ``statistics`` is the thread's row.
+    """
+    unit = errors[0]
+    side = lower.shape[0]
+    color_rows = colors.shape[1] // 3
+    u = (x0 + 0.5 * BLOCK - camera[2]) / camera[0]
+    v = (y0 + 0.5 * BLOCK - camera[3]) / camera[1]
+    for k in range(3):
+        ray[k] = direction[k] * u + direction[3 + k] * v + direction[6 + k]
+    pair_count, slot_count = _forward(
+        listed, record, box, tiles, tile_x, tile_y, colors, depth, delta, depth_error, slope, ray,
+        s, y1, y2, poly, pixels, layers, sources, lengths, reach, far, first, last, slots, heights, pairs,
+        x0, y0, d, order, m, antialiased, rules, errors,
+    )  # fmt: skip
+    if pair_count == _GROW:
+        return False
+    statistics[0] += 1
+    if pair_count == _GIVE_UP:
+        # too much may be reordered: nothing is known
+        statistics[3] += 1
+        for q in range(PIXELS):
+            row = y0 % side + q // BLOCK
+            column = x0 % side + q % BLOCK
+            for channel in range(3):
+                lower[row, column, channel] = 0.0
+                upper[row, column, channel] = 1.0
+                if linear.shape[0] > 0:
+                    linear[0, row, column, channel, 0] = 0.5
+                    linear[0, row, column, channel, m] = 0.5
+        return True
+    deepest = 0
     for q in range(PIXELS):
-        spread = (radius[channel, q] + 4.0 * _ROUND * size[q]) * _UP
-        low[q] -= spread
-        high[q] += spread
+        deepest = max(deepest, lengths[q])
+    moved[:deepest] = False
+    if slot_count > 0:
+        _settle_stops(layers, sources, lengths, first, last, s, m, rules[9], unit)
+        _swap_bounds(pairs, pair_count, slots, slot_count, heights, listed, colors, color_rows, moves, most)
+        _collect_moves(moves, slots, sources, lengths, extra, moved)
+    if d == 1 and order == 2:
+        _blend_line(
+            layers, lengths, deepest, extra, moved, background, color_rows, state, radius, low, high,
+            line[0], line[1], line[2], s,
+        )  # fmt: skip
+    else:
+        _blend(
+            layers, lengths, deepest, layer, extra, moved, background, d, order, m, color_rows,
+            state, radius, low, high, value, s,
+        )  # fmt: skip
+    for q in range(PIXELS):
+        s[_C1 + q] = s[_MIN + q]
+        s[_C2 + q] = s[_MAX + q]
+    if slot_count > 0:
+        _interval_blend(
+            layers, sources, lengths, extra, moved, _chains(last[: listed.size]), background, m, color_rows, low, high
+        )
+    statistics[1] += deepest
+    statistics[2] += pair_count
+    for channel in range(3):
+        _form_range(state[channel], d, order, m, s)
+        for q in range(PIXELS):
+            row = y0 % side + q // BLOCK
+            column = x0 % side + q % BLOCK
+            # rounding of the program's own sums and products (design.md, B8)
+            slack = (
+                (3.0 * lengths[q] + 16.0) * (unit + 8.0 * UNIT64) * s[_BRIGHT + q] * 1.01
+                + color_radius
+                + negligible * s[_BRIGHT + q]
+            )
+            # a stop that was ignored shows the background in place of what lies behind (B6)
+            rho = s[_RHO + q] * (1.0 + 16.0 * unit)
+            fall = slack + rho * max(0.0, s[_C2 + q] - background[channel])
+            rise = slack + rho * max(0.0, background[channel] - s[_C1 + q])
+            bottom = max(low[channel, q], s[_SLO + q] - radius[channel, q] * _UP) - fall
+            top = min(high[channel, q], s[_SHI + q] + radius[channel, q] * _UP) + rise
+            if not bottom <= top:
+                # crossed or not a number: nothing is known
+                bottom = 0.0
+                top = 1.0
+                statistics[4] += 1
+            lower[row, column, channel] = min(1.0, max(0.0, bottom))
+            upper[row, column, channel] = max(0.0, min(1.0, top))
+            if linear.shape[0] > 0:
+                for k in range(m):
+                    linear[0, row, column, channel, k] = state[channel, k, q]
+                linear[0, row, column, channel, m] = radius[channel, q] + max(fall, rise)
+    return True
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _pixel_worker(
-    thread, wanted, offsets, entries, record, box, tiles, depth, delta, depth_error, colors, color_radius,
-    slope, direction, camera, rules, errors, background, negligible, pair_limit, d, order, m, antialiased,
-    threads, lower, upper, linear, statistics,
+    thread, wanted, offsets, entries, record_, box_, tiles_, depth_, delta_, depth_error_, colors_, color_radius,
+    slope_, direction_, camera_, rules_, errors_, background_, negligible, pair_limit, d, order, m, antialiased,
+    threads, lower_, upper_, linear_, statistics_,
 ):  # fmt: skip
     """Every ``threads``-th tile, from number ``thread``; see `pixel_stage`."""
-    fx, fy, cx, cy, image_width, image_height = camera[0], camera[1], camera[2], camera[3], camera[4], camera[5]
-    unit = errors[0]
-    stop = rules[9]
-    color_rows = colors.shape[1] // 3
+    record, box, tiles, depth = borrowed(record_), borrowed(box_), borrowed(tiles_), borrowed(depth_)
+    delta, depth_error, colors, slope = borrowed(delta_), borrowed(depth_error_), borrowed(colors_), borrowed(slope_)
+    direction, camera, rules, errors = borrowed(direction_), borrowed(camera_), borrowed(rules_), borrowed(errors_)
+    background, lower, upper = borrowed(background_), borrowed(lower_), borrowed(upper_)
+    linear, statistics = borrowed(linear_), borrowed(statistics_)
+    image_width, image_height = camera[4], camera[5]
     side = lower.shape[1]
     tiles_x = int(math.ceil(image_width / side))
     blocks = side // BLOCK
-    lanes = np.zeros((_LANE_ROWS, PIXELS))
-    y1 = np.empty((m, PIXELS))
-    y2 = np.empty((m, PIXELS))
-    poly = np.empty((m, PIXELS))
-    value = np.empty((m, PIXELS))
-    color = np.empty((2, PIXELS))
-    layers = np.empty((256, m + 5 + colors.shape[1], PIXELS))
-    sources = np.empty((256, 1, PIXELS), np.int64)
-    lengths = np.empty(PIXELS, np.int64)
-    state = np.empty((3, m, PIXELS))
-    radius = np.empty((3, PIXELS))
-    low = np.empty((3, PIXELS))
-    high = np.empty((3, PIXELS))
-    form_low = np.empty(PIXELS)
-    form_high = np.empty(PIXELS)
+    rows = m + 5 + colors.shape[1]
+    scratch = np.zeros(_ROWS * PIXELS)
+    planes = np.empty((4 * m + rows, PIXELS))
+    integers = np.empty((2, PIXELS), np.int64)
+    ray_ = np.empty(3)
+    s = borrowed(scratch)
+    y1, y2, poly = borrowed(planes[:m]), borrowed(planes[m : 2 * m]), borrowed(planes[2 * m : 3 * m])
+    value, layer = borrowed(planes[3 * m : 4 * m]), borrowed(planes[4 * m :])
+    pixels, lengths, ray = borrowed(integers[0]), borrowed(integers[1]), borrowed(ray_)
+    state_ = np.empty((3, m, PIXELS))
+    line_ = np.empty((3, _CHANNEL_ROWS * PIXELS))
+    line = borrowed(line_)
+    ends = np.empty((3, 3, PIXELS))
+    state, radius, low, high = borrowed(state_), borrowed(ends[0]), borrowed(ends[1]), borrowed(ends[2])
+    layers_ = np.empty((256, PIXELS, rows))
+    sources_ = np.empty((256, PIXELS), np.int64)
+    extra_ = np.empty((256, 6, PIXELS))
+    moved_ = np.empty(256, np.bool_)
+    heights_ = np.empty((64, PIXELS))
+    moves_ = np.empty((2, 64, 6, PIXELS))
+    reach_ = np.empty(1024)
+    order_ = np.empty((4, 1024), np.int64)
+    pairs_ = np.empty((pair_limit, 2), np.int64)
     block_offsets = np.empty(blocks * blocks + 1, np.int64)
     block_entries = np.empty(4096, np.int32)
-    extra = np.zeros((256, 6, PIXELS))
-    ray = np.empty(3)
-    brightest = np.empty(PIXELS)
     for number in range(thread, wanted.size, threads):
         tile = wanted[number]
         tile_x = tile % tiles_x
@@ -814,83 +1337,34 @@ def _pixel_worker(
             if x0 >= image_width or y0 >= image_height:
                 continue
             listed = block_entries[block_offsets[b] : block_offsets[b + 1]]
-            count = listed.size
-            first = np.empty(count, np.int64)
-            last = np.empty(count, np.int64)
-            u = (x0 + 0.5 * BLOCK - cx) / fx
-            v = (y0 + 0.5 * BLOCK - cy) / fy
-            for k in range(3):
-                ray[k] = direction[k] * u + direction[3 + k] * v + direction[6 + k]
-            pairs = _windows(listed, depth, delta, depth_error, slope, ray, m, pair_limit, first, last)
-            ordered = pairs == 0
-            layers, sources = _forward(
-                listed, record, tiles, tile_x, tile_y, colors, lanes, y1, y2, poly, layers, sources, lengths,
-                first, last, ordered, x0, y0, d, order, m, antialiased, rules, errors,
-            )  # fmt: skip
-            deepest = 0
-            for q in range(PIXELS):
-                deepest = max(deepest, lengths[q])
-            for q in range(PIXELS):
-                for e in range(lengths[q], deepest):
-                    for r in range(layers.shape[1]):
-                        layers[e, r, q] = 0.0
-            if not ordered:
-                if extra.shape[0] < deepest:
-                    extra = np.zeros((layers.shape[0], 6, PIXELS))
-                extra[:deepest] = 0.0
-                _settle_stops(layers, sources, lengths, first, last, m, stop, unit)
-                _swap_bounds(
-                    layers, sources, lengths, listed, last, depth, delta, depth_error, slope, m, color_rows,
-                    pairs < 0, extra,
-                )  # fmt: skip
-                # groups of consecutive layers that no certain boundary separates
-                chain = np.empty(count, np.int64)
-                group = 0
-                reach = -1
-                for k in range(count):
-                    if k > reach:
-                        group += 1
-                    chain[k] = group
-                    reach = max(reach, last[k])
-                _interval_blend(
-                    layers, sources, lengths, extra, chain, background, m, color_rows, low, high
-                )
-            _blend(
-                layers, deepest, extra, ordered, background, d, order, m, color_rows,
-                state, radius, low, high, color, value, brightest, lanes,
-            )  # fmt: skip
-            statistics[thread, 0] += 1
-            statistics[thread, 1] += deepest
-            statistics[thread, 2] += max(pairs, 0)
-            if pairs < 0:
-                statistics[thread, 3] += 1
-            for channel in range(3):
-                _form_range(state, radius, channel, d, order, m, form_low, form_high)
-                for q in range(PIXELS):
-                    column = x0 - tile_x * side + q % BLOCK
-                    row = y0 - tile_y * side + q // BLOCK
-                    # rounding of the program's own sums and products (design.md, B8)
-                    slack = (
-                        (3.0 * lengths[q] + 16.0) * (unit + 8.0 * UNIT64) * brightest[q] * 1.01
-                        + color_radius
-                        + negligible * brightest[q]
-                    )
-                    bottom = max(low[channel, q], form_low[q]) - slack
-                    top = min(high[channel, q], form_high[q]) + slack
-                    if not bottom <= top:
-                        # crossed or not a number: nothing is known
-                        bottom = 0.0
-                        top = 1.0
-                        statistics[thread, 4] += 1
-                    lower[number, row, column, channel] = min(1.0, max(0.0, bottom))
-                    upper[number, row, column, channel] = max(0.0, min(1.0, top))
-                    if linear.shape[0] > 0:
-                        for k in range(m):
-                            linear[number, row, column, channel, k] = state[channel, k, q]
-                        linear[number, row, column, channel, m] = radius[channel, q] + slack
+            if listed.size > reach_.size:
+                reach_ = np.empty(2 * listed.size)
+                order_ = np.empty((4, 2 * listed.size), np.int64)
+            while not _block(
+                borrowed(listed), x0, y0, tile_x, tile_y, record, box, tiles, depth, delta, depth_error, colors,
+                color_radius, slope, direction, camera, rules, errors, background, negligible, d, order, m,
+                antialiased, s, y1, y2, poly, value, layer, pixels, borrowed(layers_), borrowed(sources_), lengths,
+                borrowed(reach_), borrowed(order_[0]), borrowed(order_[1]), borrowed(order_[2]), borrowed(order_[3]),
+                borrowed(heights_), borrowed(pairs_), borrowed(moves_[0]), borrowed(moves_[1]), borrowed(extra_),
+                borrowed(moved_), line, state, radius, low, high, ray, lower[number], upper[number],
+                linear[min(number, linear.shape[0]) :], statistics[thread],
+            ):  # fmt: skip
+                capacity = 2 * layers_.shape[0]
+                layers_ = np.empty((capacity, PIXELS, rows))
+                sources_ = np.empty((capacity, PIXELS), np.int64)
+                extra_ = np.empty((capacity, 6, PIXELS))
+                moved_ = np.empty(capacity, np.bool_)
+                slot_capacity = 2 * heights_.shape[0]
+                heights_ = np.empty((slot_capacity, PIXELS))
+                moves_ = np.empty((2, slot_capacity, 6, PIXELS))
+    # the owners of the borrowed arrays live to here
+    return (
+        scratch.size + planes.size + integers.size + ray_.size + line_.size + state_.size + ends.size + layers_.size + sources_.size
+        + extra_.size + moved_.size + heights_.size + moves_.size + reach_.size + order_.size + pairs_.size
+    )  # fmt: skip
 
 
-@njit(cache=True, parallel=True)
+@njit(cache=True, parallel=True, error_model="numpy")
 def pixel_stage(
     wanted, offsets, entries, record, box, tiles, depth, delta, depth_error, colors, color_radius,
     slope, direction, camera, rules, errors, background, negligible, pair_limit, d, order, m, antialiased,

@@ -11,16 +11,15 @@ import math
 import numpy as np
 from numba import get_num_threads, njit, prange
 
+from ns_abstract.arithmetic.compiled import borrowed
 from ns_abstract.arithmetic.elementary import exp_kernel
 from ns_abstract.methods.splat.activate import Splats
 from ns_abstract.methods.splat.colors import sh_color
-from ns_abstract.methods.splat.constants import Rasteriser
+from ns_abstract.methods.splat.constants import Rasteriser, rules_array
 from ns_abstract.methods.splat.lists import BLOCK, PIXELS, block_lists, depth_order, tile_lists
 from ns_abstract.sets.path import Camera
 
 _CHUNK = 1024
-#: Tile side where the rasteriser itself has no tiles.
-WORK_TILE = 16
 _EXPONENT_LIMIT = 60.0
 _REGION = 1.0 + 2.0**-30
 
@@ -29,12 +28,12 @@ _MEAN_X, _MEAN_Y, _P, _Q, _S, _OPACITY, _RED = range(7)
 _COLUMNS = 9
 
 
-@njit(cache=True, parallel=True)
-def _project(
-    means, axes, opacity, sh, degree, rotation, position, camera, rules, antialiased, tile,
+@njit(cache=True, error_model="numpy")
+def _project_chunk(
+    chunk, means, axes, opacity, sh, degree, rotation, position, camera, rules, antialiased, tile,
     record, box, tiles, depth, visible,
 ):  # fmt: skip
-    """Project every Gaussian; see `ns_abstract.methods.splat.constants` for the rules' sources."""
+    """Project one chunk of Gaussians; see `ns_abstract.methods.splat.constants` for the rules' sources."""
     n = means.shape[0]
     fx, fy, cx, cy, width, height = camera[0], camera[1], camera[2], camera[3], camera[4], camera[5]
     near, far, eps2d, cutoff, sigmas, discriminant_min, margin, alpha_min = (
@@ -52,176 +51,211 @@ def _project(
     r00, r01, r02 = rotation[0, 0], rotation[0, 1], rotation[0, 2]
     r10, r11, r12 = rotation[1, 0], rotation[1, 1], rotation[1, 2]
     r20, r21, r22 = rotation[2, 0], rotation[2, 1], rotation[2, 2]
-    for chunk in prange((n + _CHUNK - 1) // _CHUNK):
-        basis = np.empty(16)
-        direction = np.empty(3)
-        for i in range(chunk * _CHUNK, min(n, (chunk + 1) * _CHUNK)):
-            visible[i] = 0
-            d0 = means[i, 0] - position[0]
-            d1 = means[i, 1] - position[1]
-            d2 = means[i, 2] - position[2]
-            z = r20 * d0 + r21 * d1 + r22 * d2
-            if not (near <= z and z <= far) or opacity[i] < alpha_min:
+    basis = np.empty(16)
+    direction = np.empty(3)
+    for i in range(chunk * _CHUNK, min(n, (chunk + 1) * _CHUNK)):
+        visible[i] = 0
+        d0 = means[i, 0] - position[0]
+        d1 = means[i, 1] - position[1]
+        d2 = means[i, 2] - position[2]
+        z = r20 * d0 + r21 * d1 + r22 * d2
+        if not (near <= z and z <= far) or opacity[i] < alpha_min:
+            continue
+        x = r00 * d0 + r01 * d1 + r02 * d2
+        y = r10 * d0 + r11 * d1 + r12 * d2
+        inverse = 1.0 / z
+        u = x * inverse
+        v = y * inverse
+        mean_x = fx * u + cx
+        mean_y = fy * v + cy
+        u = min(right, max(-left, u))
+        v = min(bottom, max(-top, v))
+        jx = fx * inverse
+        jy = fy * inverse
+        a0 = jx * (r00 - u * r20)
+        a1 = jx * (r01 - u * r21)
+        a2 = jx * (r02 - u * r22)
+        b0 = jy * (r10 - v * r20)
+        b1 = jy * (r11 - v * r21)
+        b2 = jy * (r12 - v * r22)
+        m00 = a0 * axes[i, 0, 0] + a1 * axes[i, 1, 0] + a2 * axes[i, 2, 0]
+        m01 = a0 * axes[i, 0, 1] + a1 * axes[i, 1, 1] + a2 * axes[i, 2, 1]
+        m02 = a0 * axes[i, 0, 2] + a1 * axes[i, 1, 2] + a2 * axes[i, 2, 2]
+        m10 = b0 * axes[i, 0, 0] + b1 * axes[i, 1, 0] + b2 * axes[i, 2, 0]
+        m11 = b0 * axes[i, 0, 1] + b1 * axes[i, 1, 1] + b2 * axes[i, 2, 1]
+        m12 = b0 * axes[i, 0, 2] + b1 * axes[i, 1, 2] + b2 * axes[i, 2, 2]
+        a = m00 * m00 + m01 * m01 + m02 * m02
+        c = m10 * m10 + m11 * m11 + m12 * m12
+        b = m00 * m10 + m01 * m11 + m02 * m12
+        k0 = m00 * m11 - m01 * m10
+        k1 = m00 * m12 - m02 * m10
+        k2 = m01 * m12 - m02 * m11
+        sharp = k0 * k0 + k1 * k1 + k2 * k2
+        det = sharp + eps2d * (a + c) + eps2d * eps2d
+        a += eps2d
+        c += eps2d
+        if not det > 0.0:
+            continue
+        alpha = opacity[i]
+        if antialiased:
+            alpha *= math.sqrt(sharp / det)
+        if alpha < alpha_min or alpha == 0.0:
+            continue
+        # pixels where alpha reaches the threshold
+        exponent = 2.0 * math.log(alpha / alpha_min) * _REGION + 2.0**-30
+        extent_x = math.sqrt(exponent * a) * _REGION
+        extent_y = math.sqrt(exponent * c) * _REGION
+        x0, x1 = mean_x - extent_x, mean_x + extent_x
+        y0, y1 = mean_y - extent_y, mean_y + extent_y
+        if cutoff > 0.0:
+            half = 0.5 * (a - c)
+            radius = math.ceil(
+                sigmas * math.sqrt(0.5 * (a + c) + math.sqrt(max(discriminant_min, half * half + b * b)))
+            )
+            if (
+                mean_x + radius <= 0.0
+                or mean_x - radius >= width
+                or mean_y + radius <= 0.0
+                or mean_y - radius >= height
+            ):
                 continue
-            x = r00 * d0 + r01 * d1 + r02 * d2
-            y = r10 * d0 + r11 * d1 + r12 * d2
-            inverse = 1.0 / z
-            u = x * inverse
-            v = y * inverse
-            mean_x = fx * u + cx
-            mean_y = fy * v + cy
-            u = min(right, max(-left, u))
-            v = min(bottom, max(-top, v))
-            jx = fx * inverse
-            jy = fy * inverse
-            a0 = jx * (r00 - u * r20)
-            a1 = jx * (r01 - u * r21)
-            a2 = jx * (r02 - u * r22)
-            b0 = jy * (r10 - v * r20)
-            b1 = jy * (r11 - v * r21)
-            b2 = jy * (r12 - v * r22)
-            m00 = a0 * axes[i, 0, 0] + a1 * axes[i, 1, 0] + a2 * axes[i, 2, 0]
-            m01 = a0 * axes[i, 0, 1] + a1 * axes[i, 1, 1] + a2 * axes[i, 2, 1]
-            m02 = a0 * axes[i, 0, 2] + a1 * axes[i, 1, 2] + a2 * axes[i, 2, 2]
-            m10 = b0 * axes[i, 0, 0] + b1 * axes[i, 1, 0] + b2 * axes[i, 2, 0]
-            m11 = b0 * axes[i, 0, 1] + b1 * axes[i, 1, 1] + b2 * axes[i, 2, 1]
-            m12 = b0 * axes[i, 0, 2] + b1 * axes[i, 1, 2] + b2 * axes[i, 2, 2]
-            a = m00 * m00 + m01 * m01 + m02 * m02
-            c = m10 * m10 + m11 * m11 + m12 * m12
-            b = m00 * m10 + m01 * m11 + m02 * m12
-            k0 = m00 * m11 - m01 * m10
-            k1 = m00 * m12 - m02 * m10
-            k2 = m01 * m12 - m02 * m11
-            sharp = k0 * k0 + k1 * k1 + k2 * k2
-            det = sharp + eps2d * (a + c) + eps2d * eps2d
-            a += eps2d
-            c += eps2d
-            if not det > 0.0:
-                continue
-            alpha = opacity[i]
-            if antialiased:
-                alpha *= math.sqrt(sharp / det)
-            if alpha < alpha_min or alpha == 0.0:
-                continue
-            # pixels where alpha reaches the threshold
-            exponent = 2.0 * math.log(alpha / alpha_min) * _REGION + 2.0**-30
-            extent_x = math.sqrt(exponent * a) * _REGION
-            extent_y = math.sqrt(exponent * c) * _REGION
-            x0, x1 = mean_x - extent_x, mean_x + extent_x
-            y0, y1 = mean_y - extent_y, mean_y + extent_y
-            if cutoff > 0.0:
-                half = 0.5 * (a - c)
-                radius = math.ceil(
-                    sigmas * math.sqrt(0.5 * (a + c) + math.sqrt(max(discriminant_min, half * half + b * b)))
-                )
-                if (
-                    mean_x + radius <= 0.0
-                    or mean_x - radius >= width
-                    or mean_y + radius <= 0.0
-                    or mean_y - radius >= height
-                ):
-                    continue
-                # the tiles hit by the radius cut the region off
-                x0 = max(x0, math.floor((mean_x - radius) / tile) * tile)
-                x1 = min(x1, math.ceil((mean_x + radius) / tile) * tile)
-                y0 = max(y0, math.floor((mean_y - radius) / tile) * tile)
-                y1 = min(y1, math.ceil((mean_y + radius) / tile) * tile)
-            if x1 < 0.5 or x0 > width - 0.5 or y1 < 0.5 or y0 > height - 0.5 or x1 < x0 or y1 < y0:
-                continue
-            tiles[i, 0] = int(max(0.0, math.floor(x0 / tile)))
-            tiles[i, 1] = int(min(float(tiles_x), math.floor(x1 / tile) + 1.0))
-            tiles[i, 2] = int(max(0.0, math.floor(y0 / tile)))
-            tiles[i, 3] = int(min(float(tiles_y), math.floor(y1 / tile) + 1.0))
-            box[i, 0], box[i, 1], box[i, 2], box[i, 3] = x0, x1, y0, y1
-            p = math.sqrt(c / det)
-            record[i, _MEAN_X], record[i, _MEAN_Y] = mean_x, mean_y
-            record[i, _P], record[i, _Q], record[i, _S] = p, p * (b / c), 1.0 / math.sqrt(c)
-            record[i, _OPACITY] = alpha
-            if degree == 0:
-                for channel in range(3):
-                    record[i, _RED + channel] = sh[i, 0, channel]
-            else:
-                direction[0], direction[1], direction[2] = d0, d1, d2
-                sh_color(sh[i], direction, degree, basis, record[i, _RED:])
-            depth[i] = z
-            visible[i] = 1
+            # the tiles hit by the radius cut the region off
+            x0 = max(x0, math.floor((mean_x - radius) / tile) * tile)
+            x1 = min(x1, math.ceil((mean_x + radius) / tile) * tile)
+            y0 = max(y0, math.floor((mean_y - radius) / tile) * tile)
+            y1 = min(y1, math.ceil((mean_y + radius) / tile) * tile)
+        if x1 < 0.5 or x0 > width - 0.5 or y1 < 0.5 or y0 > height - 0.5 or x1 < x0 or y1 < y0:
+            continue
+        tiles[i, 0] = int(max(0.0, math.floor(x0 / tile)))
+        tiles[i, 1] = int(min(float(tiles_x), math.floor(x1 / tile) + 1.0))
+        tiles[i, 2] = int(max(0.0, math.floor(y0 / tile)))
+        tiles[i, 3] = int(min(float(tiles_y), math.floor(y1 / tile) + 1.0))
+        box[i, 0], box[i, 1], box[i, 2], box[i, 3] = x0, x1, y0, y1
+        p = math.sqrt(c / det)
+        record[i, _MEAN_X], record[i, _MEAN_Y] = mean_x, mean_y
+        record[i, _P], record[i, _Q], record[i, _S] = p, p * (b / c), 1.0 / math.sqrt(c)
+        record[i, _OPACITY] = alpha
+        if degree == 0:
+            for channel in range(3):
+                record[i, _RED + channel] = sh[i, 0, channel]
+        else:
+            direction[0], direction[1], direction[2] = d0, d1, d2
+            sh_color(sh[i], direction, degree, basis, record[i, _RED:])
+        depth[i] = z
+        visible[i] = 1
 
 
-@njit(cache=True, parallel=True)
-def _rasterise(wanted, offsets, entries, record, box, camera, rules, background, tile, threads, image):
-    """Blend the tiles ``wanted`` into ``image`` [t, tile, tile, 3]."""
+@njit(cache=True, parallel=True, error_model="numpy")
+def _project(
+    means, axes, opacity, sh, degree, rotation, position, camera, rules, antialiased, tile,
+    record, box, tiles, depth, visible,
+):  # fmt: skip
+    """Project every Gaussian."""
+    for chunk in prange((means.shape[0] + _CHUNK - 1) // _CHUNK):
+        _project_chunk(
+            chunk, means, axes, opacity, sh, degree, rotation, position, camera, rules, antialiased, tile,
+            record, box, tiles, depth, visible,
+        )  # fmt: skip
+
+
+# rows of a block's state: transmittance, colours, whether the pixel still takes light
+_LIGHT, _R, _G, _B, _LIVE = range(0, 5 * PIXELS, PIXELS)
+
+
+@njit(cache=True, error_model="numpy")
+def _add_gaussian(record, i, ox, oy, n, state, alpha_min, alpha_max, stop):
+    """Blend Gaussian i into the first ``n`` pixels of ``state``, whose first pixel lies at offset (ox, oy)."""
+    p, s, skew, opacity = record[i, _P], record[i, _S], record[i, _Q], record[i, _OPACITY]
+    red, green, blue = record[i, _RED], record[i, _RED + 1], record[i, _RED + 2]
+    for q in range(n):
+        ax = ox + (q % BLOCK)
+        ay = oy + (q // BLOCK)
+        y1 = p * ax - skew * ay
+        y2 = s * ay
+        sigma = 0.5 * (y1 * y1 + y2 * y2)
+        alpha = min(alpha_max, opacity * exp_kernel(-min(sigma, _EXPONENT_LIMIT)))
+        live = state[_LIVE + q]
+        alpha = alpha * live if alpha >= alpha_min else 0.0
+        light = state[_LIGHT + q]
+        after = light * (1.0 - alpha)
+        stops = after <= stop
+        weight = 0.0 if stops else alpha * light
+        state[_LIVE + q] = 0.0 if stops else live
+        state[_LIGHT + q] = light if stops else after
+        state[_R + q] += weight * red
+        state[_G + q] += weight * green
+        state[_B + q] += weight * blue
+
+
+@njit(cache=True, error_model="numpy")
+def _rasterise_worker(
+    thread, wanted, offsets, entries, record_, box_, camera, rules, background, tile, threads, image_
+):  # fmt: skip
+    """Every ``threads``-th tile, from number ``thread``; see `_rasterise`."""
+    record, box, image = borrowed(record_), borrowed(box_), borrowed(image_)
     width, height = camera[4], camera[5]
     alpha_min, alpha_max, stop = rules[7], rules[8], rules[9]
     tiles_x = int(math.ceil(width / tile))
     blocks = tile // BLOCK
-    for thread in prange(threads):
-        # transmittance, red, green, blue, live
-        state = np.empty((5, PIXELS))
-        block_offsets = np.empty(blocks * blocks + 1, np.int64)
-        block_entries = np.empty(4096, np.int32)
-        for number in range(thread, wanted.size, threads):
-            t = wanted[number]
-            left = (t % tiles_x) * tile
-            top = (t // tiles_x) * tile
-            block_entries = block_lists(
-                entries[offsets[t] : offsets[t + 1]], box, left, top, tile, block_offsets, block_entries
-            )
-            for b in range(blocks * blocks):
-                x0 = left + (b % blocks) * BLOCK
-                y0 = top + (b // blocks) * BLOCK
-                if x0 >= width or y0 >= height:
+    state_ = np.empty(5 * PIXELS)
+    state = borrowed(state_)
+    block_offsets = np.empty(blocks * blocks + 1, np.int64)
+    block_entries = np.empty(4096, np.int32)
+    for number in range(thread, wanted.size, threads):
+        t = wanted[number]
+        left = (t % tiles_x) * tile
+        above = (t // tiles_x) * tile
+        block_entries = block_lists(
+            entries[offsets[t] : offsets[t + 1]], box, left, above, tile, block_offsets, block_entries
+        )
+        for b in range(blocks * blocks):
+            x0 = left + (b % blocks) * BLOCK
+            y0 = above + (b // blocks) * BLOCK
+            if x0 >= width or y0 >= height:
+                continue
+            for q in range(PIXELS):
+                state[_LIGHT + q] = 1.0
+                state[_R + q] = 0.0
+                state[_G + q] = 0.0
+                state[_B + q] = 0.0
+                state[_LIVE + q] = 1.0
+            since = 0
+            for k in range(block_offsets[b], block_offsets[b + 1]):
+                i = block_entries[k]
+                # only the rows of pixels that the Gaussian reaches
+                top = int(math.ceil(min(max(box[i, 2] - 0.5 - y0, 0.0), float(BLOCK))))
+                bottom = int(math.floor(min(max(box[i, 3] - 0.5 - y0, -1.0), BLOCK - 1.0)))
+                if top > bottom:
                     continue
-                for q in range(PIXELS):
-                    state[0, q] = 1.0
-                    state[1, q] = 0.0
-                    state[2, q] = 0.0
-                    state[3, q] = 0.0
-                    state[4, q] = 1.0
-                for k in range(block_offsets[b], block_offsets[b + 1]):
-                    g = record[block_entries[k]]
-                    ox = x0 + 0.5 - g[_MEAN_X]
-                    oy = y0 + 0.5 - g[_MEAN_Y]
-                    p, s, skew, opacity = g[_P], g[_S], g[_Q], g[_OPACITY]
-                    red, green, blue = g[_RED], g[_RED + 1], g[_RED + 2]
+                _add_gaussian(
+                    record, i, x0 + 0.5 - record[i, _MEAN_X], y0 + top + 0.5 - record[i, _MEAN_Y],
+                    (bottom - top + 1) * BLOCK, state[top * BLOCK :], alpha_min, alpha_max, stop,
+                )  # fmt: skip
+                since += 1
+                if since == 8:
+                    since = 0
                     live = 0.0
                     for q in range(PIXELS):
-                        ax = ox + (q % BLOCK)
-                        ay = oy + (q // BLOCK)
-                        y1 = p * ax - skew * ay
-                        y2 = s * ay
-                        sigma = 0.5 * (y1 * y1 + y2 * y2)
-                        alpha = min(alpha_max, opacity * exp_kernel(-min(sigma, _EXPONENT_LIMIT)))
-                        alpha = alpha * state[4, q] if alpha >= alpha_min else 0.0
-                        transmittance = state[0, q]
-                        after = transmittance * (1.0 - alpha)
-                        stops = after <= stop
-                        weight = 0.0 if stops else alpha * transmittance
-                        state[4, q] = 0.0 if stops else state[4, q]
-                        state[0, q] = transmittance if stops else after
-                        state[1, q] += weight * red
-                        state[2, q] += weight * green
-                        state[3, q] += weight * blue
-                        live += state[4, q]
+                        live += state[_LIVE + q]
                     if live == 0.0:
                         break
-                for q in range(PIXELS):
-                    row = y0 - top + q // BLOCK
-                    column = x0 - left + q % BLOCK
-                    for channel in range(3):
-                        value = state[1 + channel, q] + state[0, q] * background[channel]
-                        image[number, row, column, channel] = min(1.0, max(0.0, value))
+            for q in range(PIXELS):
+                row = y0 - above + q // BLOCK
+                column = x0 - left + q % BLOCK
+                for channel in range(3):
+                    value = state[(1 + channel) * PIXELS + q] + state[_LIGHT + q] * background[channel]
+                    image[number, row, column, channel] = min(1.0, max(0.0, value))
+    # the owner of the borrowed state lives to here
+    return state_.size
 
 
-def rules_array(rasteriser: Rasteriser) -> np.ndarray:
-    """The rasteriser's constants in the order the kernels expect."""
-    r = rasteriser
-    alpha_min = r.alpha_min if r.alpha_min > 0.0 else r.alpha_negligible
-    return np.array(
-        [
-            r.near, r.far, r.eps2d, float(r.tile_size), r.radius_sigmas, r.discriminant_min, r.view_margin,
-            alpha_min, r.alpha_max, r.transmittance_min,
-        ]
-    )  # fmt: skip
+@njit(cache=True, parallel=True, error_model="numpy")
+def _rasterise(wanted, offsets, entries, record, box, camera, rules, background, tile, threads, image):
+    """Blend the tiles ``wanted`` into ``image`` [t, tile, tile, 3]."""
+    for thread in prange(threads):
+        _rasterise_worker(
+            thread, wanted, offsets, entries, record, box, camera, rules, background, tile, threads, image
+        )
 
 
 def camera_array(camera: Camera) -> np.ndarray:
@@ -255,7 +289,7 @@ class Renderer:
         n = splats.count
         self.splats = splats
         self.rules = rules_array(rasteriser)
-        self.side = rasteriser.tile_size or WORK_TILE
+        self.side = rasteriser.work_tile
         self._record = np.empty((n, _COLUMNS))
         self._box = np.empty((n, 4))
         self._tiles = np.empty((n, 4), np.int32)
