@@ -7,9 +7,11 @@ does not depend on the platform's mathematical library.
 from __future__ import annotations
 
 import math
+import struct
+from fractions import Fraction
 
 from llvmlite import ir
-from numba import njit, types
+from numba import config, njit, types
 from numba.extending import intrinsic
 
 #: Proven bound of ``|exp_kernel(x) - exp(x)| / exp(x)`` for ``EXP_LOWEST <= x <= EXP_HIGHEST``
@@ -53,6 +55,22 @@ def _double_of_bits(typingctx, bits):
         return builder.bitcast(args[0], ir.DoubleType())
 
     return types.float64(types.int64), codegen
+
+
+if config.DISABLE_JIT:
+
+    def fma(x, y, z):
+        """``x * y + z`` with one rounding."""
+        if not (math.isfinite(x) and math.isfinite(y) and math.isfinite(z)):
+            return float(x) * float(y) + float(z)
+        return float(Fraction(float(x)) * Fraction(float(y)) + Fraction(float(z)))
+
+    def _bits_of_double(x):
+        return struct.unpack("<q", struct.pack("<d", x))[0]
+
+    def _double_of_bits(bits):
+        # the shift of an int64 drops what leaves its 64 bits
+        return struct.unpack("<d", struct.pack("<Q", bits & 0xFFFFFFFFFFFFFFFF))[0]
 
 
 @njit(inline="always", error_model="numpy")

@@ -30,7 +30,8 @@ class CellBounds:
     Attributes:
         wanted: [t] tile numbers, row-major.
         lower, upper: [t, side, side, 3] float64 enclosures of every image of the cell.
-        visible: Scene indices of the Gaussians that some pose of the cell may show.
+        visible: [n] scene indices of the Gaussians that some pose of the cell may show.
+        reach: [n, 4] their ranges of tiles: columns first and past, rows first and past.
         linear: [t, side, side, 3, m + 1] polynomial coefficients and radius, or None.
         statistics: Blocks, layers, uncertain pairs, blocks that gave up on order, results that were
             not numbers.
@@ -40,6 +41,7 @@ class CellBounds:
     lower: np.ndarray
     upper: np.ndarray
     visible: np.ndarray
+    reach: np.ndarray
     linear: np.ndarray | None
     statistics: np.ndarray
 
@@ -140,8 +142,9 @@ class SplatBounds:
             lower, upper, linear, statistics,
         )  # fmt: skip
         return CellBounds(
-            wanted, lower, upper, candidates[alive], linear if keep_linear else None, statistics.sum(axis=0)
-        )
+            wanted, lower, upper, candidates[alive], np.ascontiguousarray(tiles[alive, :4]),
+            linear if keep_linear else None, statistics.sum(axis=0),
+        )  # fmt: skip
 
     def _colors(self, forms: PoseForms, candidates: np.ndarray, alive: np.ndarray, n: int) -> np.ndarray:
         """Colours of the visible Gaussians: [n, 3], [n, 6] (centre, radius) or forms."""

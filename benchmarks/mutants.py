@@ -1,0 +1,452 @@
+"""Mutation check of the soundness tests: each planted fault must be caught by the test named beside it.
+
+Every mutant is one textual change of one file of a copy of the package, and one test that has to fail on it.
+The compiled kernels run interpreted (NUMBA_DISABLE_JIT=1), so that nothing is compiled per mutant; ``--compiled``
+compiles instead, into a cache of each mutant's own. Each test is also run once on the unchanged copy, where it
+has to pass.
+
+    python benchmarks/mutants.py [--only NAME ...] [--compiled] [--list]
+
+writes benchmarks/mutants.md and exits with 1 if a mutant survives.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[1]
+REPORT = Path(__file__).with_suffix(".md")
+_TIMEOUT_S = 600.0
+# pytest's exit codes
+_PASSED, _FAILED = 0, 1
+
+FORMS = "arithmetic/forms.py"
+ELEMENTARY = "arithmetic/elementary.py"
+TRIGONOMETRY = "arithmetic/trigonometry.py"
+UNITS = "arithmetic/units.py"
+POSES = "sets/poses.py"
+BOX = "sets/box.py"
+GAUSSIANS = "methods/splat/gaussians.py"
+PIXELS = "methods/splat/pixels.py"
+COLORS = "methods/splat/colors.py"
+
+
+@dataclass(frozen=True)
+class Mutant:
+    """One planted fault.
+
+    Attributes:
+        name: What is wrong, in a few words.
+        file: The mutated file, relative to the package.
+        old: Text that stands in it exactly once.
+        new: What replaces it.
+        test: The test that has to fail, as pytest names it, relative to ``tests``.
+    """
+
+    name: str
+    file: str
+    old: str
+    new: str
+    test: str
+
+
+MUTANTS = (
+    # forms: remainders, signs, roundings
+    Mutant(
+        "product drops the linear terms' remainder", FORMS,
+        "        for q in range(n):\n            out[m, q] += a[m + 1, q] * b[m + 1, q]\n"
+        "        for k in range(1, d + 1):\n            for q in range(n):\n                half = ",
+        "        for k in range(1, d + 1):\n            for q in range(n):\n                half = ",
+        "test_forms.py::test_binary_contains[plain-mul-d2o1]",
+    ),
+    Mutant(
+        "product drops one operand's radius", FORMS,
+        "out[m, q] = pa * b[m, q] + pb * a[m, q] + a[m, q] * b[m, q] + _COEFFICIENT * (pa * pb)",
+        "out[m, q] = pa * b[m, q] + a[m, q] * b[m, q] + _COEFFICIENT * (pa * pb)",
+        "test_forms.py::test_binary_contains[plain-mul-d1o2]",
+    ),
+    Mutant(
+        "product's rounding is dropped", FORMS,
+        "pb * a[m, q] + a[m, q] * b[m, q] + _COEFFICIENT * (pa * pb)\n        out[0, q]",
+        "pb * a[m, q] + a[m, q] * b[m, q]\n        out[0, q]",
+        "test_forms.py::test_binary_contains[exact-mul-d2o2]",
+    ),
+    Mutant(
+        "sum's rounding is dropped", FORMS,
+        "absolute_t * b[m, q] + _COEFFICIENT * magnitude)", "absolute_t * b[m, q])",
+        "test_forms.py::test_binary_contains[exact-scale_add-d3o1]",
+    ),
+    Mutant(
+        "accumulated product's rounding is dropped", FORMS,
+        "a[m, q] * b[m, q] + 4.0 * _COEFFICIENT * (pa * pb)", "a[m, q] * b[m, q]",
+        "test_forms.py::test_binary_contains[exact-three_products-d2o2]",
+    ),
+    Mutant(
+        "underflow is not charged", UNITS,
+        "UNDERFLOW64 = 2.0**-1060", "UNDERFLOW64 = 0.0",
+        "test_forms.py::test_binary_contains[tiny-mul-d2o2]",
+    ),
+    Mutant(
+        "row sums are not rounded up", FORMS,
+        "        out[m + 1, q] *= _UP\n        out[m + 2, q] *= _UP", "        pass",
+        "test_forms.py::test_settle[d6o2]",
+    ),
+    Mutant(
+        "second derivative's bounds are swapped", FORMS,
+        "            low = min(0.0, f2_low[q]) * (e * e)\n            high = max(0.0, f2_high[q]) * (e * e)",
+        "            low = min(0.0, f2_high[q]) * (e * e)\n            high = max(0.0, f2_low[q]) * (e * e)",
+        "test_forms.py::test_function_contains[plain-rsqrt-d2o1]",
+    ),
+    Mutant(
+        "reciprocal takes its remainder at the far end", FORMS,
+        "work[4, q] = 1.0 / (low2 * low2) if low > 0.0 else np.inf",
+        "work[4, q] = 1.0 / (c * c * c * c) if low > 0.0 else np.inf",
+        "test_forms.py::test_function_contains[plain-reciprocal-d1o2]",
+    ),
+    Mutant(
+        "third-order remainder is dropped", FORMS,
+        " + f3[q] * e * e * e + rounding", " + rounding",
+        "test_forms.py::test_compose[d2o2]",
+    ),
+    Mutant(
+        "reciprocal accepts 0", FORMS,
+        "work[3, q] = 1.0 / (low * low * low) * _UP if low > 0.0 else np.inf",
+        "work[3, q] = 1.0 / (low * low * low) * _UP",
+        "test_forms.py::test_domain[reciprocal-d1o1]",
+    ),
+    Mutant(
+        "bounds ignore the vertex", FORMS,
+        "            if abs(g) < 2.0 * abs(s):\n                vertex", "            if False:\n                vertex",
+        "test_forms.py::test_bounds[d2o2]",
+    ),
+    Mutant(
+        "bounds take the vertex for the wrong side", FORMS,
+        "                if s > 0.0:\n                    bottom = vertex", "                if s < 0.0:\n                    bottom = vertex",
+        "test_forms.py::test_bounds[d1o2]",
+    ),
+    Mutant(
+        "bounds forget the mixed terms", FORMS,
+        "                high[q] += abs(a[row, q])\n                low[q] -= abs(a[row, q])", "                pass",
+        "test_forms.py::test_bounds[d3o2]",
+    ),
+    Mutant(
+        "clamp's chord starts at the wrong end", FORMS,
+        "s = above / (above + below)", "s = below / (above + below)",
+        "test_forms.py::test_clamp_below[0.0-d2o1]",
+    ),
+    Mutant(
+        "clamp keeps half the chord's error", FORMS,
+        "a[m, q] = (s * a[m, q] + shift + ", "a[m, q] = (s * a[m, q] + 0.5 * shift + ",
+        "test_forms.py::test_clamp_below[0.0-d1o1]",
+    ),
+    Mutant(
+        "exponential loses its last term", ELEMENTARY,
+        "    c = fma(r4, _C12, c)\n", "", "test_elementary.py::test_exp_hard",
+    ),
+    Mutant(
+        "exponential reduces with one part of ln 2", ELEMENTARY,
+        "    r = fma(-k, _LN2_LOW, r)\n", "", "test_elementary.py::test_exp_any",
+    ),
+    # sets of poses
+    Mutant(
+        "cosine misses its maximum in a cell", TRIGONOMETRY,
+        "np.where(has_top, 1.0, np.minimum(most, 1.0))", "np.minimum(most, 1.0)",
+        "test_elementary.py::test_cos_sin_dense[1]",
+    ),
+    Mutant(
+        "angle's rounding is dropped", TRIGONOMETRY,
+        "slack = 8 * UNIT64 * (np.abs(middle) + 2.0)", "slack = 0.0 * middle",
+        "test_elementary.py::test_cos_sin_absolute_error",
+    ),
+    Mutant(
+        "rotations in the wrong order", "sets/perturbation.py",
+        'ROTATIONS = ("yaw", "pitch", "roll")', 'ROTATIONS = ("pitch", "yaw", "roll")',
+        "test_poses.py::test_enclosure[six-1]",
+    ),
+    Mutant(
+        "camera's translation in world axes", POSES,
+        "position = position + rotation[:, k] * shift", "position = position + shift * np.eye(3)[k]",
+        "test_poses.py::test_enclosure[translation-1]",
+    ),
+    Mutant(
+        "poses without their rounding", POSES,
+        "_POSE_ROUNDING = 32.0 * UNIT64", "_POSE_ROUNDING = 0.0", "test_poses.py::test_enclosure[x-1]",
+    ),
+    Mutant(
+        "orbit about the origin", POSES,
+        "turn @ rotation, turn @ (position - target) + target", "turn @ rotation, turn @ position",
+        "test_poses.py::test_enclosure[orbit_six-2]",
+    ),
+    Mutant(
+        "split leaves a gap", BOX,
+        "[self.replace(axis, ends[i], ends[i + 1]) for i in range(parts)]",
+        "[self.replace(axis, ends[i], min(ends[i + 1], high - (high - low) * 1e-9)) for i in range(parts)]",
+        "test_box.py::test_split",
+    ),
+    # Gaussians
+    Mutant(
+        "near plane is not uncertain", GAUSSIANS,
+        "    if not (z_low >= near * (1.0 + 4.0 * unit) and z_high < np.inf):",
+        "    if not (z_low > 0.0 and z_high < np.inf):",
+        "test_bounds.py::test_near_plane_alone[2]",
+    ),
+    Mutant(
+        "near plane culls what crosses it", GAUSSIANS,
+        "if scalars[_ZHI, q] + spread_z < near or", "if scalars[_ZLO, q] + spread_z < near or",
+        "test_bounds.py::test_near_plane[2]",
+    ),
+    Mutant(
+        "tile cut-off taken for sure", PIXELS,
+        "        sure = tiles[i, 4] <= tile_x and tile_x < tiles[i, 5] and tiles[i, 6] <= tile_y and tile_y < tiles[i, 7]",
+        "        sure = True",
+        "test_bounds.py::test_tile_cut[2]",
+    ),
+    Mutant(
+        "tile cut-off by the smallest radius", GAUSSIANS,
+        "_tile_range(mean_x_low - radius_high - snap_x, mean_x_high + radius_high + snap_x, tile, tiles_x)",
+        "_tile_range(mean_x_low - radius_low + 1.0, mean_x_high + radius_low - 1.0, tile, tiles_x)",
+        "test_bounds.py::test_tile_cut[1]",
+    ),
+    Mutant(
+        "Jacobian without its clamp", GAUSSIANS,
+        "    # the Jacobian's clamped ratios\n    if margin >= 0.0:", "    if False:",
+        "test_bounds.py::test_jacobian_clamp[2]",
+    ),
+    Mutant(
+        "clamped on one side only", GAUSSIANS,
+        "    clamp_below(a, -limit_high, other[0], other[1], d, order, m)\n", "",
+        "test_bounds.py::test_jacobian_clamp_all_sides[1]",
+    ),
+    Mutant(
+        "no compensation when antialiased", GAUSSIANS,
+        "        if antialiased and record[index, WILD] == 0.0:\n            _form_to_record(work[_K]",
+        "        if antialiased and record[index, WILD] == 0.0:\n            _form_to_record(work[_S]",
+        "test_bounds.py::test_antialiased[2]",
+    ),
+    Mutant(
+        "blur left out of the determinant", GAUSSIANS,
+        "    add_product(work[_T1], work[_T2], 1.0, work[_DET], d, order, m)\n", "",
+        "test_bounds.py::test_depth_swap[2]",
+    ),
+    Mutant(
+        "region of pixels without the mean's range", GAUSSIANS,
+        "    box[index, 1] = mean_x_high + extent_x", "    box[index, 1] = mean_x_low + extent_x",
+        "test_bounds.py::test_alpha_threshold[2]",
+    ),
+    # pixels
+    Mutant(
+        "order swap is ignored", PIXELS,
+        "    return not (abs(center) > (spread + radius)", "    return False and not (abs(center) > (spread + radius)",
+        "test_bounds.py::test_depth_swap[2]",
+    ),
+    Mutant(
+        "order swap raises but does not lower", PIXELS,
+        "                    t[_PR + q] += 0.5 * (lift + lower) * _UP\n                    t[_PHI + q] += lift\n"
+        "                    t[_PLO + q] -= lower",
+        "                    t[_PR + q] += 0.5 * (lift + lower) * _UP\n                    t[_PHI + q] += lift",
+        "test_bounds.py::test_depth_swap[2]",
+    ),
+    Mutant(
+        "equal depths keep the list's order", PIXELS,
+        "return not (abs(center) > (spread + radius) * _UP + rounding + depth_error[i] + depth_error[j])",
+        "return abs(center) < (spread + radius) * _UP",
+        "test_bounds.py::test_ties[2]",
+    ),
+    Mutant(
+        "antichain sorted the wrong way", PIXELS,
+        "keys[e] = c_low if side == 0 else -c_high", "keys[e] = -c_low if side == 0 else c_high",
+        "test_bounds.py::test_three_layers_swap[1]",
+    ),
+    Mutant(
+        "1/255 is not a jump", PIXELS,
+        "jump = min(alpha_min_high, a_high) if skips else 0.0", "jump = 0.0",
+        "test_bounds.py::test_alpha_threshold[2]",
+    ),
+    Mutant(
+        "1/255 does not make 0 possible", PIXELS,
+        "a_low = 0.0 if skips else sure * a_low", "a_low = sure * a_low",
+        "test_bounds.py::test_alpha_threshold[2]",
+    ),
+    Mutant(
+        "0.999 clamp missing from the interval", PIXELS,
+        "        a_low = min(a_low, alpha_max * (1.0 - 2.0 * unit))\n", "",
+        "test_bounds.py::test_alpha_clamp[2]",
+    ),
+    Mutant(
+        "0.999 clamp missing from the form", PIXELS,
+        "excess = max(0.0, a_high - alpha_max)", "excess = 0.0",
+        "test_bounds.py::test_alpha_clamp[2]",
+    ),
+    Mutant(
+        "stop ignored", PIXELS,
+        "            dropped = False\n            if alone and t_low <= stop_high:",
+        "            dropped = False\n            if False and t_low <= stop_high:",
+        "test_bounds.py::test_stop[2]",
+    ),
+    Mutant(
+        "stop drops layers that may be drawn", PIXELS,
+        "            if alone and t_high <= stop_low:", "            if alone and t_low <= stop_low:",
+        "test_bounds.py::test_stop[2]",
+    ),
+    Mutant(
+        "stop ignored where orders are uncertain", PIXELS,
+        "            if t_low > stop_high:\n                continue\n            # the most light",
+        "            if True:\n                continue\n            # the most light",
+        "test_bounds.py::test_stop_and_swap[2]",
+    ),
+    Mutant(
+        "remainder of the exponential's fit is dropped", PIXELS,
+        "        fit += 1.2e-4 * x * x2 * x2 + (1.0 - quadratic) * (2.0 * x * j2)", "        fit = 0.0 * x",
+        "test_bounds.py::test_linear[x-1]",
+    ),
+    Mutant(
+        "exponent's vertex counted for the wrong end", PIXELS,
+        "bottom = min(quadratic - slope, vertex) if inside else quadratic - slope",
+        "bottom = quadratic + slope",
+        "test_bounds.py::test_six_parameters[2]",
+    ),
+    Mutant(
+        "blend picks alpha's other end", PIXELS,
+        "        t[_PHI + q] += (high if v > 0.0 else low) * v", "        t[_PHI + q] += (low if v > 0.0 else high) * v",
+        "test_bounds.py::test_one_layer[2]",
+    ),
+    Mutant(
+        "blend drops the radius of alpha", PIXELS,
+        "            + s[_AR + q] * size\n            + a1 * v2", "            + a1 * v2",
+        "test_bounds.py::test_linear[x-2]",
+    ),
+    # colours
+    Mutant(
+        "colour forms lose their radius", COLORS,
+        "target[m, q] = (target[m, q] + w * form[m, q] + ", "target[m, q] = (target[m, q] + ",
+        "test_bounds.py::test_view_dependence_alone[1]",
+    ),
+    Mutant(
+        "wrong sign in band 1", COLORS,
+        "scale_add(work[7], -0.48860251190292, work[7]", "scale_add(work[7], 0.48860251190292, work[7]",
+        "test_bounds.py::test_view_dependence[1-2]",
+    ),
+    Mutant(
+        "colours are not clamped at 0", COLORS,
+        "                clamp_below(form, 0.0, low, high, d, order, m)\n", "",
+        "test_bounds.py::test_view_dependence[3-2]",
+    ),
+)
+
+
+@dataclass
+class Outcome:
+    """What became of one mutant: how it ended and how long its test took, seconds."""
+
+    mutant: Mutant
+    verdict: str
+    seconds: float
+
+
+def copy_package(folder: Path) -> None:
+    """The package, its tests and nothing else, so that the tests import the copy."""
+    skip = shutil.ignore_patterns("__pycache__", "*.nbi", "*.nbc")
+    shutil.copytree(ROOT / "ns_abstract", folder / "ns_abstract", ignore=skip)
+    shutil.copytree(ROOT / "tests", folder / "tests", ignore=skip)
+
+
+def mutate(folder: Path, mutant: Mutant) -> str:
+    """Apply the change to the copy; returns the original text.
+
+    Raises:
+        ValueError: ``old`` does not stand in the file exactly once.
+    """
+    path = folder / "ns_abstract" / mutant.file
+    text = path.read_text()
+    count = text.count(mutant.old)
+    if count != 1:
+        raise ValueError(f"{mutant.name}: the text to change stands {count} times in {mutant.file}, not once")
+    path.write_text(text.replace(mutant.old, mutant.new))
+    return text
+
+
+def run_test(folder: Path, test: str, compiled: bool) -> tuple[int, str, float]:
+    """pytest's exit code, its output and the seconds it took, on the copy in ``folder``."""
+    with tempfile.TemporaryDirectory() as cache:
+        environment = os.environ | {
+            "PYTHONPATH": str(folder),
+            "PYTHONDONTWRITEBYTECODE": "1",
+            "NUMBA_CACHE_DIR": cache,
+            "NUMBA_DISABLE_JIT": "0" if compiled else "1",
+            "NUMBA_NUM_THREADS": "1",
+        }
+        command = [
+            sys.executable, "-W", "ignore", "-m", "pytest", "-q", "-x", "-p", "no:cacheprovider",
+            "--hypothesis-seed=1", f"tests/{test}",
+        ]  # fmt: skip
+        start = time.perf_counter()
+        done = subprocess.run(
+            command, cwd=folder, env=environment, capture_output=True, text=True, timeout=_TIMEOUT_S, check=False
+        )
+        return done.returncode, done.stdout + done.stderr, time.perf_counter() - start
+
+
+def table(outcomes: list[Outcome]) -> str:
+    """The outcomes as a Markdown table."""
+    rows = ["| mutant | file | killed by | seconds |", "| --- | --- | --- | --- |"]
+    for outcome in outcomes:
+        m = outcome.mutant
+        killer = f"`{m.test}`" if outcome.verdict == "killed" else f"**{outcome.verdict}** (`{m.test}`)"
+        rows.append(f"| {m.name} | {m.file} | {killer} | {outcome.seconds:.1f} |")
+    return "\n".join(rows)
+
+
+def main() -> int:
+    """Run the mutants one after the other."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--only", nargs="+", default=[], help="run the mutants whose names contain one of these")
+    parser.add_argument("--compiled", action="store_true", help="compile the kernels, into a private cache")
+    parser.add_argument("--list", action="store_true", help="check that every change applies, and stop")
+    options = parser.parse_args()
+    chosen = [m for m in MUTANTS if not options.only or any(part in m.name for part in options.only)]
+    outcomes: list[Outcome] = []
+    with tempfile.TemporaryDirectory() as temporary:
+        folder = Path(temporary)
+        copy_package(folder)
+        for mutant in chosen:
+            original = mutate(folder, mutant)
+            (folder / "ns_abstract" / mutant.file).write_text(original)
+        if options.list:
+            print(f"{len(chosen)} mutants apply")
+            return 0
+        healthy: dict[str, bool] = {}
+        for mutant in chosen:
+            if mutant.test not in healthy:
+                code, output, _ = run_test(folder, mutant.test, options.compiled)
+                healthy[mutant.test] = code == _PASSED
+                if code != _PASSED:
+                    print(output[-2000:])
+            verdict, seconds = "its test fails without it", 0.0
+            if healthy[mutant.test]:
+                original = mutate(folder, mutant)
+                code, output, seconds = run_test(folder, mutant.test, options.compiled)
+                (folder / "ns_abstract" / mutant.file).write_text(original)
+                # an assertion that fails, not a crash
+                asserted = code == _FAILED and "AssertionError" in output
+                verdict = {_PASSED: "survived", _FAILED: "killed" if asserted else "crashed"}.get(code, f"pytest {code}")
+            outcomes.append(Outcome(mutant, verdict, seconds))
+            print(f"{verdict:10s} {seconds:6.1f} s  {mutant.name}", flush=True)
+    killed = sum(outcome.verdict == "killed" for outcome in outcomes)
+    summary = f"{killed} of {len(outcomes)} mutants killed, {sum(o.seconds for o in outcomes):.0f} s."
+    print(summary)
+    if not options.only:
+        header = "# Planted faults and the tests that catch them\n\nWritten by `python benchmarks/mutants.py`. "
+        REPORT.write_text(f"{header}{summary}\n\n{table(outcomes)}\n")
+    return 0 if killed == len(outcomes) else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,44 @@
+"""Writes the demo scene; imported only when it is asked for."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from ns_abstract.demo.airfield import airfield
+from ns_abstract.demo.paths import View, write_airfield_paths
+from ns_abstract.demo.runs import write_splatfacto_run
+from ns_abstract.methods.splat.activate import activate
+from ns_abstract.methods.splat.constants import GSPLAT_1_4_0
+from ns_abstract.methods.splat.render import Renderer
+from ns_abstract.sets.path import Camera
+
+#: Name of the run's folder: a fixed time, so that the demo is the same every time.
+TIMESTAMP = "2026-01-01_120000"
+
+
+def write_demo(folder: Path) -> tuple[Path, dict[str, Path]]:
+    """Write run, camera paths and perturbation; returns config.yml and the files by name."""
+    scene = airfield()
+    renderer = Renderer(activate(scene, GSPLAT_1_4_0), GSPLAT_1_4_0)
+
+    def picture(view: View) -> np.ndarray:
+        focal = 0.5 * view.height / np.tan(np.radians(view.fov) / 2.0)
+        camera = Camera(
+            camera_to_world=view.camera_to_world,
+            fx=focal,
+            fy=focal,
+            cx=0.5 * view.width,
+            cy=0.5 * view.height,
+            width=view.width,
+            height=view.height,
+        )
+        pose = view.camera_to_world
+        rotation = np.ascontiguousarray(pose[:3, :3].T * np.array([1.0, -1.0, -1.0])[:, None])
+        return renderer.image(camera, rotation, np.ascontiguousarray(pose[:3, 3]))
+
+    config = write_splatfacto_run(
+        scene, folder, timestamp=TIMESTAMP, experiment_name="airfield", render=picture
+    )
+    return config, write_airfield_paths(folder)

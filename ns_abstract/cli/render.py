@@ -1,0 +1,89 @@
+"""``ns-abstract-render``: abstract images of a camera path."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Literal
+
+import tyro
+
+from ns_abstract.cli.common import DONE, INTERRUPTED, Stop, run
+from ns_abstract.errors import InputError
+
+#: Seconds by frame where no time budget is given.
+_SECONDS_BY_FRAME = 60.0
+
+
+@dataclass
+class Render:
+    """Bound every image that Nerfstudio would show, for every pose in a set around each keyframe.
+
+    Writes frame_00000.npz and .png by keyframe, report.json and report.html. Exit codes: 0 done;
+    2 bad input; 3 interrupted, or the time budget ended before every frame had a result.
+    """
+
+    load_config: Path
+    """config.yml of a Splatfacto run, or a standard 3DGS .ply."""
+    camera_path_filename: Path
+    """Camera path as Nerfstudio's viewer writes it."""
+    output_dir: Path
+    """Folder for the results; made if missing."""
+    perturbation_filename: Path | None = None
+    """Set of poses (JSON). Default: the key "perturbation" of the camera path."""
+    time_budget: float | None = None
+    """Seconds for all frames together. Default: 60 per frame."""
+    target_ratio: float = 1.05
+    """A frame is done when its mean pixel gap is at most this many times the one of real renders."""
+    frames: tuple[int, ...] | None = None
+    """Entries of the camera path, counted from 0. Default: all."""
+    downscale_factor: float = 1.0
+    """Images become this many times smaller."""
+    renderer: Literal["gsplat", "paper"] = "gsplat"
+    """gsplat: what Nerfstudio shows. paper: Algorithm 1 of "Abstract Rendering" (no thresholds, RGB)."""
+    arithmetic: Literal["float32", "real"] = "float32"
+    """float32: enclose every float32 evaluation. real: the real-number renderer and its float64 evaluation."""
+    seed: int = 0
+    """Seed of the random witnesses."""
+    engine: Literal["local", "dask"] = "local"
+    """dask: spread the frames over a Dask cluster (needs the extra "cluster")."""
+    scheduler_address: str | None = None
+    """HOST:PORT of a running Dask scheduler. Default: a cluster on this machine."""
+    resume: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    """Keep the frames that an interrupted run with the same inputs has finished."""
+    save_cells: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    """Store every leaf cell's box and linear sets in the npz files."""
+    memory_limit: float | None = None
+    """GiB that may be used. Default: 80 % of what is free."""
+
+
+def render(options: Render) -> int:
+    """Run the command; returns the exit code.
+
+    Raises:
+        InputError: A file, a field or an option cannot be used.
+    """
+    from ns_abstract.cli.rendering import render_path
+
+    for name, value in (("--target-ratio", options.target_ratio), ("--time-budget", options.time_budget)):
+        if value is not None and not 0.0 < value < float("inf"):
+            raise InputError(f"found {value}", field=name, fix="give a positive number")
+    if options.target_ratio < 1.0:
+        raise InputError(f"found {options.target_ratio}", field="--target-ratio", fix="give a number of at least 1")
+    if options.seed < 0:
+        raise InputError(f"found {options.seed}", field="--seed", fix="give a number of at least 0")
+    if options.engine == "local" and options.scheduler_address is not None:
+        raise InputError("given without --engine dask", field="--scheduler-address", fix="add --engine dask")
+    stop = Stop()
+    with stop.installed():
+        complete = render_path(options, stop, _SECONDS_BY_FRAME)
+    return DONE if complete and not stop() else INTERRUPTED
+
+
+def main() -> None:
+    """Entry point of the console script."""
+    run(render, lambda: tyro.cli(Render, prog="ns-abstract-render"))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,213 @@
+"""One frame of a splat scene, ready for refinement: bounds, renders and motion of its set of poses."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ns_abstract.arithmetic.units import Arithmetic
+from ns_abstract.methods.splat.activate import Splats
+from ns_abstract.methods.splat.bounds import SplatBounds
+from ns_abstract.methods.splat.constants import Rasteriser
+from ns_abstract.methods.splat.render import Renderer, tile_grid
+from ns_abstract.sets.box import ParameterBox
+from ns_abstract.sets.poses import PoseSet
+
+#: Gaussians and poses looked at to estimate how far the picture moves.
+_MOTION_GAUSSIANS = 2000
+_MOTION_POSES = 9
+#: Step of the difference quotient, as a part of the parameter's range.
+_MOTION_STEP = 2.0**-10
+
+
+@dataclass(frozen=True)
+class Context:
+    """What a cell may show, for the cells inside it.
+
+    Attributes:
+        visible: [n] scene indices.
+        reach: [n, 4] first and past tile columns, first and past tile rows.
+    """
+
+    visible: np.ndarray
+    reach: np.ndarray
+
+
+@dataclass(frozen=True)
+class TileBounds:
+    """Bounds of some tiles over one cell.
+
+    Attributes:
+        lower, upper: [t, side, side, 3] float32, rounded outward.
+        slopes: [d] mean absolute linear coefficient by parameter: what a split along it may gain.
+        context: For the cells inside this one.
+        linear: (A_lower, b_lower, A_upper, b_upper) as in `ns_abstract.refine.result.Leaves`, or None.
+        trivial: Blocks of pixels where too many depth orders were open, so that nothing is known.
+    """
+
+    lower: np.ndarray
+    upper: np.ndarray
+    slopes: np.ndarray
+    context: Context
+    linear: tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray] | None
+    trivial: int
+
+
+def outward(lower: np.ndarray, upper: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Float32 neighbours of ``lower`` from below and ``upper`` from above."""
+    low, high = lower.astype(np.float32), upper.astype(np.float32)
+    low = np.where(low > lower, np.nextafter(low, np.float32(-np.inf)), low)
+    high = np.where(high < upper, np.nextafter(high, np.float32(np.inf)), high)
+    return low, high
+
+
+class SplatFrame:
+    """Bounds and renders one frame's set of poses.
+
+    Args:
+        splats: The activated scene.
+        rasteriser, arithmetic: What is bounded.
+        pose_set: The poses.
+        order: Order of the forms; by default 2 for one parameter and 1 for more.
+    """
+
+    def __init__(
+        self,
+        splats: Splats,
+        rasteriser: Rasteriser,
+        arithmetic: Arithmetic,
+        pose_set: PoseSet,
+        order: int | None = None,
+    ) -> None:
+        self.pose_set = pose_set
+        self.camera = pose_set.camera
+        self.box = pose_set.box
+        self.order = order or (2 if self.box.dimensions <= 1 else 1)
+        self.renderer = Renderer(splats, rasteriser)
+        self.bounds = SplatBounds(splats, rasteriser, arithmetic)
+        self.side = rasteriser.work_tile
+        self.across, self.down = tile_grid(self.camera, self.side)
+
+    @property
+    def tile_count(self) -> int:
+        """Number of tiles, row by row."""
+        return self.across * self.down
+
+    def render(self, values: np.ndarray, tiles: np.ndarray | None = None) -> np.ndarray:
+        """Tiles [t, side, side, 3] float32 of the concrete image at parameter values [d]."""
+        return self.renderer.tiles(self.camera, *self.pose_set.world_to_camera(values), tiles).astype(np.float32)
+
+    def bound(
+        self, box: ParameterBox, tiles: np.ndarray, within: Context | None = None, keep_linear: bool = False
+    ) -> TileBounds:
+        """Bounds of ``tiles`` over ``box``; ``within`` is the context of a box around it."""
+        candidates = self._candidates(tiles, within)
+        cell = self.bounds.cell(
+            self.camera, self.pose_set.enclosure(box, self.order), tiles, candidates, keep_linear or box.dimensions > 1
+        )
+        lower, upper = outward(cell.lower, cell.upper)
+        d = box.dimensions
+        slopes = np.zeros(d) if cell.linear is None else np.abs(cell.linear[..., 1 : 1 + d]).mean(axis=(0, 1, 2, 3))
+        if within is not None and cell.visible.size > 0.8 * within.visible.size:
+            # hardly smaller: not worth its memory
+            context = within
+        elif tiles.size == self.tile_count or within is None:
+            context = Context(cell.visible, cell.reach)
+        else:
+            # only what reaches these tiles was looked at
+            context = within
+        linear = linear_sets(cell.linear, cell.lower, cell.upper, d) if keep_linear else None
+        return TileBounds(lower, upper, slopes, context, linear, int(cell.statistics[3]))
+
+    def _candidates(self, tiles: np.ndarray, within: Context | None) -> np.ndarray | None:
+        if within is None:
+            return None
+        if tiles.size == self.tile_count:
+            return within.visible
+        mask = np.zeros((self.down + 1, self.across + 1), np.int32)
+        rows, columns = tiles // self.across, tiles % self.across
+        mask[rows + 1, columns + 1] = 1
+        sums = mask.cumsum(0).cumsum(1)
+        x0, x1, y0, y1 = within.reach.T
+        hits = sums[y1, x1] - sums[y0, x1] - sums[y1, x0] + sums[y0, x0]
+        return within.visible[hits > 0]
+
+    def motion(self, box: ParameterBox) -> np.ndarray:
+        """[d] pixels that typical Gaussians move by over each parameter's range (an estimate)."""
+        d = box.dimensions
+        means = self.bounds.splats.means
+        rng = np.random.default_rng(0)
+        if means.shape[0] > _MOTION_GAUSSIANS:
+            means = means[rng.choice(means.shape[0], _MOTION_GAUSSIANS, replace=False)]
+        low, high = np.array(box.lower), np.array(box.upper)
+        total = np.zeros(d)
+        poses = [box.middle, *box.sample(_MOTION_POSES - 1, rng)]
+        for values in poses:
+            here, z = self._project(values, means)
+            seen = (
+                (z > 0.01)
+                & (here[:, 0] > 0)
+                & (here[:, 0] < self.camera.width)
+                & (here[:, 1] > 0)
+                & (here[:, 1] < self.camera.height)
+            )
+            if not seen.any():
+                continue
+            for k in range(d):
+                step = np.zeros(d)
+                step[k] = (high[k] - low[k]) * _MOTION_STEP
+                there, _ = self._project(values + step, means)
+                moved = np.linalg.norm(there[seen] - here[seen], axis=1) / _MOTION_STEP
+                total[k] = max(total[k], float(np.quantile(moved, 0.75)))
+        return total
+
+    def _project(self, values: np.ndarray, means: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        rotation, position = self.pose_set.world_to_camera(values)
+        x, y, z = rotation @ (means - position).T
+        with np.errstate(all="ignore"):
+            pixels = np.stack(
+                [self.camera.fx * x / z + self.camera.cx, self.camera.fy * y / z + self.camera.cy], axis=1
+            )
+        return np.where(np.isfinite(pixels), pixels, 0.0), z
+
+
+def linear_sets(
+    forms: np.ndarray, lower: np.ndarray, upper: np.ndarray, d: int
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Linear lower and upper bounds of clamped pixels from their forms (design.md, B9).
+
+    Args:
+        forms: [..., m + 1] polynomial coefficients and radius before the clamp to [0, 1].
+        lower, upper: [...] bounds of the clamped values.
+        d: Number of parameters.
+
+    Returns:
+        A_lower [..., d], b_lower [...], A_upper, b_upper, float32, rounded outward.
+    """
+    slope = forms[..., 1 : 1 + d]
+    steep = np.abs(slope).sum(axis=-1)
+    radius = forms[..., -1] * (1.0 + 2.0**-40)
+    sink, rise = -radius, radius.copy()
+    row = 1 + d
+    if forms.shape[-1] > d + 2:
+        for k in range(d):
+            for l in range(k, d):
+                c = forms[..., row]
+                # p_k^2 lies in [0, 1], p_k p_l in [-1, 1]
+                sink += np.minimum(c, 0.0) if k == l else -np.abs(c)
+                rise += np.maximum(c, 0.0) if k == l else np.abs(c)
+                row += 1
+    center = forms[..., 0]
+    # rounding of the sums above and of the slopes to float32
+    a = slope.astype(np.float32)
+    slack = np.abs(a.astype(np.float64) - slope).sum(axis=-1) + 2.0**-44 * (np.abs(center) + steep + rise - sink)
+    b_lower, b_upper = center + sink - slack, center + rise + slack
+    # the clamp lowers values above 1 and raises values below 0
+    b_lower = b_lower - np.maximum(0.0, b_upper + steep - 1.0)
+    b_upper = b_upper + np.maximum(0.0, steep - (center + sink - slack))
+    flat_lower, flat_upper = ~(b_lower >= lower), ~(b_upper <= upper)
+    A_lower, A_upper = a.copy(), a.copy()
+    A_lower[flat_lower], A_upper[flat_upper] = 0.0, 0.0
+    low, high = outward(np.where(flat_lower, lower, b_lower), np.where(flat_upper, upper, b_upper))
+    return A_lower, low, A_upper, high

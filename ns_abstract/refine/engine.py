@@ -1,0 +1,484 @@
+"""Anytime two-sided refinement of one frame (design.md, R1-R4).
+
+The set is covered by cells. Every (cell, tile) pair is a leaf with an outer bound; real renders
+give an inner one. What the leaves of a tile leave open beyond the witnesses is the tile's excess,
+and the leaves with most of it are split until the ratio of outer to inner gap is reached or the
+time is over. The order of splits depends on bounds only, so the result after a given number of
+cells is the same on every machine and for every number of threads.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any, Protocol
+
+import numpy as np
+
+from ns_abstract.refine.result import FrameResult, Leaves, TracePoint, mean_pixel_gap
+from ns_abstract.sets.box import ParameterBox
+
+#: Part of the whole excess that one round of splitting takes on.
+_ROUND_SHARE = 0.8
+#: Excess over what the goal allows from which on cells are cut into four parts rather than two.
+_FAR = 4.0
+#: Cells are cut until typical Gaussians move by fewer pixels, before any is bounded.
+FIRST_MOTION = 2.0
+#: The same for one parameter, where fine cells are affordable from the start.
+FIRST_MOTION_LINE = 0.5
+#: Leaves whose box is narrower than this part of the set are not split: rounding rules there.
+_NARROWEST = 2.0**-40
+#: Most corners of the set that are rendered at the start.
+_CORNERS = 64
+#: Part of the time that the first cover of the set may take.
+_COVER_SHARE = 0.5
+#: Most cells of the first cover.
+_COVER_CELLS = 4096
+
+
+class Bounds(Protocol):
+    """What a frame's ``bound`` returns; see `ns_abstract.methods.splat.frame.TileBounds`."""
+
+    lower: np.ndarray
+    upper: np.ndarray
+    slopes: np.ndarray
+    context: Any
+    linear: tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray] | None
+
+
+class Frame(Protocol):
+    """What refinement needs to know about a frame; see `ns_abstract.methods.splat.frame.SplatFrame`."""
+
+    box: ParameterBox
+    camera: Any
+    side: int
+    across: int
+    down: int
+
+    @property
+    def tile_count(self) -> int: ...
+
+    def render(self, values: np.ndarray, tiles: np.ndarray | None = None) -> np.ndarray: ...
+
+    def bound(
+        self, box: ParameterBox, tiles: np.ndarray, within: Any = None, keep_linear: bool = False
+    ) -> Any: ...
+
+    def motion(self, box: ParameterBox) -> np.ndarray: ...
+
+
+@dataclass(frozen=True)
+class Goal:
+    """When to stop.
+
+    Attributes:
+        ratio: MPG over witness MPG that is good enough.
+        seconds: Time budget of the frame.
+        cells: Largest number of cells, or None (for reproducible runs).
+        leaf_bytes: Memory that open leaves may take.
+    """
+
+    ratio: float = 1.05
+    seconds: float = 60.0
+    cells: int | None = None
+    leaf_bytes: int = 4 << 30
+
+
+class _Cell:
+    """A box, the context for boxes inside it, and the axis to split along."""
+
+    __slots__ = ("axis", "box", "context")
+
+    def __init__(self, box: ParameterBox, context: Any, axis: int) -> None:
+        self.box, self.context, self.axis = box, context, axis
+
+
+@dataclass
+class _Tile:
+    """The leaves of one tile: [n, side, side, 3] bounds, and everything that is no longer split."""
+
+    closed_lower: np.ndarray
+    closed_upper: np.ndarray
+    cells: list[_Cell] = field(default_factory=list)
+    lower: np.ndarray | None = None
+    upper: np.ndarray | None = None
+
+    def replace(self, gone: set[int], cells: list[_Cell], lower: list[np.ndarray], upper: list[np.ndarray]) -> None:
+        """Take out the leaves of the cells whose ``id`` is in ``gone`` and append others."""
+        keep = [k for k, cell in enumerate(self.cells) if id(cell) not in gone]
+        old_lower = [] if self.lower is None else [self.lower[keep]]
+        old_upper = [] if self.upper is None else [self.upper[keep]]
+        self.cells = [self.cells[k] for k in keep] + cells
+        if not self.cells:
+            self.lower = self.upper = None
+            return
+        self.lower = np.concatenate([*old_lower, *(a[None] for a in lower)])
+        self.upper = np.concatenate([*old_upper, *(a[None] for a in upper)])
+
+    def close(self, which: np.ndarray) -> None:
+        """Leaves ``which`` [n] (bool) keep their bounds and are not split any more."""
+        if self.lower is None or self.upper is None or not which.any():
+            return
+        self.closed_lower = np.minimum(self.closed_lower, self.lower[which].min(axis=0))
+        self.closed_upper = np.maximum(self.closed_upper, self.upper[which].max(axis=0))
+        stay = ~which
+        self.cells = [cell for cell, s in zip(self.cells, stay, strict=True) if s]
+        self.lower, self.upper = (self.lower[stay], self.upper[stay]) if self.cells else (None, None)
+
+    def outer(self) -> tuple[np.ndarray, np.ndarray]:
+        """[side, side, 3] bounds over all leaves."""
+        if self.lower is None or self.upper is None:
+            return self.closed_lower, self.closed_upper
+        return (
+            np.minimum(self.closed_lower, self.lower.min(axis=0)),
+            np.maximum(self.closed_upper, self.upper.max(axis=0)),
+        )
+
+
+class Refinement:
+    """Refines one frame.
+
+    Args:
+        frame: Bounds and renders.
+        index: The frame's number.
+        goal: When to stop.
+        seed: Of the random witnesses.
+        keep_leaves: Whether the result carries the leaves' linear sets.
+        stopped: Asked between cells; true ends the work with what is known.
+        progress: Called with (trace point, ratio, cells of the first cover) after every round.
+        plan: Sentences for the result.
+    """
+
+    def __init__(
+        self,
+        frame: Frame,
+        index: int,
+        goal: Goal,
+        *,
+        seed: int = 0,
+        keep_leaves: bool = False,
+        stopped: Callable[[], bool] = lambda: False,
+        progress: Callable[[TracePoint, float], None] = lambda point, share: None,
+    ) -> None:
+        self.frame, self.index, self.goal = frame, index, goal
+        self.keep_leaves, self.stopped, self.progress = keep_leaves, stopped, progress
+        self.random = np.random.default_rng([seed, index])
+        side = frame.side
+        shape = (side, side, 3)
+        self.tiles = [
+            _Tile(np.full(shape, np.inf, np.float32), np.full(shape, -np.inf, np.float32))
+            for _ in range(frame.tile_count)
+        ]
+        whole = (frame.tile_count, *shape)
+        self.outer_lower, self.outer_upper = np.zeros(whole, np.float32), np.ones(whole, np.float32)
+        self.witness_lower, self.witness_upper = np.full(whole, np.inf, np.float32), np.full(whole, -np.inf, np.float32)
+        self.inside = _pixels_inside(frame)
+        self.outer_lower[~self.inside] = 0.0
+        self.outer_upper[~self.inside] = 0.0
+        self.cells = 0
+        self.trace: list[TracePoint] = []
+        self.start = time.perf_counter()
+        self.covered = False
+        #: scene elements that some cell of the cover shows, if the frame tells
+        self.shown: int | None = None
+        self.leaf_sets: dict[tuple[int, int], tuple[ParameterBox, tuple[np.ndarray, ...]]] = {}
+
+    # --- the two sides -------------------------------------------------------------------------
+
+    def _witness(self, values: np.ndarray, tiles: np.ndarray | None = None) -> None:
+        """Render at ``values`` and widen the inner bound."""
+        picture = self.frame.render(values, tiles)
+        which = slice(None) if tiles is None else tiles
+        self.witness_lower[which] = np.minimum(self.witness_lower[which], picture)
+        self.witness_upper[which] = np.maximum(self.witness_upper[which], picture)
+
+    def _bound(self, cell: _Cell, parent: _Cell | None, tiles: np.ndarray) -> Bounds:
+        bounds = self.frame.bound(cell.box, tiles, None if parent is None else parent.context, self.keep_leaves)
+        self.cells += 1
+        cell.context = bounds.context
+        cell.axis = self._axis(cell.box, bounds.slopes)
+        return bounds
+
+    def _axis(self, box: ParameterBox, slopes: np.ndarray) -> int:
+        """The axis that the picture varies most along."""
+        if box.dimensions < 2:
+            return 0
+        # a parameter that only moves what the linear part does not see still has to be split
+        motion = self.frame.motion(box) if not np.any(slopes > 0.0) else np.zeros(box.dimensions)
+        return int(np.argmax(slopes + motion))
+
+    def _settle(self, tiles: np.ndarray) -> None:
+        """Update the outer bound of ``tiles``."""
+        for t in tiles:
+            lower, upper = self.tiles[t].outer()
+            self.outer_lower[t] = np.clip(lower, 0.0, 1.0)
+            self.outer_upper[t] = np.clip(upper, 0.0, 1.0)
+
+    # --- measures ------------------------------------------------------------------------------
+
+    def _mpg(self, lower: np.ndarray, upper: np.ndarray) -> float:
+        length = np.linalg.norm(upper.astype(np.float64) - lower, axis=-1)
+        return float(length[self.inside].mean())
+
+    def point(self) -> TracePoint:
+        """Where the work stands."""
+        return TracePoint(
+            time.perf_counter() - self.start,
+            self.cells,
+            self._mpg(self.outer_lower, self.outer_upper),
+            self._mpg(self.witness_lower, self.witness_upper),
+        )
+
+    def _record(self, share: float) -> TracePoint:
+        point = self.point()
+        self.trace.append(point)
+        self.progress(point, share)
+        return point
+
+    def _over(self) -> bool:
+        return (
+            self.stopped()
+            or time.perf_counter() - self.start >= self.goal.seconds
+            or (self.goal.cells is not None and self.cells >= self.goal.cells)
+        )
+
+    # --- the work ------------------------------------------------------------------------------
+
+    def run(self) -> FrameResult:
+        """Refine until the goal is reached; sound whenever it ends."""
+        box = self.frame.box
+        # the first call compiles kernels; the clock of the trace starts after it
+        image = self.frame.render(box.middle)
+        self._witness(box.middle)
+        self.start = time.perf_counter()
+        corners = box.corners()
+        if corners.shape[0] > _CORNERS:
+            corners = corners[np.sort(self.random.choice(corners.shape[0], _CORNERS, replace=False))]
+        cover = self._cover()
+        if cover and not self._over():
+            for values in corners if box.dimensions else []:
+                self._witness(values)
+                if self._over():
+                    break
+            self._refine()
+        point = self._record(1.0)
+        return self._result(image, point)
+
+    def _cover(self) -> bool:
+        """Bound a first cover of the set; False if the time was over first."""
+        frame, box = self.frame, self.frame.box
+        boxes, motion = [box], frame.motion(box)
+        history: list[list[ParameterBox]] = [boxes]
+        limit = FIRST_MOTION_LINE if box.dimensions == 1 else FIRST_MOTION
+        while motion.size and motion.max() > limit and 2 * len(boxes) <= _COVER_CELLS:
+            axis = int(np.argmax(motion))
+            boxes = [half for b in boxes for half in b.split(axis)]
+            motion[axis] *= 0.5
+            history.append(boxes)
+        everything = np.arange(frame.tile_count)
+        # the time of one cell tells how many can be afforded
+        started = time.perf_counter()
+        first = boxes[len(boxes) // 2]
+        probe = frame.bound(first, everything, None, self.keep_leaves)
+        seconds = time.perf_counter() - started
+        allowed = max(1.0, _COVER_SHARE * self.goal.seconds / max(seconds, 1e-4))
+        if self.goal.cells is not None:
+            allowed = max(1.0, self.goal.cells / 2)
+        while len(boxes) > allowed and len(history) > 1:
+            history.pop()
+            boxes = history[-1]
+        for number, part in enumerate(boxes):
+            if number and self._over():
+                return False
+            cell = _Cell(part, None, 0)
+            if part is first:
+                bounds = probe
+                self.cells += 1
+                cell.context, cell.axis = bounds.context, self._axis(part, bounds.slopes)
+            else:
+                bounds = self._bound(cell, None, everything)
+            for t in everything:
+                self.tiles[t].replace(set(), [cell], [bounds.lower[t]], [bounds.upper[t]])
+            self._keep(cell, bounds, everything)
+            self._witness(part.middle)
+            self.progress(self.point(), (number + 1) / len(boxes))
+        self.covered = True
+        visible = [getattr(tile_cell.context, "visible", None) for tile_cell in self.tiles[0].cells]
+        if all(v is not None for v in visible):
+            self.shown = int(np.unique(np.concatenate(visible)).size)
+        self._settle(everything)
+        self._record(1.0)
+        return True
+
+    def _refine(self) -> None:
+        while True:
+            point = self._record(1.0)
+            if self._over() or point.mpg <= self.goal.ratio * point.mpg_witness:
+                return
+            jobs, parts = self._choose()
+            if not jobs:
+                return
+            touched: set[int] = set()
+            for cell, tiles in jobs:
+                if self._over():
+                    break
+                self._split(cell, tiles, parts)
+                touched.update(tiles.tolist())
+            self._settle(np.array(sorted(touched), np.int64))
+
+    def _choose(self) -> tuple[list[tuple[_Cell, np.ndarray]], int]:
+        """The cells to split in the next round, each with its tiles, and into how many parts."""
+        excess: list[np.ndarray] = []
+        owner: list[tuple[int, int]] = []
+        held = 0
+        for t, tile in enumerate(self.tiles):
+            if tile.lower is None or tile.upper is None:
+                continue
+            beyond = np.maximum(0.0, self.witness_lower[t] - tile.lower)
+            beyond += np.maximum(0.0, tile.upper - self.witness_upper[t])
+            amount = beyond[:, self.inside[t]].sum(axis=(1, 2), dtype=np.float64)
+            done = (amount <= 0.0) | np.array([_narrow(cell.box, self.frame.box) for cell in tile.cells])
+            tile.close(done)
+            amount = amount[~done]
+            if tile.lower is not None and tile.upper is not None:
+                held += tile.lower.nbytes + tile.upper.nbytes
+            excess.append(amount)
+            owner.extend((t, k) for k in range(amount.size))
+        if not owner:
+            return [], 2
+        amounts = np.concatenate(excess)
+        order = np.argsort(-amounts, kind="stable")
+        if held > self.goal.leaf_bytes:
+            self._close_least(order, owner)
+            return self._choose()
+        running = np.cumsum(amounts[order])
+        count = int(np.searchsorted(running, _ROUND_SHARE * running[-1])) + 1
+        by_cell: dict[int, tuple[_Cell, list[int]]] = {}
+        for position in order[:count]:
+            t, k = owner[position]
+            cell = self.tiles[t].cells[k]
+            by_cell.setdefault(id(cell), (cell, []))[1].append(t)
+        jobs = [(cell, np.array(sorted(tiles), np.int64)) for cell, tiles in by_cell.values()]
+        # excess falls at least in proportion to the width: far from the goal, levels are skipped
+        allowed = (self.goal.ratio - 1.0) * float((self.witness_upper - self.witness_lower)[self.inside].sum())
+        far = self.frame.box.dimensions == 1 and running[-1] > _FAR * allowed
+        return jobs, 4 if far else 2
+
+    def _close_least(self, order: np.ndarray, owner: list[tuple[int, int]]) -> None:
+        """Free memory: the half of the leaves that have least excess are not split any more."""
+        closing: dict[int, list[int]] = {}
+        for position in order[order.size // 2 :]:
+            t, k = owner[position]
+            closing.setdefault(t, []).append(k)
+        for t, which in closing.items():
+            mask = np.zeros(len(self.tiles[t].cells), bool)
+            mask[which] = True
+            self.tiles[t].close(mask)
+
+    def _split(self, cell: _Cell, tiles: np.ndarray, parts: int) -> None:
+        children = [_Cell(part, None, 0) for part in cell.box.split(cell.axis, parts)]
+        found = []
+        for child in children:
+            found.append(self._bound(child, cell, tiles))
+            if cell.box.dimensions > 1:
+                self._witness(child.box.middle, tiles)
+        if cell.box.dimensions == 1:
+            for child in children[:-1]:
+                self._witness(np.array(child.box.upper), tiles)
+        for k, t in enumerate(tiles):
+            parent = self._leaf_bounds(t, cell)
+            # a child lies inside its parent, so both bounds hold
+            self.tiles[t].replace(
+                {id(cell)},
+                children,
+                [np.maximum(b.lower[k], parent[0]) for b in found],
+                [np.minimum(b.upper[k], parent[1]) for b in found],
+            )
+        for child, bounds in zip(children, found, strict=True):
+            self._keep(child, bounds, tiles, cell)
+
+    def _leaf_bounds(self, t: int, cell: _Cell) -> tuple[np.ndarray, np.ndarray]:
+        tile = self.tiles[t]
+        assert tile.lower is not None and tile.upper is not None
+        k = next(k for k, other in enumerate(tile.cells) if other is cell)
+        return tile.lower[k], tile.upper[k]
+
+    # --- results -------------------------------------------------------------------------------
+
+    def _keep(self, cell: _Cell, bounds: Bounds, tiles: np.ndarray, parent: _Cell | None = None) -> None:
+        """Remember the linear sets of leaves, in place of their parent's."""
+        if not self.keep_leaves or bounds.linear is None:
+            return
+        for k, t in enumerate(tiles):
+            if parent is not None:
+                self.leaf_sets.pop((id(parent), int(t)), None)
+            self.leaf_sets[(id(cell), int(t))] = (cell.box, tuple(a[k] for a in bounds.linear), cell)  # type: ignore[assignment]
+
+    def _leaves(self) -> Leaves | None:
+        if not self.keep_leaves:
+            return None
+        d = self.frame.box.dimensions
+        entries = sorted(self.leaf_sets.items(), key=lambda item: (item[1][0].lower, item[1][0].upper, item[0][1]))
+        side = self.frame.side
+        n = len(entries)
+
+        def stack(part: int, shape: tuple[int, ...]) -> np.ndarray:
+            rows = [entry[1][1][part] for entry in entries]
+            return np.stack(rows) if rows else np.zeros((0, *shape), np.float32)
+
+        slopes, offsets = (side, side, 3, d), (side, side, 3)
+        return Leaves(
+            np.array([e[1][0].lower for e in entries], np.float64).reshape(n, d),
+            np.array([e[1][0].upper for e in entries], np.float64).reshape(n, d),
+            np.array(
+                [(e[0][1] // self.frame.across * side, e[0][1] % self.frame.across * side) for e in entries], np.int32
+            ).reshape(n, 2),
+            stack(0, slopes),
+            stack(1, offsets),
+            stack(2, slopes),
+            stack(3, offsets),
+        )
+
+    def _result(self, image: np.ndarray, point: TracePoint) -> FrameResult:
+        return FrameResult(
+            index=self.index,
+            box=self.frame.box,
+            lower=self._whole(self.outer_lower),
+            upper=self._whole(self.outer_upper),
+            witness_lower=self._whole(self.witness_lower),
+            witness_upper=self._whole(self.witness_upper),
+            image=self._whole(image),
+            seconds=point.seconds,
+            cells=self.cells,
+            trace=tuple(self.trace),
+            bounded=self.covered,
+            leaves=self._leaves() if self.covered else None,
+        )
+
+    def _whole(self, tiles: np.ndarray) -> np.ndarray:
+        return assemble_tiles(tiles, self.frame)
+
+
+def _narrow(box: ParameterBox, root: ParameterBox) -> bool:
+    """Whether no axis can be halved sensibly."""
+    return all(
+        high - low <= _NARROWEST * (b - a)
+        for low, high, a, b in zip(box.lower, box.upper, root.lower, root.upper, strict=True)
+    )
+
+
+def _pixels_inside(frame: Frame) -> np.ndarray:
+    """[T, side, side] whether a tile's pixel belongs to the image."""
+    rows = np.arange(frame.down * frame.side) < frame.camera.height
+    columns = np.arange(frame.across * frame.side) < frame.camera.width
+    grid = (rows[:, None] & columns[None, :]).reshape(frame.down, frame.side, frame.across, frame.side)
+    return grid.swapaxes(1, 2).reshape(-1, frame.side, frame.side)
+
+
+def assemble_tiles(tiles: np.ndarray, frame: Frame) -> np.ndarray:
+    """[H, W, ...] from all tiles [T, side, side, ...]."""
+    rest = tiles.shape[3:]
+    grid = tiles.reshape(frame.down, frame.across, frame.side, frame.side, *rest).swapaxes(1, 2)
+    whole = grid.reshape(frame.down * frame.side, frame.across * frame.side, *rest)
+    return np.ascontiguousarray(whole[: frame.camera.height, : frame.camera.width])

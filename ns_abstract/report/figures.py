@@ -1,0 +1,44 @@
+"""The figures of a frame, and how they are written for people."""
+
+from __future__ import annotations
+
+import math
+
+from ns_abstract.refine.result import FrameResult, max_pixel_gap, mean_pixel_gap
+
+
+def metrics(result: FrameResult) -> dict[str, float | None]:
+    """The figures of one frame.
+
+    Returns:
+        ``mpg``, ``xpg``: mean and maximum over the pixels of the length over RGB of upper - lower
+        (the paper's metrics); ``mpg_witness``, ``xpg_witness``: the same of what was rendered;
+        ``ratio``: mpg / mpg_witness, None where that is no finite number.
+    """
+    mpg = mean_pixel_gap(result.lower, result.upper)
+    witness = mean_pixel_gap(result.witness_lower, result.witness_upper)
+    ratio = mpg / witness if witness > 0.0 else math.inf
+    return {
+        "mpg": mpg,
+        "xpg": max_pixel_gap(result.lower, result.upper),
+        "mpg_witness": witness,
+        "xpg_witness": max_pixel_gap(result.witness_lower, result.witness_upper),
+        "ratio": ratio if math.isfinite(ratio) else None,
+    }
+
+
+def number(value: float | None, digits: int = 4) -> str:
+    """A figure for people: ``digits`` significant ones, a dash for None."""
+    if value is None:
+        return "–"
+    text = f"{value:.{digits}g}"
+    if "e" not in text:
+        return text
+    mantissa, exponent = text.split("e")
+    return f"{mantissa}e{int(exponent)}"
+
+
+def interval(name: str, unit: str, low: float, high: float) -> str:
+    """One side of a box for people, a symmetric one as a radius."""
+    size = f"± {number(high)}" if low == -high else f"∈ [{number(low, 6)}, {number(high, 6)}]"
+    return f"{name} {size} {unit}".strip()

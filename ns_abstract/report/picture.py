@@ -1,0 +1,222 @@
+"""Frame pictures: lower bound, upper bound, gap and one render side by side.
+
+Matplotlib is imported when a picture is drawn, not before.
+"""
+
+from __future__ import annotations
+
+import io
+import os
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ns_abstract.refine.result import FrameResult, gap, max_pixel_gap
+from ns_abstract.report.figures import interval, metrics, number
+from ns_abstract.report.files import write_atomic
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+    from ns_abstract.sets.box import ParameterBox
+
+#: Colour map of gaps: perceptually uniform, black where the bounds meet.
+GAP_COLORS = "inferno"
+
+_PANEL_INCHES = 2.6
+_LEAST_WIDTH, _LEAST_HEIGHT = 1.6, 0.6
+_PANEL_PIXELS = 400
+_PANEL_PIXELS_MAX = 1000
+# inches
+_MARGIN, _GUTTER, _LABEL, _LINE, _BAR, _BAR_TEXT = 0.14, 0.12, 0.24, 0.19, 0.09, 0.50
+_INK, _SOFT, _WARN = "#1a1a1a", "#555555", "#a32a12"
+_TITLE_POINTS, _TEXT_POINTS, _LABEL_POINTS, _TICK_POINTS = 10.5, 8.0, 8.5, 7.5
+
+
+def to_bytes(image: NDArray[np.floating]) -> NDArray[np.uint8]:
+    """[H, W, 3] in [0, 1] as uint8, as Nerfstudio's viewer shows it (render_state_machine.py:279)."""
+    return (np.clip(image, 0.0, 1.0) * 255.0).astype(np.uint8)
+
+
+def _wrapped(items: list[str], width: int) -> list[str]:
+    """Lines of at most ``width`` characters, broken between items only (a longer item is cut)."""
+    lines: list[str] = []
+    for item in items:
+        item = item if len(item) <= width else f"{item[: width - 1]}…"
+        if lines and len(lines[-1]) + 5 + len(item) <= width:
+            lines[-1] += f"  ·  {item}"
+        else:
+            lines.append(item)
+    return lines
+
+
+def _box_items(box: ParameterBox) -> list[str]:
+    sides = zip(box.names, box.units, box.lower, box.upper, strict=True)
+    return [interval(*side) for side in sides] or ["one camera pose"]
+
+
+def frame_figure(result: FrameResult, *, guarantee: str = "", about: str = "") -> Figure:
+    """The picture of one frame: lower | upper | gap heat map with colour bar | one render.
+
+    Panels show whole pixels, several screen pixels each for small images.
+
+    Args:
+        result: The frame.
+        guarantee: "float32-sound", "real-sound" or "sampled"; shown in the title.
+        about: More for the title, such as the scene's name.
+    """
+    from matplotlib.figure import Figure
+
+    height, width = result.lower.shape[:2]
+    panel_w = int(_PANEL_PIXELS_MAX if width > _PANEL_PIXELS_MAX else width * max(1, round(_PANEL_PIXELS / width)))
+    panel_h = max(1, round(panel_w * height / width))
+    if panel_h > 1.5 * panel_w:
+        # tall images: the height sets the scale
+        panel_h = int(min(1.5 * _PANEL_PIXELS_MAX, height * max(1, round(1.5 * _PANEL_PIXELS / height))))
+        panel_w = max(1, round(panel_h * width / height))
+    inches = min(_PANEL_INCHES, 1.5 * _PANEL_INCHES * panel_w / panel_h)
+    dpi = panel_w / inches
+    # labels and the colour bar need room beside narrow and flat images, which keep their shape
+    panel_w, panel_h = max(panel_w, round(_LEAST_WIDTH * dpi)), max(panel_h, round(_LEAST_HEIGHT * dpi))
+
+    def px(length: float) -> int:
+        return round(length * dpi)
+
+    bar = px(_GUTTER / 2 + _BAR + _BAR_TEXT)
+    total_w = 2 * px(_MARGIN) + 4 * panel_w + 3 * px(_GUTTER) + bar
+    characters = max(40, int(total_w / dpi / (_TEXT_POINTS * 0.0087)))
+    lines = _wrapped(_box_items(result.box), characters)
+    figures = metrics(result)
+    text = [
+        f"MPG {number(figures['mpg'])}",
+        f"XPG {number(figures['xpg'])}",
+        f"witness MPG {number(figures['mpg_witness'])}",
+        f"ratio {number(figures['ratio'])}",
+        f"{result.cells} cells",
+        f"{number(result.seconds, 3)} s",
+    ]
+    measured = _wrapped(text, characters)
+    head = px(_LINE) * (1 + len(lines) + len(measured)) + px(_LINE) // 2
+    total_h = px(_MARGIN) + head + px(_LABEL) + panel_h + px(_MARGIN)
+
+    figure = Figure(figsize=(total_w / dpi, total_h / dpi), dpi=dpi, facecolor="white")
+
+    def write(x: float, y: float, content: str, points: float, **style: Any) -> None:
+        figure.text(
+            x / total_w, 1.0 - y / total_h, content, fontsize=points, va="baseline", parse_math=False, **style
+        )  # fmt: skip
+
+    title = f"Frame {result.index}"
+    for part in (about, guarantee):
+        title += f"  ·  {part}" if part else ""
+    title_room = max(20, int(characters * _TEXT_POINTS / _TITLE_POINTS * 0.85))
+    title = title if len(title) <= title_room else f"{title[: title_room - 1]}…"
+    y = px(_MARGIN) + px(_LINE) * 0.7
+    write(px(_MARGIN), y, title, _TITLE_POINTS, weight="bold", color=_INK)
+    if not result.bounded:
+        measured = ["no bound but [0, 1] is known: the time ended before this frame was done", *measured[1:]]
+    for k, line in enumerate([*lines, *measured]):
+        warned = not result.bounded and k == len(lines)
+        write(px(_MARGIN), y + (k + 1) * px(_LINE), line, _TEXT_POINTS, color=_WARN if warned else _SOFT)
+
+    length = gap(result.lower, result.upper)
+    top = float(length.max())
+    panels: list[tuple[str, Any]] = [
+        ("lower bound", to_bytes(result.lower)),
+        ("upper bound", to_bytes(result.upper)),
+        ("gap |upper − lower|", length),
+        ("render at the middle" if result.box.dimensions else "render", to_bytes(result.image)),
+    ]
+    x, base = px(_MARGIN), px(_MARGIN)
+    for k, (label, image) in enumerate(panels):
+        axes = figure.add_axes((x / total_w, base / total_h, panel_w / total_w, panel_h / total_h))
+        shown = axes.imshow(
+            image, cmap=GAP_COLORS if k == 2 else None, vmin=0.0, vmax=top if top > 0.0 else 1.0,
+            interpolation="antialiased",
+        )  # fmt: skip
+        _bare(axes)
+        write(x, total_h - base - panel_h - px(0.075), label, _LABEL_POINTS, color=_INK)
+        x += panel_w + px(_GUTTER)
+        if k == 2:
+            left = x - px(_GUTTER) + px(_GUTTER / 2)
+            side = figure.add_axes((left / total_w, base / total_h, px(_BAR) / total_w, panel_h / total_h))
+            _color_bar(figure, shown, side, panel_h / dpi)
+            x += bar
+    return figure
+
+
+def _bare(axes: Axes) -> None:
+    axes.set_xticks([])
+    axes.set_yticks([])
+    for spine in axes.spines.values():
+        spine.set_linewidth(0.4)
+        spine.set_color(_SOFT)
+
+
+def _color_bar(figure: Figure, shown: Any, side: Axes, inches: float) -> None:
+    """A colour bar with as many ticks as fit into ``inches``."""
+    from matplotlib.ticker import MaxNLocator, ScalarFormatter
+
+    bar = figure.colorbar(shown, cax=side)
+    bar.outline.set_linewidth(0.4)  # pyright: ignore[reportCallIssue]
+    bar.locator = MaxNLocator(nbins=max(1, min(6, int(inches / 0.4))))
+    # a common factor of small gaps stands above the bar
+    bar.formatter = ScalarFormatter(useMathText=True)
+    bar.formatter.set_powerlimits((-2, 3))
+    bar.update_ticks()
+    side.yaxis.get_offset_text().set(size=_TICK_POINTS, color=_INK, horizontalalignment="left")
+    side.tick_params(labelsize=_TICK_POINTS, width=0.4, length=2.0, pad=2.0, colors=_INK)
+
+
+def save_picture(path: str | os.PathLike[str], result: FrameResult, *, guarantee: str = "", about: str = "") -> None:
+    """Write `frame_figure` as PNG, whole or not at all.
+
+    Raises:
+        OSError: The file cannot be written.
+    """
+    figure = frame_figure(result, guarantee=guarantee, about=about)
+    write_atomic(path, lambda stream: figure.savefig(stream, format="png", metadata={"Software": "ns_abstract"}))
+
+
+def heat(length: NDArray[np.floating], top: float) -> NDArray[np.uint8]:
+    """[H, W] gaps as [H, W, 3] uint8 colours of the scale from 0 to ``top``."""
+    from matplotlib import colormaps
+
+    scaled = np.asarray(length, np.float64) / (top if top > 0.0 else 1.0)
+    return colormaps[GAP_COLORS](scaled, bytes=True)[..., :3]
+
+
+def color_stops(count: int = 9) -> list[str]:
+    """``count`` evenly spaced hex colours of the gap scale."""
+    from matplotlib import colormaps
+    from matplotlib.colors import to_hex
+
+    return [to_hex(colormaps[GAP_COLORS](k / (count - 1))) for k in range(count)]
+
+
+def preview(image: NDArray[np.uint8], side: int) -> bytes:
+    """PNG of ``image`` [H, W, 3], made smaller (area average) where a side exceeds ``side`` pixels."""
+    from PIL import Image
+
+    picture = Image.fromarray(image)
+    if max(picture.size) > side:
+        picture.thumbnail((side, side), Image.Resampling.BOX)
+    buffer = io.BytesIO()
+    picture.save(buffer, "png", optimize=True)
+    return buffer.getvalue()
+
+
+def previews(result: FrameResult, side: int) -> Mapping[str, bytes]:
+    """PNGs of a frame for the page: lower, upper, gap, witness gap (same scale) and render."""
+    top = max_pixel_gap(result.lower, result.upper)
+    images = {
+        "lower": to_bytes(result.lower),
+        "upper": to_bytes(result.upper),
+        "gap": heat(gap(result.lower, result.upper), top),
+        "witness": heat(gap(result.witness_lower, result.witness_upper), top),
+        "image": to_bytes(result.image),
+    }
+    return {name: preview(image, side) for name, image in images.items()}

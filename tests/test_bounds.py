@@ -1,0 +1,524 @@
+"""The bounds of tiny synthetic scenes, each aimed at one rule of the rasteriser.
+
+Every test compares the bounds of cells of poses with concrete renders of poses of those cells: the ends, a
+dense line (one parameter) or corners and random poses (more), at tolerance zero.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from ns_abstract.arithmetic.units import FLOAT32, REAL
+from ns_abstract.methods.splat.activate import Splats, rotation_matrices
+from ns_abstract.methods.splat.bounds import SplatBounds
+from ns_abstract.methods.splat.constants import GSPLAT_1_4_0
+from ns_abstract.methods.splat.render import Renderer, assemble
+from ns_abstract.sets.box import ParameterBox
+from ns_abstract.sets.path import Camera
+from ns_abstract.sets.perturbation import Perturbation
+from ns_abstract.sets.poses import PoseSet
+
+both_orders = pytest.mark.parametrize("order", [1, 2])
+TURN = (0.8, 0.3, -0.4, 0.33)
+
+
+def scene(*gaussians: dict, background=(0.0, 0.0, 0.0), antialiased: bool = False) -> Splats:
+    """Activated Gaussians from ``mean``, ``scale``, ``quat``, ``opacity`` and ``color`` or ``sh`` [K, 3]."""
+    quats = np.array([g.get("quat", (1.0, 0.0, 0.0, 0.0)) for g in gaussians], np.float64)
+    scales = np.array([np.broadcast_to(g["scale"], 3) for g in gaussians], np.float64)
+    sh = np.array([g.get("sh", [g.get("color", (1.0, 1.0, 1.0))]) for g in gaussians], np.float64)
+    return Splats(
+        means=np.array([g["mean"] for g in gaussians], np.float64),
+        axes=np.ascontiguousarray(rotation_matrices(quats) * scales[:, None]),
+        opacity=np.array([g["opacity"] for g in gaussians], np.float64),
+        sh=sh,
+        degree=math.isqrt(sh.shape[1]) - 1,
+        background=np.array(background, np.float64),
+        antialiased=antialiased,
+    )
+
+
+def camera(width: int = 16, height: int = 16, focal: float = 16.0, position=(0.0, 0.0, 0.0)) -> Camera:
+    """A camera at ``position`` that looks along -z of the world."""
+    pose = np.concatenate([np.eye(3), np.array(position, np.float64)[:, None]], axis=1)
+    return Camera(pose, focal, focal, width / 2, height / 2, width, height)
+
+
+def moves(**limits) -> Perturbation:
+    """Ranges by parameter name; a number r means [-r, r]."""
+    ranges = {k: v if isinstance(v, tuple) else (-v, v) for k, v in limits.items()}
+    return Perturbation(
+        translation={k: v for k, v in ranges.items() if k in ("x", "y", "z")},
+        rotation={k: v for k, v in ranges.items() if k in ("yaw", "pitch", "roll")},
+    )
+
+
+class Case:
+    """A scene, a camera and a set of poses."""
+
+    def __init__(self, splats: Splats, perturbation: Perturbation, view: Camera | None = None) -> None:
+        self.camera = view or camera()
+        self.splats = splats
+        self.poses = PoseSet.around(self.camera, perturbation)
+        self.renderer = Renderer(splats, GSPLAT_1_4_0)
+
+    def image(self, values: np.ndarray) -> np.ndarray:
+        return self.renderer.image(self.camera, *self.poses.world_to_camera(values))
+
+    def bounds(self, box: ParameterBox, order: int, arithmetic=REAL, **options):
+        return SplatBounds(self.splats, GSPLAT_1_4_0, arithmetic).cell(
+            self.camera, self.poses.enclosure(box, order), **options
+        )
+
+    def samples(self, box: ParameterBox, count: int) -> np.ndarray:
+        """Ends and a line of poses for one parameter; corners and random poses for more."""
+        if box.dimensions == 1:
+            return box.at(np.linspace(-1.0, 1.0, count)[:, None])
+        generator = np.random.default_rng(0)
+        return np.concatenate([box.corners()[:4], box.corners()[-4:], box.sample(count, generator)])
+
+    def check(self, order: int, parts: int = 2, count: int = 9, arithmetic=REAL) -> tuple[np.ndarray, np.ndarray]:
+        """Bounds of the set from ``parts`` cells along the first parameter, after checking each cell.
+
+        Returns the width of the bounds and the width of the sampled images, [H, W, 3].
+        """
+        lowest, highest = np.ones((2, self.camera.height, self.camera.width, 3)) * [[[[1.0]]], [[[0.0]]]]
+        least, most = lowest.copy(), highest.copy()
+        for box in self.poses.box.split(0, parts):
+            cell = self.bounds(box, order, arithmetic, keep_linear=True)
+            assert cell.statistics[4] == 0
+            lower, upper = assemble(cell.lower, self.camera), assemble(cell.upper, self.camera)
+            linear = assemble(cell.linear, self.camera)
+            pairs = self.poses.enclosure(box, order).rotation.basis.pairs
+            for values in self.samples(box, count):
+                image = self.image(values)
+                p = 2.0 * (values - np.array(box.lower)) / (np.array(box.upper) - np.array(box.lower)) - 1.0
+                # the polynomial sets hold the picture before it is clamped; evaluated in float64 here
+                middle = linear[..., :-1] @ np.array([1.0, *p, *(p[k] * p[l] for k, l in pairs)])
+                radius = linear[..., -1] + 1e-12
+                assert (np.minimum(1.0, middle - radius) <= image).all(), (box, values)
+                assert (np.maximum(0.0, middle + radius) >= image).all(), (box, values)
+                assert (lower <= image).all() and (image <= upper).all(), (box, values, worst(lower, image, upper))
+                least, most = np.minimum(least, image), np.maximum(most, image)
+            lowest, highest = np.minimum(lowest, lower), np.maximum(highest, upper)
+        return highest - lowest, most - least
+
+
+def worst(lower: np.ndarray, image: np.ndarray, upper: np.ndarray) -> float:
+    """How far the image leaves the bounds."""
+    return float(max((lower - image).max(), (image - upper).max()))
+
+
+def swap_case() -> Case:
+    """Two overlapping layers side by side at equal depth: yaw decides which is nearer."""
+    return Case(
+        scene(
+            {"mean": (-0.4, 0.0, -5.0), "scale": 0.8, "opacity": 0.9, "color": (1.0, 0.1, 0.0)},
+            {"mean": (0.4, 0.1, -5.0), "scale": 0.8, "opacity": 0.8, "color": (0.0, 0.9, 1.0)},
+            background=(0.2, 0.3, 0.4),
+        ),
+        moves(yaw=0.05),
+    )
+
+
+@both_orders
+def test_depth_swap(order):
+    """The cell that spans the swap holds both orders."""
+    case = swap_case()
+    near, far = case.image(np.array([-1e-9])), case.image(np.array([1e-9]))
+    assert np.abs(near - far).max() > 0.2
+    width, sampled = case.check(order, parts=1)
+    assert width.mean() < 2.0 * sampled.mean()
+    case.check(order, parts=3)
+
+
+@both_orders
+def test_three_layers_swap(order):
+    """Three layers that all change places, the middle one much brighter than 1."""
+    case = Case(
+        scene(
+            {"mean": (-0.5, 0.0, -5.0), "scale": 0.7, "opacity": 0.9, "color": (1.0, 0.0, 0.3)},
+            {"mean": (0.0, 0.1, -5.0), "scale": 0.7, "opacity": 0.7, "color": (0.0, 3.0, 0.2)},
+            {"mean": (0.5, -0.1, -5.0), "scale": 0.7, "opacity": 0.8, "color": (0.5, 0.2, 2.0)},
+            background=(1.0, 0.0, 0.5),
+        ),
+        moves(yaw=0.04),
+    )
+    case.check(order, parts=1)
+
+
+@both_orders
+def test_order_by_pitch_and_roll(order):
+    """Several rotations at once."""
+    case = swap_case()
+    case.poses = PoseSet.around(case.camera, moves(yaw=0.02, pitch=0.03, roll=0.05))
+    case.check(order, parts=2, count=6)
+
+
+@both_orders
+def test_tile_cut(order):
+    """A layer reaches the second tile with its 3-sigma square at some poses only."""
+    splats = scene({"mean": (-2.8125, 0.0, -5.0), "scale": 0.78, "opacity": 1.0}, background=(0.5, 0.0, 0.0))
+    case = Case(splats, moves(x=0.15), camera(32, 16))
+    jumps = np.array([case.image(v)[:, 16].max(axis=0) for v in case.samples(case.poses.box, 41)])
+    assert np.abs(np.diff(jumps, axis=0)).max() > 3e-3
+    case.check(order, parts=1, count=41)
+    case.check(order, parts=4)
+
+
+@both_orders
+def test_tile_cut_vertical(order):
+    splats = scene({"mean": (0.0, 2.8125, -5.0), "scale": 0.78, "opacity": 1.0}, background=(0.5, 0.0, 0.0))
+    Case(splats, moves(y=0.15), camera(16, 32)).check(order, parts=1, count=41)
+
+
+@both_orders
+def test_alpha_threshold(order):
+    """Layers whose alpha crosses 1/255 at most pixels."""
+    splats = scene(
+        {"mean": (0.3, 0.0, -5.0), "scale": 1.0, "opacity": 0.006},
+        {"mean": (-0.2, 0.2, -6.0), "scale": 0.7, "opacity": 0.02},
+    )
+    width, sampled = Case(splats, moves(x=0.1)).check(order, parts=2, count=15)
+    assert sampled.max() > 1 / 256 and width.max() < 0.02
+
+
+@both_orders
+def test_one_layer(order):
+    """One layer that hides and uncovers a background of another colour."""
+    splats = scene(
+        {"mean": (0.0, 0.0, -5.0), "scale": 0.7, "opacity": 0.9, "color": (1.0, 0.0, 0.5)}, background=(0.0, 1.0, 0.5)
+    )
+    width, sampled = Case(splats, moves(x=0.1)).check(order, parts=2)
+    assert width.mean() < 1.5 * sampled.mean()
+
+
+@both_orders
+def test_alpha_threshold_of_all(order):
+    """The whole layer is below the threshold at some poses."""
+    splats = scene({"mean": (0.0, 0.0, -5.0), "scale": 0.01, "opacity": 0.00396}, background=(0.3, 0.3, 0.3))
+    Case(splats, moves(x=0.3)).check(order, parts=1, count=31)
+
+
+@both_orders
+def test_alpha_clamp(order):
+    """Opacity 1: alpha stays at 0.999, so that a thousandth of a bright background remains."""
+    # the mean falls on the centre of pixel (8, 8)
+    mean = (0.15625, -0.15625, -5.0)
+    splats = scene({"mean": mean, "scale": 3.0, "opacity": 1.0, "color": (0.0, 0.5, 1.0)}, background=(1.0, 1.0, 0.0))
+    case = Case(splats, moves(x=0.01))
+    assert case.image(np.zeros(1))[8, 8, 0] == pytest.approx(0.001, abs=1e-5)
+    width, _ = case.check(order, parts=1)
+    assert width[8, 8].max() < 2.5e-3
+
+
+@both_orders
+def test_alpha_clamp_crossed(order):
+    """Alpha leaves the clamp within the cell."""
+    splats = scene({"mean": (0.0, 0.0, -5.0), "scale": 0.5, "opacity": 1.0, "color": (0.0, 0.5, 1.0)}, background=(1.0, 1.0, 0.0))
+    Case(splats, moves(x=0.2)).check(order, parts=1)
+
+
+def stop_scene(opacity: float) -> Splats:
+    return scene(
+        {"mean": (0.0, 0.0, -5.0), "scale": 2.0, "opacity": opacity, "color": (0.1, 0.0, 0.0)},
+        {"mean": (0.1, 0.0, -6.0), "scale": 2.0, "opacity": opacity, "color": (0.0, 0.2, 0.0)},
+        {"mean": (0.0, 0.1, -7.0), "scale": 2.0, "opacity": 0.9, "color": (9.0, 9.0, 9.0)},
+        background=(0.0, 1.0, 1.0),
+    )
+
+
+@both_orders
+def test_stop(order):
+    """Two layers reach a transmittance of 1e-4 at some poses; a bright one stands behind them."""
+    case = Case(stop_scene(0.9902), moves(x=0.3))
+    middle = [case.image(v)[8, 8] for v in case.samples(case.poses.box, 15)]
+    assert np.abs(np.diff(middle, axis=0)).max() > 1e-3
+    case.check(order, parts=1, count=21)
+    case.check(order, parts=4, count=5)
+
+
+@both_orders
+def test_stop_everywhere(order):
+    """The second layer stops every pose at the middle pixel: it is never drawn."""
+    case = Case(stop_scene(0.998), moves(x=0.02))
+    width, _ = case.check(order, parts=1)
+    assert width[8, 8].max() < 0.1
+
+
+@both_orders
+def test_stop_and_swap(order):
+    """The two layers that end the light change places as well."""
+    splats = scene(
+        {"mean": (-0.3, 0.0, -5.0), "scale": 2.0, "opacity": 0.9902, "color": (1.0, 0.0, 0.0)},
+        {"mean": (0.3, 0.0, -5.0), "scale": 2.0, "opacity": 0.9902, "color": (0.0, 1.0, 0.0)},
+        {"mean": (0.0, 0.1, -7.0), "scale": 2.0, "opacity": 0.9, "color": (9.0, 9.0, 9.0)},
+        background=(0.0, 0.0, 1.0),
+    )
+    Case(splats, moves(yaw=0.05)).check(order, parts=1, count=31)
+
+
+@both_orders
+def test_near_plane(order):
+    """A layer passes the near plane."""
+    splats = scene(
+        {"mean": (0.0, 0.0, -0.05), "scale": 0.004, "opacity": 0.9, "color": (1.0, 0.2, 0.0)},
+        {"mean": (0.0, 0.0, -3.0), "scale": 0.5, "opacity": 0.5, "color": (0.0, 0.4, 1.0)},
+    )
+    case = Case(splats, moves(z=(-0.06, 0.0)))
+    case.check(order, parts=1, count=31)
+    case.check(order, parts=3)
+
+
+@both_orders
+def test_near_plane_alone(order):
+    """A single layer, large enough to be seen on both sides of the near plane."""
+    splats = scene({"mean": (0.0, 0.0, -0.02), "scale": 0.004, "opacity": 0.9}, background=(0.0, 0.5, 0.0))
+    case = Case(splats, moves(z=(-0.014, -0.002)))
+    assert case.image(np.array([-0.0139])).max() < 0.6 < case.image(np.array([-0.005])).max()
+    case.check(order, parts=1, count=25)
+
+
+@both_orders
+def test_behind(order):
+    """A large layer behind the camera is not drawn, and in front of it is."""
+    splats = scene({"mean": (0.0, 0.0, 0.3), "scale": 0.5, "opacity": 0.9})
+    Case(splats, moves(yaw=(0.0, math.pi))).check(order, parts=3, count=8)
+
+
+@both_orders
+def test_jacobian_clamp(order):
+    """A large layer outside the view, where the Jacobian is evaluated at the margin."""
+    splats = scene({"mean": (1.62, 0.1, -2.4), "scale": (0.5, 0.3, 0.9), "quat": TURN, "opacity": 0.95})
+    case = Case(splats, moves(yaw=0.1))
+    width, sampled = case.check(order, parts=4, count=8)
+    assert sampled.max() > 0.05 and width.mean() < 3.0 * sampled.mean()
+
+
+@both_orders
+def test_jacobian_clamp_all_sides(order):
+    """The four margins, from far outside."""
+    splats = scene(
+        *({"mean": mean, "scale": (0.9, 0.5, 0.7), "quat": TURN, "opacity": 0.8, "color": color}
+          for mean, color in (
+              ((-2.4, 0.1, -2.0), (1.0, 0.0, 0.0)), ((2.4, 0.2, -2.0), (0.0, 1.0, 0.0)),
+              ((0.1, -2.4, -2.0), (0.0, 0.0, 1.0)), ((0.2, 2.4, -2.0), (1.0, 1.0, 0.0)),
+          ))
+    )  # fmt: skip
+    Case(splats, moves(z=0.02)).check(order, parts=1)
+
+
+@both_orders
+def test_antialiased(order):
+    """Layers thinner than a pixel, whose opacity is compensated."""
+    splats = scene(
+        {"mean": (0.1, 0.0, -4.0), "scale": (0.05, 0.1, 0.02), "quat": TURN, "opacity": 0.95, "color": (1.0, 0.3, 0.0)},
+        {"mean": (-0.3, 0.3, -5.0), "scale": 0.2, "opacity": 0.9, "color": (0.0, 1.0, 0.6)},
+        background=(0.1, 0.1, 0.3),
+        antialiased=True,
+    )
+    width, sampled = Case(splats, moves(z=0.2)).check(order, parts=2)
+    assert sampled.max() > 1e-3 and width.mean() < 5.0 * sampled.mean()
+
+
+@both_orders
+@pytest.mark.parametrize("degree", [1, 2, 3])
+def test_view_dependence(degree, order):
+    """Colours that turn with the direction from a camera that moves."""
+    generator = np.random.default_rng(degree)
+    splats = scene(
+        *({"mean": mean, "scale": 0.5, "opacity": 0.9, "sh": generator.normal(size=((degree + 1) ** 2, 3)) * 0.6}
+          for mean in ((0.2, 0.1, -1.5), (-0.3, -0.1, -2.0)))
+    )  # fmt: skip
+    case = Case(splats, moves(x=0.4))
+    width, sampled = case.check(order, parts=4, count=7)
+    assert width.mean() < 4.0 * sampled.mean()
+
+
+@both_orders
+def test_view_dependence_alone(order):
+    """A layer that covers the picture evenly: what changes is its colour."""
+    generator = np.random.default_rng(5)
+    splats = scene({"mean": (0.0, 0.0, -2.0), "scale": 60.0, "opacity": 0.9, "sh": generator.normal(size=(16, 3)) * 0.15})
+    case = Case(splats, moves(x=0.5), camera(8, 8))
+    width, sampled = case.check(order, parts=3, count=9)
+    assert width.mean() < 3.0 * sampled.mean()
+
+
+@both_orders
+def test_turning_colors(order):
+    """A camera that turns on the spot sees every Gaussian in its one colour."""
+    generator = np.random.default_rng(4)
+    splats = scene({"mean": (0.2, 0.1, -1.5), "scale": 0.3, "opacity": 0.9, "sh": generator.normal(size=(16, 3)) * 0.4})
+    Case(splats, moves(yaw=0.1)).check(order, parts=1)
+
+
+@both_orders
+def test_needle(order):
+    """Long thin layers in several directions."""
+    splats = scene(
+        {"mean": (0.0, 0.0, -4.0), "scale": (2.0, 1e-3, 1e-3), "quat": TURN, "opacity": 0.95, "color": (1.0, 0.0, 0.2)},
+        {"mean": (0.3, 0.1, -4.5), "scale": (1e-4, 3.0, 0.01), "quat": (0.7, -0.2, 0.5, 0.4), "opacity": 0.9},
+        background=(0.0, 0.2, 0.2),
+    )
+    case = Case(splats, moves(x=0.02))
+    case.check(order, parts=2)
+    case.poses = PoseSet.around(case.camera, moves(roll=0.05))
+    case.check(order, parts=2)
+
+
+def permuted(splats: Splats, order: list[int]) -> Splats:
+    return replace(
+        splats, means=splats.means[order], axes=splats.axes[order], opacity=splats.opacity[order], sh=splats.sh[order]
+    )
+
+
+@both_orders
+def test_ties(order):
+    """Exactly equal depths: the bounds hold whichever layer the sort puts first."""
+    splats = scene(
+        {"mean": (0.0, 0.0, -4.0), "scale": 0.5, "opacity": 0.9, "color": (1.0, 0.0, 0.0)},
+        {"mean": (0.0, 0.0, -4.0), "scale": 0.6, "opacity": 0.8, "color": (0.0, 1.0, 0.0)},
+        {"mean": (0.3, 0.1, -4.0), "scale": 0.4, "opacity": 0.7, "color": (0.0, 0.0, 1.0)},
+    )
+    perturbation = moves(x=0.05)
+    case = Case(splats, perturbation)
+    cell = case.bounds(case.poses.box, order)
+    lower, upper = assemble(cell.lower, case.camera), assemble(cell.upper, case.camera)
+    images = []
+    for arrangement in ([0, 1, 2], [2, 1, 0], [1, 0, 2], [1, 2, 0]):
+        other = Case(permuted(splats, arrangement), perturbation)
+        for values in case.samples(case.poses.box, 5):
+            image = other.image(values)
+            assert (lower <= image).all() and (image <= upper).all(), worst(lower, image, upper)
+        images.append(image)
+    assert np.abs(images[0] - images[1]).max() > 0.1
+
+
+POINTS = {
+    "none": moves(),
+    "six": moves(x=(0.02, 0.02), y=(-0.1, -0.1), z=(0.3, 0.3), yaw=(0.1, 0.1), pitch=(-0.05, -0.05), roll=(1.0, 1.0)),
+}
+
+
+def quiet_scene(antialiased: bool = False) -> Splats:
+    """Layers with no rule near its switch."""
+    return scene(
+        {"mean": (0.11, 0.02, -4.0), "scale": (1.9, 1.4, 1.7), "quat": TURN, "opacity": 0.6, "color": (0.9, 0.2, 0.1)},
+        {"mean": (-0.23, 0.17, -5.0), "scale": 1.8, "opacity": 0.5, "color": (0.1, 0.7, 0.3)},
+        {"mean": (0.05, -0.3, -6.0), "scale": (2.5, 1.8, 2.2), "opacity": 0.7, "color": (0.3, 0.1, 0.8)},
+        background=(0.25, 0.5, 0.75),
+        antialiased=antialiased,
+    )
+
+
+@both_orders
+@pytest.mark.parametrize("name", POINTS)
+@pytest.mark.parametrize("antialiased", [False, True])
+def test_one_pose(name, antialiased, order):
+    """A single pose in real arithmetic: the bounds are the render, up to rounding."""
+    case = Case(quiet_scene(antialiased), POINTS[name])
+    image = case.image(np.empty(0))
+    for arithmetic, limit in ((REAL, 1e-6), (FLOAT32, 1e-2)):
+        cell = case.bounds(case.poses.box, order, arithmetic)
+        lower, upper = assemble(cell.lower, case.camera), assemble(cell.upper, case.camera)
+        assert (lower <= image).all() and (image <= upper).all()
+        assert (upper - lower).max() <= limit
+
+
+def test_zero_width_cell():
+    """The same with parameters whose cell has shrunk to a point."""
+    case = Case(quiet_scene(), moves(x=0.1, yaw=0.1))
+    box = case.poses.box.replace(0, 0.05, 0.05).replace(1, -0.03, -0.03)
+    image = case.image(np.array([0.05, -0.03]))
+    cell = case.bounds(box, 2)
+    lower, upper = assemble(cell.lower, case.camera), assemble(cell.upper, case.camera)
+    assert (lower <= image).all() and (image <= upper).all() and (upper - lower).max() <= 1e-6
+
+
+@both_orders
+def test_six_parameters(order):
+    case = Case(quiet_scene(), moves(x=0.01, y=0.01, z=0.01, yaw=0.005, pitch=0.005, roll=0.005), camera(8, 8, 8.0))
+    width, sampled = case.check(order, parts=1, count=12)
+    assert width.mean() < 4.0 * sampled.mean()
+
+
+def test_second_order_is_tighter():
+    case = Case(quiet_scene(), moves(x=0.05))
+    widths = [case.check(order, parts=2, count=3)[0].mean() for order in (1, 2)]
+    assert widths[1] <= widths[0]
+
+
+def test_narrower_cells_are_tighter():
+    """Widths fall to the sampled ones: within a few per cent from sixteen cells."""
+    case = Case(quiet_scene(), moves(x=0.1), camera(8, 8, 8.0))
+    ratios = []
+    for parts in (1, 4, 16):
+        width, sampled = case.check(2, parts=parts, count=3)
+        ratios.append(width.mean() / sampled.mean())
+    assert ratios[0] >= ratios[1] >= ratios[2] and ratios[2] < 1.02
+
+
+@both_orders
+def test_float32_is_wider(order):
+    """What a float32 program may show includes what exact evaluation shows."""
+    case = swap_case()
+    real, single = case.bounds(case.poses.box, order, REAL), case.bounds(case.poses.box, order, FLOAT32)
+    assert (single.lower <= real.lower).all() and (single.upper >= real.upper).all()
+
+
+@both_orders
+@pytest.mark.parametrize("parameters", [moves(x=0.05), moves(yaw=0.02), moves(x=0.02, roll=0.05)], ids=["x", "yaw", "two"])
+def test_linear(parameters, order):
+    """The linear sets hold the picture before it is clamped, colours above 1 included."""
+    bright = scene(
+        {"mean": (-0.3, 0.0, -5.0), "scale": 0.8, "opacity": 0.9, "color": (4.0, 0.1, 0.0)},
+        {"mean": (0.3, 0.1, -5.0), "scale": 0.8, "opacity": 0.7, "color": (0.0, 0.9, 2.5)},
+        background=(0.5, 0.5, 3.0),
+    )
+    case = Case(bright, parameters)
+    # the picture is linear in the colours; scaled by a power of two it is not clamped
+    dark = Case(replace(bright, sh=bright.sh / 8.0, background=bright.background / 8.0), parameters)
+    box = case.poses.box
+    cell = case.bounds(box, order, keep_linear=True)
+    linear = assemble(cell.linear, case.camera)
+    basis = case.poses.enclosure(box, order).rotation.basis
+    assert linear.shape == (16, 16, 3, basis.monomials + 1)
+    generator = np.random.default_rng(1)
+    brightest = 0.0
+    for scaled in [np.ones(box.dimensions), -np.ones(box.dimensions), *generator.uniform(-1, 1, (6, box.dimensions))]:
+        image = 8.0 * dark.image(box.at(scaled))
+        brightest = max(brightest, image.max())
+        point = [1.0, *scaled, *(scaled[k] * scaled[l] for k, l in basis.pairs)]
+        error = np.abs(linear[..., :-1] @ point - image)
+        assert (error <= linear[..., -1] + 1e-14).all()
+    assert brightest > 1.5
+
+
+def test_wanted_tiles():
+    """Bounds of chosen tiles and candidates are those of the whole picture."""
+    splats = scene(
+        {"mean": (-1.0, 0.0, -5.0), "scale": 0.5, "opacity": 0.9, "color": (1.0, 0.0, 0.0)},
+        {"mean": (1.5, 0.0, -5.0), "scale": 0.5, "opacity": 0.9, "color": (0.0, 1.0, 0.0)},
+        {"mean": (0.0, 50.0, -5.0), "scale": 0.5, "opacity": 0.9},
+    )
+    case = Case(splats, moves(x=0.1), camera(32, 16))
+    whole = case.bounds(case.poses.box, 2)
+    assert whole.visible.tolist() == [0, 1]
+    part = case.bounds(case.poses.box, 2, wanted=np.array([1]), candidates=whole.visible)
+    assert np.array_equal(part.lower[0], whole.lower[1]) and np.array_equal(part.upper[0], whole.upper[1])
+
+
+@both_orders
+def test_too_many_pairs(order, monkeypatch):
+    """Where depth orders are not examined, nothing is claimed."""
+    monkeypatch.setattr("ns_abstract.methods.splat.bounds.PAIR_LIMIT", 0)
+    case = swap_case()
+    cell = case.bounds(case.poses.box, order)
+    assert cell.statistics[3] > 0
+    assert (cell.lower <= 0.0).any() and (cell.upper >= 1.0).any()
+    case.check(order, parts=1, count=3)
