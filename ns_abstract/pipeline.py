@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import json
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -148,6 +147,17 @@ class Job:
         """Frame ``index``, ready for refinement."""
         return SplatFrame(self.splats, self.rasteriser, self.arithmetic, self.pose_sets[index])
 
+    def warm_up(self, index: int | None) -> None:
+        """Compile the kernels that frame ``index`` needs, so that its clock measures bounding alone."""
+        if index is None:
+            return
+        frame = self.frame(index)
+        box = frame.box
+        for axis in range(box.dimensions):
+            box = box.split(axis, 1024)[0]
+        frame.bound(box, np.arange(1))
+        frame.render(box.middle)
+
     def bound(
         self,
         index: int,
@@ -243,8 +253,3 @@ def check_frames(frames: tuple[int, ...] | None, count: int) -> tuple[int, ...]:
                 f"found {frame}", field="--frames", fix=f"the camera path has entries 0 to {count - 1}"
             )
     return tuple(sorted(set(frames)))
-
-
-def stable_json(value: object) -> str:
-    """JSON with sorted keys, for comparing fingerprints."""
-    return json.dumps(value, sort_keys=True)

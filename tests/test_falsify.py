@@ -118,11 +118,11 @@ def test_honest_bounds(spec: dict[str, Any], cells: Any) -> None:
 
 
 def grid_bounds(scene: SplatScene, pose_set: PoseSet, count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """[count, H, W, 3] images along one parameter, and their range widened by the largest step between two."""
+    """[count, H, W, 3] images along one parameter, and their range widened by four times the largest step."""
     render, _ = compiled_renderer(scene, pose_set, GSPLAT_1_4_0)
     images = np.array([render(pose_set.box.at(np.array([s]))) for s in np.linspace(-1, 1, count)])
     step = np.abs(np.diff(images, axis=0)).max(axis=0)
-    return images, images.min(axis=0) - step, images.max(axis=0) + step
+    return images, images.min(axis=0) - 4.0 * step, images.max(axis=0) + 4.0 * step
 
 
 def test_narrow_range() -> None:

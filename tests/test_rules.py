@@ -65,6 +65,16 @@ def arb(value: Fraction) -> flint.arb:
     return flint.arb(flint.fmpq(value.numerator, value.denominator))
 
 
+def arb_exp(value: Fraction) -> flint.arb:
+    """exp with 200 bits after the leading one of ``exp(x) - 1``."""
+    before = flint.ctx.prec
+    flint.ctx.prec = before + max(0, value.denominator.bit_length() - value.numerator.bit_length())
+    try:
+        return arb(value).exp()
+    finally:
+        flint.ctx.prec = before
+
+
 def each(function: Callable[[Any], Any], values: np.ndarray) -> np.ndarray:
     out = np.empty(values.shape, object)
     for index in np.ndindex(*values.shape):
@@ -141,8 +151,6 @@ class Case:
     exact: Callable[..., Any]
     domain: str = "reals"
     extra: tuple[int, ...] = ()
-    #: greatest allowed width of the interval and affine face over the range's, for boxes of seed 0
-    limits: tuple[float, float] = (1.0, 1.0)
 
 
 def _scalar(value: Any) -> np.ndarray:
@@ -161,7 +169,7 @@ CASES = {
     "Sum": Case(((6,),), lambda x: _scalar(sum(x, Fraction(0)))),
     "Prod": Case(((5,),), lambda x: _scalar(np.prod(x))),
     "Transpose": Case(((2, 3),), lambda x: x.T),
-    "Exp": Case(((4,),), lambda x: each(lambda v: arb(v).exp(), x), "moderate"),
+    "Exp": Case(((4,),), lambda x: each(arb_exp, x), "moderate"),
     "Norm": Case(((2, 3),), lambda x: _scalar(arb(sum((x * x).ravel(), Fraction(0))).sqrt())),
     "Ind": Case(((4,),), lambda x: each(lambda v: Fraction(int(v > 0)), x)),
     "Sort": Case(((4,), (4,)), lambda x, y: x[np.argsort(y, kind="stable")]),
@@ -370,7 +378,7 @@ def test_thin_in_thin_out(name: str, data: Any) -> None:
 @given(st.floats(-800, 800))
 def test_exp_is_tight_over_its_range(x: float) -> None:
     bound = Interval(x).exp()
-    truth = arb(Fraction(x)).exp()
+    truth = arb_exp(Fraction(x))
     assert within(float(bound.lower), truth, float(bound.upper))
     if -700.0 < x < 709.0:
         assert bound.width <= 2.0**-46 * bound.upper
@@ -439,6 +447,8 @@ def test_undefined_and_unbounded() -> None:
         Enclosure.parameters(Interval([-1.0], [1.0]), 2).sqrt(),
     ):
         assert bad.range.lower[0] == -np.inf and not np.isnan(bad.range.upper[0])
+    plain = FormArray.constant(Enclosure.parameters(Interval([0.0])).basis, np.array([0.5, 2.0]))
+    assert RULES["Add"].affine(plain, np.array([1.0, 1.0])).range.contains([1.5, 3.0])
     with pytest.raises(TypeError, match="form"):
         RULES["Exp"].affine(np.ones(2))
     with pytest.raises(ValueError, match="square"):
@@ -447,20 +457,34 @@ def test_undefined_and_unbounded() -> None:
 
 # --- tightness --------------------------------------------------------------------------------------
 
-#: Mean width over the mean width of the sampled range, interval and affine face, seed 0, recorded
-#: figures plus one in the third digit.
-LIMITS = {name: (1.0, 1.0) for name in CASES}
+#: Mean width over the mean width of the sampled range for the boxes of seed 0: the interval face, and
+#: the forms of the affine face without their range. Recorded figures, raised in the third digit.
+LIMITS = {
+    "Add": (1.001, 1.001),
+    "Mul": (1.001, 1.095),
+    "Div": (1.001, 1.203),
+    "Mmul": (1.001, 1.056),
+    "Inv": (1.001, 1.079),
+    "Pow": (1.260, 1.187),
+    "Sum": (1.001, 1.001),
+    "Prod": (1.001, 1.382),
+    "Transpose": (1.001, 1.001),
+    "Exp": (1.001, 1.063),
+    "Norm": (1.001, 1.073),
+    "Ind": (1.001, 1.001),
+    "Sort": (1.001, 1.001),
+}
 
 
 def looseness(name: str, face: str) -> float:
     case, rng = CASES[name], np.random.default_rng(0)
     operands = [box("wide" if name == "Ind" else "random", shape, case.domain, rng) for shape in case.shapes]
     rule = RULES[name]
-    result = (
-        rule.interval(*operands, *case.extra)
-        if face == "interval"
-        else rule.affine(*enclosures(operands, 1), *case.extra).range
-    )
+    if face == "interval":
+        width = rule.interval(*operands, *case.extra).width
+    else:
+        low, high = rule.affine(*enclosures(operands, 1), *case.extra).form.bounds()
+        width = high - low
     samples = [rule.concrete(*v, *case.extra) for v in points(operands, rng, 300)]
     flat = np.array([np.concatenate([x.bounds()[side].ravel() for x in operands]) for side in (0, 1)])
     corners = np.array(list(itertools.product(*flat.T)))
@@ -468,7 +492,7 @@ def looseness(name: str, face: str) -> float:
         sizes = np.cumsum([int(np.prod(s)) for s in case.shapes])[:-1]
         parts = [part.reshape(s) for part, s in zip(np.split(corner, sizes), case.shapes, strict=True)]
         samples.append(rule.concrete(*parts, *case.extra))
-    return float(result.width.mean() / np.ptp(np.array(samples), axis=0).mean())
+    return float(width.mean() / np.ptp(np.array(samples), axis=0).mean())
 
 
 @pytest.mark.parametrize("face", ["interval", "affine"])
@@ -547,8 +571,8 @@ MUTANTS = {
 @pytest.mark.parametrize("name", list(CASES))
 def test_mutants_are_caught(name: str) -> None:
     for face, mutant in MUTANTS[name]:
-        kinds = ("random", "corner") if name == "Ind" else ("random", "wide") if name != "Div" else ("random",)
-        assert escapes(name, mutant, face, kinds if face == "interval" else ("random",)) > 0
+        kinds = ("random", "corner") if name == "Ind" else ("random", "degenerate")
+        assert escapes(name, mutant, face, kinds if face == "interval" else ("random",), seeds=6) > 0
 
 
 # --- the paper's figures ----------------------------------------------------------------------------
@@ -657,10 +681,9 @@ def blended(alphas: np.ndarray, depths: np.ndarray, colors: np.ndarray) -> Fract
     return total
 
 
-def ignores_undecided(alphas: Interval, depths: Interval, colors: np.ndarray) -> Interval:
-    """VR-IND that takes undecided indicators for 0."""
-    thin = Interval(np.where(np.arange(depths.shape[0]) > 0, depths.lower, depths.lower))
-    return vr_ind(alphas, thin, colors)
+def decides_at_one_end(alphas: Interval, depths: Interval, colors: np.ndarray) -> Interval:
+    """VR-IND that decides the order at one end of the depths."""
+    return vr_ind(alphas, Interval(depths.lower), colors)
 
 
 def test_uncertain_order_contains_every_order() -> None:
@@ -674,7 +697,7 @@ def test_uncertain_order_contains_every_order() -> None:
             Interval(*(np.concatenate(pair) for pair in zip(alphas.bounds(), depths.bounds())))
         )
         bounds += [rule(lines[:4], lines[4:], colors) for rule in (vr_ind, sorted_blend)]
-        mutant = ignores_undecided(alphas, depths, colors)
+        mutant = decides_at_one_end(alphas, depths, colors)
         for a, d in points([alphas, depths], np.random.default_rng(seed), 30):
             truth = _scalar(blended(a, d, colors))
             assert all(outside(bound, truth) == 0 for bound in bounds)
@@ -710,9 +733,6 @@ def test_fixed_order_is_exact(seed: int, n: int) -> None:
     assert within(float(bound.lower), low, float(bound.upper)) and within(float(bound.lower), high, float(bound.upper))
     assert outside(affine, _scalar(low)) == outside(affine, _scalar(high)) == 0
     assert float(bound.width) <= float(high - low) + 1e-14
-    # swapped ends are not the hull
-    swapped = blended(np.where(colors > colors.mean(), alphas.lower, alphas.upper), np.arange(n), colors)
-    assert low <= swapped <= high
 
 
 def test_swapped_blend_ends_are_caught() -> None:
@@ -755,7 +775,7 @@ def test_linear_bounds_contain(seed: int, weight: float) -> None:
     positive = box("random", (4,), "positive", rng)
     for operand, apply, truth in (
         (x, lambda v: v[:2].multiply(v[2:], weight), lambda v: v[:2] * v[2:]),
-        (x, lambda v: v.exp(), lambda v: each(lambda e: arb(e).exp(), v)),
+        (x, lambda v: v.exp(), lambda v: each(arb_exp, v)),
         (x, lambda v: v.reshape(2, 2) @ v.reshape(2, 2), lambda v: v.reshape(2, 2) @ v.reshape(2, 2)),
         (x, lambda v: 1.0 - v.scale(np.array([1.5, -0.7, 0.0, 3.0])), lambda v: 1 - v * exact([1.5, -0.7, 0.0, 3.0])),
         (positive, lambda v: v.reciprocal(), lambda v: each(lambda e: 1 / e, v)),
