@@ -177,8 +177,9 @@ MUTANTS = (
         "test_poses.py::test_enclosure[translation-1]",
     ),
     Mutant(
-        "poses without their rounding", POSES,
-        "_POSE_ROUNDING = 32.0 * UNIT64", "_POSE_ROUNDING = 0.0", "test_poses.py::test_enclosure[x-1]",
+        "offset ignores the camera's motion", POSES,
+        "offset = world_to_camera @ (origin - position)", "offset = world_to_camera @ (origin - position.center)",
+        "test_poses.py::test_enclosure[x-1]",
     ),
     Mutant(
         "orbit about the origin", POSES,
@@ -200,7 +201,11 @@ MUTANTS = (
     ),
     Mutant(
         "near plane culls what crosses it", GAUSSIANS,
-        "if scalars[_ZHI, q] + spread_z < near or", "if scalars[_ZLO, q] + spread_z < near or",
+        "        if not (scalars[_ZHI, q] + spread_z >= near and scalars[_ZLO, q] - spread_z <= far):\n"
+        "            # a bound that is not a number keeps the Gaussian\n"
+        "            if scalars[_ZHI, q] + spread_z < near or",
+        "        if not (scalars[_ZLO, q] + spread_z >= near and scalars[_ZLO, q] - spread_z <= far):\n"
+        "            if scalars[_ZLO, q] + spread_z < near or",
         "test_bounds.py::test_near_plane[2]",
     ),
     Mutant(
@@ -239,7 +244,7 @@ MUTANTS = (
     Mutant(
         "region of pixels without the mean's range", GAUSSIANS,
         "    box[index, 1] = mean_x_high + extent_x", "    box[index, 1] = mean_x_low + extent_x",
-        "test_bounds.py::test_alpha_threshold[2]",
+        "test_bounds.py::test_alpha_threshold_of_all[2]",
     ),
     # pixels
     Mutant(
@@ -283,7 +288,7 @@ MUTANTS = (
     Mutant(
         "0.999 clamp missing from the form", PIXELS,
         "excess = max(0.0, a_high - alpha_max)", "excess = 0.0",
-        "test_bounds.py::test_alpha_clamp[2]",
+        "test_bounds.py::test_alpha_clamp_crossed[2]",
     ),
     Mutant(
         "stop ignored", PIXELS,
@@ -311,7 +316,7 @@ MUTANTS = (
         "exponent's vertex counted for the wrong end", PIXELS,
         "bottom = min(quadratic - slope, vertex) if inside else quadratic - slope",
         "bottom = quadratic + slope",
-        "test_bounds.py::test_six_parameters[2]",
+        "test_bounds.py::test_one_layer[2]",
     ),
     Mutant(
         "blend picks alpha's other end", PIXELS,

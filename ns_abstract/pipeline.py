@@ -179,7 +179,7 @@ class Job:
         total = self.splats.count
         plan = []
         shown = refinement.shown
-        if shown is not None:
+        if shown is not None and shown < total:
             plan.append(
                 f"{total - shown:,} of {total:,} Gaussians left out: no pose of the set shows them "
                 "(behind, beside or below the alpha threshold)"

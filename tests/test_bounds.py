@@ -200,8 +200,10 @@ def test_one_layer(order):
 @both_orders
 def test_alpha_threshold_of_all(order):
     """The whole layer is below the threshold at some poses."""
-    splats = scene({"mean": (0.0, 0.0, -5.0), "scale": 0.01, "opacity": 0.00396}, background=(0.3, 0.3, 0.3))
-    Case(splats, moves(x=0.3)).check(order, parts=1, count=31)
+    # the mean crosses the centre of pixel (8, 8), and nowhere else is alpha large enough
+    splats = scene({"mean": (0.0, -0.15625, -5.0), "scale": 0.01, "opacity": 0.00396}, background=(0.3, 0.3, 0.3))
+    _, sampled = Case(splats, moves(x=0.3)).check(order, parts=1, count=61)
+    assert np.argwhere(sampled[..., 0]).tolist() == [[8, 7], [8, 8]]
 
 
 @both_orders
@@ -219,8 +221,10 @@ def test_alpha_clamp(order):
 @both_orders
 def test_alpha_clamp_crossed(order):
     """Alpha leaves the clamp within the cell."""
-    splats = scene({"mean": (0.0, 0.0, -5.0), "scale": 0.5, "opacity": 1.0, "color": (0.0, 0.5, 1.0)}, background=(1.0, 1.0, 0.0))
-    Case(splats, moves(x=0.2)).check(order, parts=1)
+    mean = (0.15625, -0.15625, -5.0)
+    splats = scene({"mean": mean, "scale": 0.9, "opacity": 1.0, "color": (0.0, 0.5, 1.0)}, background=(1.0, 1.0, 0.0))
+    width, sampled = Case(splats, moves(x=0.2)).check(order, parts=1)
+    assert sampled[8, 8, 0] > 0.01 and width[8, 8, 0] < 1.5 * sampled[8, 8, 0]
 
 
 def stop_scene(opacity: float) -> Splats:
@@ -254,12 +258,15 @@ def test_stop_everywhere(order):
 def test_stop_and_swap(order):
     """The two layers that end the light change places as well."""
     splats = scene(
-        {"mean": (-0.3, 0.0, -5.0), "scale": 2.0, "opacity": 0.9902, "color": (1.0, 0.0, 0.0)},
-        {"mean": (0.3, 0.0, -5.0), "scale": 2.0, "opacity": 0.9902, "color": (0.0, 1.0, 0.0)},
-        {"mean": (0.0, 0.1, -7.0), "scale": 2.0, "opacity": 0.9, "color": (9.0, 9.0, 9.0)},
+        {"mean": (0.05, -0.15625, -5.0), "scale": 2.0, "opacity": 0.9915, "color": (1.0, 0.0, 0.0)},
+        {"mean": (0.25, -0.15625, -5.0), "scale": 2.0, "opacity": 0.9915, "color": (0.0, 1.0, 0.0)},
+        {"mean": (0.0, 0.1, -7.0), "scale": 2.0, "opacity": 0.9, "color": (0.5, 0.5, 0.5)},
         background=(0.0, 0.0, 1.0),
     )
-    Case(splats, moves(yaw=0.05)).check(order, parts=1, count=31)
+    case = Case(splats, moves(yaw=0.02))
+    middle = [case.image(v)[8, 8, 2] for v in case.samples(case.poses.box, 15)]
+    assert max(middle) > 5e-3
+    case.check(order, parts=1, count=25)
 
 
 @both_orders

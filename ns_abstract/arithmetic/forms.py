@@ -38,6 +38,8 @@ MAX_DIMENSIONS = 8
 _COEFFICIENT = 8.0 * UNIT64
 _UP = 1.0 + 128.0 * UNIT64
 _TINY = UNDERFLOW64
+# Between these, fourth powers and their reciprocals neither overflow nor lose digits to underflow.
+_SMALLEST, _LARGEST = 1e-75, 1e75
 
 
 @dataclass(frozen=True)
@@ -335,22 +337,23 @@ def bounds(a, low, high, d, order, m):
 
 @njit(cache=True, error_model="numpy")
 def reciprocal(a, work, out, d, order, m):
-    """``out = 1 / a`` for ``a > 0``; ``work`` is [5, n] scratch."""
+    """``out = 1 / a`` for ``a > 0`` (1e-75 to 1e75); ``work`` is [5, n] scratch."""
     for q in range(out.shape[1]):
         c = a[0, q]
         e = (a[m + 1, q] + a[m + 2, q] + a[m, q]) * _UP
         low = (c - e) * (1.0 - _COEFFICIENT)
-        f0 = 1.0 / c
+        inside = _SMALLEST < low < _LARGEST
+        f0 = 1.0 / c if inside else 1.0
         work[0, q] = f0
         work[1, q] = -f0 * f0
         if order == 2:
             work[2, q] = f0 * f0 * f0
             low2 = low * low
-            work[4, q] = 1.0 / (low2 * low2) if low > 0.0 else np.inf
+            work[4, q] = 1.0 / (low2 * low2) * _UP if inside else np.inf
         else:
             high = (c + e) * _UP
-            work[2, q] = 1.0 / (high * high * high) * (1.0 - _COEFFICIENT)
-            work[3, q] = 1.0 / (low * low * low) * _UP if low > 0.0 else np.inf
+            work[2, q] = 1.0 / (high * high * high) * (1.0 - _COEFFICIENT) if inside else 0.0
+            work[3, q] = 1.0 / (low * low * low) * _UP if inside else np.inf
     compose(a, work[0], work[1], work[2], work[3], work[4], out, d, order, m)
 
 
@@ -361,7 +364,7 @@ def square_root(a, work, out, d, order, m):
         c = a[0, q]
         e = (a[m + 1, q] + a[m + 2, q] + a[m, q]) * _UP
         low = (c - e) * (1.0 - _COEFFICIENT)
-        inside = low > 0.0
+        inside = _SMALLEST < low < _LARGEST
         f0 = np.sqrt(c) if inside else 1.0
         work[0, q] = f0
         work[1, q] = 0.5 / f0
@@ -382,7 +385,7 @@ def reciprocal_square_root(a, work, out, d, order, m):
         c = a[0, q]
         e = (a[m + 1, q] + a[m + 2, q] + a[m, q]) * _UP
         low = (c - e) * (1.0 - _COEFFICIENT)
-        inside = low > 0.0
+        inside = _SMALLEST < low < _LARGEST
         f0 = 1.0 / np.sqrt(c) if inside else 1.0
         f2 = f0 * f0
         work[0, q] = f0
@@ -402,13 +405,13 @@ def logarithm(a, work, out, d, order, m):
     """``out = log(a)`` for ``a > 0``; ``work`` is [5, n] scratch.
 
     The library's logarithm is charged four units of ``|log(a)| + 1`` (checked at start-up,
-    `ns_abstract.arithmetic.platform`).
+    `ns_abstract.arithmetic.selfcheck`).
     """
     for q in range(out.shape[1]):
         c = a[0, q]
         e = (a[m + 1, q] + a[m + 2, q] + a[m, q]) * _UP
         low = (c - e) * (1.0 - _COEFFICIENT)
-        inside = low > 0.0
+        inside = _SMALLEST < low < _LARGEST
         inverse = 1.0 / c if inside else 1.0
         work[0, q] = np.log(c) if inside else 0.0
         work[1, q] = inverse

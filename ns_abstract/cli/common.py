@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import io
+import re
 import signal
 import sys
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, redirect_stderr
 from types import FrameType
 from typing import Any, NoReturn
 
@@ -40,10 +42,50 @@ class Stop:
                 signal.signal(number, handler)
 
 
+def parse(read: Callable[[], Any]) -> Any:
+    """Call ``read``, which parses the command line with tyro, and turn its complaint into one line.
+
+    Raises:
+        InputError: The options cannot be used.
+        SystemExit: Help was asked for and printed.
+    """
+    said = io.StringIO()
+    try:
+        with redirect_stderr(said):
+            return read()
+    except SystemExit as leave:
+        if leave.code != BAD_INPUT:
+            raise
+        raise InputError(complaint(said.getvalue()), fix="--help lists the options") from None
+
+
+def complaint(text: str) -> str:
+    """The point of an error box that tyro prints, as one line."""
+    sections: list[list[str]] = [[]]
+    for line in text.splitlines():
+        # the box is drawn in ASCII where the terminal knows nothing else
+        inner = re.sub(r"^\s*[│|] ?| *[│|]\s*$", "", line)
+        if re.fullmatch(r"\s*[─-]{8,}\s*", inner):
+            sections.append([])
+        elif inner.strip() and not re.match(r"\s*[╭╰+]", line):
+            sections[-1].append(inner)
+    points = []
+    for section in sections:
+        words = " ".join(" ".join(section).split())
+        if words.startswith("Missing from"):
+            # below each option stands its help
+            words = "missing " + ", ".join(re.findall(r"^ {4}(-[\w-]+)", "\n".join(section), re.MULTILINE))
+        if words.startswith("Perhaps you meant"):
+            words = "perhaps " + " or ".join(re.findall(r"^ {4}(-[\w-]+)", "\n".join(section), re.MULTILINE))
+        if words and not words.startswith(("For full helptext", "Argument helptext")):
+            points.append(words.partition(" Got errors:")[0].rstrip("."))
+    return "; ".join(points) or "the options cannot be read"
+
+
 def run(main: Callable[..., int], options: Callable[[], Any]) -> NoReturn:
     """Parse options, run ``main`` and leave with its exit code; a user's mistake is one line and exit code 2."""
     try:
-        code = main(options())
+        code = main(parse(options))
     except InputError as error:
         print(f"error: {error}", file=sys.stderr)
         code = BAD_INPUT

@@ -6,6 +6,7 @@ import dataclasses
 import sys
 import time
 from collections.abc import Callable, Iterator
+from contextlib import ExitStack
 from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
@@ -19,7 +20,7 @@ from ns_abstract.report.record import Report, Run
 if TYPE_CHECKING:
     from ns_abstract.cli.render import Render
 
-#: Shortest time that a frame is given, so that each gets its first cover if the budget allows at all.
+#: Shortest time that a frame is given once it is begun.
 _LEAST_SECONDS = 0.01
 
 
@@ -56,21 +57,45 @@ def render_path(options: Render, stop: Callable[[], bool], seconds_by_frame: flo
     job = Job(settings_of(options))
     frames = check_frames(options.frames, job.frame_count)
     problems = check_functions()
-    for problem in problems:
-        console.print(f"warning: {problem}", markup=False)
-    run = make_run(job, options, frames, problems)
-    report = (Report.resume if options.resume else Report)(options.output_dir, run)
-    for reason in report.ignored:
-        console.print(f"not used: {reason}", markup=False)
-    _introduce(console, job, report)
-    pending = report.pending
-    budget = options.time_budget if options.time_budget is not None else seconds_by_frame * max(1, len(pending))
-    outcome = "done"
-    try:
+    with ExitStack() as stack:
+        client = None
         if options.engine == "dask":
+            from ns_abstract.cli.cluster import connected
+
+            client = stack.enter_context(connected(options.scheduler_address))
+        run = make_run(job, options, frames, problems)
+        report = (Report.resume if options.resume else Report)(options.output_dir, run)
+        for problem in problems:
+            console.print(f"warning: {problem}", markup=False)
+        for reason in report.ignored:
+            console.print(f"not used: {reason}", markup=False)
+        _introduce(console, job, report)
+        _fill(report, job, options, client, stop, console, seconds_by_frame)
+    if report.missing:
+        console.print(f"no bounds yet for frames {', '.join(map(str, report.missing))}: raise --time-budget, --resume")
+    console.print(f"report: {options.output_dir / 'report.html'}", markup=False, soft_wrap=True)
+    return not report.missing
+
+
+def _fill(
+    report: Report,
+    job: Job,
+    options: Render,
+    client: Any,
+    stop: Callable[[], bool],
+    console: Console,
+    seconds_by_frame: float,
+) -> None:
+    """Bound what is pending and write it, here or through the Dask ``client``."""
+    # a frame without bounds comes before one that could be tighter
+    missing = set(report.missing)
+    pending = sorted(report.pending, key=lambda index: index not in missing)
+    budget = options.time_budget if options.time_budget is not None else seconds_by_frame * max(1, len(pending))
+    try:
+        if client is not None:
             from ns_abstract.cli.cluster import bound_on_cluster
 
-            results = bound_on_cluster(job, options, pending, budget, stop)
+            results = bound_on_cluster(client, job, options, pending, budget, stop)
         else:
             results = _bound_here(job, options, pending, budget, stop, console)
         for result in results:
@@ -78,22 +103,15 @@ def render_path(options: Render, stop: Callable[[], bool], seconds_by_frame: flo
             _tell(console, entry)
     finally:
         # also after a failure: what is finished is written
-        if stop():
-            outcome = "interrupted"
-        elif report.missing:
-            outcome = "budget"
-        report.finish(outcome)
-    if report.missing:
-        console.print(f"no bounds yet for frames {', '.join(map(str, report.missing))}: raise --time-budget, --resume")
-    console.print(f"report: {options.output_dir / 'report.html'}", markup=False, soft_wrap=True)
-    return not report.missing
+        report.finish("interrupted" if stop() else "budget" if report.missing else "done")
 
 
 def _introduce(console: Console, job: Job, report: Report) -> None:
     scene = job.scene
-    console.print(f"{scene.name}: {scene.count:,} Gaussians, {job.rasteriser.name} {job.rasteriser.version}", markup=False)
+    program = f"{job.rasteriser.name} {job.rasteriser.version}"
+    console.print(f"{scene.name}: {scene.count:,} Gaussians, {program}", markup=False)
     for note in (*scene.notes, *job.plan):
-        console.print(f"  {note}", markup=False)
+        console.print(f"  {note}", markup=False, soft_wrap=True)
     if report.kept:
         console.print(f"  kept from before: frames {', '.join(map(str, report.kept))}", markup=False)
 
@@ -109,7 +127,7 @@ def _tell(console: Console, entry: dict[str, Any]) -> None:
         markup=False,
     )
     for sentence in entry["plan"]:
-        console.print(f"  {sentence}", markup=False)
+        console.print(f"  {sentence}", markup=False, soft_wrap=True)
 
 
 def _bound_here(
@@ -130,7 +148,8 @@ def _bound_here(
         job.warm_up(pending[0] if pending else None)
         deadline = time.perf_counter() + budget
         for done, index in enumerate(pending):
-            if stop():
+            # one frame is always tried, so that resuming with any budget gets on
+            if stop() or (done and time.perf_counter() >= deadline):
                 return
             share = max(_LEAST_SECONDS, (deadline - time.perf_counter()) / (len(pending) - done))
             meter = _Meter(progress, whole, done, index, share, options.target_ratio)

@@ -9,6 +9,7 @@ cells is the same on every machine and for every number of threads.
 
 from __future__ import annotations
 
+import itertools
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -16,7 +17,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from ns_abstract.refine.result import FrameResult, Leaves, TracePoint, mean_pixel_gap
+from ns_abstract.refine.result import FrameResult, Leaves, TracePoint
 from ns_abstract.sets.box import ParameterBox
 
 #: Part of the whole excess that one round of splitting takes on.
@@ -35,6 +36,8 @@ _CORNERS = 64
 _COVER_SHARE = 0.5
 #: Most cells of the first cover.
 _COVER_CELLS = 4096
+#: Cells that may still be bounded where their number is not limited.
+_PLENTY = 1 << 60
 
 
 class Bounds(Protocol):
@@ -57,15 +60,21 @@ class Frame(Protocol):
     down: int
 
     @property
-    def tile_count(self) -> int: ...
+    def tile_count(self) -> int:
+        """Number of tiles, row by row."""
+        ...
 
-    def render(self, values: np.ndarray, tiles: np.ndarray | None = None) -> np.ndarray: ...
+    def render(self, values: np.ndarray, tiles: np.ndarray | None = None) -> np.ndarray:
+        """Tiles [t, side, side, 3] float32 of the image at parameter values [d]; all tiles if None."""
+        ...
 
-    def bound(
-        self, box: ParameterBox, tiles: np.ndarray, within: Any = None, keep_linear: bool = False
-    ) -> Any: ...
+    def bound(self, box: ParameterBox, tiles: np.ndarray, within: Any = None, keep_linear: bool = False) -> Any:
+        """`Bounds` of ``tiles`` over ``box``; ``within`` is the context of a box around it."""
+        ...
 
-    def motion(self, box: ParameterBox) -> np.ndarray: ...
+    def motion(self, box: ParameterBox) -> np.ndarray:
+        """[d] pixels that the picture moves by over each parameter's range (an estimate)."""
+        ...
 
 
 @dataclass(frozen=True)
@@ -76,7 +85,7 @@ class Goal:
         ratio: MPG over witness MPG that is good enough.
         seconds: Time budget of the frame.
         cells: Largest number of cells, or None (for reproducible runs).
-        leaf_bytes: Memory that open leaves may take.
+        leaf_bytes: Memory that open leaves, or the linear sets that are kept of all leaves, may take.
     """
 
     ratio: float = 1.05
@@ -88,10 +97,22 @@ class Goal:
 class _Cell:
     """A box, the context for boxes inside it, and the axis to split along."""
 
-    __slots__ = ("axis", "box", "context")
+    __slots__ = ("axis", "box", "context", "narrow", "number")
 
-    def __init__(self, box: ParameterBox, context: Any, axis: int) -> None:
-        self.box, self.context, self.axis = box, context, axis
+    def __init__(self, number: int, box: ParameterBox, narrow: bool) -> None:
+        self.number, self.box, self.narrow = number, box, narrow
+        self.context: Any = None
+        self.axis = 0
+
+
+@dataclass
+class _Change:
+    """What a round does to the leaves of one tile: rows that go, and what comes in their place."""
+
+    gone: list[int] = field(default_factory=list)
+    cells: list[_Cell] = field(default_factory=list)
+    lower: list[np.ndarray] = field(default_factory=list)
+    upper: list[np.ndarray] = field(default_factory=list)
 
 
 @dataclass
@@ -104,17 +125,18 @@ class _Tile:
     lower: np.ndarray | None = None
     upper: np.ndarray | None = None
 
-    def replace(self, gone: set[int], cells: list[_Cell], lower: list[np.ndarray], upper: list[np.ndarray]) -> None:
-        """Take out the leaves of the cells whose ``id`` is in ``gone`` and append others."""
-        keep = [k for k, cell in enumerate(self.cells) if id(cell) not in gone]
+    def replace(self, change: _Change) -> None:
+        """Take out the leaves in the rows ``change.gone`` and append the new ones."""
+        keep = np.ones(len(self.cells), bool)
+        keep[change.gone] = False
         old_lower = [] if self.lower is None else [self.lower[keep]]
         old_upper = [] if self.upper is None else [self.upper[keep]]
-        self.cells = [self.cells[k] for k in keep] + cells
+        self.cells = [cell for cell, stays in zip(self.cells, keep, strict=True) if stays] + change.cells
         if not self.cells:
             self.lower = self.upper = None
             return
-        self.lower = np.concatenate([*old_lower, *(a[None] for a in lower)])
-        self.upper = np.concatenate([*old_upper, *(a[None] for a in upper)])
+        self.lower = np.concatenate([*old_lower, *(a[None] for a in change.lower)])
+        self.upper = np.concatenate([*old_upper, *(a[None] for a in change.upper)])
 
     def close(self, which: np.ndarray) -> None:
         """Leaves ``which`` [n] (bool) keep their bounds and are not split any more."""
@@ -146,8 +168,8 @@ class Refinement:
         seed: Of the random witnesses.
         keep_leaves: Whether the result carries the leaves' linear sets.
         stopped: Asked between cells; true ends the work with what is known.
-        progress: Called with (trace point, ratio, cells of the first cover) after every round.
-        plan: Sentences for the result.
+        progress: Called with (trace point, covered part of the set) after every cell of the first
+            cover and after every round.
     """
 
     def __init__(
@@ -183,30 +205,43 @@ class Refinement:
         #: scene elements that some cell of the cover shows, if the frame tells
         self.shown: int | None = None
         self.leaf_sets: dict[tuple[int, int], tuple[ParameterBox, tuple[np.ndarray, ...]]] = {}
+        self._kept_bytes = 0
+        self._held_bytes = 0
+        self._numbers = itertools.count()
 
     # --- the two sides -------------------------------------------------------------------------
 
-    def _witness(self, values: np.ndarray, tiles: np.ndarray | None = None) -> None:
+    def _cell(self, box: ParameterBox) -> _Cell:
+        return _Cell(next(self._numbers), box, _narrow(box, self.frame.box))
+
+    def _witness(self, values: np.ndarray, tiles: np.ndarray | None = None) -> np.ndarray:
         """Render at ``values`` and widen the inner bound."""
         picture = self.frame.render(values, tiles)
         which = slice(None) if tiles is None else tiles
         self.witness_lower[which] = np.minimum(self.witness_lower[which], picture)
         self.witness_upper[which] = np.maximum(self.witness_upper[which], picture)
+        return picture
 
-    def _bound(self, cell: _Cell, parent: _Cell | None, tiles: np.ndarray) -> Bounds:
+    def _bound(self, cell: _Cell, parent: _Cell | None, tiles: np.ndarray) -> tuple[np.ndarray, np.ndarray, Bounds]:
+        """Lower and upper [t, side, side, 3] that can be relied on, and all that the frame returned."""
         bounds = self.frame.bound(cell.box, tiles, None if parent is None else parent.context, self.keep_leaves)
+        return self._take(cell, bounds)
+
+    def _take(self, cell: _Cell, bounds: Bounds) -> tuple[np.ndarray, np.ndarray, Bounds]:
         self.cells += 1
         cell.context = bounds.context
         cell.axis = self._axis(cell.box, bounds.slopes)
-        return bounds
+        return (*_usable(bounds.lower, bounds.upper), bounds)
 
     def _axis(self, box: ParameterBox, slopes: np.ndarray) -> int:
-        """The axis that the picture varies most along."""
+        """The axis that the picture varies most along, of those that can be halved."""
         if box.dimensions < 2:
             return 0
+        slopes = np.nan_to_num(slopes, nan=0.0, posinf=np.finfo(np.float64).max)
         # a parameter that only moves what the linear part does not see still has to be split
-        motion = self.frame.motion(box) if not np.any(slopes > 0.0) else np.zeros(box.dimensions)
-        return int(np.argmax(slopes + motion))
+        if not np.any(slopes > 0.0):
+            slopes = np.nan_to_num(self.frame.motion(box), nan=0.0)
+        return int(np.argmax(np.where(_narrow_axes(box, self.frame.box), -1.0, slopes)))
 
     def _settle(self, tiles: np.ndarray) -> None:
         """Update the outer bound of ``tiles``."""
@@ -240,8 +275,11 @@ class Refinement:
         return (
             self.stopped()
             or time.perf_counter() - self.start >= self.goal.seconds
-            or (self.goal.cells is not None and self.cells >= self.goal.cells)
+            or self._cells_left() < 1
         )
+
+    def _cells_left(self) -> int:
+        return _PLENTY if self.goal.cells is None else self.goal.cells - self.cells
 
     # --- the work ------------------------------------------------------------------------------
 
@@ -249,15 +287,10 @@ class Refinement:
         """Refine until the goal is reached; sound whenever it ends."""
         box = self.frame.box
         # the first call compiles kernels; the clock of the trace starts after it
-        image = self.frame.render(box.middle)
-        self._witness(box.middle)
+        image = self._witness(box.middle)
         self.start = time.perf_counter()
-        corners = box.corners()
-        if corners.shape[0] > _CORNERS:
-            corners = corners[np.sort(self.random.choice(corners.shape[0], _CORNERS, replace=False))]
-        cover = self._cover()
-        if cover and not self._over():
-            for values in corners if box.dimensions else []:
+        if self._cover() and not self._over():
+            for values in self._corners():
                 self._witness(values)
                 if self._over():
                     break
@@ -265,10 +298,47 @@ class Refinement:
         point = self._record(1.0)
         return self._result(image, point)
 
+    def _corners(self) -> np.ndarray:
+        """Corners of the set [n, d], some of them where there are many."""
+        box = self.frame.box
+        if not box.dimensions:
+            return np.empty((0, 0))
+        corners = box.corners()
+        if corners.shape[0] > _CORNERS:
+            corners = corners[np.sort(self.random.choice(corners.shape[0], _CORNERS, replace=False))]
+        return corners
+
     def _cover(self) -> bool:
         """Bound a first cover of the set; False if the time was over first."""
+        everything = np.arange(self.frame.tile_count)
+        boxes, first, probe = self._first_boxes(everything)
+        leaves: list[tuple[_Cell, np.ndarray, np.ndarray]] = []
+        for number, part in enumerate(boxes):
+            if number and self._over():
+                return False
+            cell = self._cell(part)
+            lower, upper, bounds = self._take(cell, probe) if part is first else self._bound(cell, None, everything)
+            leaves.append((cell, lower, upper))
+            self._keep(cell, bounds, everything)
+            if len(boxes) > 1:
+                self._witness(part.middle)
+            self.progress(self.point(), (number + 1) / len(boxes))
+        for t in everything:
+            cells, lowers, uppers = zip(*((cell, lower[t], upper[t]) for cell, lower, upper in leaves), strict=True)
+            self.tiles[t].replace(_Change([], list(cells), list(lowers), list(uppers)))
+        self.covered = True
+        visible = [getattr(cell.context, "visible", None) for cell, _, _ in leaves]
+        known = [v for v in visible if v is not None]
+        if len(known) == len(visible):
+            self.shown = int(np.unique(np.concatenate(known)).size)
+        self._settle(everything)
+        self._record(1.0)
+        return True
+
+    def _first_boxes(self, everything: np.ndarray) -> tuple[list[ParameterBox], ParameterBox, Bounds]:
+        """Boxes that cover the set, as many as motion asks for and time and memory allow; one bounded box."""
         frame, box = self.frame, self.frame.box
-        boxes, motion = [box], frame.motion(box)
+        boxes, motion = [box], np.nan_to_num(np.array(frame.motion(box), np.float64), nan=0.0)
         history: list[list[ParameterBox]] = [boxes]
         limit = FIRST_MOTION_LINE if box.dimensions == 1 else FIRST_MOTION
         while motion.size and motion.max() > limit and 2 * len(boxes) <= _COVER_CELLS:
@@ -276,94 +346,94 @@ class Refinement:
             boxes = [half for b in boxes for half in b.split(axis)]
             motion[axis] *= 0.5
             history.append(boxes)
-        everything = np.arange(frame.tile_count)
-        # the time of one cell tells how many can be afforded
+        # the time and memory of one cell tell how many can be afforded
         started = time.perf_counter()
         first = boxes[len(boxes) // 2]
         probe = frame.bound(first, everything, None, self.keep_leaves)
         seconds = time.perf_counter() - started
-        allowed = max(1.0, _COVER_SHARE * self.goal.seconds / max(seconds, 1e-4))
+        allowed = _COVER_SHARE * self.goal.seconds / max(seconds, 1e-4)
         if self.goal.cells is not None:
-            allowed = max(1.0, self.goal.cells / 2)
+            allowed = self.goal.cells / 2
+        size = probe.lower.nbytes + probe.upper.nbytes + _array_bytes(probe.context) + _linear_bytes(probe)
+        # half: the leaves are copied once when they are sorted by tile
+        allowed = max(1.0, min(allowed, 0.5 * self.goal.leaf_bytes / size))
         while len(boxes) > allowed and len(history) > 1:
             history.pop()
             boxes = history[-1]
-        for number, part in enumerate(boxes):
-            if number and self._over():
-                return False
-            cell = _Cell(part, None, 0)
-            if part is first:
-                bounds = probe
-                self.cells += 1
-                cell.context, cell.axis = bounds.context, self._axis(part, bounds.slopes)
-            else:
-                bounds = self._bound(cell, None, everything)
-            for t in everything:
-                self.tiles[t].replace(set(), [cell], [bounds.lower[t]], [bounds.upper[t]])
-            self._keep(cell, bounds, everything)
-            self._witness(part.middle)
-            self.progress(self.point(), (number + 1) / len(boxes))
-        self.covered = True
-        visible = [getattr(tile_cell.context, "visible", None) for tile_cell in self.tiles[0].cells]
-        if all(v is not None for v in visible):
-            self.shown = int(np.unique(np.concatenate(visible)).size)
-        self._settle(everything)
-        self._record(1.0)
-        return True
+        return boxes, first, probe
 
     def _refine(self) -> None:
         while True:
             point = self._record(1.0)
             if self._over() or point.mpg <= self.goal.ratio * point.mpg_witness:
                 return
-            jobs, parts = self._choose()
-            if not jobs:
+            # what is kept for the result cannot be given up for room
+            if self._kept_bytes >= self.goal.leaf_bytes:
                 return
-            touched: set[int] = set()
-            for cell, tiles in jobs:
-                if self._over():
+            jobs, parts = self._choose()
+            changes: dict[int, _Change] = {}
+            added = 0
+            for cell, rows in jobs:
+                room = self._held_bytes + added < self.goal.leaf_bytes
+                count = min(parts, self._cells_left())
+                if self._over() or count < 2 or (changes and not room):
                     break
-                self._split(cell, tiles, parts)
-                touched.update(tiles.tolist())
-            self._settle(np.array(sorted(touched), np.int64))
+                added += self._split(cell, rows, count, changes)
+            if not changes:
+                return
+            for t, change in changes.items():
+                self.tiles[t].replace(change)
+            self._settle(np.array(sorted(changes), np.int64))
 
-    def _choose(self) -> tuple[list[tuple[_Cell, np.ndarray]], int]:
-        """The cells to split in the next round, each with its tiles, and into how many parts."""
-        excess: list[np.ndarray] = []
+    def _choose(self) -> tuple[list[tuple[_Cell, dict[int, int]]], int]:
+        """The cells to split in the next round, each with its row by tile, and into how many parts."""
+        while True:
+            amounts, owner = self._excess()
+            if not owner:
+                return [], 2
+            order = np.argsort(-amounts, kind="stable")
+            if self._held_bytes <= self.goal.leaf_bytes:
+                break
+            self._close_least(order, owner)
+        running = np.cumsum(amounts[order])
+        count = int(np.searchsorted(running, _ROUND_SHARE * running[-1])) + 1
+        by_cell: dict[int, tuple[_Cell, dict[int, int]]] = {}
+        for position in order[:count]:
+            t, k = owner[position]
+            cell = self.tiles[t].cells[k]
+            by_cell.setdefault(cell.number, (cell, {}))[1][t] = k
+        jobs = [(cell, dict(sorted(rows.items()))) for cell, rows in by_cell.values()]
+        # excess falls at least in proportion to the width: far from the goal, levels are skipped
+        allowed = (self.goal.ratio - 1.0) * float((self.witness_upper - self.witness_lower)[self.inside].sum())
+        far = self.frame.box.dimensions == 1 and running[-1] > _FAR * allowed
+        return jobs, 4 if far else 2
+
+    def _excess(self) -> tuple[np.ndarray, list[tuple[int, int]]]:
+        """What every open leaf leaves open beyond the witnesses, and its tile and row.
+
+        Leaves that cannot be improved are closed; the memory of the others is counted.
+        """
+        excess: list[np.ndarray] = [np.empty(0)]
         owner: list[tuple[int, int]] = []
-        held = 0
+        contexts: dict[int, Any] = {}
+        self._held_bytes = 0
         for t, tile in enumerate(self.tiles):
             if tile.lower is None or tile.upper is None:
                 continue
             beyond = np.maximum(0.0, self.witness_lower[t] - tile.lower)
             beyond += np.maximum(0.0, tile.upper - self.witness_upper[t])
             amount = beyond[:, self.inside[t]].sum(axis=(1, 2), dtype=np.float64)
-            done = (amount <= 0.0) | np.array([_narrow(cell.box, self.frame.box) for cell in tile.cells])
+            done = (amount <= 0.0) | np.array([cell.narrow for cell in tile.cells])
             tile.close(done)
             amount = amount[~done]
             if tile.lower is not None and tile.upper is not None:
-                held += tile.lower.nbytes + tile.upper.nbytes
+                self._held_bytes += tile.lower.nbytes + tile.upper.nbytes
+            for cell in tile.cells:
+                contexts[id(cell.context)] = cell.context
             excess.append(amount)
             owner.extend((t, k) for k in range(amount.size))
-        if not owner:
-            return [], 2
-        amounts = np.concatenate(excess)
-        order = np.argsort(-amounts, kind="stable")
-        if held > self.goal.leaf_bytes:
-            self._close_least(order, owner)
-            return self._choose()
-        running = np.cumsum(amounts[order])
-        count = int(np.searchsorted(running, _ROUND_SHARE * running[-1])) + 1
-        by_cell: dict[int, tuple[_Cell, list[int]]] = {}
-        for position in order[:count]:
-            t, k = owner[position]
-            cell = self.tiles[t].cells[k]
-            by_cell.setdefault(id(cell), (cell, []))[1].append(t)
-        jobs = [(cell, np.array(sorted(tiles), np.int64)) for cell, tiles in by_cell.values()]
-        # excess falls at least in proportion to the width: far from the goal, levels are skipped
-        allowed = (self.goal.ratio - 1.0) * float((self.witness_upper - self.witness_lower)[self.inside].sum())
-        far = self.frame.box.dimensions == 1 and running[-1] > _FAR * allowed
-        return jobs, 4 if far else 2
+        self._held_bytes += sum(_array_bytes(context) for context in contexts.values())
+        return np.concatenate(excess), owner
 
     def _close_least(self, order: np.ndarray, owner: list[tuple[int, int]]) -> None:
         """Free memory: the half of the leaves that have least excess are not split any more."""
@@ -376,8 +446,10 @@ class Refinement:
             mask[which] = True
             self.tiles[t].close(mask)
 
-    def _split(self, cell: _Cell, tiles: np.ndarray, parts: int) -> None:
-        children = [_Cell(part, None, 0) for part in cell.box.split(cell.axis, parts)]
+    def _split(self, cell: _Cell, rows: dict[int, int], parts: int, changes: dict[int, _Change]) -> int:
+        """Bound the parts of ``cell`` in the tiles of ``rows``; returns the bytes of the new leaves."""
+        tiles = np.array(list(rows), np.int64)
+        children = [self._cell(part) for part in cell.box.split(cell.axis, parts)]
         found = []
         for child in children:
             found.append(self._bound(child, cell, tiles))
@@ -386,23 +458,23 @@ class Refinement:
         if cell.box.dimensions == 1:
             for child in children[:-1]:
                 self._witness(np.array(child.box.upper), tiles)
-        for k, t in enumerate(tiles):
-            parent = self._leaf_bounds(t, cell)
-            # a child lies inside its parent, so both bounds hold
-            self.tiles[t].replace(
-                {id(cell)},
-                children,
-                [np.maximum(b.lower[k], parent[0]) for b in found],
-                [np.minimum(b.upper[k], parent[1]) for b in found],
-            )
-        for child, bounds in zip(children, found, strict=True):
+        added = 0
+        for k, (t, row) in enumerate(rows.items()):
+            tile, change = self.tiles[t], changes.setdefault(t, _Change())
+            assert tile.lower is not None and tile.upper is not None
+            change.gone.append(row)
+            for child, (lower, upper, _) in zip(children, found, strict=True):
+                # a child lies inside its parent, so both bounds hold
+                low, high = _usable(np.maximum(lower[k], tile.lower[row]), np.minimum(upper[k], tile.upper[row]))
+                change.cells.append(child)
+                change.lower.append(low)
+                change.upper.append(high)
+                added += low.nbytes + high.nbytes
+        for child, (_, _, bounds) in zip(children, found, strict=True):
             self._keep(child, bounds, tiles, cell)
-
-    def _leaf_bounds(self, t: int, cell: _Cell) -> tuple[np.ndarray, np.ndarray]:
-        tile = self.tiles[t]
-        assert tile.lower is not None and tile.upper is not None
-        k = next(k for k, other in enumerate(tile.cells) if other is cell)
-        return tile.lower[k], tile.upper[k]
+            if child.context is not cell.context:
+                added += _array_bytes(child.context)
+        return added
 
     # --- results -------------------------------------------------------------------------------
 
@@ -410,10 +482,15 @@ class Refinement:
         """Remember the linear sets of leaves, in place of their parent's."""
         if not self.keep_leaves or bounds.linear is None:
             return
-        for k, t in enumerate(tiles):
+        linear = _usable_linear(bounds.linear)
+        for k, t in enumerate(tiles.tolist()):
             if parent is not None:
-                self.leaf_sets.pop((id(parent), int(t)), None)
-            self.leaf_sets[(id(cell), int(t))] = (cell.box, tuple(a[k] for a in bounds.linear), cell)  # type: ignore[assignment]
+                gone = self.leaf_sets.pop((parent.number, t), None)
+                self._kept_bytes -= 0 if gone is None else sum(a.nbytes for a in gone[1])
+            # copies: a view would keep the bounds of all tiles
+            entry = tuple(a[k].copy() for a in linear)
+            self.leaf_sets[(cell.number, t)] = (cell.box, entry)
+            self._kept_bytes += sum(a.nbytes for a in entry)
 
     def _leaves(self) -> Leaves | None:
         if not self.keep_leaves:
@@ -460,12 +537,41 @@ class Refinement:
         return assemble_tiles(tiles, self.frame)
 
 
+def _usable(lower: np.ndarray, upper: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Bounds within [0, 1]; where they are not finite, cross or miss [0, 1], nothing is known."""
+    good = np.isfinite(lower) & np.isfinite(upper) & (lower <= upper) & (lower <= 1.0) & (upper >= 0.0)
+    low, high = np.clip(lower, 0.0, 1.0), np.clip(upper, 0.0, 1.0)
+    return np.where(good, low, np.zeros_like(low)), np.where(good, high, np.ones_like(high))
+
+
+def _usable_linear(linear: tuple[np.ndarray, ...]) -> tuple[np.ndarray, ...]:
+    """Linear sets (A_lower, b_lower, A_upper, b_upper) with 0 and 1 where a number is not finite."""
+    found: list[np.ndarray] = []
+    for slope, offset, trivial in ((linear[0], linear[1], 0.0), (linear[2], linear[3], 1.0)):
+        good = np.isfinite(slope).all(axis=-1) & np.isfinite(offset)
+        found.append(np.where(good[..., None], slope, np.zeros_like(slope)))
+        found.append(np.where(good, offset, np.full_like(offset, trivial)))
+    return tuple(found)
+
+
+def _array_bytes(holder: Any) -> int:
+    """Bytes of the arrays that an object's attributes hold."""
+    return sum(value.nbytes for value in getattr(holder, "__dict__", {}).values() if isinstance(value, np.ndarray))
+
+
+def _linear_bytes(bounds: Bounds) -> int:
+    return 0 if bounds.linear is None else sum(a.nbytes for a in bounds.linear)
+
+
+def _narrow_axes(box: ParameterBox, root: ParameterBox) -> np.ndarray:
+    """[d] whether an axis cannot be halved sensibly."""
+    width, whole = np.array(box.upper) - np.array(box.lower), np.array(root.upper) - np.array(root.lower)
+    return width <= _NARROWEST * whole
+
+
 def _narrow(box: ParameterBox, root: ParameterBox) -> bool:
-    """Whether no axis can be halved sensibly."""
-    return all(
-        high - low <= _NARROWEST * (b - a)
-        for low, high, a, b in zip(box.lower, box.upper, root.lower, root.upper, strict=True)
-    )
+    """Whether no axis can be halved sensibly; true of a single pose."""
+    return bool(_narrow_axes(box, root).all())
 
 
 def _pixels_inside(frame: Frame) -> np.ndarray:

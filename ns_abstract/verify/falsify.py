@@ -306,7 +306,7 @@ def _corners(box: ParameterBox, count: int, generator: np.random.Generator) -> F
 def _ascend(record: _Record, twin: Twin, target: _Target, start: Float64Array) -> Float64Array:
     """Projected gradient ascent of one pixel channel, in parameters scaled to [-1, 1]^d.
 
-    Steps follow the normalised gradient; they double where the value grew and halve where it did not.
+    Steps follow the normalised gradient; they double where the value grew and shrink to a quarter where not.
     """
     low = torch.tensor(record.box.lower, dtype=torch.float64)
     high = torch.tensor(record.box.upper, dtype=torch.float64)
@@ -404,7 +404,7 @@ def falsify(
         seconds: Most time spent; reaching it ends the attack after the image in progress. A limit
             makes the outcome depend on the machine.
         seed: Decides every random choice.
-        starts: [n, d] poses to try first.
+        starts: [n, d] poses to try first, clipped into the box.
         strategies: Which of `STRATEGIES` to use. Poses that one does not need go to the next.
 
     Raises:
@@ -464,10 +464,11 @@ def _search(
             targets = record.targets(9, generator, done)
             if not targets:
                 break
-            for target in targets:
-                for start in (target.pose, box.sample(1, generator)[0]):
+            pairs = [(target, start) for target in targets for start in (target.pose, box.sample(1, generator)[0])]
+            for target, start in pairs:
+                if len(record.poses) < last:
                     record.image_once(_ascend(record, twin, target, start), "ascent")
-                    climbs -= 1
+                climbs -= 1
     if "jumps" in strategies and record.poses:
         while targets := record.targets(3, generator, set()):
             before = len(record.poses)

@@ -1,0 +1,111 @@
+"""Small scenes, camera paths and runs that several test files share."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from ns_abstract.demo.paths import View, look_at, path_json
+from ns_abstract.demo.runs import write_splatfacto_run
+from ns_abstract.methods.splat.scene import SplatScene
+
+TIMESTAMP = "2026-01-01_000000"
+#: A sideways shift, wide enough for several cells.
+SHIFT = {"version": 1, "translation": {"x": 0.03}}
+
+
+def blob_scene(count: int = 50, seed: int = 7, degree: int = 1) -> SplatScene:
+    """A cloud of ``count`` Gaussians of radius 0.4 about the origin, with spherical harmonics."""
+    rng = np.random.default_rng(seed)
+    bands = (degree + 1) ** 2
+    values = {
+        "means": 0.4 * rng.uniform(-1.0, 1.0, (count, 3)),
+        "log_scales": rng.uniform(-3.6, -2.2, (count, 3)),
+        "quats": rng.normal(size=(count, 4)),
+        "opacity_logits": rng.uniform(-1.0, 3.0, count),
+        "sh": rng.normal(size=(count, bands, 3)) * np.where(np.arange(bands) == 0, 0.8, 0.1)[:, None],
+    }
+    return SplatScene(
+        **{name: value.astype(np.float32) for name, value in values.items()},  # type: ignore[arg-type]
+        sh_degree=degree,
+        background=np.array([0.1, 0.2, 0.3], np.float32),
+        name="blobs",
+    )
+
+
+def ring(count: int = 3, size: int = 32) -> list[View]:
+    """``count`` views of the origin from a quarter of a circle."""
+    angles = np.linspace(0.0, 0.5 * np.pi, count)
+    return [
+        View(look_at((1.6 * np.cos(a), 1.6 * np.sin(a), 0.4), (0.0, 0.0, 0.0)), 45.0, size, size) for a in angles
+    ]
+
+
+def write_json(file: Path, value: Any) -> Path:
+    """Write ``value`` as JSON and return the file."""
+    file.write_text(json.dumps(value))
+    return file
+
+
+@dataclass(frozen=True)
+class Inputs:
+    """What a command needs; `options` gives its command line."""
+
+    config: Path
+    path: Path
+    spec: Path
+
+    @property
+    def checkpoint(self) -> Path:
+        """The run's checkpoint."""
+        return next((self.config.parent / "nerfstudio_models").glob("step-*.ckpt"))
+
+    def options(self, output: Path, **changes: Any) -> list[str]:
+        """Options of ns-abstract-render; a change of None leaves its option out, True is a flag."""
+        values: dict[str, Any] = {
+            "load_config": self.config,
+            "camera_path_filename": self.path,
+            "perturbation_filename": self.spec,
+            "output_dir": output,
+        }
+        found: list[str] = []
+        for name, value in (values | changes).items():
+            if value is None:
+                continue
+            found.append("--" + name.replace("_", "-"))
+            if value is not True:
+                found.extend(map(str, value if isinstance(value, (list, tuple)) else [value]))
+        return found
+
+
+@pytest.fixture(scope="session")
+def blobs(tmp_path_factory: pytest.TempPathFactory) -> Inputs:
+    """A run of `blob_scene`, three views of 32 x 32 pixels and a shift; not to be changed."""
+    return _write(tmp_path_factory.mktemp("blobs"))
+
+
+@pytest.fixture
+def make_blobs(tmp_path: Path) -> Callable[..., Inputs]:
+    """Writes inputs that a test may damage."""
+    return lambda **changes: _write(tmp_path / "inputs", **changes)
+
+
+def _write(folder: Path, scene: SplatScene | None = None, views: list[View] | None = None, spec: Any = None) -> Inputs:
+    folder.mkdir(exist_ok=True)
+    config = write_splatfacto_run(
+        blob_scene() if scene is None else scene, folder, timestamp=TIMESTAMP, experiment_name="blobs"
+    )
+    path = path_json(ring() if views is None else views)
+    return Inputs(
+        config,
+        write_json(folder / "camera_path.json", path),
+        write_json(folder / "spec.json", SHIFT if spec is None else spec),
+    )
+
+
