@@ -107,8 +107,8 @@ MUTANTS = (
     ),
     Mutant(
         "reciprocal takes its remainder at the far end", FORMS,
-        "work[4, q] = 1.0 / (low2 * low2) if low > 0.0 else np.inf",
-        "work[4, q] = 1.0 / (c * c * c * c) if low > 0.0 else np.inf",
+        "work[4, q] = 1.0 / (low2 * low2) * _UP if inside else np.inf",
+        "work[4, q] = 1.0 / (c * c * c * c) * _UP if inside else np.inf",
         "test_forms.py::test_function_contains[plain-reciprocal-d1o2]",
     ),
     Mutant(
@@ -118,7 +118,7 @@ MUTANTS = (
     ),
     Mutant(
         "reciprocal accepts 0", FORMS,
-        "work[3, q] = 1.0 / (low * low * low) * _UP if low > 0.0 else np.inf",
+        "work[3, q] = 1.0 / (low * low * low) * _UP if inside else np.inf",
         "work[3, q] = 1.0 / (low * low * low) * _UP",
         "test_forms.py::test_domain[reciprocal-d1o1]",
     ),

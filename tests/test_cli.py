@@ -180,11 +180,6 @@ def option(**values: Any) -> Change:
     return lambda inputs: values
 
 
-def inside(name: str, **values: Any) -> Change:
-    """Give an option the path of a file that is derived from the inputs."""
-    return lambda inputs: {key: value(inputs) for key, value in values.items()}
-
-
 def _half_checkpoint(inputs: Inputs) -> None:
     data = inputs.checkpoint.read_bytes()
     inputs.checkpoint.write_bytes(data[: len(data) // 2])
@@ -207,10 +202,8 @@ def _nan(pipeline: dict[str, Any]) -> None:
     pipeline["_model.gauss_params.means"][3, 1] = float("nan")
 
 
-def _matrix(rotation: np.ndarray) -> list[float]:
-    pose = np.eye(4)
-    pose[:3, :3] = rotation
-    return pose.flatten().tolist()
+def _matrix(x: float, y: float, z: float) -> list[float]:
+    return np.diag([x, y, z, 1.0]).flatten().tolist()
 
 
 def _folder_of_file(inputs: Inputs) -> dict[str, Any]:
@@ -244,8 +237,8 @@ MISTAKES: dict[str, tuple[Change, tuple[str, ...]]] = {
     "no angle": (edit("path", entry_fov=..., default_fov=...), ("camera_path[1].fov", "missing")),
     "15 numbers": (edit("path", entry_camera_to_world=[0.0] * 15), ("camera_path[1].camera_to_world", "16")),
     "NaN in the path": (text("path", '{"render_height": NaN}'), ("camera_path.json", "NaN")),
-    "mirror": (edit("path", entry_camera_to_world=_matrix(np.diag([1.0, 1.0, -1.0]))), ("[1].camera_to_world", "mirror")),
-    "stretched": (edit("path", entry_camera_to_world=_matrix(2.0 * np.eye(3))), ("[1].camera_to_world", "orthonormal")),
+    "mirror": (edit("path", entry_camera_to_world=_matrix(1.0, 1.0, -1.0)), ("[1].camera_to_world", "mirror")),
+    "stretched": (edit("path", entry_camera_to_world=_matrix(2.0, 2.0, 2.0)), ("[1].camera_to_world", "orthonormal")),
     "no height": (edit("path", render_height=0), ("camera_path.json", "render_height")),
     "fisheye": (edit("path", camera_type="fisheye"), ("camera_type", "perspective")),
     "crop": (edit("path", crop={}), ("crop",)),
@@ -320,14 +313,37 @@ def test_mistake_is_one_line_from_a_shell(name: str, make_blobs: Callable[..., I
     assert done.stdout == ""
 
 
-def test_a_pipe_as_camera_path_does_not_hang(blobs: Inputs, tmp_path: Path, call: Callable[..., tuple[int, str]]) -> None:
+def test_a_pipe_as_camera_path_does_not_hang(
+    blobs: Inputs, tmp_path: Path, call: Callable[..., tuple[int, str]]
+) -> None:
     os.mkfifo(tmp_path / "pipe")
     one_line(*call(blobs.options(tmp_path / "out", camera_path_filename=tmp_path / "pipe")), "not a regular file")
 
 
-def test_wide_and_plain_error_boxes_are_understood() -> None:
-    box = "+- Unknown -----+\n| no such thing |\n| -------------- |\n| For full helptext, run x |\n+---+\n"
-    assert complaint(box) == "no such thing"
+@pytest.mark.parametrize("boxes", [True, False])
+@pytest.mark.parametrize("colours", [True, False])
+@pytest.mark.parametrize("name", ["no scene", "unknown option", "unknown renderer", "frame as text"])
+def test_every_kind_of_error_box_is_understood(
+    blobs: Inputs,
+    tmp_path: Path,
+    call: Callable[..., tuple[int, str]],
+    monkeypatch: pytest.MonkeyPatch,
+    boxes: bool,
+    colours: bool,
+    name: str,
+) -> None:
+    from tyro import _fmtlib
+
+    monkeypatch.setattr(_fmtlib, "_FORCE_UTF8_BOXES", boxes)
+    monkeypatch.setattr(_fmtlib, "_FORCE_ANSI", colours)
+    change, fragments = MISTAKES[name]
+    code, said = call(blobs.options(tmp_path / "out", **(change(blobs) or {})))
+    one_line(code, said, *fragments)
+    assert "\x1b" not in said and "│" not in said and "helptext" not in said
+    assert "perhaps ;" not in said and "missing ;" not in said
+
+
+def test_no_error_box_at_all() -> None:
     assert complaint("") == "the options cannot be read"
 
 
@@ -393,7 +409,8 @@ def finished(blobs: Inputs, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_a_run_writes_what_it_promises(blobs: Inputs, finished: Path) -> None:
     names = {file.name for file in finished.iterdir()}
-    assert names == {f"frame_0000{k}.{kind}" for k in range(3) for kind in ("npz", "png")} | {"report.json", "report.html"}
+    frames = {f"frame_0000{k}.{kind}" for k in range(3) for kind in ("npz", "png")}
+    assert names == frames | {"report.json", "report.html"}
     document = report(finished)
     assert (document["version"], document["state"], document["guarantee"]) == (1, "done", "float32-sound")
     assert document["renderer"] == {"name": "gsplat", "version": "1.4.0"}
@@ -608,7 +625,8 @@ def test_signal_saves_what_is_finished(number: int, make_blobs: Callable[..., In
     path["camera_path"][2]["perturbation"] = SIX
     write_json(inputs.path, path)
     options = inputs.options(folder, perturbation_filename=None, time_budget=900, target_ratio=1.0)
-    process = subprocess.Popen([sys.executable, "-m", MODULE, *options], stderr=subprocess.PIPE, text=True, env=environment())
+    command = [sys.executable, "-m", MODULE, *options]
+    process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True, env=environment())
     try:
         deadline = time.monotonic() + 240
         while not (folder / "frame_00001.png").exists():

@@ -360,14 +360,14 @@ def run_files() -> tuple[Path, Path]:
 def test_check_run(arithmetic: str) -> None:
     config, path = run_files()
     result = check_run(
-        config, path, {"translation": {"x": 0.01}}, 0, 2, 8, 7, downscale_factor=8, arithmetic=arithmetic
+        config, path, {"translation": {"x": 0.01}}, 0, 2, 8, 7, downscale_factor=12, arithmetic=arithmetic
     )
     assert result["violations"] == 0
     names = ["compiled", "reference"] + (["reference_float32"] if arithmetic == "float32" else [])
     assert list(result["attacks"]) == names
     assert result["attacks"]["compiled"]["poses"] == 8 and result["cells"] == 2
     assert result["mpg"] >= result["mpg_witness"] > 0.0
-    assert result["size"] == [25, 25]
+    assert result["size"] == [16, 16]
 
 
 def test_check_run_notices(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -379,7 +379,7 @@ def test_check_run_notices(monkeypatch: pytest.MonkeyPatch) -> None:
         return [(low + 0.2 * (high - low), high) for low, high in bounds], statistics
 
     monkeypatch.setattr(soundness, "bound_cells", shrunk)
-    result = check_run(config, path, {"translation": {"x": 0.01}}, 0, 1, 12, downscale_factor=8)
+    result = check_run(config, path, {"translation": {"x": 0.01}}, 0, 1, 12, downscale_factor=12)
     assert result["violations"] > 0
     assert all(attack["violations"] > 0 for attack in result["attacks"].values())
 
@@ -391,7 +391,7 @@ def test_last_frame_and_cells() -> None:
     assert len(cells) == 6
     assert math.isclose(sum(np.prod(np.array(c.upper) - c.lower) for c in cells), 2.0)
     config, path = run_files()
-    result = check_run(config, path, {"rotation": {"roll": 0.01}}, 4, 1, 4, downscale_factor=8, reference_poses=4)
+    result = check_run(config, path, {"rotation": {"roll": 0.01}}, 4, 1, 4, downscale_factor=12, reference_poses=4)
     assert result["violations"] == 0 and result["parameters"] == ["roll"]
 
 

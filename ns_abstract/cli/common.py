@@ -61,25 +61,33 @@ def parse(read: Callable[[], Any]) -> Any:
 
 def complaint(text: str) -> str:
     """The point of an error box that tyro prints, as one line."""
+    # on a terminal there are colours, elsewhere the box may have no lines
+    lines = re.sub(r"\x1b\[[0-9;]*m", "", text).splitlines()
     sections: list[list[str]] = [[]]
-    for line in text.splitlines():
-        # the box is drawn in ASCII where the terminal knows nothing else
-        inner = re.sub(r"^\s*[│|] ?| *[│|]\s*$", "", line)
-        if re.fullmatch(r"\s*[─-]{8,}\s*", inner):
+    # the title comes first and repeats what follows
+    for line in lines[1:]:
+        inner = re.sub(r"^\s*│|│\s*$", "", line).rstrip()
+        if re.fullmatch(r"[\s─╰╯-]*[─-]{8}[\s─╰╯-]*", inner):
             sections.append([])
-        elif inner.strip() and not re.match(r"\s*[╭╰+]", line):
+        elif inner:
             sections[-1].append(inner)
     points = []
     for section in sections:
         words = " ".join(" ".join(section).split())
         if words.startswith("Missing from"):
-            # below each option stands its help
-            words = "missing " + ", ".join(re.findall(r"^ {4}(-[\w-]+)", "\n".join(section), re.MULTILINE))
+            words = f"missing {', '.join(_named(section))}"
         if words.startswith("Perhaps you meant"):
-            words = "perhaps " + " or ".join(re.findall(r"^ {4}(-[\w-]+)", "\n".join(section), re.MULTILINE))
+            words = f"perhaps {' or '.join(_named(section))}"
         if words and not words.startswith(("For full helptext", "Argument helptext")):
             points.append(words.partition(" Got errors:")[0].rstrip("."))
     return "; ".join(points) or "the options cannot be read"
+
+
+def _named(lines: list[str]) -> list[str]:
+    """Options that lines begin with; their help stands below them, further in."""
+    found = [match for line in lines if (match := re.match(r"( +)(--?[a-z][\w-]*)", line))]
+    outermost = min((len(match[1]) for match in found), default=0)
+    return [match[2] for match in found if len(match[1]) == outermost]
 
 
 def run(main: Callable[..., int], options: Callable[[], Any]) -> NoReturn:
