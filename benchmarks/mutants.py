@@ -124,12 +124,14 @@ MUTANTS = (
     ),
     Mutant(
         "bounds ignore the vertex", FORMS,
-        "            if abs(g) < 2.0 * abs(s):\n                vertex", "            if False:\n                vertex",
+        "            if abs(g) < 2.0 * abs(s):\n",
+        "            if False:\n",
         "test_forms.py::test_bounds[d2o2]",
     ),
     Mutant(
         "bounds take the vertex for the wrong side", FORMS,
-        "                if s > 0.0:\n                    bottom = vertex", "                if s < 0.0:\n                    bottom = vertex",
+        "                if s > 0.0:\n                    bottom = vertex",
+        "                if s < 0.0:\n                    bottom = vertex",
         "test_forms.py::test_bounds[d1o2]",
     ),
     Mutant(
@@ -210,7 +212,8 @@ MUTANTS = (
     ),
     Mutant(
         "tile cut-off taken for sure", PIXELS,
-        "        sure = tiles[i, 4] <= tile_x and tile_x < tiles[i, 5] and tiles[i, 6] <= tile_y and tile_y < tiles[i, 7]",
+        "        sure = tiles[i, 4] <= tile_x and tile_x < tiles[i, 5] and "
+        "tiles[i, 6] <= tile_y and tile_y < tiles[i, 7]",
         "        sure = True",
         "test_bounds.py::test_tile_cut[2]",
     ),
@@ -303,8 +306,8 @@ MUTANTS = (
     ),
     Mutant(
         "stop ignored where orders are uncertain", PIXELS,
-        "            if t_low > stop_high:\n                continue\n            # the most light",
-        "            if True:\n                continue\n            # the most light",
+        "            if t_low > stop_high:\n                continue\n            before = e",
+        "            if True:\n                continue\n            before = e",
         "test_bounds.py::test_stop_and_swap[2]",
     ),
     Mutant(
@@ -320,7 +323,8 @@ MUTANTS = (
     ),
     Mutant(
         "blend picks alpha's other end", PIXELS,
-        "        t[_PHI + q] += (high if v > 0.0 else low) * v", "        t[_PHI + q] += (low if v > 0.0 else high) * v",
+        "        t[_PHI + q] += (high if v > 0.0 else low) * v",
+        "        t[_PHI + q] += (low if v > 0.0 else high) * v",
         "test_bounds.py::test_one_layer[2]",
     ),
     Mutant(
@@ -441,7 +445,8 @@ def main() -> int:
                 (folder / "ns_abstract" / mutant.file).write_text(original)
                 # an assertion that fails, not a crash
                 asserted = code == _FAILED and "AssertionError" in output
-                verdict = {_PASSED: "survived", _FAILED: "killed" if asserted else "crashed"}.get(code, f"pytest {code}")
+                verdicts = {_PASSED: "survived", _FAILED: "killed" if asserted else "crashed"}
+                verdict = verdicts.get(code, f"pytest {code}")
             outcomes.append(Outcome(mutant, verdict, seconds))
             print(f"{verdict:10s} {seconds:6.1f} s  {mutant.name}", flush=True)
     killed = sum(outcome.verdict == "killed" for outcome in outcomes)

@@ -151,12 +151,7 @@ class Job:
         """Compile the kernels that frame ``index`` needs, so that its clock measures bounding alone."""
         if index is None:
             return
-        frame = self.frame(index)
-        box = frame.box
-        for axis in range(box.dimensions):
-            box = box.split(axis, 1024)[0]
-        frame.bound(box, np.arange(1))
-        frame.render(box.middle)
+        self.frame(index).warm_up()
 
     def bound(
         self,
@@ -249,7 +244,5 @@ def check_frames(frames: tuple[int, ...] | None, count: int) -> tuple[int, ...]:
         return tuple(range(count))
     for frame in frames:
         if not 0 <= frame < count:
-            raise InputError(
-                f"found {frame}", field="--frames", fix=f"the camera path has entries 0 to {count - 1}"
-            )
+            raise InputError(f"found {frame}", field="--frames", fix=f"the camera path has entries 0 to {count - 1}")
     return tuple(sorted(set(frames)))

@@ -42,9 +42,7 @@ def blob_scene(count: int = 50, seed: int = 7, degree: int = 1) -> SplatScene:
 def ring(count: int = 3, size: int = 32) -> list[View]:
     """``count`` views of the origin from a quarter of a circle."""
     angles = np.linspace(0.0, 0.5 * np.pi, count)
-    return [
-        View(look_at((1.6 * np.cos(a), 1.6 * np.sin(a), 0.4), (0.0, 0.0, 0.0)), 45.0, size, size) for a in angles
-    ]
+    return [View(look_at((1.6 * np.cos(a), 1.6 * np.sin(a), 0.4), (0.0, 0.0, 0.0)), 45.0, size, size) for a in angles]
 
 
 def write_json(file: Path, value: Any) -> Path:
@@ -107,5 +105,3 @@ def _write(folder: Path, scene: SplatScene | None = None, views: list[View] | No
         write_json(folder / "camera_path.json", path),
         write_json(folder / "spec.json", SHIFT if spec is None else spec),
     )
-
-

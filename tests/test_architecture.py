@@ -15,7 +15,20 @@ import pytest
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = ROOT / "ns_abstract"
 #: A module imports from its own level or lower ones.
-LEVELS = ("errors", "jsonio", "arithmetic", "sets", "methods", "demo", "refine", "report", "verify", "pipeline", "cli")
+LEVELS = (
+    "errors",
+    "jsonio",
+    "arithmetic",
+    "sets",
+    "methods",
+    "demo",
+    "refine",
+    "report",
+    "verify",
+    "pipeline",
+    "bench",
+    "cli",
+)
 #: Names of distributions whose modules are called otherwise.
 DISTRIBUTIONS = {"yaml": "pyyaml", "PIL": "pillow", "distributed": "dask"}
 JIT = ("njit", "jit", "vectorize", "guvectorize", "cfunc", "stencil")

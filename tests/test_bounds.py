@@ -350,7 +350,9 @@ def test_view_dependence(degree, order):
 def test_view_dependence_alone(order):
     """A layer that covers the picture evenly: what changes is its colour."""
     generator = np.random.default_rng(5)
-    splats = scene({"mean": (0.0, 0.0, -2.0), "scale": 60.0, "opacity": 0.9, "sh": generator.normal(size=(16, 3)) * 0.15})
+    splats = scene(
+        {"mean": (0.0, 0.0, -2.0), "scale": 60.0, "opacity": 0.9, "sh": generator.normal(size=(16, 3)) * 0.15}
+    )
     case = Case(splats, moves(x=0.5), camera(8, 8))
     width, sampled = case.check(order, parts=3, count=9)
     assert width.mean() < 3.0 * sampled.mean()
@@ -479,7 +481,9 @@ def test_float32_is_wider(order):
 
 
 @both_orders
-@pytest.mark.parametrize("parameters", [moves(x=0.05), moves(yaw=0.02), moves(x=0.02, roll=0.05)], ids=["x", "yaw", "two"])
+@pytest.mark.parametrize(
+    "parameters", [moves(x=0.05), moves(yaw=0.02), moves(x=0.02, roll=0.05)], ids=["x", "yaw", "two"]
+)
 def test_linear(parameters, order):
     """The linear sets hold the picture before it is clamped, colours above 1 included."""
     bright = scene(

@@ -226,7 +226,6 @@ def test_bounds(basis):
                     assert between(low[lane], high[lane], lambda: value(a, lane, point, weight))  # noqa: B023
 
 
-@pytest.mark.xfail(strict=True, reason="bounds: g * g underflows in the vertex -g^2 / (4 s)")
 @pytest.mark.parametrize("scale", [1e-160, 1e-300])
 def test_bounds_tiny(scale):
     """The vertex of g p + s p^2 where g^2 is denormal or zero."""

@@ -60,7 +60,9 @@ def off(name: str, units: float):
     return function
 
 
-@pytest.mark.parametrize("name, units", [("exp", 9), ("log", 9), ("sqrt", 3), ("sin", 7), ("cos", 7), ("reciprocal", 3)])
+@pytest.mark.parametrize(
+    "name, units", [("exp", 9), ("log", 9), ("sqrt", 3), ("sin", 7), ("cos", 7), ("reciprocal", 3)]
+)
 def test_reports_worse(name, units, monkeypatch):
     for worse in (off(name, units), off(name, -units)):
         monkeypatch.setitem(selfcheck.FUNCTIONS, name, worse)

@@ -317,7 +317,8 @@ def bounds(a, low, high, d, order, m):
             top = s + abs(g)
             bottom = s - abs(g)
             if abs(g) < 2.0 * abs(s):
-                vertex = -(g * g) / (4.0 * s)
+                # in this order nothing underflows that matters
+                vertex = -(g / (4.0 * s)) * g
                 if s > 0.0:
                     bottom = vertex
                 else:

@@ -30,7 +30,7 @@ def demo(options: Demo) -> int:
     """
     from rich.console import Console
 
-    from ns_abstract.cli.demonstration import write_demo
+    from ns_abstract.demo.writing import write_demo
 
     folder = options.output_dir
     console = Console(stderr=True, highlight=False)

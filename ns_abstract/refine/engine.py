@@ -237,7 +237,7 @@ class Refinement:
         """The axis that the picture varies most along, of those that can be halved."""
         if box.dimensions < 2:
             return 0
-        slopes = np.nan_to_num(slopes, nan=0.0, posinf=np.finfo(np.float64).max)
+        slopes = np.nan_to_num(slopes, nan=0.0, posinf=float(np.finfo(np.float64).max))
         # a parameter that only moves what the linear part does not see still has to be split
         if not np.any(slopes > 0.0):
             slopes = np.nan_to_num(self.frame.motion(box), nan=0.0)
@@ -272,11 +272,7 @@ class Refinement:
         return point
 
     def _over(self) -> bool:
-        return (
-            self.stopped()
-            or time.perf_counter() - self.start >= self.goal.seconds
-            or self._cells_left() < 1
-        )
+        return self.stopped() or time.perf_counter() - self.start >= self.goal.seconds or self._cells_left() < 1
 
     def _cells_left(self) -> int:
         return _PLENTY if self.goal.cells is None else self.goal.cells - self.cells

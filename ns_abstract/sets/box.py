@@ -47,7 +47,8 @@ class ParameterBox:
 
     def corners(self) -> Float64Array:
         """[2^d, d] corners."""
-        return np.array(list(itertools.product(*zip(self.lower, self.upper, strict=True)))).reshape(-1, self.dimensions)
+        ends = list(zip(self.lower, self.upper, strict=True))
+        return np.array(list(itertools.product(*ends)), np.float64).reshape(2**self.dimensions, self.dimensions)
 
     def split(self, axis: int, parts: int = 2) -> list[ParameterBox]:
         """``parts`` boxes of equal width along ``axis`` whose union is this box exactly."""

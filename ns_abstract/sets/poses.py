@@ -51,18 +51,38 @@ def orthonormal(matrix: Float64Array) -> Float64Array:
 
 
 def axis_angle(rotation: Float64Array) -> tuple[Float64Array, float]:
-    """Unit axis [3] and angle in [0, pi] of a rotation [3, 3]."""
-    vector = np.array(
-        [rotation[2, 1] - rotation[1, 2], rotation[0, 2] - rotation[2, 0], rotation[1, 0] - rotation[0, 1]]
+    """Unit axis [3] and angle in [0, pi] of a rotation [3, 3].
+
+    By way of the quaternion, from its largest component (Shepperd 1978), which is accurate for every
+    angle, a half turn included.
+    """
+    r = rotation
+    squares = np.array(
+        [
+            1.0 + r[0, 0] + r[1, 1] + r[2, 2],
+            1.0 + r[0, 0] - r[1, 1] - r[2, 2],
+            1.0 - r[0, 0] + r[1, 1] - r[2, 2],
+            1.0 - r[0, 0] - r[1, 1] + r[2, 2],
+        ]
     )
-    angle = float(np.arctan2(np.linalg.norm(vector), np.trace(rotation) - 1.0))
-    # the symmetric part is accurate near a half turn, the antisymmetric one elsewhere
-    if np.linalg.norm(vector) > 1e-6:
-        return vector / np.linalg.norm(vector), angle
-    if angle < 1.0:
+    # four times the products of the quaternion's components (w, x, y, z)
+    products = np.array(
+        [
+            [squares[0], r[2, 1] - r[1, 2], r[0, 2] - r[2, 0], r[1, 0] - r[0, 1]],
+            [r[2, 1] - r[1, 2], squares[1], r[0, 1] + r[1, 0], r[0, 2] + r[2, 0]],
+            [r[0, 2] - r[2, 0], r[0, 1] + r[1, 0], squares[2], r[1, 2] + r[2, 1]],
+            [r[1, 0] - r[0, 1], r[0, 2] + r[2, 0], r[1, 2] + r[2, 1], squares[3]],
+        ]
+    )
+    quaternion = products[int(np.argmax(squares))]
+    quaternion = quaternion / np.linalg.norm(quaternion)
+    if quaternion[0] < 0.0:
+        quaternion = -quaternion
+    vector = quaternion[1:]
+    length = float(np.linalg.norm(vector))
+    if length == 0.0:
         return np.array([0.0, 0.0, 1.0]), 0.0
-    values, vectors = np.linalg.eigh(0.5 * (rotation + rotation.T))
-    return vectors[:, int(np.argmax(values))], angle
+    return vector / length, 2.0 * float(np.arctan2(length, quaternion[0]))
 
 
 @dataclass(frozen=True)

@@ -26,7 +26,7 @@ class Rasteriser:
         alpha_min: Smaller alphas are skipped (rasterize_to_pixels_fwd.cu).
         alpha_max: Larger alphas are lowered to it.
         transmittance_min: The Gaussian that would bring the transmittance to this or below is not
-            drawn, nor is any behind it.
+            drawn, nor is any behind it; negative: there is no stop.
         background: Whether the scene's background shows through (else black).
         view_dependent: Whether colours use spherical harmonics beyond band 0.
         alpha_negligible: Numerical cut-off where ``alpha_min`` is 0; what it drops is bounded and
@@ -68,7 +68,7 @@ PAPER = Rasteriser(
     view_margin=-1.0,
     alpha_min=0.0,
     alpha_max=1.0,
-    transmittance_min=0.0,
+    transmittance_min=-1.0,
     background=False,
     view_dependent=False,
     alpha_negligible=2.0**-40,

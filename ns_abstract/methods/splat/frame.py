@@ -94,6 +94,14 @@ class SplatFrame:
         """Number of tiles, row by row."""
         return self.across * self.down
 
+    def warm_up(self) -> None:
+        """Compile the kernels that this frame needs."""
+        box = self.box
+        for axis in range(box.dimensions):
+            box = box.split(axis, 1024)[0]
+        self.bound(box, np.arange(1))
+        self.render(box.middle)
+
     def render(self, values: np.ndarray, tiles: np.ndarray | None = None) -> np.ndarray:
         """Tiles [t, side, side, 3] float32 of the concrete image at parameter values [d]."""
         return self.renderer.tiles(self.camera, *self.pose_set.world_to_camera(values), tiles).astype(np.float32)

@@ -534,14 +534,15 @@ def _any_live(s, row):
 @njit(cache=True, error_model="numpy")
 def _forward(
     entries, record, box, tiles, tile_x, tile_y, colors, depth, delta, depth_error, slope, ray,
-    s, y1, y2, poly, pixels, layers, sources, lengths, reach, far, first, last, slots, heights, pairs,
+    s, y1, y2, poly, pixels, layers, sources, lengths, reach, far, first, last, slots, heights, places, pairs,
     x0, y0, d, order, m, antialiased, rules, errors,
 ):  # fmt: skip
     """Collect the layers of every lane, nearest first (design.md, B5-B6).
 
     ``first[k] <= k <= last[k]`` become the list positions whose depth order against entry k is
     uncertain, ``pairs`` [., 2] all such pairs, ``slots[k]`` the row of ``heights`` that holds the
-    upper alphas of an entry that takes part in one (-1: none). Returns the number of pairs and of
+    upper alphas of an entry that takes part in one (-1: none), and of ``places`` that holds its place in
+    the lanes' lists (-1: not in it). Returns the number of pairs and of
     slots; or _GIVE_UP where more pairs are uncertain than ``pairs`` may hold, or _GROW where another
     buffer is too small.
 
@@ -617,6 +618,7 @@ def _forward(
                 return _GROW, 0
             slots[k] = slot_count
             heights[slot_count] = 0.0
+            places[slot_count] = -1
             slot_count += 1
         ended = False
         for lane in range(n):
@@ -667,6 +669,7 @@ def _forward(
             s[_THI + q] = t_high
             if not alone:
                 heights[slots[k], q] = high
+                places[slots[k], q] = count
                 # layers up to the last one whose order is uncertain may still come first
                 s[_REACH + q] = max(s[_REACH + q], float(last[k]))
         if slot_count > 0:
@@ -686,48 +689,53 @@ def _forward(
 
 
 @njit(cache=True, error_model="numpy")
-def _settle_stops(layers, sources, lengths, first, last, s, m, stop, unit):
+def _settle_stops(layers, sources, lengths, first, last, slots, places, s, m, stop, unit):
     """Drop or weaken the layers of uncertain depth order that the stop may hide (design.md, B6)."""
     stop_low = stop * (1.0 - 8.0 * unit)
     stop_high = stop * (1.0 + 8.0 * unit)
     for q in range(PIXELS):
-        n = lengths[q]
-        hidden = 0.0
-        for e in range(n):
-            k = sources[e, q]
-            if first[k] == k and last[k] == k:
+        s[_CC + q] = 0.0
+    for k in range(slots.size):
+        if slots[k] < 0:
+            continue
+        place = places[slots[k]]
+        for q in range(PIXELS):
+            e = place[q]
+            # the stop is out of reach of most lanes
+            if e < 0 or s[_TLO + q] > stop_high:
                 continue
             behind = e
-            while behind + 1 < n and sources[behind + 1, q] <= last[k]:
+            while behind + 1 < lengths[q] and sources[behind + 1, q] <= last[k]:
                 behind += 1
+            t_low = layers[behind, q, m + 3]
+            if t_low > stop_high:
+                continue
             before = e
             while before > 0 and sources[before - 1, q] >= first[k]:
                 before -= 1
-            t_low = layers[behind, q, m + 3]
             light = layers[before, q, m + 4]
             t_high = light * (1.0 - layers[e, q, m + 1]) * (1.0 + 8.0 * unit)
-            if t_low > stop_high:
-                continue
             # the most light that a stop at this layer may leave
             high = layers[e, q, m + 2]
             lost = min(light, stop_high / (1.0 - high))
             if t_high <= stop_low:
-                hidden = max(hidden, lost)
+                s[_CC + q] = max(s[_CC + q], lost)
                 for r in range(m + 3):
                     layers[e, q, r] = 0.0
             elif lost < light:
                 # kept; what the stop may leave of the light is added at the end
                 s[_RHO + q] = max(s[_RHO + q], lost, s[_TMP + q])
             else:
-                hidden = max(hidden, lost)
+                s[_CC + q] = max(s[_CC + q], lost)
                 layers[e, q, 0] = 0.5 * high
                 for r in range(1, m):
                     layers[e, q, r] = 0.0
                 layers[e, q, m] = 0.5 * high * _UP
                 layers[e, q, m + 1] = 0.0
-        # a stop at a dropped or weakened layer also hides the kept layers behind it
+    # a stop at a dropped or weakened layer also hides the kept layers behind it
+    for q in range(PIXELS):
         if s[_RHO + q] > 0.0:
-            s[_RHO + q] = max(s[_RHO + q], hidden)
+            s[_RHO + q] = max(s[_RHO + q], s[_CC + q])
 
 
 @njit(cache=True, error_model="numpy")
@@ -789,17 +797,18 @@ def _swap_bounds(pairs, pair_count, slots, slot_count, heights, entries, colors,
 
 
 @njit(cache=True, error_model="numpy")
-def _collect_moves(moves, slots, sources, lengths, extra, moved):
+def _collect_moves(moves, slot_count, places, extra, moved):
     """Move the swap bounds from slots to the lanes' layers; ``moved[e]`` tells whether row e has any."""
-    for q in range(PIXELS):
-        for e in range(lengths[q]):
-            slot = slots[sources[e, q]]
-            if slot >= 0:
-                if not moved[e]:
-                    moved[e] = True
-                    extra[e] = 0.0
-                for r in range(6):
-                    extra[e, r, q] = moves[slot, r, q]
+    for slot in range(slot_count):
+        for q in range(PIXELS):
+            e = places[slot, q]
+            if e < 0:
+                continue
+            if not moved[e]:
+                moved[e] = True
+                extra[e] = 0.0
+            for r in range(6):
+                extra[e, r, q] = moves[slot, r, q]
 
 
 @njit(cache=True, error_model="numpy")
@@ -1028,8 +1037,8 @@ def _blend(layers, lengths, count, layer, extra, moved, background, d, order, m,
 
 
 # rows of one channel of the one-parameter blend: coefficients, radius, interval, then the layer's colour
-_P0, _P1, _P2, _PR, _PLO, _PHI, _K0, _K1, _K2, _KR, _KS = range(0, 11 * PIXELS, PIXELS)
-_CHANNEL_ROWS = 11
+_P0, _P1, _P2, _PR, _PLO, _PHI, _K0, _K1, _K2, _KR = range(0, 10 * PIXELS, PIXELS)
+_CHANNEL_ROWS = 10
 
 
 @njit(cache=True, error_model="numpy")
@@ -1065,8 +1074,9 @@ def _blend_channel_line(n, s, t):
             + a2 * (v1 + v2)
             + _ROUND * (abs(p0) + size * (1.0 + a1 + a2))
         ) * _UP
-        c_high = t[_K0 + q] + t[_KS + q]
-        c_low = t[_K0 + q] - t[_KS + q]
+        spread = (abs(t[_K1 + q]) + abs(t[_K2 + q]) + t[_KR + q]) * _UP
+        c_high = t[_K0 + q] + spread
+        c_low = t[_K0 + q] - spread
         v = c_high - t[_PHI + q]
         t[_PHI + q] += (high if v > 0.0 else low) * v
         v = c_low - t[_PLO + q]
@@ -1099,9 +1109,10 @@ def _blend_line(layers, lengths, count, extra, moved, background, color_rows, st
                 s[_AR + q] = layers[e, q, 3]
                 s[_LO + q] = layers[e, q, 4]
                 s[_HI + q] = layers[e, q, 5]
-                _load_color(layers, e, q, 0, color_rows, red)
-                _load_color(layers, e, q, 1, color_rows, green)
-                _load_color(layers, e, q, 2, color_rows, blue)
+                # a list that has ended keeps the colour of its last layer, with alpha 0
+                red[_K0 + q] = layers[e, q, 8]
+                green[_K0 + q] = layers[e, q, 8 + color_rows]
+                blue[_K0 + q] = layers[e, q, 8 + 2 * color_rows]
             else:
                 s[_A0 + q] = 0.0
                 s[_LINEAR + q] = 0.0
@@ -1109,6 +1120,22 @@ def _blend_line(layers, lengths, count, extra, moved, background, color_rows, st
                 s[_AR + q] = 0.0
                 s[_LO + q] = 0.0
                 s[_HI + q] = 0.0
+        if color_rows > 1:
+            # the last row of a colour is its radius, those between are its slopes
+            for q in range(n):
+                if e < lengths[q]:
+                    red[_KR + q] = layers[e, q, 7 + color_rows]
+                    green[_KR + q] = layers[e, q, 7 + 2 * color_rows]
+                    blue[_KR + q] = layers[e, q, 7 + 3 * color_rows]
+        if color_rows > 2:
+            for q in range(n):
+                if e < lengths[q]:
+                    red[_K1 + q] = layers[e, q, 9]
+                    red[_K2 + q] = layers[e, q, 10]
+                    green[_K1 + q] = layers[e, q, 9 + color_rows]
+                    green[_K2 + q] = layers[e, q, 10 + color_rows]
+                    blue[_K1 + q] = layers[e, q, 9 + 2 * color_rows]
+                    blue[_K2 + q] = layers[e, q, 10 + 2 * color_rows]
         _blend_channel_line(n, s, red)
         _blend_channel_line(n, s, green)
         _blend_channel_line(n, s, blue)
@@ -1133,21 +1160,6 @@ def _blend_line(layers, lengths, count, extra, moved, background, color_rows, st
             radius[channel, q] = t[_PR + q]
             low[channel, q] = t[_PLO + q]
             high[channel, q] = t[_PHI + q]
-
-
-@njit(cache=True, error_model="numpy", inline="always")
-def _load_color(layers, e, q, channel, color_rows, t):
-    """One lane's colour of one channel (rows 8 .. of a one-parameter layer) into ``t``."""
-    start = 8 + channel * color_rows
-    t[_K0 + q] = layers[e, q, start]
-    if color_rows == 2:
-        t[_KR + q] = layers[e, q, start + 1]
-        t[_KS + q] = t[_KR + q] * _UP
-    elif color_rows > 2:
-        t[_K1 + q] = layers[e, q, start + 1]
-        t[_K2 + q] = layers[e, q, start + 2]
-        t[_KR + q] = layers[e, q, start + 3]
-        t[_KS + q] = (abs(t[_K1 + q]) + abs(t[_K2 + q]) + t[_KR + q]) * _UP
 
 
 @njit(cache=True, error_model="numpy")
@@ -1189,7 +1201,7 @@ def _block(
     listed, x0, y0, tile_x, tile_y, record, box, tiles, depth, delta, depth_error, colors, color_radius,
     slope, direction, camera, rules, errors, background, negligible, d, order, m, antialiased,
     s, y1, y2, poly, value, layer, pixels, layers, sources, lengths, reach, far, first, last, slots, heights,
-    pairs, moves, most, extra, moved, line, state, radius, low, high, ray, lower, upper, linear, statistics,
+    places, pairs, moves, most, extra, moved, line, state, radius, low, high, ray, lower, upper, linear, statistics,
 ):  # fmt: skip
     """Bounds of one block of pixels whose first pixel is (x0, y0). Returns whether the buffers sufficed.
 
@@ -1205,7 +1217,7 @@ def _block(
         ray[k] = direction[k] * u + direction[3 + k] * v + direction[6 + k]
     pair_count, slot_count = _forward(
         listed, record, box, tiles, tile_x, tile_y, colors, depth, delta, depth_error, slope, ray,
-        s, y1, y2, poly, pixels, layers, sources, lengths, reach, far, first, last, slots, heights, pairs,
+        s, y1, y2, poly, pixels, layers, sources, lengths, reach, far, first, last, slots, heights, places, pairs,
         x0, y0, d, order, m, antialiased, rules, errors,
     )  # fmt: skip
     if pair_count == _GROW:
@@ -1229,9 +1241,11 @@ def _block(
         deepest = max(deepest, lengths[q])
     moved[:deepest] = False
     if slot_count > 0:
-        _settle_stops(layers, sources, lengths, first, last, s, m, rules[9], unit)
+        _settle_stops(
+            layers, sources, lengths, first, last, slots[: listed.size], places, s, m, rules[9], unit
+        )
         _swap_bounds(pairs, pair_count, slots, slot_count, heights, listed, colors, color_rows, moves, most)
-        _collect_moves(moves, slots, sources, lengths, extra, moved)
+        _collect_moves(moves, slot_count, places, extra, moved)
     if d == 1 and order == 2:
         _blend_line(
             layers, lengths, deepest, extra, moved, background, color_rows, state, radius, low, high,
@@ -1317,6 +1331,7 @@ def _pixel_worker(
     extra_ = np.empty((256, 6, PIXELS))
     moved_ = np.empty(256, np.bool_)
     heights_ = np.empty((64, PIXELS))
+    places_ = np.empty((64, PIXELS), np.int64)
     moves_ = np.empty((2, 64, 6, PIXELS))
     reach_ = np.empty(1024)
     order_ = np.empty((4, 1024), np.int64)
@@ -1345,7 +1360,7 @@ def _pixel_worker(
                 color_radius, slope, direction, camera, rules, errors, background, negligible, d, order, m,
                 antialiased, s, y1, y2, poly, value, layer, pixels, borrowed(layers_), borrowed(sources_), lengths,
                 borrowed(reach_), borrowed(order_[0]), borrowed(order_[1]), borrowed(order_[2]), borrowed(order_[3]),
-                borrowed(heights_), borrowed(pairs_), borrowed(moves_[0]), borrowed(moves_[1]), borrowed(extra_),
+                borrowed(heights_), borrowed(places_), borrowed(pairs_), borrowed(moves_[0]), borrowed(moves_[1]), borrowed(extra_),
                 borrowed(moved_), line, state, radius, low, high, ray, lower[number], upper[number],
                 linear[min(number, linear.shape[0]) :], statistics[thread],
             ):  # fmt: skip
@@ -1356,11 +1371,12 @@ def _pixel_worker(
                 moved_ = np.empty(capacity, np.bool_)
                 slot_capacity = 2 * heights_.shape[0]
                 heights_ = np.empty((slot_capacity, PIXELS))
+                places_ = np.empty((slot_capacity, PIXELS), np.int64)
                 moves_ = np.empty((2, slot_capacity, 6, PIXELS))
     # the owners of the borrowed arrays live to here
     return (
         scratch.size + planes.size + integers.size + ray_.size + line_.size + state_.size + ends.size + layers_.size + sources_.size
-        + extra_.size + moved_.size + heights_.size + moves_.size + reach_.size + order_.size + pairs_.size
+        + extra_.size + moved_.size + heights_.size + places_.size + moves_.size + reach_.size + order_.size + pairs_.size
     )  # fmt: skip
 
 

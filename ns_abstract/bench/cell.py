@@ -1,0 +1,62 @@
+"""What one bounded cell costs, in units of the concrete render of the same view."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+
+import numpy as np
+
+from ns_abstract.bench.sets import pose_set
+from ns_abstract.methods.splat.frame import SplatFrame
+from ns_abstract.pipeline import Job
+
+#: Width of the measured cell as a part of the set's: about what refinement ends with.
+_PART = 1.0 / 32.0
+
+
+def measure(functions: Sequence[Callable[[], object]], repeats: int) -> np.ndarray:
+    """Seconds [repeats, k] of ``functions``, called in turn so that all see the same machine."""
+    for function in functions:
+        function()
+    seconds = np.empty((repeats, len(functions)))
+    for r in range(repeats):
+        for k, function in enumerate(functions):
+            start = time.perf_counter()
+            function()
+            seconds[r, k] = time.perf_counter() - start
+    return seconds
+
+
+def cell_cost(job: Job, name: str, frame: int, repeats: int) -> dict[str, object]:
+    """Times of the render, of a cell from nothing and of a cell inside a bounded one, and their ratios.
+
+    Returns:
+        Milliseconds (least of ``repeats``), and ratios to the render by the least and by the median.
+    """
+    poses = pose_set(job, name, frame)
+    view = SplatFrame(job.splats, job.rasteriser, job.arithmetic, poses)
+    cell = poses.box
+    for axis in range(cell.dimensions):
+        middle, half = float(cell.middle[axis]), 0.5 * _PART * (cell.upper[axis] - cell.lower[axis])
+        cell = cell.replace(axis, middle - half, middle + half)
+    tiles = np.arange(view.tile_count)
+    around = view.bound(cell, tiles).context
+    seconds = measure(
+        [lambda: view.render(cell.middle), lambda: view.bound(cell, tiles), lambda: view.bound(cell, tiles, around)],
+        repeats,
+    )
+    least, median = seconds.min(axis=0), np.median(seconds, axis=0)
+    return {
+        "scene": job.scene.name,
+        "Gaussians": job.splats.count,
+        "size": f"{view.camera.width}x{view.camera.height}",
+        "set": name,
+        "parameters": cell.dimensions,
+        "render ms": 1e3 * least[0],
+        "cell ms": 1e3 * least[1],
+        "inner cell ms": 1e3 * least[2],
+        "cell / render": least[1] / least[0],
+        "inner cell / render": least[2] / least[0],
+        "cell / render (median)": median[1] / median[0],
+    }

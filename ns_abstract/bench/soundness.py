@@ -1,0 +1,41 @@
+"""Attacks on the abstract images that refinement ends with."""
+
+from __future__ import annotations
+
+from ns_abstract.bench.sets import pose_set
+from ns_abstract.bench.tightness import refine
+from ns_abstract.pipeline import Job
+from ns_abstract.verify.falsify import falsify
+from ns_abstract.verify.soundness import compiled_renderer, reference_renderer
+
+
+def attack(
+    job: Job, name: str, frame: int, seconds: float, poses: int, reference_poses: int, seed: int, scale: float = 1.0
+) -> dict[str, object]:
+    """Refine one frame, then attack it: random poses, corners, gradient ascent and jumps.
+
+    The compiled renderer makes most images, the independent reference ``reference_poses`` of them.
+    """
+    result = refine(job, name, frame, seconds, 1.0, scale)
+    poses_set = pose_set(job, name, frame, scale)
+    render, probe = compiled_renderer(job.scene, poses_set, job.rasteriser)
+    other, other_probe, twin = reference_renderer(job.scene, poses_set, job.rasteriser)
+    first = falsify(result.lower, result.upper, poses_set.box, render, twin, probe=probe, poses=poses, seed=seed)
+    second = falsify(
+        result.lower, result.upper, poses_set.box, other, twin, probe=other_probe, poses=reference_poses,
+        seed=seed + 1, starts=first.closest,
+    )  # fmt: skip
+    last = result.trace[-1]
+    return {
+        "scene": job.scene.name,
+        "size": f"{result.lower.shape[1]}x{result.lower.shape[0]}",
+        "set": name,
+        "ratio": last.mpg / last.mpg_witness if last.mpg_witness else float("nan"),
+        "poses": first.poses,
+        "reference poses": second.poses,
+        "ascent steps": first.steps + second.steps,
+        "comparisons": first.comparisons + second.comparisons,
+        "violations": first.violations + second.violations,
+        "not finite": first.not_finite + second.not_finite,
+        "worst": max(first.amount, second.amount),
+    }

@@ -1,0 +1,39 @@
+"""Error against run time: how the ratio of outer to inner gap falls."""
+
+from __future__ import annotations
+
+from ns_abstract.bench.sets import pose_set
+from ns_abstract.methods.splat.frame import SplatFrame
+from ns_abstract.pipeline import Job
+from ns_abstract.refine.engine import Refinement
+from ns_abstract.refine.result import FrameResult, max_pixel_gap
+
+#: Ratios whose time is reported.
+MARKS = (1.5, 1.25, 1.1, 1.05, 1.02, 1.01)
+
+
+def refine(job: Job, name: str, frame: int, seconds: float, ratio: float, scale: float = 1.0) -> FrameResult:
+    """The abstract image of one frame over the set ``name``; kernels are compiled before the clock starts."""
+    view = SplatFrame(job.splats, job.rasteriser, job.arithmetic, pose_set(job, name, frame, scale))
+    view.warm_up()
+    return Refinement(view, frame, job.goal(ratio, seconds), seed=job.settings.seed).run()
+
+
+def summary(job: Job, name: str, result: FrameResult) -> dict[str, object]:
+    """One row: final figures, and the seconds after which each of `MARKS` was reached."""
+    last = result.trace[-1]
+    row: dict[str, object] = {
+        "scene": job.scene.name,
+        "size": f"{result.lower.shape[1]}x{result.lower.shape[0]}",
+        "set": name,
+        "Rt s": last.seconds,
+        "cells": last.cells,
+        "MPG": last.mpg,
+        "XPG": max_pixel_gap(result.lower, result.upper),
+        "witness MPG": last.mpg_witness,
+        "ratio": last.mpg / last.mpg_witness if last.mpg_witness else float("nan"),
+    }
+    for mark in MARKS:
+        reached = [p.seconds for p in result.trace if p.mpg <= mark * p.mpg_witness]
+        row[f"s to {mark:g}"] = reached[0] if reached else None
+    return row
