@@ -193,7 +193,9 @@ class Job:
             plan.append("view dependence left out: the run stores plain colours (sh_degree 0)")
         elif splats.degree < scene.sh_degree:
             why = "the paper's renderer has RGB colours" if not self.rasteriser.view_dependent else "all zero"
-            plan.append(f"spherical-harmonics bands {splats.degree + 1} to {scene.sh_degree} left out: {why}")
+            first, last = splats.degree + 1, scene.sh_degree
+            bands = f"band {last}" if first == last else f"bands {first} to {last}"
+            plan.append(f"spherical-harmonics {bands} left out: {why}")
         if not splats.antialiased:
             plan.append("opacity compensation left out: rasterize_mode is classic")
         return tuple(plan)

@@ -188,6 +188,22 @@ def test_no_time_still_gives_a_sound_cover() -> None:
     assert (result.bounded, result.cells) == (True, 1)
 
 
+@pytest.mark.parametrize("dimensions", [1, 2])
+def test_a_cover_that_takes_too_long_becomes_one_cell(dimensions: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    frame, hours = Waves(dimensions, pace=30.0), itertools.count()
+    # the first bounds cost nothing, later ones an hour each
+    monkeypatch.setattr(
+        engine, "time", SimpleNamespace(perf_counter=lambda: 0.0 if len(frame.calls) < 2 else 3600.0 * next(hours))
+    )
+    result = refine(frame, Goal(1.0, 100.0), keep_leaves=True)
+    check(frame, result)
+    assert result.bounded
+    assert frame.calls[-1][0] == frame.box
+    assert result.leaves is not None
+    assert {tuple(row) for row in result.leaves.box_lower.tolist()} == {frame.box.lower}
+    assert len(result.leaves.tile) == frame.tile_count
+
+
 # ---------------------------------------------------------------- reproducible
 
 

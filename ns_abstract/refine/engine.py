@@ -305,13 +305,22 @@ class Refinement:
         return corners
 
     def _cover(self) -> bool:
-        """Bound a first cover of the set; False if the time was over first."""
-        everything = np.arange(self.frame.tile_count)
+        """Bound a first cover of the set; False if the work was stopped first."""
+        box, everything = self.frame.box, np.arange(self.frame.tile_count)
         boxes, first, probe = self._first_boxes(everything)
         leaves: list[tuple[_Cell, np.ndarray, np.ndarray]] = []
         for number, part in enumerate(boxes):
             if number and self._over():
-                return False
+                if self.stopped():
+                    return False
+                # slower than expected: one cell for the whole set is better than no bounds
+                self.leaf_sets.clear()
+                self._kept_bytes = 0
+                cell = self._cell(box)
+                lower, upper, bounds = self._bound(cell, None, everything)
+                leaves = [(cell, lower, upper)]
+                self._keep(cell, bounds, everything)
+                break
             cell = self._cell(part)
             lower, upper, bounds = self._take(cell, probe) if part is first else self._bound(cell, None, everything)
             leaves.append((cell, lower, upper))
