@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from llvmlite import ir
 from numba import config, types
 from numba.core import cgutils
 from numba.extending import intrinsic
@@ -34,8 +35,34 @@ def borrowed(typingctx, array):
     return array(array), codegen
 
 
+@intrinsic
+def prefetch(typingctx, array, row, byte):
+    """Ask for the cache line of ``array[row]`` (first axis) that lies ``byte`` bytes in; changes nothing."""
+    if not isinstance(array, types.Array):
+        raise TypeError(f"prefetch() takes an array, not {array}")
+
+    def codegen(context, builder, signature, args):
+        source = arrayobj.make_array(signature.args[0])(context, builder, args[0])
+        stride = cgutils.unpack_tuple(builder, source.strides)[0]
+        offset = builder.add(builder.mul(stride, args[1]), args[2])
+        raw = ir.IntType(8).as_pointer()
+        address = builder.gep(builder.bitcast(source.data, raw), [offset], source_etype=ir.IntType(8))
+        int32 = ir.IntType(32)
+        function = builder.module.declare_intrinsic(
+            "llvm.prefetch", [raw], ir.FunctionType(ir.VoidType(), [raw, int32, int32, int32])
+        )
+        # read, keep in all levels, data
+        builder.call(function, [address, int32(0), int32(3), int32(1)])
+        return context.get_dummy_value()
+
+    return types.void(array, types.intp, types.intp), codegen
+
+
 if config.DISABLE_JIT:
 
     def borrowed(array):
         """The array itself: the interpreter counts its references."""
         return array
+
+    def prefetch(array, row, byte):
+        """Nothing: the interpreter has no say in caches."""

@@ -33,9 +33,9 @@ Float64Array = NDArray[np.float64]
 
 #: Largest number of parameters of a set.
 MAX_DIMENSIONS = 8
-# A coefficient is a sum of at most four products: 5 roundings. Radii are sums of at most
-# 40 non-negative terms, so one factor covers their own rounding.
-_COEFFICIENT = 8.0 * UNIT64
+# A coefficient is a sum of at most four products, the centre of an order-1 product one of 1 + d <= 9:
+# 10 roundings. Radii are sums of at most 40 non-negative terms, so one factor covers their own rounding.
+_COEFFICIENT = 12.0 * UNIT64
 _UP = 1.0 + 128.0 * UNIT64
 _TINY = UNDERFLOW64
 # Between these, fourth powers and their reciprocals neither overflow nor lose digits to underflow.

@@ -46,10 +46,12 @@ class Arithmetic:
     rsqrt: float = 4.0
     exp: float = 4.0
     fast_exp: float = 4.0
+    #: products beyond this may overflow
+    overflow: float = 2.0**1000
     fast_exp_per_unit_argument: float = 2.346
 
 
-FLOAT32 = Arithmetic("float32", UNIT32, UNDERFLOW32)
+FLOAT32 = Arithmetic("float32", UNIT32, UNDERFLOW32, overflow=2.0**120)
 REAL = Arithmetic("real", UNIT64, UNDERFLOW64)
 
 

@@ -22,8 +22,8 @@ from ns_abstract.sets.perturbation import ROTATIONS, TRANSLATIONS, Perturbation
 _CAMERA_AXES = {"yaw": (0.0, 1.0, 0.0), "pitch": (1.0, 0.0, 0.0), "roll": (0.0, 0.0, 1.0)}
 #: OpenGL to OpenCV camera axes.
 _FLIP = np.array([1.0, -1.0, -1.0])
-# Evaluating a pose in float64 takes fewer than 32 roundings of numbers of this size.
-_POSE_ROUNDING = 32.0 * UNIT64
+# Evaluating a pose in float64 takes fewer than 64 roundings of numbers of this size: five rotations.
+_POSE_ROUNDING = 64.0 * UNIT64
 
 
 def _cross_matrix(axis: Float64Array) -> Float64Array:

@@ -62,7 +62,7 @@ class SplatBounds:
         self.rules = rules_array(rasteriser)
         self.side = rasteriser.work_tile
         a = arithmetic
-        self._errors = np.array([a.unit, a.flush, a.division, a.sqrt, a.rsqrt, a.exp])
+        self._errors = np.array([a.unit, a.flush, a.division, a.sqrt, a.rsqrt, a.exp, a.overflow])
         self._buffers: dict[str, np.ndarray] = {}
         self._noise = covariance_noise(splats.axes, a.unit, a.flush)
         self._color_radius = 8.0 * a.unit * float(np.abs(splats.sh).max(initial=1.0)) if splats.degree == 0 else 0.0

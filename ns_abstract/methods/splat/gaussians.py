@@ -244,7 +244,7 @@ def gaussian_stage(
         rotation_reach: [9] upper bounds of the rotation's absolute entries.
         camera: fx, fy, cx, cy, width, height.
         rules: See `ns_abstract.methods.splat.constants.rules_array`.
-        errors: unit, flush, division, sqrt, rsqrt, exp errors in units.
+        errors: unit, flush, division, sqrt, rsqrt, exp errors in units, largest product.
         record, box, tiles, depth, delta, depth_error, state: outputs, one row per candidate;
             ``box`` [n, 4] pixels x0, x1, y0, y1; ``tiles`` [n, 8] outer then inner tile ranges;
             ``depth`` [n] at the middle; ``delta`` [n, 3] mean minus origin; ``state`` [n] 1 if visible.
@@ -331,7 +331,7 @@ def _cull_block(
             error = focal * (
                 _coordinate_error(rotation_reach, camera_reach, means, i, axis, unit)
                 + _mean_spread(rotation_reach, mean_radius, i, axis)
-            ) + (extent + blur) * spread_z
+            ) + (max(extent, abs(center), abs(extent - center)) + blur) * spread_z
             # focal x + (center + blur) z + reach < 0: left of the image at every pose with z > 0
             low_side = _linear_top(work[_X + axis], work[_Z], q, focal, center + blur, m)
             high_side = _linear_top(work[_X + axis], work[_Z], q, -focal, extent - center + blur, m)
@@ -582,7 +582,7 @@ def _finish(
         rules[0], rules[3], rules[4], rules[5], rules[6], rules[7], rules[10],
     )  # fmt: skip
     fx, fy, cx, cy, width, height = camera[0], camera[1], camera[2], camera[3], camera[4], camera[5]
-    unit, division, root = errors[0], errors[2], errors[3]
+    unit, division, root, overflow = errors[0], errors[2], errors[3], errors[6]
     stride = m + 1
     record[index, FORMS + 3 * stride + m] = 0.0
     record[index, KAPPA] = 0.0
@@ -590,7 +590,9 @@ def _finish(
     # sigmoid: two exponentials or divisions and an addition
     slack = 12.0 * unit
     record[index, OPACITY_LOW] = opacity_low[i] * (1.0 - slack)
-    record[index, OPACITY_HIGH] = opacity_high[i] * (1.0 + slack)
+    # the compensation is at most 1 but for the rounding of its division and root
+    above = 1.0 + (0.5 * division + root + 2.0) * unit if antialiased else 1.0
+    record[index, OPACITY_HIGH] = opacity_high[i] * (1.0 + slack) * above
     tiles_x = int(math.ceil(width / (tile if tile > 0.0 else work_tile)))
     tiles_y = int(math.ceil(height / (tile if tile > 0.0 else work_tile)))
     box[index, 0] = -np.inf
@@ -646,13 +648,16 @@ def _finish(
     gy0 = jy * (rotation_reach[3] + ratio_y * rotation_reach[6])
     gy1 = jy * (rotation_reach[4] + ratio_y * rotation_reach[7])
     gy2 = jy * (rotation_reach[5] + ratio_y * rotation_reach[8])
-    grow = 2.0 * relative_j
+    grow = relative_j * (2.0 + relative_j)
     f00 = noise[i, 0] + grow * noise[i, 6]
     f11 = noise[i, 1] + grow * noise[i, 7]
     f22 = noise[i, 2] + grow * noise[i, 8]
     f01 = noise[i, 3] + grow * noise[i, 9]
     f02 = noise[i, 4] + grow * noise[i, 10]
     f12 = noise[i, 5] + grow * noise[i, 11]
+    r0, r1, r2 = rotation_reach[6], rotation_reach[7], rotation_reach[8]
+    depth_variance += f00 * r0 * r0 + f11 * r1 * r1 + f22 * r2 * r2
+    depth_variance += 2.0 * (f01 * r0 * r1 + f02 * r0 * r2 + f12 * r1 * r2)
     h0 = f00 * gx0 + f01 * gx1 + f02 * gx2
     h1 = f01 * gx0 + f11 * gx1 + f12 * gx2
     h2 = f02 * gx0 + f12 * gx1 + f22 * gx2
@@ -666,6 +671,9 @@ def _finish(
     a = scalars[_AHI, q] / (z_low * z_low)
     c = scalars[_CHI, q] / (z_low * z_low)
     b = max(abs(scalars[_BLO, q]), abs(scalars[_BHI, q])) / (z_low * z_low)
+    # products of covariances that may overflow leave nothing known
+    if not a * c < overflow:
+        return
     det = scalars[_DLO, q] / (z_high * z_high * z_high * z_high)
     jump_x = jx * error_u
     jump_y = jy * error_v
@@ -761,9 +769,7 @@ def _finish(
             return
         compensation_slack = 0.51 * relative * (1.0 + relative) + (root + 1.0) * unit
         record[index, OPACITY_LOW] *= 1.0 - compensation_slack
-        record[index, OPACITY_HIGH] = min(
-            record[index, OPACITY_HIGH] * (1.0 + compensation_slack), opacity_high[i] * (1.0 + slack)
-        )
+        record[index, OPACITY_HIGH] *= 1.0 + compensation_slack
     record[index, KAPPA] = kappa
     record[index, WILD] = 0.0
     record[index, FORMS + 3 * stride + m] = (

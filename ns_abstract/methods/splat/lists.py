@@ -5,10 +5,14 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
+from ns_abstract.arithmetic.compiled import prefetch
+
 #: Side of a block in pixels; a block is what one pass of the compiled pixel stages works on.
 BLOCK = 8
 #: Pixels of a block.
 PIXELS = BLOCK * BLOCK
+#: How many entries ahead memory is asked for: lists name Gaussians in depth order, which is no order in memory.
+AHEAD = 8
 
 
 def depth_order(visible, depth):
@@ -72,6 +76,7 @@ def block_lists(entries, box, x0, y0, tile, offsets, out):
     side = tile // BLOCK
     offsets[:] = 0
     for k in range(entries.size):
+        prefetch(box, entries[min(k + AHEAD, entries.size - 1)], 0)
         i = entries[k]
         bx0, bx1 = _block_range(box[i, 0], box[i, 1], x0, side)
         by0, by1 = _block_range(box[i, 2], box[i, 3], y0, side)

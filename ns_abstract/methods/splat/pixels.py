@@ -13,7 +13,7 @@ import math
 import numpy as np
 from numba import njit, prange
 
-from ns_abstract.arithmetic.compiled import borrowed
+from ns_abstract.arithmetic.compiled import borrowed, prefetch
 from ns_abstract.arithmetic.elementary import EXP_RELATIVE_ERROR, exp_kernel
 from ns_abstract.arithmetic.units import UNIT64
 from ns_abstract.methods.splat.gaussians import (
@@ -25,10 +25,12 @@ from ns_abstract.methods.splat.gaussians import (
     OPACITY_LOW,
     WILD,
 )
-from ns_abstract.methods.splat.lists import BLOCK, PIXELS, block_lists
+from ns_abstract.methods.splat.lists import AHEAD, BLOCK, PIXELS, block_lists
 
 _ROUND = 16.0 * UNIT64
 _UP = 1.0 + 128.0 * UNIT64
+#: Room for rounding where pixels are left out.
+_ROOM = 1.0 + 2.0**-30
 #: Half-width of the exponent's range up to which exp(-t) is fitted by a polynomial.
 _FIT_LIMIT = 2.0
 #: Exponents are cut here; exp(-60) is far below any threshold.
@@ -59,7 +61,7 @@ def _spread(rows, first, last, n, s, out):
 
 
 @njit(cache=True, error_model="numpy")
-def _alpha_forms(record, i, n, s, y1, y2, poly, d, order, m, antialiased, sure, rules, errors):
+def _alpha_forms(record, i, n, s, y1, y2, poly, sigma_max, d, order, m, antialiased, sure, rules, errors):
     """Alpha of one Gaussian on the lanes of a block (design.md, B1-B4).
 
     Takes the pixel offsets of ``n`` lanes from rows _AX, _AY of ``s``. Leaves the polynomial's
@@ -88,8 +90,6 @@ def _alpha_forms(record, i, n, s, y1, y2, poly, d, order, m, antialiased, sure, 
         _exponent(record, i, n, s, y1, y2, poly, d, order, m, antialiased)
     kappa = record[i, KAPPA]
     # nothing to do where the exponent keeps alpha below the threshold on every lane
-    sigma_max = math.log(opacity_high / alpha_min) * (1.0 + 2.0**-40) + 2.0**-40 if opacity_high > 0.0 else -1.0
-    sigma_max /= 1.0 - kappa
     reachable = 0
     for q in range(n):
         reachable += 1 if s[_SLO + q] <= sigma_max else 0
@@ -453,6 +453,10 @@ def _depth_reach(entries, depth, delta, depth_error, slope, ray, m, reach):
     along += slope[m, 0] * abs(ray[0]) + slope[m, 1] * abs(ray[1]) + slope[m, 2] * abs(ray[2])
     total = 0.0
     for k in range(count):
+        ahead = entries[min(k + AHEAD, count - 1)]
+        prefetch(delta, ahead, 0)
+        prefetch(depth, ahead, 0)
+        prefetch(depth_error, ahead, 0)
         i = entries[k]
         # offset from the central ray: what a rotation moves in depth relative to the ray
         x = delta[i, 0] - depth[i] * ray[0]
@@ -523,6 +527,72 @@ def _find_pairs(
 
 
 @njit(cache=True, error_model="numpy")
+def _largest_exponent(record, i, alpha_min, unit):
+    """The exponent from which on alpha is below the threshold, however it is evaluated (design.md, B4)."""
+    opacity = record[i, OPACITY_HIGH]
+    if record[i, WILD] != 0.0 or not opacity > 0.0:
+        return -1.0
+    # room for the rounding of the exponential, which grows more slowly than the exponent's own error
+    return (math.log(opacity * (1.0 + 64.0 * unit) / alpha_min) * (1.0 + 2.0**-40) + 2.0**-40) / (1.0 - record[i, KAPPA])
+
+
+@njit(cache=True, error_model="numpy")
+def _list_lanes(record, i, ox, oy, left, right, top, bottom, sigma_max, m, s, pixels):
+    """List the pixels of [left, right] x [top, bottom] where the exponent may stay below ``sigma_max``.
+
+    Row by row, sigma >= (near1^2 + near2^2)/2 bounds the columns, where near1 and near2 are what the
+    forms' spread leaves of |y1| and |y2| (design.md, B2). Writes the offsets from the mean into rows _AX
+    and _AY and the pixel numbers into ``pixels``; returns their number. (ox, oy) is the offset of the
+    block's first pixel.
+    """
+    wild = record[i, WILD] != 0.0
+    p, c, g, w1, w2 = 0.0, 0.0, 0.0, 0.0, 0.0
+    spread1, spread2 = np.inf, np.inf
+    if not wild:
+        stride = m + 1
+        p = record[i, FORMS]
+        c = record[i, FORMS + stride]
+        g = record[i, FORMS + 2 * stride]
+        w1 = record[i, FORMS + 3 * stride]
+        w2 = record[i, FORMS + 4 * stride]
+        x = max(abs(ox + left), abs(ox + right))
+        y = max(abs(oy + top), abs(oy + bottom))
+        spread1 = _ROUND * (abs(p) * x + abs(c) * y + abs(w1))
+        spread2 = _ROUND * (abs(g) * y + abs(w2))
+        for k in range(1, m + 1):
+            spread1 += (
+                abs(record[i, FORMS + k]) * x + abs(record[i, FORMS + stride + k]) * y + abs(record[i, FORMS + 3 * stride + k])
+            )
+            spread2 += abs(record[i, FORMS + 2 * stride + k]) * y + abs(record[i, FORMS + 4 * stride + k])
+        spread1 *= _ROOM
+        spread2 *= _ROOM
+    inverse = 1.0 / p if p > 0.0 else 0.0
+    # without a bound on the columns the whole rows are taken
+    bounded = p > 0.0 and spread1 < np.inf and spread2 < np.inf
+    n = 0
+    for row in range(top, bottom + 1):
+        ay = oy + row
+        start = left
+        stop = right
+        if bounded:
+            near = max(0.0, abs(g * ay - w2) - spread2)
+            rest = 2.0 * sigma_max * _ROOM - near * near * (2.0 - _ROOM)
+            if rest < 0.0:
+                continue
+            half = (math.sqrt(rest) + spread1) * inverse * _ROOM
+            center = (c * ay + w1) * inverse - ox
+            slack = (_ROOM - 1.0) * (abs(center) + abs(ox) + half)
+            start = int(math.ceil(min(max(center - half - slack, float(left)), right + 1.0)))
+            stop = int(math.floor(max(min(center + half + slack, float(right)), left - 1.0)))
+        for column in range(start, stop + 1):
+            s[_AX + n] = ox + column
+            s[_AY + n] = ay
+            pixels[n] = row * BLOCK + column
+            n += 1
+    return n
+
+
+@njit(cache=True, error_model="numpy")
 def _any_live(s, row):
     """Whether some pixel of a block's row still takes light."""
     for q in range(row * BLOCK, (row + 1) * BLOCK):
@@ -580,7 +650,18 @@ def _forward(
     slot_count = 0
     live_first = 0
     live_last = BLOCK - 1
+    record_bytes = 8 * record.shape[1]
+    color_bytes = 8 * colors.shape[1]
     for k in range(entries.size):
+        if k + AHEAD < entries.size:
+            ahead = entries[k + AHEAD]
+            prefetch(box, ahead, 0)
+            prefetch(tiles, ahead, 0)
+            for byte in range(0, record_bytes, 64):
+                prefetch(record, ahead, byte)
+            prefetch(record, ahead, record_bytes - 8)
+            for byte in range(0, color_bytes, 64):
+                prefetch(colors, ahead, byte)
         i = entries[k]
         # only the pixels that the Gaussian may reach, in rows that still take light
         left = int(math.ceil(min(max(box[i, 0] - 0.5 - x0, 0.0), float(BLOCK))))
@@ -589,22 +670,22 @@ def _forward(
         bottom = min(live_last, int(math.floor(min(max(box[i, 3] - 0.5 - y0, -1.0), BLOCK - 1.0))))
         if top > bottom or left > right:
             continue
-        ox = x0 + 0.5 - record[i, MEAN_X]
-        oy = y0 + 0.5 - record[i, MEAN_Y]
-        n = 0
-        for row in range(top, bottom + 1):
-            for column in range(left, right + 1):
-                s[_AX + n] = ox + column
-                s[_AY + n] = oy + row
-                pixels[n] = row * BLOCK + column
-                n += 1
+        sigma_max = _largest_exponent(record, i, alpha_min, unit)
+        n = _list_lanes(
+            record, i, x0 + 0.5 - record[i, MEAN_X], y0 + 0.5 - record[i, MEAN_Y], left, right, top, bottom,
+            sigma_max, m, s, pixels,
+        )  # fmt: skip
+        if n == 0:
+            continue
         # vector code works on whole multiples; the lanes in excess repeat the last one
         padded = -(-n // _VECTOR) * _VECTOR
         for lane in range(n, padded):
             s[_AX + lane] = s[_AX + n - 1]
             s[_AY + lane] = s[_AY + n - 1]
         sure = tiles[i, 4] <= tile_x and tile_x < tiles[i, 5] and tiles[i, 6] <= tile_y and tile_y < tiles[i, 7]
-        if not _alpha_forms(record, i, padded, s, y1, y2, poly, d, order, m, antialiased, sure, rules, errors):
+        if not _alpha_forms(
+            record, i, padded, s, y1, y2, poly, sigma_max, d, order, m, antialiased, sure, rules, errors
+        ):
             continue
         pair_count = _find_pairs(
             k, entries, depth, delta, depth_error, slope, m, reach, room, largest, farthest, far, far_count,
