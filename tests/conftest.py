@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numba
 import numpy as np
 import pytest
 
@@ -16,6 +17,12 @@ from ns_abstract.demo.runs import write_splatfacto_run
 from ns_abstract.methods.splat.scene import SplatScene
 
 TIMESTAMP = "2026-01-01_000000"
+
+
+@pytest.fixture(autouse=True, scope="session")
+def one_thread():
+    """Small pictures gain nothing from threads, and waiting threads take the processor from other workers."""
+    numba.set_num_threads(1)
 #: A sideways shift, wide enough for several cells.
 SHIFT = {"version": 1, "translation": {"x": 0.03}}
 

@@ -20,8 +20,10 @@ CAMERA = Camera(np.concatenate([np.eye(3), np.zeros((3, 1))], 1), FOCAL, FOCAL, 
 
 def product(a, b):
     """[i, j] sums from left to right, as the compiled loops of glm."""
-    rows = [[a[i, 0] * b[0, j] + a[i, 1] * b[1, j] + a[i, 2] * b[2, j] for j in range(b.shape[1])] for i in range(len(a))]
-    return np.array(rows, f)
+    def entry(i, j):
+        return a[i, 0] * b[0, j] + a[i, 1] * b[1, j] + a[i, 2] * b[2, j]
+
+    return np.array([[entry(i, j) for j in range(b.shape[1])] for i in range(len(a))], f)
 
 
 def pixel(mean, log_scales, quat, logit, color, compensated, column, row):

@@ -553,7 +553,7 @@ class Reader(html.parser.HTMLParser):
         if tag not in ("meta", "img", "br", "line", "circle", "rect", "path"):
             self.open.append(tag)
         for name, value in attrs:
-            assert value is None or "NaN" not in value and "nan" not in value.split()
+            assert value is None or ("NaN" not in value and "nan" not in value.split())
             assert not name.startswith("on")
             if name in ("src", "href"):
                 self.addresses.append(value or "")

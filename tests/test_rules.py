@@ -651,7 +651,7 @@ def pictures(splats: Any, poses: PoseSet, count: int = 10) -> list[np.ndarray]:
 
 def test_example_2() -> None:
     splats = activate(three_gaussians(), PAPER)
-    poses = views({name: (-0.3, 0.3) for name in "xyz"}, {})
+    poses = views(dict.fromkeys("xyz", (-0.3, 0.3)), {})
     forms = poses.enclosure(poses.box)
     bounds = {name: paper.bound(splats, poses.camera, forms, blend=name).range for name in ("vr-ind", "sort")}
     for picture in pictures(splats, poses):
@@ -693,7 +693,7 @@ def test_uncertain_order_contains_every_order() -> None:
         flat = enclosures([alphas, depths], 1)
         bounds = [rule(*arguments, colors) for rule in rules for arguments in ((alphas, depths), flat)]
         lines = LinearBounds.parameters(
-            Interval(*(np.concatenate(pair) for pair in zip(alphas.bounds(), depths.bounds())))
+            Interval(*(np.concatenate(pair) for pair in zip(alphas.bounds(), depths.bounds(), strict=False)))
         )
         bounds += [rule(lines[:4], lines[4:], colors) for rule in (vr_ind, sorted_blend)]
         mutant = decides_at_one_end(alphas, depths, colors)

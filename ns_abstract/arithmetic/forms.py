@@ -624,7 +624,8 @@ class FormArray:
 
     def compose(self, f0, f1, f2_low, f2_high, f3) -> FormArray:
         """See the kernel `compose`; arguments broadcast against ``shape``."""
-        flat = [np.broadcast_to(np.asarray(v, np.float64), self.shape).ravel().copy() for v in (f0, f1, f2_low, f2_high, f3)]
+        values = (f0, f1, f2_low, f2_high, f3)
+        flat = [np.broadcast_to(np.asarray(v, np.float64), self.shape).ravel().copy() for v in values]
         out = np.empty_like(self.data)
         compose(self.data, *flat, out, *self._layout)
         return FormArray(self.basis, out, self.shape)

@@ -64,7 +64,7 @@ def pose_set(job: Job, name: str, frame: int, scale: float = 1.0) -> PoseSet:
     """
     if name not in SETS:
         raise InputError(f"found {name}", field="--sets", fix=f"the sets are {', '.join(SETS)}")
-    spec = {key: value for key, value in SETS[name].items()}
+    spec = dict(SETS[name].items())
     if name == "orbit":
         target = np.median(job.scene.means.astype(np.float64), axis=0)
         spec["orbit"] = {**spec["orbit"], "target": [float(v) for v in target]}

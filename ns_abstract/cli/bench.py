@@ -115,7 +115,7 @@ def bench(options: Cell | Tightness | Soundness) -> int:
                         options.reference_poses,
                         options.seed,
                         options.scale,
-                    )  # fmt: skip
+                    )
                 )
             print(markdown(rows[-1:]) if len(rows) == 1 else markdown(rows[-1:]).splitlines()[2], flush=True)
     kind = type(options).__name__.lower()

@@ -128,14 +128,8 @@ def airfield_path(size: int = 200) -> dict[str, Any]:
 
 
 def airfield_perturbation() -> dict[str, Any]:
-    """A sideways shift of 0.02 scene units and a yaw of 0.01 radians, each either way."""
-    return {
-        "version": 1,
-        "frame": "camera",
-        "translation": {"x": 0.02},
-        "rotation": {"yaw": 0.01},
-        "sweep": "keyframes",
-    }
+    """A sideways shift of 0.02 scene units either way."""
+    return {"version": 1, "frame": "camera", "translation": {"x": 0.02}, "sweep": "keyframes"}
 
 
 def airfield_orbit(size: int = 32) -> dict[str, Any]:

@@ -706,7 +706,12 @@ def _finish(
     half_low = 0.5 * (max(scalars[_ALO, q], 0.0) + max(scalars[_CLO, q], 0.0)) / z2_high
     error_half = 0.5 * (error_a + error_c) + 4.0 * unit * half_high
     error_det = (
-        c * error_a + a * error_c + 2.0 * b * error_b + error_a * error_c + error_b * error_b + 6.0 * unit * (a * c + b * b)
+        c * error_a
+        + a * error_c
+        + 2.0 * b * error_b
+        + error_a * error_c
+        + error_b * error_b
+        + 6.0 * unit * (a * c + b * b)
     ) * 1.01
     error_disc = 2.0 * half_high * error_half + error_half * error_half + error_det + 4.0 * unit * half_high * half_high
     disc_high = max(discriminant_min, difference * difference + b * b + error_disc)

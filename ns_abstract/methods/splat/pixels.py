@@ -126,8 +126,11 @@ def _alpha_forms(record, i, n, s, y1, y2, poly, sigma_max, d, order, m, antialia
 
 @njit(cache=True, error_model="numpy")
 def _exponent(record, i, n, s, y1, y2, poly, d, order, m, antialiased):
-    """sigma = (y1^2 + y2^2)/2 + K: coefficients into ``poly`` (row 0 unused), centre, radius and
-    bounds into rows _S0, _SR, _SLO, _SHI, sums of absolute coefficients into _SL, _SB (design.md, B1-B2)."""
+    """Form sigma = (y1^2 + y2^2)/2 + K (design.md, B1-B2).
+
+    Coefficients go into ``poly`` (row 0 unused), centre, radius and bounds into rows _S0, _SR, _SLO, _SHI,
+    sums of absolute coefficients into _SL, _SB.
+    """
     stride = m + 1
     base = FORMS
     for k in range(m):
@@ -343,8 +346,11 @@ def _add_range(poly, d, n, s):
 def _fit_exponential(
     n, s, opacity_low, opacity_high, kappa, sigma_max, alpha_min, alpha_min_high, alpha_max, sure, unit, order
 ):
-    """alpha = opacity exp(-sigma) with its thresholds: centre _A0, radius _AR, bounds _LO, _HI, and the
-    factors _WEIGHT, _CURVE that turn sigma's coefficients into alpha's (design.md, B3-B4)."""
+    """Form alpha = opacity exp(-sigma) with its thresholds.
+
+    Leaves centre _A0, radius _AR, bounds _LO, _HI, and the
+    factors _WEIGHT, _CURVE that turn sigma's coefficients into alpha's (design.md, B3-B4).
+    """
     opacity = 0.5 * (opacity_low + opacity_high)
     opacity_spread = 0.5 * (opacity_high - opacity_low) * _UP + _ROUND * opacity
     quadratic = 1.0 if order == 2 else 0.0
@@ -482,8 +488,9 @@ def _depth_reach(entries, depth, delta, depth_error, slope, ray, m, reach):
 
 @njit(cache=True, error_model="numpy")
 def _find_pairs(
-    k, entries, depth, delta, depth_error, slope, m, reach, room, largest, farthest, far, far_count, first, last, pairs, count
-):
+    k, entries, depth, delta, depth_error, slope, m, reach, room, largest, farthest, far, far_count, first, last,
+    pairs, count,
+):  # fmt: skip
     """Append the pairs (k, later entry) of uncertain order to ``pairs`` and widen ``first``, ``last``.
 
     Returns their number, or -1 where ``pairs`` is full.
@@ -533,7 +540,8 @@ def _largest_exponent(record, i, alpha_min, unit):
     if record[i, WILD] != 0.0 or not opacity > 0.0:
         return -1.0
     # room for the rounding of the exponential, which grows more slowly than the exponent's own error
-    return (math.log(opacity * (1.0 + 64.0 * unit) / alpha_min) * (1.0 + 2.0**-40) + 2.0**-40) / (1.0 - record[i, KAPPA])
+    exponent = math.log(opacity * (1.0 + 64.0 * unit) / alpha_min) * (1.0 + 2.0**-40) + 2.0**-40
+    return exponent / (1.0 - record[i, KAPPA])
 
 
 @njit(cache=True, error_model="numpy")
@@ -561,7 +569,9 @@ def _list_lanes(record, i, ox, oy, left, right, top, bottom, sigma_max, m, s, pi
         spread2 = _ROUND * (abs(g) * y + abs(w2))
         for k in range(1, m + 1):
             spread1 += (
-                abs(record[i, FORMS + k]) * x + abs(record[i, FORMS + stride + k]) * y + abs(record[i, FORMS + 3 * stride + k])
+                abs(record[i, FORMS + k]) * x
+                + abs(record[i, FORMS + stride + k]) * y
+                + abs(record[i, FORMS + 3 * stride + k])
             )
             spread2 += abs(record[i, FORMS + 2 * stride + k]) * y + abs(record[i, FORMS + 4 * stride + k])
         spread1 *= _ROOM
@@ -843,8 +853,10 @@ def _gaussian_color_range(colors, i, channel, color_rows):
 
 @njit(cache=True, error_model="numpy")
 def _swap_bounds(pairs, pair_count, slots, slot_count, heights, entries, colors, color_rows, moves, most):
-    """``moves[slot, 2 c]`` and ``moves[slot, 2 c + 1]`` (rows of lanes): how much reordering may lower or
-    raise channel c when the slot's layer joins the layers behind it (design.md, O2)."""
+    """Bound what reordering may change when a slot's layer joins the layers behind it (design.md, O2).
+
+    ``moves[slot, 2 c]`` and ``moves[slot, 2 c + 1]`` (rows of lanes) are how much it may lower or raise channel c.
+    """
     moves[:slot_count] = 0.0
     most[:slot_count] = 0.0
     n = heights.shape[1]
@@ -978,7 +990,10 @@ def _interval_blend(layers, sources, lengths, extra, moved, chain, background, m
 
 
 @njit(cache=True, error_model="numpy")
-def _blend(layers, lengths, count, layer, extra, moved, background, d, order, m, color_rows, state, radius, low, high, value, s):
+def _blend(
+    layers, lengths, count, layer, extra, moved, background, d, order, m, color_rows,
+    state, radius, low, high, value, s,
+):  # fmt: skip
     """Blend the layers back to front, as forms and as intervals (design.md, B7).
 
     ``state`` [3, m, lanes] and ``radius`` [3, lanes] receive the polynomial forms, ``low`` and
@@ -1167,7 +1182,9 @@ def _blend_channel_line(n, s, t):
 
 
 @njit(cache=True, error_model="numpy")
-def _blend_line(layers, lengths, count, extra, moved, background, color_rows, state, radius, low, high, red, green, blue, s):
+def _blend_line(
+    layers, lengths, count, extra, moved, background, color_rows, state, radius, low, high, red, green, blue, s
+):
     """`_blend` for one parameter and order 2; ``red``, ``green``, ``blue`` are [_CHANNEL_ROWS * lanes] scratch."""
     n = lengths.shape[0]
     for q in range(n):
@@ -1441,8 +1458,8 @@ def _pixel_worker(
                 color_radius, slope, direction, camera, rules, errors, background, negligible, d, order, m,
                 antialiased, s, y1, y2, poly, value, layer, pixels, borrowed(layers_), borrowed(sources_), lengths,
                 borrowed(reach_), borrowed(order_[0]), borrowed(order_[1]), borrowed(order_[2]), borrowed(order_[3]),
-                borrowed(heights_), borrowed(places_), borrowed(pairs_), borrowed(moves_[0]), borrowed(moves_[1]), borrowed(extra_),
-                borrowed(moved_), line, state, radius, low, high, ray, lower[number], upper[number],
+                borrowed(heights_), borrowed(places_), borrowed(pairs_), borrowed(moves_[0]), borrowed(moves_[1]),
+                borrowed(extra_), borrowed(moved_), line, state, radius, low, high, ray, lower[number], upper[number],
                 linear[min(number, linear.shape[0]) :], statistics[thread],
             ):  # fmt: skip
                 capacity = 2 * layers_.shape[0]
@@ -1456,8 +1473,9 @@ def _pixel_worker(
                 moves_ = np.empty((2, slot_capacity, 6, PIXELS))
     # the owners of the borrowed arrays live to here
     return (
-        scratch.size + planes.size + integers.size + ray_.size + line_.size + state_.size + ends.size + layers_.size + sources_.size
-        + extra_.size + moved_.size + heights_.size + places_.size + moves_.size + reach_.size + order_.size + pairs_.size
+        scratch.size + planes.size + integers.size + ray_.size + line_.size + state_.size + ends.size
+        + layers_.size + sources_.size + extra_.size + moved_.size + heights_.size + places_.size + moves_.size
+        + reach_.size + order_.size + pairs_.size
     )  # fmt: skip
 
 
