@@ -177,7 +177,7 @@ class Job:
         if shown is not None and shown < total:
             plan.append(
                 f"{total - shown:,} of {total:,} Gaussians left out: no pose of the set shows them "
-                "(behind, beside or below the alpha threshold)"
+                "(behind, beside, hidden by others or below the alpha threshold)"
             )
         if translation_only(frame.pose_set.enclosure(frame.box, 1)):
             plan.append("depth-order rules left out but for near-ties: translations never change the order")

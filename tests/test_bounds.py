@@ -533,3 +533,39 @@ def test_too_many_pairs(order, monkeypatch):
     assert cell.statistics[3] > 0
     assert (cell.lower <= 0.0).any() and (cell.upper >= 1.0).any()
     case.check(order, parts=1, count=3)
+
+
+@both_orders
+def test_inner_cells_leave_out_what_is_hidden(order):
+    """What no pixel of a cell draws or stops at can be left out of the cells inside it."""
+    generator = np.random.default_rng(5)
+    wall = [
+        {
+            # no two depths are equal
+            "mean": (x, y, -2.0 - 0.1 * layer - 0.01 * x - 0.017 * y),
+            "scale": (0.12, 0.12, 0.01),
+            "opacity": 0.998,
+            "color": (0.2, 0.3, 0.4),
+        }
+        for layer in range(4)
+        for x in np.arange(-1.2, 0.05, 0.1)
+        for y in np.arange(-1.2, 1.25, 0.1)
+    ]
+    behind = [
+        {"mean": (*generator.uniform(-1.5, 1.5, 2), -3.5), "scale": 0.15, "opacity": 0.8, "color": generator.random(3)}
+        for _ in range(40)
+    ]
+    case = Case(scene(*wall, *behind), moves(x=0.003, y=0.003), camera(32, 32, 32.0))
+    outer = case.bounds(case.poses.box, order)
+    count = len(wall) + len(behind)
+    assert 0 < outer.visible.size < count
+    # neither the wall's visible side nor what shows beside it is left out
+    assert set(range(len(wall), count)) & set(outer.visible.tolist())
+    for box in case.poses.box.split(1, 2):
+        inner = case.bounds(box, order, candidates=outer.visible)
+        lower, upper = assemble(inner.lower, case.camera), assemble(inner.upper, case.camera)
+        whole = case.bounds(box, order)
+        assert np.abs(inner.lower - whole.lower).max() < 1e-3 and np.abs(inner.upper - whole.upper).max() < 1e-3
+        for values in case.samples(box, 30):
+            image = case.image(values)
+            assert (lower <= image).all() and (image <= upper).all(), worst(lower, image, upper)

@@ -30,7 +30,7 @@ class CellBounds:
     Attributes:
         wanted: [t] tile numbers, row-major.
         lower, upper: [t, side, side, 3] float64 enclosures of every image of the cell.
-        visible: [n] scene indices of the Gaussians that some pose of the cell may show.
+        visible: [n] scene indices of the Gaussians that some pose of the cell may show in these tiles.
         reach: [n, 4] their ranges of tiles: columns first and past, rows first and past.
         linear: [t, side, side, 3, m + 1] polynomial coefficients and radius, or None.
         statistics: Blocks, layers, uncertain pairs, blocks that gave up on order, results that were
@@ -134,15 +134,17 @@ class SplatBounds:
         linear = np.zeros((wanted.size if keep_linear else 0, self.side, self.side, 3, m + 1))
         threads = get_num_threads()
         statistics = np.zeros((threads, 5), np.int64)
+        marks = np.zeros(n, np.uint8)
         negligible = self.rasteriser.alpha_negligible * splats.count
         pixel_stage(
             wanted, offsets, entries, record, box, tiles, depth, delta, depth_error, colors, self._color_radius,
             slope, np.ascontiguousarray(rotation[0]), view, self.rules, self._errors,
             splats.background, negligible, PAIR_LIMIT, d, order, m, splats.antialiased, threads,
-            lower, upper, linear, statistics,
+            lower, upper, linear, statistics, marks,
         )  # fmt: skip
+        used = np.flatnonzero(marks)
         return CellBounds(
-            wanted, lower, upper, candidates[alive], np.ascontiguousarray(tiles[alive, :4]),
+            wanted, lower, upper, candidates[used], np.ascontiguousarray(tiles[used, :4]),
             linear if keep_linear else None, statistics.sum(axis=0),
         )  # fmt: skip
 

@@ -19,11 +19,13 @@ _MOTION_GAUSSIANS = 2000
 _MOTION_POSES = 9
 #: Step of the difference quotient, as a part of the parameter's range.
 _MOTION_STEP = 2.0**-10
+#: A context that is larger than this part of the one around it is not kept beside it.
+_WORTH_KEEPING = 0.8
 
 
 @dataclass(frozen=True)
 class Context:
-    """What a cell may show, for the cells inside it.
+    """What a cell may show in the tiles that were bounded, for the same tiles of the cells inside it.
 
     Attributes:
         visible: [n] scene indices.
@@ -109,7 +111,7 @@ class SplatFrame:
     def bound(
         self, box: ParameterBox, tiles: np.ndarray, within: Context | None = None, keep_linear: bool = False
     ) -> TileBounds:
-        """Bounds of ``tiles`` over ``box``; ``within`` is the context of a box around it."""
+        """Bounds of ``tiles`` over ``box``; ``within`` is the context of these tiles and a box around it."""
         candidates = self._candidates(tiles, within)
         cell = self.bounds.cell(
             self.camera, self.pose_set.enclosure(box, self.order), tiles, candidates, keep_linear or box.dimensions > 1
@@ -117,14 +119,9 @@ class SplatFrame:
         lower, upper = outward(cell.lower, cell.upper)
         d = box.dimensions
         slopes = np.zeros(d) if cell.linear is None else np.abs(cell.linear[..., 1 : 1 + d]).mean(axis=(0, 1, 2, 3))
-        if within is not None and cell.visible.size > 0.8 * within.visible.size:
-            # hardly smaller: not worth its memory
-            context = within
-        elif tiles.size == self.tile_count or within is None:
-            context = Context(cell.visible, cell.reach)
-        else:
-            # only what reaches these tiles was looked at
-            context = within
+        # hardly smaller: not worth its memory
+        kept = within is not None and cell.visible.size > _WORTH_KEEPING * within.visible.size
+        context = within if within is not None and kept else Context(cell.visible, cell.reach)
         linear = linear_sets(cell.linear, cell.lower, cell.upper, d) if keep_linear else None
         return TileBounds(lower, upper, slopes, context, linear, int(cell.statistics[3]))
 

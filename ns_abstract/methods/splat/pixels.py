@@ -615,7 +615,7 @@ def _any_live(s, row):
 def _forward(
     entries, record, box, tiles, tile_x, tile_y, colors, depth, delta, depth_error, slope, ray,
     s, y1, y2, poly, pixels, layers, sources, lengths, reach, far, first, last, slots, heights, places, pairs,
-    x0, y0, d, order, m, antialiased, rules, errors,
+    x0, y0, d, order, m, antialiased, rules, errors, marks,
 ):  # fmt: skip
     """Collect the layers of every lane, nearest first (design.md, B5-B6).
 
@@ -626,7 +626,8 @@ def _forward(
     slots; or _GIVE_UP where more pairs are uncertain than ``pairs`` may hold, or _GROW where another
     buffer is too small.
 
-    Row _RHO of ``s`` receives how much transmittance may be lost to a stop that the kept layers ignore.
+    Row _RHO of ``s`` receives how much transmittance may be lost to a stop that the kept layers ignore;
+    ``marks`` is set for the entries that some lane that takes light may draw, or stop at.
     """
     unit = errors[0]
     alpha_min = rules[7] * (1.0 - 2.0 * unit)
@@ -717,6 +718,7 @@ def _forward(
             q = pixels[lane]
             if s[_LIVE + q] == 0.0 or high < alpha_min:
                 continue
+            marks[i] = 1
             low = s[_LO + lane]
             before = s[_THI + q]
             # two roundings of the running transmittance
@@ -1300,6 +1302,7 @@ def _block(
     slope, direction, camera, rules, errors, background, negligible, d, order, m, antialiased,
     s, y1, y2, poly, value, layer, pixels, layers, sources, lengths, reach, far, first, last, slots, heights,
     places, pairs, moves, most, extra, moved, line, state, radius, low, high, ray, lower, upper, linear, statistics,
+    marks,
 ):  # fmt: skip
     """Bounds of one block of pixels whose first pixel is (x0, y0). Returns whether the buffers sufficed.
 
@@ -1316,7 +1319,7 @@ def _block(
     pair_count, slot_count = _forward(
         listed, record, box, tiles, tile_x, tile_y, colors, depth, delta, depth_error, slope, ray,
         s, y1, y2, poly, pixels, layers, sources, lengths, reach, far, first, last, slots, heights, places, pairs,
-        x0, y0, d, order, m, antialiased, rules, errors,
+        x0, y0, d, order, m, antialiased, rules, errors, marks,
     )  # fmt: skip
     if pair_count == _GROW:
         return False
@@ -1324,6 +1327,8 @@ def _block(
     if pair_count == _GIVE_UP:
         # too much may be reordered: nothing is known
         statistics[3] += 1
+        for k in range(listed.size):
+            marks[listed[k]] = 1
         for q in range(PIXELS):
             row = y0 % side + q // BLOCK
             column = x0 % side + q % BLOCK
@@ -1398,14 +1403,14 @@ def _block(
 def _pixel_worker(
     thread, wanted, offsets, entries, record_, box_, tiles_, depth_, delta_, depth_error_, colors_, color_radius,
     slope_, direction_, camera_, rules_, errors_, background_, negligible, pair_limit, d, order, m, antialiased,
-    threads, lower_, upper_, linear_, statistics_,
+    threads, lower_, upper_, linear_, statistics_, marks_,
 ):  # fmt: skip
     """Every ``threads``-th tile, from number ``thread``; see `pixel_stage`."""
     record, box, tiles, depth = borrowed(record_), borrowed(box_), borrowed(tiles_), borrowed(depth_)
     delta, depth_error, colors, slope = borrowed(delta_), borrowed(depth_error_), borrowed(colors_), borrowed(slope_)
     direction, camera, rules, errors = borrowed(direction_), borrowed(camera_), borrowed(rules_), borrowed(errors_)
     background, lower, upper = borrowed(background_), borrowed(lower_), borrowed(upper_)
-    linear, statistics = borrowed(linear_), borrowed(statistics_)
+    linear, statistics, marks = borrowed(linear_), borrowed(statistics_), borrowed(marks_)
     image_width, image_height = camera[4], camera[5]
     side = lower.shape[1]
     tiles_x = int(math.ceil(image_width / side))
@@ -1460,7 +1465,7 @@ def _pixel_worker(
                 borrowed(reach_), borrowed(order_[0]), borrowed(order_[1]), borrowed(order_[2]), borrowed(order_[3]),
                 borrowed(heights_), borrowed(places_), borrowed(pairs_), borrowed(moves_[0]), borrowed(moves_[1]),
                 borrowed(extra_), borrowed(moved_), line, state, radius, low, high, ray, lower[number], upper[number],
-                linear[min(number, linear.shape[0]) :], statistics[thread],
+                linear[min(number, linear.shape[0]) :], statistics[thread], marks,
             ):  # fmt: skip
                 capacity = 2 * layers_.shape[0]
                 layers_ = np.empty((capacity, PIXELS, rows))
@@ -1483,7 +1488,7 @@ def _pixel_worker(
 def pixel_stage(
     wanted, offsets, entries, record, box, tiles, depth, delta, depth_error, colors, color_radius,
     slope, direction, camera, rules, errors, background, negligible, pair_limit, d, order, m, antialiased,
-    threads, lower, upper, linear, statistics,
+    threads, lower, upper, linear, statistics, marks,
 ):  # fmt: skip
     """Bounds of the pixels of the tiles ``wanted`` [t] (tile numbers, row-major).
 
@@ -1499,6 +1504,8 @@ def pixel_stage(
         pair_limit: Most depth-order pairs looked at in one block.
         lower, upper: [t, side, side, 3] outputs.
         linear: [t, side, side, 3, m + 1] forms before the clamp, or empty.
+        marks: [n] uint8; set to 1 for every Gaussian that some pixel of these tiles may draw or stop at.
+            Those that stay 0 are hidden or too faint for every pose: leaving them out changes nothing.
         statistics: [threads, 5] blocks, layers, uncertain pairs, blocks where too many pairs were
             uncertain, results that were not numbers.
     """
@@ -1506,5 +1513,5 @@ def pixel_stage(
         _pixel_worker(
             thread, wanted, offsets, entries, record, box, tiles, depth, delta, depth_error, colors, color_radius,
             slope, direction, camera, rules, errors, background, negligible, pair_limit, d, order, m, antialiased,
-            threads, lower, upper, linear, statistics,
+            threads, lower, upper, linear, statistics, marks,
         )  # fmt: skip
