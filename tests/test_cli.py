@@ -713,5 +713,5 @@ def test_demo_writes_what_the_next_command_needs(
     assert call(["--output-dir", str(tmp_path)], demo_command.main)[0] == 0
     job = Job(Settings(next(tmp_path.rglob("config.yml")), tmp_path / "camera_path.json", tmp_path / "SPEC.json"))
     assert job.frame_count == 5
-    assert job.pose_sets[0].box.names == ("x", "yaw")
+    assert job.pose_sets[0].box.names == ("x",)
     assert len(list((tmp_path / "data" / "images").glob("*.png"))) == 10

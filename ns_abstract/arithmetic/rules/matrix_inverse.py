@@ -89,11 +89,13 @@ def matrix_inverse(
         return _unbounded(x)
     identity = np.eye(n)
     difference = identity - x @ inverse
-    size = Interval(matrix_norm(_range(difference), norm))
-    if not size.upper < 1.0:
+    reach, scale = matrix_norm(_range(difference), norm), matrix_norm(Interval(inverse), norm)
+    if not (reach < 1.0 and scale < np.inf):
         return _unbounded(x)
-    power = size.power(order + 1)
-    remainder = (Interval(matrix_norm(Interval(inverse), norm)) * power / (1.0 - size)).upper
+    size = Interval(reach)
+    remainder = (Interval(scale) * size.power(order + 1) / (1.0 - size)).upper
+    if not remainder < np.inf:
+        return _unbounded(x)
     total = difference + identity if order else difference * 0.0 + identity
     for step in range(order - 1):
         if isinstance(total, LinearBounds):
