@@ -546,7 +546,7 @@ def _largest_exponent(record, i, alpha_min, unit):
 
 @njit(cache=True, error_model="numpy")
 def _list_lanes(record, i, ox, oy, left, right, top, bottom, sigma_max, m, s, pixels):
-    """List the pixels of [left, right] x [top, bottom] where the exponent may stay below ``sigma_max``.
+    """List the pixels of a range that take light and where the exponent may stay below ``sigma_max``.
 
     Row by row, sigma >= (near1^2 + near2^2)/2 bounds the columns, where near1 and near2 are what the
     forms' spread leaves of |y1| and |y2| (design.md, B2). Writes the offsets from the mean into rows _AX
@@ -595,10 +595,11 @@ def _list_lanes(record, i, ox, oy, left, right, top, bottom, sigma_max, m, s, pi
             start = int(math.ceil(min(max(center - half - slack, float(left)), right + 1.0)))
             stop = int(math.floor(max(min(center + half + slack, float(right)), left - 1.0)))
         for column in range(start, stop + 1):
+            # overwritten by the next pixel where no light is taken any more
             s[_AX + n] = ox + column
             s[_AY + n] = ay
             pixels[n] = row * BLOCK + column
-            n += 1
+            n += 1 if s[_LIVE + row * BLOCK + column] != 0.0 else 0
     return n
 
 
@@ -716,7 +717,7 @@ def _forward(
         for lane in range(n):
             high = s[_HI + lane]
             q = pixels[lane]
-            if s[_LIVE + q] == 0.0 or high < alpha_min:
+            if high < alpha_min:
                 continue
             marks[i] = 1
             low = s[_LO + lane]
