@@ -10,7 +10,7 @@ from numba.np import arrayobj
 
 
 @intrinsic
-def borrowed(typingctx, array):
+def borrowed(typingctx, array):  # pyright: ignore[reportRedeclaration]
     """The same array without a reference to its owner.
 
     Views and calls cost two atomic operations per counted array, which is more than the arithmetic
@@ -36,7 +36,7 @@ def borrowed(typingctx, array):
 
 
 @intrinsic
-def prefetch(typingctx, array, row, byte):
+def prefetch(typingctx, array, row, byte):  # pyright: ignore[reportRedeclaration]
     """Ask for the cache line of ``array[row]`` (first axis) that lies ``byte`` bytes in; changes nothing."""
     if not isinstance(array, types.Array):
         raise TypeError(f"prefetch() takes an array, not {array}")
@@ -58,7 +58,7 @@ def prefetch(typingctx, array, row, byte):
     return types.void(array, types.intp, types.intp), codegen
 
 
-if config.DISABLE_JIT:
+if config.DISABLE_JIT:  # pyright: ignore[reportAttributeAccessIssue]
 
     def borrowed(array):
         """The array itself: the interpreter counts its references."""

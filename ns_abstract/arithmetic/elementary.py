@@ -31,7 +31,7 @@ _C8, _C9, _C10, _C11, _C12 = _INVERSE_FACTORIALS[8:13]
 
 
 @intrinsic
-def fma(typingctx, x, y, z):
+def fma(typingctx, x, y, z):  # pyright: ignore[reportRedeclaration]
     """``x * y + z`` with one rounding."""
     signature = types.float64(types.float64, types.float64, types.float64)
 
@@ -42,7 +42,7 @@ def fma(typingctx, x, y, z):
 
 
 @intrinsic
-def _bits_of_double(typingctx, x):
+def _bits_of_double(typingctx, x):  # pyright: ignore[reportRedeclaration]
     def codegen(context, builder, sig, args):
         return builder.bitcast(args[0], ir.IntType(64))
 
@@ -50,14 +50,14 @@ def _bits_of_double(typingctx, x):
 
 
 @intrinsic
-def _double_of_bits(typingctx, bits):
+def _double_of_bits(typingctx, bits):  # pyright: ignore[reportRedeclaration]
     def codegen(context, builder, sig, args):
         return builder.bitcast(args[0], ir.DoubleType())
 
     return types.float64(types.int64), codegen
 
 
-if config.DISABLE_JIT:
+if config.DISABLE_JIT:  # pyright: ignore[reportAttributeAccessIssue]
 
     def fma(x, y, z):
         """``x * y + z`` with one rounding."""

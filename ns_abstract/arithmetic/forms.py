@@ -22,6 +22,7 @@ non-finite radius, which every later rule keeps.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numba import njit
@@ -568,7 +569,7 @@ class FormArray:
 
     __rmul__ = __mul__
 
-    def __getitem__(self, index: object) -> FormArray:
+    def __getitem__(self, index: Any) -> FormArray:
         rows = self.basis.rows
         data = self.data.reshape(rows, *self.shape)[(slice(None), *(index if isinstance(index, tuple) else (index,)))]
         return FormArray(self.basis, np.ascontiguousarray(data.reshape(rows, -1)), data.shape[1:])
@@ -627,5 +628,6 @@ class FormArray:
         values = (f0, f1, f2_low, f2_high, f3)
         flat = [np.broadcast_to(np.asarray(v, np.float64), self.shape).ravel().copy() for v in values]
         out = np.empty_like(self.data)
-        compose(self.data, *flat, out, *self._layout)
+        # one array per value
+        compose(self.data, *flat, out, *self._layout)  # pyright: ignore[reportCallIssue]
         return FormArray(self.basis, out, self.shape)

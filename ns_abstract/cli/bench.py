@@ -2,12 +2,19 @@
 
 from __future__ import annotations
 
+import faulthandler
+import sys
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any, Literal
 
 import tyro
 
 from ns_abstract.cli.common import DONE, run
+from ns_abstract.errors import InputError
+
+#: Seconds after which a case that does not end ends the process, with a trace of where it stands.
+_STUCK = 900.0
 
 
 @dataclass
@@ -82,8 +89,79 @@ class Soundness:
     """Decides every random choice."""
 
 
-def bench(options: Cell | Tightness | Soundness) -> int:
+@dataclass
+class Stiff:
+    """Bound and attack tiny scenes at the ends of what can be loaded and asked."""
+
+    output_dir: Path = Path("bench")
+    """Folder for the tables."""
+    cases: tuple[str, ...] = ()
+    """Parts of the names of the cases to run. Default: all cases."""
+    arithmetics: tuple[Literal["float32", "real"], ...] = ("float32", "real")
+    """What is bounded: float32, real."""
+    cells: int = 16
+    """Most cells bounded for every case."""
+    seconds: float = 20.0
+    """Limit of the refinement and of every attack."""
+    poses: int = 60
+    """Images by the compiled renderer for every case."""
+    reference_poses: int = 16
+    """Images by each reference."""
+    compare: bool = False
+    """Also write what float32 costs against real arithmetic."""
+    seed: int = 0
+    """Decides every random choice."""
+
+
+def stiff(options: Stiff) -> int:
+    """Run the stiff cases; the exit code is 1 if a bound was broken or a number was not finite."""
+    from ns_abstract.bench.stiff import all_cases, compare, run_case
+    from ns_abstract.bench.tables import markdown, write
+
+    cases = [c for c in all_cases() if not options.cases or any(part in c.name for part in options.cases)]
+    if not cases:
+        raise InputError(
+            f"no case has {' or '.join(options.cases)} in its name",
+            field="--cases",
+            fix="give parts of names, such as needles, or leave the option out",
+        )
+    rows: list[dict[str, Any]] = []
+    failed = 0
+    for case in cases:
+        for kind in options.arithmetics:
+            faulthandler.dump_traceback_later(_STUCK, exit=True, file=sys.__stderr__)
+            try:
+                outcome = run_case(
+                    case,
+                    kind,
+                    cells=options.cells,
+                    seconds=options.seconds,
+                    poses=options.poses,
+                    reference_poses=options.reference_poses,
+                    seed=options.seed,
+                )
+            finally:
+                faulthandler.cancel_dump_traceback_later()
+            rows.append(outcome.row)
+            failed += outcome.failed
+            # a case that never ends must not take the others' rows with it
+            write(rows, options.output_dir, "stiff", "Stiff and extreme cases")
+            print(markdown(rows[-1:]) if len(rows) == 1 else markdown(rows[-1:]).splitlines()[2], flush=True)
+            for violation in outcome.worst[:1]:
+                print(f"  {violation}", flush=True)
+    if options.compare and (differences := compare(rows)):
+        write(differences, options.output_dir, "stiff-compare", "Float32 against real arithmetic")
+        print(markdown(differences))
+    total = sum(row["comparisons"] for row in rows)
+    violations = sum(row["violations"] for row in rows)
+    print(f"{len(rows)} runs, {failed} failed: {total:,} comparisons, {violations:,} violations")
+    return 1 if failed else DONE
+
+
+def bench(options: Cell | Tightness | Soundness | Stiff) -> int:
     """Run one benchmark; the exit code of a soundness benchmark with violations is 1."""
+    if isinstance(options, Stiff):
+        return stiff(options)
     from ns_abstract.bench.sets import open_jobs
     from ns_abstract.bench.tables import markdown, write
 
@@ -139,7 +217,7 @@ def bench(options: Cell | Tightness | Soundness) -> int:
 def main() -> None:
     """Entry point of the console script."""
     kinds = tyro.extras.subcommand_type_from_defaults(
-        {"cell": Cell(), "tightness": Tightness(), "soundness": Soundness()}
+        {"cell": Cell(), "tightness": Tightness(), "soundness": Soundness(), "stiff": Stiff()}
     )
     run(bench, lambda: tyro.cli(kinds, prog="ns-abstract-bench"))
 

@@ -282,10 +282,11 @@ def _plot(
     width, height = size
     start, end = (x.start, x.end) if x else (52, width - 12)
     parts = []
-    for value in x.ticks() if x else []:
-        at = x(value)
-        parts.append(f'<line class="axis" x1="{at:.1f}" x2="{at:.1f}" y1="{y.start:.1f}" y2="{y.end:.1f}"/>')
-        parts.append(f'<text x="{at:.1f}" y="{y.start + 15:.1f}" text-anchor="middle">{number(value, 3)}</text>')
+    if x is not None:
+        for value in x.ticks():
+            at = x(value)
+            parts.append(f'<line class="axis" x1="{at:.1f}" x2="{at:.1f}" y1="{y.start:.1f}" y2="{y.end:.1f}"/>')
+            parts.append(f'<text x="{at:.1f}" y="{y.start + 15:.1f}" text-anchor="middle">{number(value, 3)}</text>')
     for value in y.ticks():
         at = y(value)
         parts.append(f'<line class="axis" x1="{start:.1f}" x2="{end:.1f}" y1="{at:.1f}" y2="{at:.1f}"/>')

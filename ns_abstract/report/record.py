@@ -303,8 +303,8 @@ class Report:
                         field="fingerprint",
                         fix="give another --output-dir, or leave out --resume to start again",
                     )
-        stored_before = {frame_index(self.folder / file) for file in self._found} - {None}
-        for index in sorted(stored_before):
+        stored_before = (frame_index(self.folder / file) for file in self._found)
+        for index in sorted({index for index in stored_before if index is not None}):
             path = self.folder / frame_name(index, "npz")
             try:
                 stored = load_frame(path, leaves=False)

@@ -123,7 +123,7 @@ class _Record:
         shape = self.lower.shape
         self.poses: list[Float64Array] = []
         self.seen: set[bytes] = set()
-        self.tried = dict.fromkeys(STRATEGIES, 0)
+        self.tried: dict[str, int] = dict.fromkeys(STRATEGIES, 0)
         self.probes = self.steps = self.comparisons = self.violations = self.not_finite = 0
         self.least = np.full(shape, np.inf)
         self.most = np.full(shape, -np.inf)
@@ -135,7 +135,8 @@ class _Record:
         self.violations += int(bad.sum())
         for place in np.argwhere(bad)[:_KEPT]:
             bound = self.lower[tuple(place)] if not np.isfinite(self.lower[tuple(place)]) else self.upper[tuple(place)]
-            self._keep(Violation((), *map(int, place), float("nan"), float(bound), float("nan")))
+            row, column, channel = map(int, place)
+            self._keep(Violation((), row, column, channel, float("nan"), float(bound), float("nan")))
 
     def _keep(self, violation: Violation) -> None:
         place = (violation.row, violation.column, violation.channel)

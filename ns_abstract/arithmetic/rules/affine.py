@@ -7,12 +7,14 @@ arithmetic gives, and a form that says less than its range is replaced by it.
 
 from __future__ import annotations
 
+from typing import Any, overload
+
 import numpy as np
 from numpy.typing import ArrayLike
 
 from ns_abstract.arithmetic.forms import Basis, Float64Array, FormArray, settle
 from ns_abstract.arithmetic.rules import lines
-from ns_abstract.arithmetic.rules.interval import Interval
+from ns_abstract.arithmetic.rules.interval import BoolArray, Interval
 
 # `FormArray`'s second-order remainders are third powers; between these sizes none under- or overflows
 _SMALL, _LARGE = 2.0**-200, 2.0**200
@@ -33,7 +35,7 @@ def form_of(basis: Basis, values: Interval) -> FormArray:
     return FormArray.constant(basis, values.middle, values.radius)
 
 
-def _merge(mask: Float64Array, first: FormArray, second: FormArray) -> FormArray:
+def _merge(mask: BoolArray, first: FormArray, second: FormArray) -> FormArray:
     """``first`` where ``mask``, else ``second``."""
     return FormArray(first.basis, np.where(mask.ravel(), first.data, second.data), first.shape)
 
@@ -66,12 +68,28 @@ class Enclosure:
         values = Interval.lift(values)
         return cls(form_of(basis, values), values)
 
+    @overload
     @classmethod
-    def lift(cls, value: Enclosure | FormArray, basis: Basis | None = None) -> Enclosure:
-        """``value`` as an enclosure; numbers and intervals need ``basis``."""
-        if isinstance(value, cls):
+    def lift(cls, value: Enclosure | FormArray, basis: Basis | None = None) -> Enclosure: ...
+
+    @overload
+    @classmethod
+    def lift(cls, value: Enclosure | FormArray | Interval | ArrayLike, basis: Basis) -> Enclosure: ...
+
+    @classmethod
+    def lift(cls, value: Enclosure | FormArray | Interval | ArrayLike, basis: Basis | None = None) -> Enclosure:
+        """``value`` as an enclosure; numbers and intervals need ``basis``.
+
+        Raises:
+            TypeError: They have none.
+        """
+        if isinstance(value, Enclosure):
             return value
-        return cls(value) if isinstance(value, FormArray) else cls.of(basis, value)
+        if isinstance(value, FormArray):
+            return cls(value)
+        if basis is None:
+            raise TypeError("numbers and intervals have no basis of their own: name one")
+        return cls.of(basis, value)
 
     @classmethod
     def parameters(cls, box: Interval, order: int = 1) -> Enclosure:
@@ -110,7 +128,7 @@ class Enclosure:
         """The same quantity, known to lie in ``other`` as well."""
         return Enclosure(self.form, self.range.intersect(other))
 
-    def __getitem__(self, index: object) -> Enclosure:
+    def __getitem__(self, index: Any) -> Enclosure:
         return Enclosure(self.form[index], self.range[index])
 
     def reshape(self, *shape: int) -> Enclosure:
@@ -197,7 +215,7 @@ class Enclosure:
             base = base.square() if exponent else base
         return result.meet(whole)
 
-    def _curve(self, curve: lines.Curve, domain: Float64Array, taylor: FormArray | None) -> Enclosure:
+    def _curve(self, curve: lines.Curve, domain: BoolArray, taylor: FormArray | None) -> Enclosure:
         """A convex or concave function: a band, or the Taylor polynomial where that leaves less."""
         whole = curve.value(self.range)
         domain = domain & np.isfinite(self.range.lower) & np.isfinite(self.range.upper)

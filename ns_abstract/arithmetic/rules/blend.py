@@ -12,9 +12,7 @@ import numpy as np
 
 from ns_abstract.arithmetic.rules.affine import Enclosure
 from ns_abstract.arithmetic.rules.interval import Float64Array, Interval
-from ns_abstract.arithmetic.rules.linear import LinearBounds
-
-Layers = Interval | Enclosure | LinearBounds
+from ns_abstract.arithmetic.rules.linear import Face, LinearBounds, constant_like
 
 
 def blend(alphas: Float64Array, colors: Float64Array) -> Float64Array:
@@ -23,20 +21,23 @@ def blend(alphas: Float64Array, colors: Float64Array) -> Float64Array:
     return (light * alphas * colors).sum(axis=0)
 
 
-def cumulative_blend(alphas: Layers, colors: Interval | Float64Array) -> Layers:
+def cumulative_blend(alphas: Face, colors: Interval | Float64Array) -> Face:
     """Lines 8-10 of Algorithm 2 operation by operation: every opacity is used once per layer behind it.
 
     Args:
         alphas: Opacities [n, ...], of any face.
         colors: Colours [n, ...]; numbers for `LinearBounds`.
+
+    Raises:
+        IndexError: There are no layers.
     """
-    light = None
-    total = None
-    for i in range(alphas.shape[0]):
-        weight = alphas[i] if light is None else alphas[i] * light
-        part = weight * colors[i]
-        total = part if total is None else total + part
-        light = 1.0 - alphas[i] if light is None else light * (1.0 - alphas[i])
+    color: Interval | Float64Array = colors[0]
+    total = alphas[0] * color
+    light = 1.0 - alphas[0]
+    for i in range(1, alphas.shape[0]):
+        color = colors[i]
+        total = total + alphas[i] * light * color
+        light = light * (1.0 - alphas[i])
     return total
 
 
@@ -49,7 +50,7 @@ def _over(alpha: Interval, color: Interval, behind: Interval) -> Interval:
     )
 
 
-def sumcumprod(alphas: Layers, colors: Interval | Float64Array, behind: float = 0.0) -> Layers:
+def sumcumprod(alphas: Face, colors: Interval | Float64Array, behind: float = 0.0) -> Face:
     """SUMCUMPROD (Algorithm 5): blend back to front, ``P <- a_i c_i + (1 - a_i) P``, each ``a_i`` once.
 
     For independent opacities in [0, 1] the interval face is the exact range up to rounding: P
@@ -63,10 +64,15 @@ def sumcumprod(alphas: Layers, colors: Interval | Float64Array, behind: float = 
 
     Returns:
         The blended value, of the same face, [...].
+
+    Raises:
+        TypeError: `LinearBounds` with intervals of colours.
     """
     n = alphas.shape[0]
     if isinstance(alphas, LinearBounds):
-        result: Layers = LinearBounds.of(alphas.basis, np.full(alphas.shape[1:], behind))
+        if isinstance(colors, Interval):
+            raise TypeError("linear bounds are blended with numbers for colours")
+        result = LinearBounds.of(alphas.basis, np.full(alphas.shape[1:], behind))
         for i in reversed(range(n)):
             result = alphas[i].scale(colors[i]) + (1.0 - alphas[i]) * result
         return result
@@ -80,7 +86,7 @@ def sumcumprod(alphas: Layers, colors: Interval | Float64Array, behind: float = 
             shape = value.shape
             alpha = alphas[i].broadcast_to(shape)
             form = (form + alpha * (colors[i] - form)).meet(value)
-    return value if form is None else form
+    return constant_like(alphas, value) if form is None else form
 
 
 def convex_combination(weights: Interval, values: Interval | Float64Array) -> Interval:

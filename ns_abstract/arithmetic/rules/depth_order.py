@@ -5,29 +5,33 @@ Layers run along the first axis in any order; depths are [n], opacities [n, ...]
 
 from __future__ import annotations
 
+from typing import TypeVar
+
 import numpy as np
 
 from ns_abstract.arithmetic.rules.affine import Enclosure
-from ns_abstract.arithmetic.rules.blend import Layers, convex_combination, cumulative_blend
-from ns_abstract.arithmetic.rules.interval import Float64Array, Interval
+from ns_abstract.arithmetic.rules.blend import convex_combination, cumulative_blend
+from ns_abstract.arithmetic.rules.interval import BoolArray, Float64Array, Interval
+from ns_abstract.arithmetic.rules.linear import Face, LinearBounds, constant_like
+
+# depths may be of another face than opacities
+Depths = TypeVar("Depths", Interval, Enclosure, LinearBounds)
+# the faces that another bound can narrow
+Ranged = TypeVar("Ranged", Interval, Enclosure)
 
 
-def _range(x: Layers) -> Interval:
+def _range(x: Interval | Enclosure | LinearBounds) -> Interval:
     return x if isinstance(x, Interval) else x.range
 
 
-def _constant(like: Layers, values: Interval) -> Layers:
-    return values if isinstance(like, Interval) else type(like).of(like.basis, values)
-
-
-def _differences(depths: Layers) -> Interval:
+def _differences(depths: Depths) -> Interval:
     """Ranges of ``d_i - d_j`` [n, n]."""
     n = depths.shape[0]
     rows = depths.reshape(n, 1).broadcast_to((n, n))
     return _range(rows - depths.reshape(1, n).broadcast_to((n, n)))
 
 
-def surely_in_front(depths: Layers) -> np.ndarray:
+def surely_in_front(depths: Depths) -> BoolArray:
     """[n, n] whether layer j lies in front of layer i, ``d_j < d_i``, for every parameter value."""
     return _differences(depths).lower > 0.0
 
@@ -37,7 +41,7 @@ def permute(x: Float64Array, y: Float64Array) -> Float64Array:
     return np.asarray(x)[np.argsort(y, kind="stable")]
 
 
-def sort_by(x: Layers, y: Layers) -> Layers:
+def sort_by(x: Face, y: Depths) -> Face:
     """Bounds of `permute`: each place holds every element that may stand there.
 
     Element i may take the places from the number of elements surely before it to n - 1 minus the
@@ -59,16 +63,16 @@ def sort_by(x: Layers, y: Layers) -> Layers:
             places.append(x[int(candidates[0])])
             continue
         among = _range(x)[candidates]
-        places.append(_constant(x, Interval(among.lower.min(axis=0), among.upper.max(axis=0))))
+        places.append(constant_like(x, Interval(among.lower.min(axis=0), among.upper.max(axis=0))))
     return type(x).stack(places)
 
 
-def sorted_blend(alphas: Layers, depths: Layers, colors: Interval | Float64Array) -> Layers:
+def sorted_blend(alphas: Face, depths: Depths, colors: Interval | Float64Array) -> Face:
     """Lines 13-18 of Algorithm 1 with sorted opacities and colours bounded one by one."""
     return cumulative_blend(sort_by(alphas, depths), sort_by(Interval.lift(colors), depths))
 
 
-def vr_ind_weights(alphas: Layers, depths: Layers) -> tuple[Layers, Layers]:
+def vr_ind_weights(alphas: Face, depths: Depths) -> tuple[Face, Face]:
     """Weights of the layers and of what is behind them, from pairwise indicators.
 
     ``w_i = a_i prod_{j != i} (1 - a_j Ind(d_i - d_j))`` (eq. 22; its ``a_i`` inside the product is a
@@ -95,7 +99,7 @@ def vr_ind_weights(alphas: Layers, depths: Layers) -> tuple[Layers, Layers]:
             if front[i, j]:
                 weight = weight * passing[j]
             else:
-                weight = weight * (1.0 - alphas[j] * _constant(alphas, either.broadcast_to(alphas.shape[1:])))
+                weight = weight * (1.0 - alphas[j] * constant_like(alphas, either.broadcast_to(alphas.shape[1:])))
         weights.append(weight)
     behind = passing[0]
     for j in range(1, n):
@@ -103,7 +107,7 @@ def vr_ind_weights(alphas: Layers, depths: Layers) -> tuple[Layers, Layers]:
     return type(alphas).stack(weights), behind
 
 
-def vr_ind(alphas: Layers, depths: Layers, colors: Interval | Float64Array) -> Layers:
+def vr_ind(alphas: Face, depths: Depths, colors: Interval | Float64Array) -> Face:
     """VR-IND (Algorithm 4): ``pc = sum_i w_i c_i``, without sorting.
 
     Args:
@@ -115,19 +119,17 @@ def vr_ind(alphas: Layers, depths: Layers, colors: Interval | Float64Array) -> L
     return _weighted_sum(weights, colors)
 
 
-def _weighted_sum(weights: Layers, colors: Interval | Float64Array) -> Layers:
-    total = None
-    for i in range(weights.shape[0]):
+def _weighted_sum(weights: Face, colors: Interval | Float64Array) -> Face:
+    shape = np.broadcast_shapes(weights.shape[1:], colors.shape[1:])
+    color: Interval | Float64Array = colors[0]
+    total = weights[0].broadcast_to(shape) * color
+    for i in range(1, weights.shape[0]):
         color = colors[i]
-        shape = np.broadcast_shapes(weights.shape[1:], color.shape)
-        part = weights[i].broadcast_to(shape) * color
-        total = part if total is None else total + part
+        total = total + weights[i].broadcast_to(shape) * color
     return total
 
 
-def ordered_blend(
-    alphas: Interval | Enclosure, depths: Layers, colors: Interval | Float64Array
-) -> Interval | Enclosure:
+def ordered_blend(alphas: Ranged, depths: Depths, colors: Interval | Float64Array) -> Ranged:
     """VR-IND, narrowed by the fact that the weights and the light that passes add up to 1.
 
     Args:

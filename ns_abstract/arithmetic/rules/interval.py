@@ -19,6 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 from ns_abstract.arithmetic.elementary import EXP_HIGHEST, EXP_RELATIVE_ERROR, exp_kernel
 
 Float64Array = NDArray[np.float64]
+BoolArray = NDArray[np.bool_]
 
 # the kernel's error and the rounding of one product with a factor next to 1
 _EXP_DOWN = 1.0 - 2.0 * EXP_RELATIVE_ERROR
@@ -197,7 +198,7 @@ class Interval:
         """Whether every interval holds the other."""
         return bool(np.all((self.lower <= other.lower) & (other.upper <= self.upper)))
 
-    def __getitem__(self, index: object) -> Interval:
+    def __getitem__(self, index: Any) -> Interval:
         return Interval(self.lower[index], self.upper[index])
 
     def _map(self, change: Callable[[Float64Array], Float64Array]) -> Interval:

@@ -12,16 +12,18 @@ whose radius holds their own rounding.
 
 from __future__ import annotations
 
+from typing import Any, TypeVar
+
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from ns_abstract.arithmetic.forms import Basis, Float64Array, FormArray
 from ns_abstract.arithmetic.rules import lines
 from ns_abstract.arithmetic.rules.affine import Enclosure
-from ns_abstract.arithmetic.rules.interval import Interval
+from ns_abstract.arithmetic.rules.interval import BoolArray, Interval
 
 
-def _select(mask: Float64Array, form: FormArray, otherwise: Float64Array) -> FormArray:
+def _select(mask: BoolArray, form: FormArray, otherwise: Float64Array) -> FormArray:
     """``form`` where ``mask``, else numbers."""
     constant = FormArray.constant(form.basis, otherwise)
     return FormArray(form.basis, np.where(mask.ravel(), form.data, constant.data), form.shape)
@@ -92,7 +94,7 @@ class LinearBounds:
         """Lower and upper bounds over the box."""
         return self.range.bounds()
 
-    def __getitem__(self, index: object) -> LinearBounds:
+    def __getitem__(self, index: Any) -> LinearBounds:
         return LinearBounds(self.lower[index], self.upper[index])
 
     def reshape(self, *shape: int) -> LinearBounds:
@@ -165,7 +167,7 @@ class LinearBounds:
         axis %= len(self.shape)
         return LinearBounds(self.lower.sum(axis), self.upper.sum(axis))
 
-    def matmul(self, other: LinearBounds | ArrayLike, weight: float = 1.0) -> LinearBounds:
+    def matmul(self, other: LinearBounds | NDArray[Any], weight: float = 1.0) -> LinearBounds:
         """Product of two matrices."""
         n, k = self.shape
         m = other.shape[1]
@@ -174,7 +176,7 @@ class LinearBounds:
             return left.multiply(other.reshape(1, k, m).broadcast_to((n, k, m)), weight).sum(1)
         return left.scale(np.asarray(other, np.float64)[None]).sum(1)
 
-    def __matmul__(self, other: LinearBounds | ArrayLike) -> LinearBounds:
+    def __matmul__(self, other: LinearBounds | NDArray[Any]) -> LinearBounds:
         return self.matmul(other)
 
     def __rmatmul__(self, other: ArrayLike) -> LinearBounds:
@@ -183,7 +185,7 @@ class LinearBounds:
         m = self.shape[1]
         return self.reshape(1, k, m).broadcast_to((n, k, m)).scale(other[:, :, None]).sum(1)
 
-    def _curve(self, curve: lines.Curve, domain: Float64Array) -> LinearBounds:
+    def _curve(self, curve: lines.Curve, domain: BoolArray) -> LinearBounds:
         """The chord on one side and the tangent at the middle of the range on the other."""
         x = self.range
         domain = domain & np.isfinite(x.lower) & np.isfinite(x.upper)
@@ -210,3 +212,12 @@ class LinearBounds:
     def exp(self) -> LinearBounds:
         """``exp(x)``."""
         return self._curve(lines.EXP, np.abs(self.range.middle) < 600.0)
+
+
+#: The face of a rule: a result has that of its operands.
+Face = TypeVar("Face", Interval, Enclosure, LinearBounds)
+
+
+def constant_like(like: Face, values: Interval) -> Face:
+    """Quantities of which nothing but ``values`` is known, of the face and basis of ``like``."""
+    return type(like).lift(values) if isinstance(like, Interval) else type(like).of(like.basis, values)

@@ -7,26 +7,25 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Sequence
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
 from ns_abstract.arithmetic.rules.affine import Enclosure
 from ns_abstract.arithmetic.rules.interval import Float64Array, Interval
-from ns_abstract.arithmetic.rules.linear import LinearBounds
+from ns_abstract.arithmetic.rules.linear import Face, LinearBounds, constant_like
 
-Matrix = Interval | Enclosure | LinearBounds
 Norm = Literal["frobenius", "spectral"]
 
 #: Most entries of a matrix whose corners are enumerated.
 CORNER_LIMIT = 9
 
 
-def _range(x: Matrix) -> Interval:
+def _range(x: Interval | Enclosure | LinearBounds) -> Interval:
     return x if isinstance(x, Interval) else x.range
 
 
-def matrix_norm(x: Interval, norm: Norm) -> Float64Array:
+def matrix_norm(x: Interval, norm: Norm) -> Float64Array | np.float64:
     """Upper bound of a submultiplicative norm that is at least the largest entry.
 
     Args:
@@ -40,18 +39,31 @@ def matrix_norm(x: Interval, norm: Norm) -> Float64Array:
     return (Interval(columns) * rows).sqrt().upper if np.isfinite(columns + rows) else np.float64(np.inf)
 
 
-def _unbounded(x: Matrix) -> Matrix:
-    entire = Interval.entire(x.shape)
-    return entire if isinstance(x, Interval) else type(x).of(x.basis, entire)
+def _unbounded(x: Face) -> Face:
+    return constant_like(x, Interval.entire(x.shape))
+
+
+def _product(x: Face, y: Face, weight: float) -> Face:
+    """``x * y``, with this weight of McCormick's planes where there are any."""
+    if isinstance(x, LinearBounds) and isinstance(y, LinearBounds):
+        return x.multiply(y, weight)
+    return x * y
+
+
+def _matrix_product(x: Face, y: Face, weight: float) -> Face:
+    """``x @ y``, with this weight of McCormick's planes where there are any."""
+    if isinstance(x, LinearBounds) and isinstance(y, LinearBounds):
+        return x.matmul(y, weight)
+    return x @ y
 
 
 def matrix_inverse(
-    x: Matrix,
+    x: Face,
     reference: Float64Array | None = None,
     order: int = 2,
     norm: Norm = "frobenius",
     weights: Sequence[float] = (),
-) -> Matrix:
+) -> Face:
     """MATRIXINV (Algorithm 3): ``X^-1`` by a Taylor polynomial around a reference matrix.
 
     With ``R`` a floating-point inverse of the reference and ``D = I - X R``,
@@ -98,14 +110,12 @@ def matrix_inverse(
         return _unbounded(x)
     total = difference + identity if order else difference * 0.0 + identity
     for step in range(order - 1):
-        if isinstance(total, LinearBounds):
-            total = total.matmul(difference, weights[step] if step < len(weights) else 1.0) + identity
-        else:
-            total = total @ difference + identity
+        weight = weights[step] if step < len(weights) else 1.0
+        total = _matrix_product(total, difference, weight) + identity
     return inverse @ total + Interval(np.full((n, n), -remainder), np.full((n, n), remainder))
 
 
-def adjugate_inverse(x: Matrix, weights: tuple[float, float] = (1.0, 1.0)) -> Matrix:
+def adjugate_inverse(x: Face, weights: tuple[float, float] = (1.0, 1.0)) -> Face:
     """The inverse of 2 x 2 matrices as adjugate over determinant, the paper's point of comparison.
 
     Args:
@@ -119,10 +129,10 @@ def adjugate_inverse(x: Matrix, weights: tuple[float, float] = (1.0, 1.0)) -> Ma
     if x.shape != (2, 2):
         raise ValueError(f"the adjugate is written out for [2, 2], got {x.shape}")
     a, b, c, d = x[0, 0], x[0, 1], x[1, 0], x[1, 1]
-    linear = isinstance(x, LinearBounds)
-    determinant = (a.multiply(d, weights[0]) if linear else a * d) - b * c
+    determinant = _product(a, d, weights[0]) - b * c
     factor = determinant.reciprocal()
-    entries = [(e.multiply(factor, weights[1]) if linear else e * factor) for e in (d, -b, -c, a)]
+    # of the face of x, which checkers lose in a list
+    entries: list[Any] = [_product(e, factor, weights[1]) for e in (d, -b, -c, a)]
     return type(x).stack(entries).reshape(2, 2)
 
 

@@ -76,8 +76,10 @@ def _matrix_power(x: Interval | Enclosure, exponent: int) -> Interval | Enclosur
 
 def _inverse(x: Interval | Enclosure) -> Interval | Enclosure:
     # any norm is sound; this one is the smaller of the two for most matrices
+    if isinstance(x, Enclosure):
+        return matrix_inverse(x, order=_INVERSE_ORDER, norm="spectral")
     taylor = matrix_inverse(x, order=_INVERSE_ORDER, norm="spectral")
-    if isinstance(x, Interval) and x.lower.size <= CORNER_LIMIT and np.all(np.isfinite(x.lower) & np.isfinite(x.upper)):
+    if x.lower.size <= CORNER_LIMIT and np.all(np.isfinite(x.lower) & np.isfinite(x.upper)):
         return taylor.intersect(corner_inverse(x))
     return taylor
 

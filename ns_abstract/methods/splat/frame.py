@@ -122,7 +122,10 @@ class SplatFrame:
         # hardly smaller: not worth its memory
         kept = within is not None and cell.visible.size > _WORTH_KEEPING * within.visible.size
         context = within if within is not None and kept else Context(cell.visible, cell.reach)
-        linear = linear_sets(cell.linear, cell.lower, cell.upper, d) if keep_linear else None
+        linear = None
+        if keep_linear:
+            assert cell.linear is not None
+            linear = linear_sets(cell.linear, cell.lower, cell.upper, d)
         return TileBounds(lower, upper, slopes, context, linear, int(cell.statistics[3]))
 
     def _candidates(self, tiles: np.ndarray, within: Context | None) -> np.ndarray | None:

@@ -38,7 +38,8 @@ def _require_plain(splats: Splats) -> None:
 
 def pixel_centers(camera: Camera) -> Float64Array:
     """[H * W, 2] pixel centres (x, y), row-major."""
-    x, y = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
+    x, y = (np.arange(size, dtype=np.float64) + 0.5 for size in (camera.width, camera.height))
+    x, y = np.meshgrid(x, y)
     return np.stack([x.ravel(), y.ravel()], axis=1)
 
 
