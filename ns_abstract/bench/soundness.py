@@ -14,7 +14,8 @@ def attack(
 ) -> dict[str, object]:
     """Refine one frame, then attack it: random poses, corners, gradient ascent and jumps.
 
-    The compiled renderer makes most images, the independent reference ``reference_poses`` of them.
+    Gradient ascent goes through the differentiable reference; what it finds is rendered by the compiled renderer.
+    The poses that came closest, random ones and corners are then rendered by the reference as well.
     """
     result = refine(job, name, frame, seconds, 1.0, scale)
     poses_set = pose_set(job, name, frame, scale)
@@ -23,7 +24,7 @@ def attack(
     first = falsify(result.lower, result.upper, poses_set.box, render, twin, probe=probe, poses=poses, seed=seed)
     second = falsify(
         result.lower, result.upper, poses_set.box, other, twin, probe=other_probe, poses=reference_poses,
-        seed=seed + 1, starts=first.closest,
+        seed=seed + 1, starts=first.closest, strategies=("given", "corners", "random"),
     )  # fmt: skip
     last = result.trace[-1]
     return {

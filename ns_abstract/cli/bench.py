@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import faulthandler
-import sys
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -129,7 +128,7 @@ def stiff(options: Stiff) -> int:
     failed = 0
     for case in cases:
         for kind in options.arithmetics:
-            faulthandler.dump_traceback_later(_STUCK, exit=True, file=sys.__stderr__)
+            faulthandler.dump_traceback_later(_STUCK, exit=True, file=2)
             try:
                 outcome = run_case(
                     case,

@@ -208,7 +208,7 @@ def _stage_chunk(
         lanes = min(LANES, stop - first)
         count = _cull_block(
             candidates, first, lanes, means, axes, opacity_high, mean_radius, rotation, offset, origin,
-            camera_reach, rotation_reach, camera, rules, errors, d, order, m, work, scalars, vectors,
+            camera_reach, rotation_reach, camera, rules, errors, d, order, m, antialiased, work, scalars, vectors,
             state, alive, count,
         )  # fmt: skip
     for first in range(0, count, LANES):
@@ -279,7 +279,7 @@ def _mean_spread(rotation_reach, mean_radius, i, row):
 @njit(cache=True, error_model="numpy")
 def _cull_block(
     candidates, first, lanes, means, axes, opacity_high, mean_radius, rotation, offset, origin,
-    camera_reach, rotation_reach, camera, rules, errors, d, order, m, work, scalars, vectors,
+    camera_reach, rotation_reach, camera, rules, errors, d, order, m, antialiased, work, scalars, vectors,
     state, alive, count,
 ):  # fmt: skip
     """Drop the Gaussians that no pose of the cell shows (design.md, G3); append the others to ``alive``."""
@@ -312,7 +312,8 @@ def _cull_block(
             # a bound that is not a number keeps the Gaussian
             if scalars[_ZHI, q] + spread_z < near or scalars[_ZLO, q] - spread_z > far:
                 continue
-        if opacity_high[i] * (1.0 + 64.0 * unit) < alpha_min:
+        # antialiased, rounding may raise it: see _finish
+        if not antialiased and opacity_high[i] * (1.0 + 64.0 * unit) < alpha_min:
             continue
         size = 0.0
         for k in range(3):
@@ -590,9 +591,11 @@ def _finish(
     # sigmoid: two exponentials or divisions and an addition
     slack = 12.0 * unit
     record[index, OPACITY_LOW] = opacity_low[i] * (1.0 - slack)
-    # the compensation is at most 1 but for the rounding of its division and root
+    # the compensation's own division and root
     above = 1.0 + (0.5 * division + root + 2.0) * unit if antialiased else 1.0
-    record[index, OPACITY_HIGH] = opacity_high[i] * (1.0 + slack) * above
+    opacity = opacity_high[i] * (1.0 + slack) * above
+    # det0/det exceeds 1 where rounding lowers det: nothing is known before its error is
+    record[index, OPACITY_HIGH] = 1.0 if antialiased else opacity
     tiles_x = int(math.ceil(width / (tile if tile > 0.0 else work_tile)))
     tiles_y = int(math.ceil(height / (tile if tile > 0.0 else work_tile)))
     box[index, 0] = -np.inf
@@ -718,8 +721,9 @@ def _finish(
     disc_low = max(discriminant_min, nearest * nearest + b_nearest * b_nearest - error_disc)
     top_high = (half_high + error_half + math.sqrt(disc_high)) * (1.0 + 2.0 * root * unit)
     top_low = max(0.0, half_low - error_half + math.sqrt(disc_low)) * (1.0 - 2.0 * root * unit)
-    radius_high = math.ceil(sigmas * math.sqrt(top_high) * (1.0 + 2.0 * root * unit) * _REGION)
-    radius_low = math.ceil(sigmas * math.sqrt(top_low) * (1.0 - 2.0 * root * unit) / _REGION)
+    # np.ceil: math.ceil is an int64, which a huge Gaussian overflows
+    radius_high = np.ceil(sigmas * math.sqrt(top_high) * (1.0 + 2.0 * root * unit) * _REGION)
+    radius_low = np.ceil(sigmas * math.sqrt(top_low) * (1.0 - 2.0 * root * unit) / _REGION)
     if tile > 0.0:
         snap_x = 8.0 * unit * (abs(mean_x_low) + abs(mean_x_high) + radius_high)
         snap_y = 8.0 * unit * (abs(mean_y_low) + abs(mean_y_high) + radius_high)
@@ -759,6 +763,14 @@ def _finish(
     # G7: relative error of the exponent
     if not (det > 0.0 and error_det < 0.5 * det):
         return
+    if antialiased:
+        # compensation_fl^2 <= (det + e0)/(det - e), which falls in det
+        sharp_error = (error_det + 6.0 * unit * (a * c + b * b)) / det
+        excess = math.sqrt((1.0 + sharp_error) / (1.0 - error_det / det)) * _REGION
+        record[index, OPACITY_HIGH] = min(1.0, opacity * excess)
+        if record[index, OPACITY_HIGH] * (1.0 + 64.0 * unit) < alpha_min:
+            state[index] = 0
+            return
     eta = (c * error_a + 2.0 * math.sqrt(a * c) * error_b + a * error_c) / det
     kappa = (eta + 80.0 * unit * (a * c) / det) * 1.01
     if not kappa < 0.25:
@@ -774,7 +786,7 @@ def _finish(
             return
         compensation_slack = 0.51 * relative * (1.0 + relative) + (root + 1.0) * unit
         record[index, OPACITY_LOW] *= 1.0 - compensation_slack
-        record[index, OPACITY_HIGH] *= 1.0 + compensation_slack
+        record[index, OPACITY_HIGH] = opacity * (1.0 + compensation_slack)
     record[index, KAPPA] = kappa
     record[index, WILD] = 0.0
     record[index, FORMS + 3 * stride + m] = (

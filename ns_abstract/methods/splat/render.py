@@ -109,7 +109,8 @@ def _project_chunk(
         y0, y1 = mean_y - extent_y, mean_y + extent_y
         if cutoff > 0.0:
             half = 0.5 * (a - c)
-            radius = math.ceil(
+            # np.ceil: math.ceil is an int64, which a huge Gaussian overflows
+            radius = np.ceil(
                 sigmas * math.sqrt(0.5 * (a + c) + math.sqrt(max(discriminant_min, half * half + b * b)))
             )
             if (
@@ -120,16 +121,16 @@ def _project_chunk(
             ):
                 continue
             # the tiles hit by the radius cut the region off
-            x0 = max(x0, math.floor((mean_x - radius) / tile) * tile)
-            x1 = min(x1, math.ceil((mean_x + radius) / tile) * tile)
-            y0 = max(y0, math.floor((mean_y - radius) / tile) * tile)
-            y1 = min(y1, math.ceil((mean_y + radius) / tile) * tile)
+            x0 = max(x0, np.floor((mean_x - radius) / tile) * tile)
+            x1 = min(x1, np.ceil((mean_x + radius) / tile) * tile)
+            y0 = max(y0, np.floor((mean_y - radius) / tile) * tile)
+            y1 = min(y1, np.ceil((mean_y + radius) / tile) * tile)
         if x1 < 0.5 or x0 > width - 0.5 or y1 < 0.5 or y0 > height - 0.5 or x1 < x0 or y1 < y0:
             continue
-        tiles[i, 0] = int(max(0.0, math.floor(x0 / tile)))
-        tiles[i, 1] = int(min(float(tiles_x), math.floor(x1 / tile) + 1.0))
-        tiles[i, 2] = int(max(0.0, math.floor(y0 / tile)))
-        tiles[i, 3] = int(min(float(tiles_y), math.floor(y1 / tile) + 1.0))
+        tiles[i, 0] = int(max(0.0, np.floor(x0 / tile)))
+        tiles[i, 1] = int(min(float(tiles_x), np.floor(x1 / tile) + 1.0))
+        tiles[i, 2] = int(max(0.0, np.floor(y0 / tile)))
+        tiles[i, 3] = int(min(float(tiles_y), np.floor(y1 / tile) + 1.0))
         box[i, 0], box[i, 1], box[i, 2], box[i, 3] = x0, x1, y0, y1
         p = math.sqrt(c / det)
         record[i, _MEAN_X], record[i, _MEAN_Y] = mean_x, mean_y
