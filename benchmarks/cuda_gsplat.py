@@ -89,8 +89,8 @@ class CudaRenderer:
 
 def check(job: Any, name: str, frame: int, seconds: float, poses: int) -> dict[str, object]:
     """Bound one set and compare ``poses`` CUDA renders with it."""
-    result = refine(job, name, frame, seconds, 1.0)
     a_set = pose_set(job, name, frame)
+    result = refine(job, a_set, frame, seconds, 1.0)
     renderer = CudaRenderer(job.scene)
     corners = a_set.box.corners()[:64]
     values = np.concatenate([corners, a_set.box.sample(max(0, poses - len(corners)), np.random.default_rng(0))])

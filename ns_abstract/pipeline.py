@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -56,23 +57,24 @@ class Settings:
 class Job:
     """An opened scene, camera path and set of poses.
 
+    Args:
+        settings: What to bound.
+        perturbation: For every entry of the path, in place of what the files say.
+
     Raises:
         InputError: A file, a field or an option cannot be used.
     """
 
-    def __init__(self, settings: Settings) -> None:
+    def __init__(self, settings: Settings, perturbation: Perturbation | None = None) -> None:
         self.settings = settings
-        if not 0.0 < settings.downscale_factor < float("inf"):
-            raise InputError(
-                f"found {settings.downscale_factor}", field="--downscale-factor", fix="give a positive number"
-            )
         self.rasteriser: Rasteriser = RASTERISERS[settings.renderer]
         self.arithmetic = arithmetic_named(settings.arithmetic)
         self.path: CameraPath = load_camera_path(settings.camera_path_filename, settings.downscale_factor)
         self.scene: SplatScene = load_scene(settings.load_config)
-        self.perturbations: tuple[Perturbation, ...] = self._perturbations()
+        given = (perturbation,) * self.frame_count if perturbation is not None else None
+        self.perturbations: tuple[Perturbation, ...] = given or self._perturbations()
         # a set that cannot be made is found before hours of work
-        self.pose_sets = tuple(self._pose_set(k) for k in range(len(self.path.cameras)))
+        self.pose_sets = tuple(self.pose_set(k, p) for k, p in enumerate(self.perturbations))
         self.splats: Splats = activate(self.scene, self.rasteriser)
         self._check_memory()
 
@@ -104,11 +106,14 @@ class Job:
                 raise error.within(self.path.source) from None
         return tuple(found)
 
-    def _pose_set(self, index: int) -> PoseSet:
-        cameras = self.path.cameras
-        following = cameras[index + 1] if index + 1 < len(cameras) else None
+    def pose_set(self, index: int, perturbation: Perturbation) -> PoseSet:
+        """The poses of ``perturbation`` around entry ``index`` of the path.
+
+        Raises:
+            InputError: The path cannot be swept as asked.
+        """
         try:
-            return PoseSet.around(cameras[index], self.perturbations[index], following)
+            return PoseSet.around(self.path.cameras[index], perturbation, self.path.following(index))
         except InputError as error:
             raise error.within(self.path.source) from None
 
@@ -200,6 +205,7 @@ class Job:
             plan.append("opacity compensation left out: rasterize_mode is classic")
         return tuple(plan)
 
+    @cached_property
     def fingerprint(self) -> dict[str, Any]:
         """What a stored result must agree with to be continued."""
         digest = hashlib.sha256()

@@ -17,6 +17,7 @@ PACKAGE = ROOT / "ns_abstract"
 #: A module imports from its own level or lower ones.
 LEVELS = (
     "errors",
+    "atomic",
     "jsonio",
     "arithmetic",
     "sets",

@@ -16,11 +16,12 @@ from ns_abstract.arithmetic.units import FLOAT32, REAL
 from ns_abstract.methods.splat.activate import Splats, rotation_matrices
 from ns_abstract.methods.splat.bounds import SplatBounds
 from ns_abstract.methods.splat.constants import GSPLAT_1_4_0
-from ns_abstract.methods.splat.render import Renderer, assemble
+from ns_abstract.methods.splat.render import Renderer
 from ns_abstract.sets.box import ParameterBox
 from ns_abstract.sets.path import Camera
 from ns_abstract.sets.perturbation import Perturbation
 from ns_abstract.sets.poses import PoseSet
+from ns_abstract.sets.tiles import assemble
 
 both_orders = pytest.mark.parametrize("order", [1, 2])
 TURN = (0.8, 0.3, -0.4, 0.33)

@@ -679,9 +679,9 @@ def test_worker_with_other_files_is_refused(blobs: Inputs, tmp_path: Path) -> No
 
     job = Job(Settings(blobs.config, blobs.path, blobs.spec))
     goal = job.goal(1.5, 1.0, 2)
-    assert bound_frame(job.settings, job.fingerprint(), 0, goal, False).index == 0
+    assert bound_frame(job.settings, job.fingerprint, 0, goal, False).index == 0
     with pytest.raises(InputError, match="other content"):
-        bound_frame(job.settings, job.fingerprint() | {"scene": "another"}, 0, goal, False)
+        bound_frame(job.settings, job.fingerprint | {"scene": "another"}, 0, goal, False)
 
 
 @needs_dask

@@ -26,7 +26,6 @@ from ns_abstract.demo.paths import (
     airfield_views,
     dataset_views,
     write_airfield_paths,
-    write_atomically,
 )
 from ns_abstract.demo.runs import write_splatfacto_run
 from ns_abstract.errors import InputError
@@ -346,20 +345,6 @@ def test_names_that_leave_the_folder_are_refused(tmp_path: Path, name: str) -> N
     with pytest.raises(InputError, match="timestamp"):
         write_splatfacto_run(small_scene(), tmp_path, timestamp=name, experiment_name="e")
     assert not list(tmp_path.iterdir())
-
-
-def test_unfinished_files_leave_no_trace(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    file = tmp_path / "value.json"
-    write_atomically(file, b"old")
-
-    def refuse(*_: object) -> None:
-        raise OSError("disk full")
-
-    monkeypatch.setattr(os, "replace", refuse)
-    with pytest.raises(OSError, match="disk full"):
-        write_atomically(file, b"new")
-    assert [f.name for f in tmp_path.iterdir()] == ["value.json"]
-    assert file.read_bytes() == b"old"
 
 
 # Runs in its own process: Nerfstudio changes global state, and takes paths from the working directory.

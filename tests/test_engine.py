@@ -13,9 +13,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ns_abstract.refine import engine
-from ns_abstract.refine.engine import Goal, Refinement, assemble_tiles
+from ns_abstract.refine.engine import Goal, Refinement
 from ns_abstract.refine.result import FrameResult, mean_pixel_gap
 from ns_abstract.sets.box import ParameterBox
+from ns_abstract.sets.tiles import assemble
 
 SIDE = 4
 FOREVER = 1e9
@@ -133,8 +134,8 @@ def refine(frame: Any, goal: Goal, **options: Any) -> FrameResult:
 def check(frame: Waves, result: FrameResult) -> None:
     """The bounds hold the exact range, the witnesses lie inside it."""
     lower, upper, _ = frame.exact(frame.box)
-    assert (result.lower <= assemble_tiles(lower, frame)).all()
-    assert (result.upper >= assemble_tiles(upper, frame)).all()
+    assert (result.lower <= assemble(lower, frame.camera)).all()
+    assert (result.upper >= assemble(upper, frame.camera)).all()
     assert (result.lower >= 0.0).all() and (result.upper <= 1.0).all()
     for witness in (result.image, result.witness_lower, result.witness_upper):
         assert (result.lower <= witness).all() and (witness <= result.upper).all()

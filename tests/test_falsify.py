@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import numba
 import numpy as np
 import pytest
 import torch
@@ -36,15 +34,6 @@ SIX = {
     "translation": {"x": 0.1, "y": 0.1, "z": 0.1},
     "rotation": {"yaw": 0.05, "pitch": 0.05, "roll": 0.1},
 }
-
-
-@pytest.fixture(autouse=True, scope="module")
-def one_thread() -> Iterator[None]:
-    """The pictures are too small to share among threads, which wait busily for one another."""
-    threads = numba.get_num_threads()
-    numba.set_num_threads(1)
-    yield
-    numba.set_num_threads(threads)
 
 
 def ball(x: float, y: float, *, deviation: float, opacity: float, color: float, depth: float = 2.0) -> dict[str, Any]:

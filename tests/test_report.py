@@ -19,11 +19,12 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from ns_abstract.atomic import write_atomic
 from ns_abstract.errors import InputError
 from ns_abstract.refine.result import FrameResult, Leaves, TracePoint
 from ns_abstract.report import files, page, picture, record
 from ns_abstract.report.figures import interval, metrics, number
-from ns_abstract.report.files import IMAGES, LEAVES, check_frame, frame_name, load_frame, save_frame, write_atomic
+from ns_abstract.report.files import IMAGES, LEAVES, check_frame, frame_name, load_frame, save_frame
 from ns_abstract.report.record import Report, Run, differences, file_stamp, guarantee_text, merged, plain
 from ns_abstract.sets.box import ParameterBox
 
@@ -138,11 +139,24 @@ def test_interrupted_write(tmp_path):
     assert path.read_bytes() == before and os.listdir(tmp_path) == [path.name]
 
 
+def test_refused_write(tmp_path, monkeypatch):
+    path = tmp_path / "value.json"
+    path.write_bytes(b"old")
+
+    def refuse(*_):
+        raise OSError("disk full")
+
+    monkeypatch.setattr(os, "replace", refuse)
+    with pytest.raises(OSError, match="disk full"):
+        write_atomic(path, lambda stream: stream.write(b"new"))
+    assert path.read_bytes() == b"old" and os.listdir(tmp_path) == [path.name]
+
+
 def test_killed_write(tmp_path):
     path = tmp_path / "report.json"
     path.write_text("old")
     code = (
-        "import os, sys\nfrom ns_abstract.report.files import write_atomic\n"
+        "import os, sys\nfrom ns_abstract.atomic import write_atomic\n"
         "def die(stream):\n    stream.write(b'half'); stream.flush(); os._exit(9)\n"
         "write_atomic(sys.argv[1], die)"
     )

@@ -11,7 +11,7 @@ import numpy as np
 
 from ns_abstract.errors import InputError
 from ns_abstract.pipeline import Job, Settings
-from ns_abstract.sets.perturbation import parse_perturbation
+from ns_abstract.sets.perturbation import Perturbation, parse_perturbation
 from ns_abstract.sets.poses import PoseSet
 
 #: Perturbation objects by name; "orbit" turns about the vertical through the median Gaussian.
@@ -49,10 +49,8 @@ def open_jobs(
     jobs = []
     for config in load_config:
         path = camera_path if camera_path is not None else config.resolve().parents[2] / "camera_path.json"
-        with tempfile.NamedTemporaryFile("w", suffix=".json") as nothing:
-            nothing.write("{}")
-            nothing.flush()
-            jobs.append(Job(Settings(config, path, Path(nothing.name), downscale_factor, arithmetic=arithmetic)))
+        settings = Settings(config, path, downscale_factor=downscale_factor, arithmetic=arithmetic)
+        jobs.append(Job(settings, Perturbation()))
     return jobs
 
 
@@ -76,6 +74,4 @@ def pose_set(job: Job, name: str, frame: int, scale: float = 1.0) -> PoseSet:
     perturbation = replace(
         perturbation, translation=scaled(perturbation.translation), rotation=scaled(perturbation.rotation)
     )
-    cameras = job.path.cameras
-    following = cameras[frame + 1] if frame + 1 < len(cameras) else None
-    return PoseSet.around(cameras[frame], perturbation, following)
+    return job.pose_set(frame, perturbation)

@@ -17,8 +17,8 @@ def attack(
     Gradient ascent goes through the differentiable reference; what it finds is rendered by the compiled renderer.
     The poses that came closest, random ones and corners are then rendered by the reference as well.
     """
-    result = refine(job, name, frame, seconds, 1.0, scale)
     poses_set = pose_set(job, name, frame, scale)
+    result = refine(job, poses_set, frame, seconds, 1.0)
     render, probe = compiled_renderer(job.scene, poses_set, job.rasteriser)
     other, other_probe, twin = reference_renderer(job.scene, poses_set, job.rasteriser)
     first = falsify(result.lower, result.upper, poses_set.box, render, twin, probe=probe, poses=poses, seed=seed)

@@ -2,19 +2,19 @@
 
 from __future__ import annotations
 
-from ns_abstract.bench.sets import pose_set
 from ns_abstract.methods.splat.frame import SplatFrame
 from ns_abstract.pipeline import Job
 from ns_abstract.refine.engine import Refinement
 from ns_abstract.refine.result import FrameResult, max_pixel_gap
+from ns_abstract.sets.poses import PoseSet
 
 #: Ratios whose time is reported.
 MARKS = (1.5, 1.25, 1.1, 1.05, 1.02, 1.01)
 
 
-def refine(job: Job, name: str, frame: int, seconds: float, ratio: float, scale: float = 1.0) -> FrameResult:
-    """The abstract image of one frame over the set ``name``; kernels are compiled before the clock starts."""
-    view = SplatFrame(job.splats, job.rasteriser, job.arithmetic, pose_set(job, name, frame, scale))
+def refine(job: Job, poses: PoseSet, frame: int, seconds: float, ratio: float) -> FrameResult:
+    """The abstract image of ``poses`` about entry ``frame``; kernels are compiled before the clock starts."""
+    view = SplatFrame(job.splats, job.rasteriser, job.arithmetic, poses)
     view.warm_up()
     return Refinement(view, frame, job.goal(ratio, seconds), seed=job.settings.seed).run()
 

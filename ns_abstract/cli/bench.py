@@ -17,41 +17,37 @@ _STUCK = 900.0
 
 
 @dataclass
-class Cell:
-    """What one bounded cell costs in units of the concrete render of the same view."""
+class Scenes:
+    """What is measured."""
 
     load_config: tuple[Path, ...] = ()
     """Runs (config.yml or .ply). Default: the demo scene."""
     camera_path_filename: Path | None = None
     """Default: camera_path.json in the folder that holds the method's folder."""
     output_dir: Path = Path("bench")
-    """Folder for the tables."""
-    sets: tuple[str, ...] = ("x",)
-    """Sets of poses: x, yaw, roll, six, segments, orbit, point."""
+    """Folder for tables and curves."""
     frame: int = 0
     """Entry of the camera path."""
     downscale_factor: float = 1.0
     """Images become this many times smaller."""
+
+
+@dataclass
+class Cell(Scenes):
+    """What one bounded cell costs in units of the concrete render of the same view."""
+
+    sets: tuple[str, ...] = ("x",)
+    """Sets of poses: x, yaw, roll, six, segments, orbit, point."""
     repeats: int = 15
     """Times that everything is measured."""
 
 
 @dataclass
-class Tightness:
+class Tightness(Scenes):
     """Error against run time: ratio of outer to inner gap, with curves."""
 
-    load_config: tuple[Path, ...] = ()
-    """Runs (config.yml or .ply). Default: the demo scene."""
-    camera_path_filename: Path | None = None
-    """Default: camera_path.json in the folder that holds the method's folder."""
-    output_dir: Path = Path("bench")
-    """Folder for tables, traces and curves."""
     sets: tuple[str, ...] = ("x", "yaw")
     """Sets of poses: x, yaw, roll, six, segments, orbit, point."""
-    frame: int = 0
-    """Entry of the camera path."""
-    downscale_factor: float = 1.0
-    """Images become this many times smaller."""
     seconds: float = 60.0
     """Time for every scene and set."""
     target_ratio: float = 1.01
@@ -61,21 +57,11 @@ class Tightness:
 
 
 @dataclass
-class Soundness:
+class Soundness(Scenes):
     """Attack abstract images by random poses, corners, gradient ascent and threshold jumps."""
 
-    load_config: tuple[Path, ...] = ()
-    """Runs (config.yml or .ply). Default: the demo scene."""
-    camera_path_filename: Path | None = None
-    """Default: camera_path.json in the folder that holds the method's folder."""
-    output_dir: Path = Path("bench")
-    """Folder for the tables."""
     sets: tuple[str, ...] = ("x", "yaw", "roll", "six", "segments", "orbit")
     """Sets of poses: x, yaw, roll, six, segments, orbit, point."""
-    frame: int = 0
-    """Entry of the camera path."""
-    downscale_factor: float = 1.0
-    """Images become this many times smaller."""
     seconds: float = 10.0
     """Time for bounding every scene and set."""
     poses: int = 200
@@ -161,7 +147,7 @@ def bench(options: Cell | Tightness | Soundness | Stiff) -> int:
     """Run one benchmark; the exit code of a soundness benchmark with violations is 1."""
     if isinstance(options, Stiff):
         return stiff(options)
-    from ns_abstract.bench.sets import open_jobs
+    from ns_abstract.bench.sets import open_jobs, pose_set
     from ns_abstract.bench.tables import markdown, write
 
     jobs = open_jobs(options.load_config, options.camera_path_filename, options.downscale_factor)
@@ -176,7 +162,8 @@ def bench(options: Cell | Tightness | Soundness | Stiff) -> int:
             elif isinstance(options, Tightness):
                 from ns_abstract.bench.tightness import refine, summary
 
-                result = refine(job, name, options.frame, options.seconds, options.target_ratio, options.scale)
+                poses = pose_set(job, name, options.frame, options.scale)
+                result = refine(job, poses, options.frame, options.seconds, options.target_ratio)
                 results[f"{job.scene.name} {name}"] = result
                 rows.append(summary(job, name, result))
             else:

@@ -34,10 +34,10 @@ def bound_frame(
     Raises:
         InputError: The worker reads other files under the same names than the command did.
     """
-    if settings not in _jobs or _jobs[settings].fingerprint() != fingerprint:
+    if settings not in _jobs or _jobs[settings].fingerprint != fingerprint:
         _jobs.clear()
         job = Job(settings)
-        if job.fingerprint() != fingerprint:
+        if job.fingerprint != fingerprint:
             raise InputError(
                 "the worker finds other content than this machine",
                 file=settings.load_config,
@@ -99,7 +99,7 @@ def bound_on_cluster(
     workers = max(1, sum(client.nthreads().values()))
     rounds = -(-len(pending) // workers)
     goal = job.goal(options.target_ratio, budget / rounds)
-    settings, fingerprint = _with_whole_paths(job.settings), job.fingerprint()
+    settings, fingerprint = _with_whole_paths(job.settings), job.fingerprint
     # a scheduler serves several commands: equal keys would hand one the results of another
     command = secrets.token_hex(8)
     waiting = {

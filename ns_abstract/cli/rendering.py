@@ -39,7 +39,7 @@ def make_run(job: Job, options: Render, frames: tuple[int, ...], problems: list[
         renderer={"name": job.rasteriser.name, "version": job.rasteriser.version},
         scene=job.describe(),
         frames=frames,
-        fingerprint=job.fingerprint(),
+        fingerprint=job.fingerprint,
         settings=dataclasses.asdict(options),
         plan=job.plan,
         command=("ns-abstract-render", *sys.argv[1:]),

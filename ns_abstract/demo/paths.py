@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
-import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ns_abstract.atomic import write_atomic
 from ns_abstract.demo.airfield import TARGET
 
 FOV = 45.0  # vertical, degrees
@@ -156,26 +155,6 @@ def write_airfield_paths(folder: str | Path) -> dict[str, Path]:
         "spec": (folder / "SPEC.json", airfield_perturbation()),
     }
     for file, value in files.values():
-        write_atomically(file, (json.dumps(value, indent=1) + "\n").encode())
+        text = json.dumps(value, indent=1) + "\n"
+        write_atomic(file, lambda stream, text=text: stream.write(text.encode()))
     return {name: file for name, (file, _) in files.items()}
-
-
-def write_atomically(file: Path, data: bytes, *, scratch: Path | None = None) -> None:
-    """Write ``data`` so that ``file`` is seen whole or not at all.
-
-    Args:
-        scratch: Folder on the same file system for the unfinished file; the file's own by default.
-    """
-    file.parent.mkdir(parents=True, exist_ok=True)
-    handle, name = tempfile.mkstemp(prefix=".unfinished-", dir=scratch or file.parent)
-    try:
-        with os.fdopen(handle, "wb") as stream:
-            stream.write(data)
-        # mkstemp files are private; give the usual permissions.
-        mask = os.umask(0)
-        os.umask(mask)
-        os.chmod(name, 0o666 & ~mask)
-        os.replace(name, file)
-    except BaseException:
-        Path(name).unlink(missing_ok=True)
-        raise

@@ -19,7 +19,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ns_abstract.demo.paths import View, dataset_views, write_atomically
+from ns_abstract.atomic import write_atomic
+from ns_abstract.demo.paths import View, dataset_views
 from ns_abstract.errors import InputError
 from ns_abstract.methods.splat.scene import SplatScene
 
@@ -88,13 +89,18 @@ def write_splatfacto_run(
 
     _write_dataset(scene, folder / "data", dataset_views() if views is None else views, render)
     transform = {"transform": scene.dataparser.matrix.tolist(), "scale": float(scene.dataparser.scale)}
-    write_atomically(run / "dataparser_transforms.json", json.dumps(transform, indent=4).encode())
+    _write(run / "dataparser_transforms.json", json.dumps(transform, indent=4).encode())
     # Nerfstudio reads the step out of every name in nerfstudio_models: nothing else may stand there.
     checkpoint = run / "nerfstudio_models" / f"step-{STEP:09d}.ckpt"
-    write_atomically(checkpoint, _checkpoint_bytes(scene), scratch=run)
+    _write(checkpoint, _checkpoint_bytes(scene), scratch=run)
     config = run / "config.yml"
-    write_atomically(config, _config_text(scene, timestamp, experiment_name).encode())
+    _write(config, _config_text(scene, timestamp, experiment_name).encode())
     return config
+
+
+def _write(file: Path, data: bytes, *, scratch: Path | None = None) -> None:
+    file.parent.mkdir(parents=True, exist_ok=True)
+    write_atomic(file, lambda stream: stream.write(data), scratch=scratch)
 
 
 def _config_text(scene: SplatScene, timestamp: str, experiment_name: str) -> str:
@@ -209,7 +215,7 @@ def _write_dataset(
             image = np.broadcast_to(scene.background, (height, width, 3))
         else:
             image = np.asarray(render(view), np.float64)
-        write_atomically(folder / name, _png(image))
+        _write(folder / name, _png(image))
         frames.append({"file_path": name, "transform_matrix": view.camera_to_world.tolist()})
     meta: dict[str, Any] = {
         "camera_model": "OPENCV",
@@ -230,7 +236,7 @@ def _write_dataset(
         meta["applied_transform"] = scene.dataparser.matrix.tolist()
         meta["applied_scale"] = float(scene.dataparser.scale)
     meta["frames"] = frames
-    write_atomically(folder / "transforms.json", json.dumps(meta, indent=1).encode())
+    _write(folder / "transforms.json", json.dumps(meta, indent=1).encode())
 
 
 def _png(image: NDArray[Any]) -> bytes:

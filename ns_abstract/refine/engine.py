@@ -17,8 +17,9 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from ns_abstract.refine.result import FrameResult, Leaves, TracePoint
+from ns_abstract.refine.result import FrameResult, Leaves, TracePoint, gap
 from ns_abstract.sets.box import ParameterBox
+from ns_abstract.sets.tiles import assemble
 
 #: Part of the whole excess that one round of splitting takes on.
 _ROUND_SHARE = 0.8
@@ -253,8 +254,7 @@ class Refinement:
     # --- measures ------------------------------------------------------------------------------
 
     def _mpg(self, lower: np.ndarray, upper: np.ndarray) -> float:
-        length = np.linalg.norm(upper.astype(np.float64) - lower, axis=-1)
-        return float(length[self.inside].mean())
+        return float(gap(lower, upper)[self.inside].mean())
 
     def point(self) -> TracePoint:
         """Where the work stands."""
@@ -539,7 +539,7 @@ class Refinement:
         )
 
     def _whole(self, tiles: np.ndarray) -> np.ndarray:
-        return assemble_tiles(tiles, self.frame)
+        return assemble(tiles, self.frame.camera)
 
 
 def _usable(lower: np.ndarray, upper: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -585,11 +585,3 @@ def _pixels_inside(frame: Frame) -> np.ndarray:
     columns = np.arange(frame.across * frame.side) < frame.camera.width
     grid = (rows[:, None] & columns[None, :]).reshape(frame.down, frame.side, frame.across, frame.side)
     return grid.swapaxes(1, 2).reshape(-1, frame.side, frame.side)
-
-
-def assemble_tiles(tiles: np.ndarray, frame: Frame) -> np.ndarray:
-    """[H, W, ...] from all tiles [T, side, side, ...]."""
-    rest = tiles.shape[3:]
-    grid = tiles.reshape(frame.down, frame.across, frame.side, frame.side, *rest).swapaxes(1, 2)
-    whole = grid.reshape(frame.down * frame.side, frame.across * frame.side, *rest)
-    return np.ascontiguousarray(whole[: frame.camera.height, : frame.camera.width])

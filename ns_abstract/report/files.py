@@ -7,7 +7,6 @@ import json
 import math
 import os
 import re
-import secrets
 import struct
 import zipfile
 import zlib
@@ -18,6 +17,7 @@ from typing import Any, BinaryIO
 
 import numpy as np
 
+from ns_abstract.atomic import write_atomic
 from ns_abstract.errors import InputError
 from ns_abstract.jsonio import parse_json
 from ns_abstract.refine.result import FrameResult, Leaves, TracePoint
@@ -50,32 +50,6 @@ def frame_index(path: Path) -> int | None:
     """The frame number in the name of a frame file, or None for any other name."""
     match = _NAME.fullmatch(path.name)
     return int(match[1]) if match else None
-
-
-def write_atomic(path: str | os.PathLike[str], write: Callable[[BinaryIO], object]) -> None:
-    """Write a file under a temporary name in the same folder, then move it into place.
-
-    Whoever opens ``path`` sees the old file or the whole new one, also after a crash, a kill or
-    a loss of power between the two.
-
-    Args:
-        path: The file.
-        write: Called with the open temporary file.
-
-    Raises:
-        OSError: The folder cannot be written; ``path`` is as before.
-    """
-    path = Path(path)
-    temporary = path.with_name(f".{path.name}.{secrets.token_hex(4)}.part")
-    try:
-        with open(temporary, "xb") as stream:
-            write(stream)
-            stream.flush()
-            os.fsync(stream.fileno())
-        os.replace(temporary, path)
-    except BaseException:
-        temporary.unlink(missing_ok=True)
-        raise
 
 
 def remove_parts(folder: Path) -> None:

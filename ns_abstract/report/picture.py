@@ -13,9 +13,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ns_abstract.atomic import write_atomic
 from ns_abstract.refine.result import FrameResult, gap, max_pixel_gap
 from ns_abstract.report.figures import interval, metrics, number
-from ns_abstract.report.files import write_atomic
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

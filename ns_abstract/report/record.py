@@ -16,6 +16,7 @@ from typing import Any, Literal
 
 import numpy as np
 
+from ns_abstract.atomic import write_atomic
 from ns_abstract.errors import InputError
 from ns_abstract.jsonio import file_size, is_number, load_json
 from ns_abstract.refine.result import FrameResult, TracePoint
@@ -28,7 +29,6 @@ from ns_abstract.report.files import (
     load_frame,
     remove_parts,
     save_frame,
-    write_atomic,
 )
 
 VERSION = 1

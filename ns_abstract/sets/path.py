@@ -106,6 +106,10 @@ class CameraPath:
         own = self.overrides[index]
         return self.perturbation if own is None else own
 
+    def following(self, index: int) -> Camera | None:
+        """The camera after ``index``; None for the last."""
+        return self.cameras[index + 1] if index + 1 < len(self.cameras) else None
+
 
 def load_camera_path(path: str | os.PathLike[str], downscale_factor: float = 1) -> CameraPath:
     """Read the JSON that Nerfstudio's viewer writes.

@@ -13,14 +13,16 @@ from ns_abstract.arithmetic.units import arithmetic as arithmetic_of
 from ns_abstract.methods.splat.activate import activate
 from ns_abstract.methods.splat.bounds import SplatBounds
 from ns_abstract.methods.splat.constants import GSPLAT_1_4_0, Rasteriser
+from ns_abstract.methods.splat.frame import outward
 from ns_abstract.methods.splat.load import load_scene
 from ns_abstract.methods.splat.reference import Reference
-from ns_abstract.methods.splat.render import Renderer, assemble, tile_grid
+from ns_abstract.methods.splat.render import Renderer
 from ns_abstract.methods.splat.scene import SplatScene
 from ns_abstract.sets.box import Float64Array, ParameterBox
 from ns_abstract.sets.path import load_camera_path
 from ns_abstract.sets.perturbation import parse_perturbation
 from ns_abstract.sets.poses import PoseSet
+from ns_abstract.sets.tiles import assemble, tile_grid
 from ns_abstract.sets.twin import pose_twin
 from ns_abstract.verify.falsify import Attack, Probe, Render, Twin, falsify, merge
 
@@ -73,14 +75,6 @@ def equal_cells(box: ParameterBox, parts: int | Sequence[int]) -> list[Parameter
     return cells
 
 
-def _outward(lower: Float64Array, upper: Float64Array) -> tuple[np.ndarray, np.ndarray]:
-    """The tightest float32 bounds that hold float64 ones."""
-    low, high = lower.astype(np.float32), upper.astype(np.float32)
-    low = np.where(low > lower, np.nextafter(low, np.float32(-np.inf)), low)
-    high = np.where(high < upper, np.nextafter(high, np.float32(np.inf)), high)
-    return low, high
-
-
 def bound_cells(
     scene: SplatScene,
     pose_set: PoseSet,
@@ -96,7 +90,7 @@ def bound_cells(
     out, statistics = [], np.zeros(5, np.int64)
     for cell in cells:
         result = bounds.cell(camera, pose_set.enclosure(cell, order))
-        out.append(_outward(assemble(result.lower, camera), assemble(result.upper, camera)))
+        out.append(outward(assemble(result.lower, camera), assemble(result.upper, camera)))
         statistics += result.statistics
     return out, statistics
 
@@ -163,8 +157,7 @@ def check_run(
     """
     scene = load_scene(load_config)
     path = load_camera_path(camera_path, downscale_factor)
-    following = path.cameras[frame + 1] if frame + 1 < len(path.cameras) else None
-    pose_set = PoseSet.around(path.cameras[frame], parse_perturbation(dict(spec)), following)
+    pose_set = PoseSet.around(path.cameras[frame], parse_perturbation(dict(spec)), path.following(frame))
     boxes = equal_cells(pose_set.box, cells)
     bounds, statistics = bound_cells(scene, pose_set, boxes, rasteriser=rasteriser, arithmetic=arithmetic, order=order)
     render, probe = compiled_renderer(scene, pose_set, rasteriser)

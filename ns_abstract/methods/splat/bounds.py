@@ -15,9 +15,10 @@ from ns_abstract.methods.splat.constants import Rasteriser, rules_array
 from ns_abstract.methods.splat.gaussians import FORMS, covariance_noise, gaussian_stage
 from ns_abstract.methods.splat.lists import depth_order, tile_lists
 from ns_abstract.methods.splat.pixels import pixel_stage
-from ns_abstract.methods.splat.render import camera_array, tile_grid
+from ns_abstract.methods.splat.render import camera_array
 from ns_abstract.sets.path import Camera
 from ns_abstract.sets.poses import PoseForms
+from ns_abstract.sets.tiles import tile_grid
 
 #: Most pairs of layers whose depth order is examined in one block of pixels.
 PAIR_LIMIT = 20_000

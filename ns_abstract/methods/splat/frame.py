@@ -10,9 +10,10 @@ from ns_abstract.arithmetic.units import Arithmetic
 from ns_abstract.methods.splat.activate import Splats
 from ns_abstract.methods.splat.bounds import SplatBounds
 from ns_abstract.methods.splat.constants import Rasteriser
-from ns_abstract.methods.splat.render import Renderer, tile_grid
+from ns_abstract.methods.splat.render import Renderer
 from ns_abstract.sets.box import ParameterBox
 from ns_abstract.sets.poses import PoseSet
+from ns_abstract.sets.tiles import tile_grid
 
 #: Gaussians and poses looked at to estimate how far the picture moves.
 _MOTION_GAUSSIANS = 2000

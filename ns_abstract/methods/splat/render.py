@@ -18,6 +18,7 @@ from ns_abstract.methods.splat.colors import sh_color
 from ns_abstract.methods.splat.constants import Rasteriser, rules_array
 from ns_abstract.methods.splat.lists import BLOCK, PIXELS, block_lists, depth_order, tile_lists
 from ns_abstract.sets.path import Camera
+from ns_abstract.sets.tiles import assemble, tile_grid
 
 _CHUNK = 1024
 _EXPONENT_LIMIT = 60.0
@@ -262,20 +263,6 @@ def _rasterise(wanted, offsets, entries, record, box, camera, rules, background,
 def camera_array(camera: Camera) -> np.ndarray:
     """Intrinsics and size in the order the kernels expect."""
     return np.array([camera.fx, camera.fy, camera.cx, camera.cy, float(camera.width), float(camera.height)])
-
-
-def tile_grid(camera: Camera, side: int) -> tuple[int, int]:
-    """Tiles across and down."""
-    return -(-camera.width // side), -(-camera.height // side)
-
-
-def assemble(tiles: np.ndarray, camera: Camera) -> np.ndarray:
-    """The image [H, W, ...] from all its tiles [T, side, side, ...] in row-major order."""
-    side = tiles.shape[1]
-    across, down = tile_grid(camera, side)
-    rest = tiles.shape[3:]
-    grid = tiles.reshape(down, across, side, side, *rest).swapaxes(1, 2)
-    return np.ascontiguousarray(grid.reshape(down * side, across * side, *rest)[: camera.height, : camera.width])
 
 
 class Renderer:

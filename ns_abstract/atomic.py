@@ -1,0 +1,38 @@
+"""Files that are seen whole or not at all."""
+
+from __future__ import annotations
+
+import os
+import secrets
+from collections.abc import Callable
+from pathlib import Path
+from typing import BinaryIO
+
+
+def write_atomic(
+    path: str | os.PathLike[str], write: Callable[[BinaryIO], object], *, scratch: Path | None = None
+) -> None:
+    """Write a file under a temporary name on the same file system, then move it into place.
+
+    Whoever opens ``path`` sees the old file or the whole new one, also after a crash, a kill or
+    a loss of power between the two.
+
+    Args:
+        path: The file.
+        write: Called with the open temporary file.
+        scratch: Folder of the temporary file, on the same file system; the file's own by default.
+
+    Raises:
+        OSError: The folder cannot be written; ``path`` is as before.
+    """
+    path = Path(path)
+    temporary = (scratch or path.parent) / f".{path.name}.{secrets.token_hex(4)}.part"
+    try:
+        with open(temporary, "xb") as stream:
+            write(stream)
+            stream.flush()
+            os.fsync(stream.fileno())
+        os.replace(temporary, path)
+    except BaseException:
+        temporary.unlink(missing_ok=True)
+        raise
