@@ -66,3 +66,13 @@ if config.DISABLE_JIT:  # pyright: ignore[reportAttributeAccessIssue]
 
     def prefetch(array, row, byte):
         """Nothing: the interpreter has no say in caches."""
+
+
+@intrinsic
+def lowest_bit(typingctx, mask):  # pyright: ignore[reportRedeclaration]
+    """Number of the lowest bit that is set in an int64 that is not 0."""
+
+    def codegen(context, builder, signature, args):
+        return builder.cttz(args[0], ir.IntType(1)(1))
+
+    return types.int64(types.int64), codegen

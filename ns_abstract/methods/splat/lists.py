@@ -50,7 +50,7 @@ def tile_lists(order, tiles, wanted, tiles_x):
                     offsets[t + 1] += 1
     for t in range(count):
         offsets[t + 1] += offsets[t]
-    entries = np.empty(offsets[count], np.int32)
+    entries = np.empty(offsets[count], np.uint32)
     position = offsets[:-1].copy()
     for k in range(order.size):
         i = order[k]
@@ -86,7 +86,7 @@ def block_lists(entries, box, x0, y0, tile, offsets, out):
     for b in range(side * side):
         offsets[b + 1] += offsets[b]
     if out.size < offsets[side * side]:
-        out = np.empty(2 * offsets[side * side], np.int32)
+        out = np.empty(2 * offsets[side * side], np.uint32)
     position = offsets[:-1].copy()
     for k in range(entries.size):
         i = entries[k]

@@ -13,7 +13,7 @@ import math
 import numpy as np
 from numba import njit, prange
 
-from ns_abstract.arithmetic.compiled import borrowed, prefetch
+from ns_abstract.arithmetic.compiled import borrowed, lowest_bit, prefetch
 from ns_abstract.arithmetic.elementary import EXP_RELATIVE_ERROR, exp_kernel
 from ns_abstract.arithmetic.units import UNIT64
 from ns_abstract.methods.splat.gaussians import (
@@ -37,17 +37,22 @@ _FIT_LIMIT = 2.0
 _EXPONENT_LIMIT = 60.0
 #: Reordering that moves no channel of a pixel by more is not examined beyond the swap bound.
 _REORDERING_MATTERS = 1e-4
-#: Lane loops run over multiples of this many lanes.
-_VECTOR = 16
+#: Lane loops run over multiples of this many lanes: short loops of one vector each, or many of several.
+_VECTOR_LINE, _VECTOR = 4, 16
+#: Lanes that are blended together, down to the deepest of their lists.
+_GROUP = 16
+#: Pixel q of a block lies in row q >> _ROW_SHIFT; sets of pixels are the bits of an int64.
+_ROW_SHIFT = BLOCK.bit_length() - 1
+assert PIXELS == 64
 
 # Scratch is flat: row r holds its lanes at r * PIXELS .. r * PIXELS + PIXELS - 1. With constant
 # offsets the compiler sees that rows do not overlap. Lane loops run to a length taken from an array:
 # with a constant length they would be unrolled into scalar code, as it is they become vector code.
 (
-    _AX, _AY, _C1, _C2, _R1, _R2, _L1, _L2, _B1, _B2, _CC, _S0, _SR, _SL, _SB, _SLO, _SHI, _WEIGHT, _CURVE,
-    _A0, _AR, _LO, _HI, _TLO, _THI, _LIVE, _REACH, _RHO, _TMP, _MIN, _MAX, _BRIGHT, _LINEAR, _QUADRATIC,
-) = range(0, 34 * PIXELS, PIXELS)  # fmt: skip
-_ROWS = 34
+    _AX, _AY, _C1, _C2, _L1, _L2, _B1, _B2, _CC, _S0, _SR, _SL, _SB, _SLO, _SHI, _WEIGHT, _CURVE,
+    _A0, _AR, _LO, _HI, _TLO, _THI, _REACH, _RHO, _TMP, _MIN, _MAX, _LINEAR, _QUADRATIC, _DARKEST, _BRIGHTEST,
+) = range(0, 32 * PIXELS, PIXELS)  # fmt: skip
+_ROWS = 32
 
 
 @njit(cache=True, error_model="numpy", inline="always")
@@ -545,13 +550,13 @@ def _largest_exponent(record, i, alpha_min, unit):
 
 
 @njit(cache=True, error_model="numpy")
-def _list_lanes(record, i, ox, oy, left, right, top, bottom, sigma_max, m, s, pixels):
+def _list_lanes(record, i, ox, oy, left, right, top, bottom, sigma_max, m, live, s, pixels):
     """List the pixels of a range that take light and where the exponent may stay below ``sigma_max``.
 
-    Row by row, sigma >= (near1^2 + near2^2)/2 bounds the columns, where near1 and near2 are what the
-    forms' spread leaves of |y1| and |y2| (design.md, B2). Writes the offsets from the mean into rows _AX
-    and _AY and the pixel numbers into ``pixels``; returns their number. (ox, oy) is the offset of the
-    block's first pixel.
+    ``live`` holds the pixels that take light. Row by row, sigma >= (near1^2 + near2^2)/2 bounds the
+    columns, where near1 and near2 are what the forms' spread leaves of |y1| and |y2| (design.md, B2).
+    Writes the offsets from the mean into rows _AX and _AY and the pixel numbers into ``pixels``; returns
+    their number. (ox, oy) is the offset of the block's first pixel.
     """
     wild = record[i, WILD] != 0.0
     p, c, g, w1, w2 = 0.0, 0.0, 0.0, 0.0, 0.0
@@ -576,40 +581,39 @@ def _list_lanes(record, i, ox, oy, left, right, top, bottom, sigma_max, m, s, pi
             spread2 += abs(record[i, FORMS + 2 * stride + k]) * y + abs(record[i, FORMS + 4 * stride + k])
         spread1 *= _ROOM
         spread2 *= _ROOM
-    inverse = 1.0 / p if p > 0.0 else 0.0
     # without a bound on the columns the whole rows are taken
     bounded = p > 0.0 and spread1 < np.inf and spread2 < np.inf
-    n = 0
-    for row in range(top, bottom + 1):
-        ay = oy + row
-        start = left
-        stop = right
-        if bounded:
+    mask = 0
+    if bounded:
+        inverse = 1.0 / p
+        reach = 2.0 * sigma_max * _ROOM
+        first, past = float(left), float(right)
+        for row in range(bottom - top + 1):
+            ay = oy + (top + row)
             near = max(0.0, abs(g * ay - w2) - spread2)
-            rest = 2.0 * sigma_max * _ROOM - near * near * (2.0 - _ROOM)
-            if rest < 0.0:
-                continue
-            half = (math.sqrt(rest) + spread1) * inverse * _ROOM
+            rest = reach - near * near * (2.0 - _ROOM)
+            half = (math.sqrt(max(rest, 0.0)) + spread1) * inverse * _ROOM
             center = (c * ay + w1) * inverse - ox
             slack = (_ROOM - 1.0) * (abs(center) + abs(ox) + half)
-            start = int(math.ceil(min(max(center - half - slack, float(left)), right + 1.0)))
-            stop = int(math.floor(max(min(center + half + slack, float(right)), left - 1.0)))
-        for column in range(start, stop + 1):
-            # overwritten by the next pixel where no light is taken any more
-            s[_AX + n] = ox + column
-            s[_AY + n] = ay
-            pixels[n] = row * BLOCK + column
-            n += 1 if s[_LIVE + row * BLOCK + column] != 0.0 else 0
+            s[_C1 + row] = np.ceil(min(max(center - half - slack, first), past + 1.0))
+            s[_C2 + row] = np.floor(max(min(center + half + slack, past), first - 1.0)) if rest >= 0.0 else -1.0
+        for row in range(bottom - top + 1):
+            start, stop = int(s[_C1 + row]), int(s[_C2 + row])
+            if start <= stop:
+                mask |= ((2 << stop) - (1 << start)) << ((top + row) * BLOCK)
+    else:
+        for row in range(top, bottom + 1):
+            mask |= ((2 << right) - (1 << left)) << (row * BLOCK)
+    mask &= live
+    n = 0
+    while mask != 0:
+        pixels[n] = lowest_bit(mask)
+        mask &= mask - 1
+        n += 1
+    for lane in range(n):
+        s[_AX + lane] = ox + (pixels[lane] & (BLOCK - 1))
+        s[_AY + lane] = oy + (pixels[lane] >> _ROW_SHIFT)
     return n
-
-
-@njit(cache=True, error_model="numpy")
-def _any_live(s, row):
-    """Whether some pixel of a block's row still takes light."""
-    for q in range(row * BLOCK, (row + 1) * BLOCK):
-        if s[_LIVE + q] != 0.0:
-            return True
-    return False
 
 
 @njit(cache=True, error_model="numpy")
@@ -635,12 +639,11 @@ def _forward(
     stop = rules[9]
     stop_low = stop * (1.0 - 8.0 * unit)
     stop_high = stop * (1.0 + 8.0 * unit)
-    colored = m + 5
-    channels = colors.shape[1]
+    line = d == 1 and order == 2
+    vector = _VECTOR_LINE if line else _VECTOR
     for q in range(PIXELS):
         s[_TLO + q] = 1.0
         s[_THI + q] = 1.0
-        s[_LIVE + q] = 1.0
         s[_REACH + q] = -1.0
         s[_RHO + q] = 0.0
         s[_TMP + q] = 0.0
@@ -660,6 +663,7 @@ def _forward(
             farthest = max(farthest, reach[k])
     pair_count = 0
     slot_count = 0
+    live = -1
     live_first = 0
     live_last = BLOCK - 1
     record_bytes = 8 * record.shape[1]
@@ -685,12 +689,12 @@ def _forward(
         sigma_max = _largest_exponent(record, i, alpha_min, unit)
         n = _list_lanes(
             record, i, x0 + 0.5 - record[i, MEAN_X], y0 + 0.5 - record[i, MEAN_Y], left, right, top, bottom,
-            sigma_max, m, s, pixels,
+            sigma_max, m, live, s, pixels,
         )  # fmt: skip
         if n == 0:
             continue
         # vector code works on whole multiples; the lanes in excess repeat the last one
-        padded = -(-n // _VECTOR) * _VECTOR
+        padded = -(-n // vector) * vector
         for lane in range(n, padded):
             s[_AX + lane] = s[_AX + n - 1]
             s[_AY + lane] = s[_AY + n - 1]
@@ -727,7 +731,7 @@ def _forward(
             t_high = before * (1.0 - low) * (1.0 + 8.0 * unit)
             if alone and t_high <= stop_low:
                 # surely the stop: neither this layer nor any behind it is drawn
-                s[_LIVE + q] = 0.0
+                live &= ~(1 << q)
                 ended = True
                 continue
             count = lengths[q]
@@ -740,23 +744,27 @@ def _forward(
                 dropped = s[_TMP + q] >= before
                 if not dropped:
                     s[_RHO + q] = s[_TMP + q]
+            row = layers[count, q]
             if dropped:
-                layers[count, q, 0] = 0.5 * high
+                row[0] = 0.5 * high
                 for r in range(1, m):
-                    layers[count, q, r] = 0.0
-                layers[count, q, m] = 0.5 * high * _UP
+                    row[r] = 0.0
+                row[m] = 0.5 * high * _UP
                 low = 0.0
+            elif line:
+                row[0] = poly[0, lane]
+                row[1] = poly[1, lane]
+                row[2] = poly[2, lane]
+                row[3] = s[_AR + lane]
             else:
                 for r in range(m):
-                    layers[count, q, r] = poly[r, lane]
-                layers[count, q, m] = s[_AR + lane]
-            layers[count, q, m + 1] = low
-            layers[count, q, m + 2] = high
+                    row[r] = poly[r, lane]
+                row[m] = s[_AR + lane]
+            row[m + 1] = low
+            row[m + 2] = high
             # transmittance after this layer at its least, before it at its most
-            layers[count, q, m + 3] = t_low
-            layers[count, q, m + 4] = before
-            for c in range(channels):
-                layers[count, q, colored + c] = colors[i, c]
+            row[m + 3] = t_low
+            row[m + 4] = before
             sources[count, q] = k
             lengths[q] = count + 1
             s[_TLO + q] = t_low
@@ -769,16 +777,15 @@ def _forward(
         if slot_count > 0:
             for lane in range(n):
                 q = pixels[lane]
-                if s[_LIVE + q] != 0.0 and s[_THI + q] <= stop_low and s[_REACH + q] <= k:
-                    s[_LIVE + q] = 0.0
+                if s[_THI + q] <= stop_low and s[_REACH + q] <= k:
+                    live &= ~(1 << q)
                     ended = True
         if ended:
-            while live_first <= live_last and not _any_live(s, live_first):
-                live_first += 1
-            while live_last >= live_first and not _any_live(s, live_last):
-                live_last -= 1
-            if live_first > live_last:
+            if live == 0:
                 break
+            live_first = lowest_bit(live) // BLOCK
+            while live & (255 << (live_last * BLOCK)) == 0:
+                live_last -= 1
     return pair_count, slot_count
 
 
@@ -833,18 +840,7 @@ def _settle_stops(layers, sources, lengths, first, last, slots, places, s, m, st
 
 
 @njit(cache=True, error_model="numpy")
-def _color_range(layer, channel, m, color_rows):
-    """Bounds of one layer's colour."""
-    start = m + 5 + channel * color_rows
-    spread = 0.0
-    for r in range(1, color_rows):
-        spread += abs(layer[start + r])
-    spread *= _UP
-    return layer[start] - spread, layer[start] + spread
-
-
-@njit(cache=True, error_model="numpy")
-def _gaussian_color_range(colors, i, channel, color_rows):
+def _color_range(colors, i, channel, color_rows):
     """Bounds of one Gaussian's colour over the cell."""
     start = channel * color_rows
     spread = 0.0
@@ -869,8 +865,8 @@ def _swap_bounds(pairs, pair_count, slots, slot_count, heights, entries, colors,
         if front < 0 or back < 0:
             continue
         for channel in range(3):
-            low_e, high_e = _gaussian_color_range(colors, entries[pairs[p, 0]], channel, color_rows)
-            low_f, high_f = _gaussian_color_range(colors, entries[pairs[p, 1]], channel, color_rows)
+            low_e, high_e = _color_range(colors, entries[pairs[p, 0]], channel, color_rows)
+            low_f, high_f = _color_range(colors, entries[pairs[p, 1]], channel, color_rows)
             for side in range(2):
                 change = max(0.0, high_e - low_f) if side == 0 else max(0.0, high_f - low_e)
                 if change == 0.0:
@@ -908,7 +904,10 @@ def _collect_moves(moves, slot_count, places, extra, moved):
 
 
 @njit(cache=True, error_model="numpy")
-def _interval_chain(layers, extra, moved, low, high, start, stop, q, channel, m, color_rows, suffix_low, suffix_high):
+def _interval_chain(
+    layers, sources, entries, colors, extra, moved, low, high, start, stop, q, channel, m, color_rows,
+    suffix_low, suffix_high,
+):  # fmt: skip
     """One step of the interval blend for layers [start, stop) whose order is uncertain (design.md, O2-O4).
 
     Returns the tighter of the swap, hull and antichain bounds, and the range of the colours so far.
@@ -916,7 +915,7 @@ def _interval_chain(layers, extra, moved, low, high, start, stop, q, channel, m,
     behind_low, behind_high = low, high
     for e in range(stop - 1, start - 1, -1):
         layer = layers[e, q]
-        c_low, c_high = _color_range(layer, channel, m, color_rows)
+        c_low, c_high = _color_range(colors, entries[sources[e, q]], channel, color_rows)
         a_low = layer[m + 1]
         a_high = layer[m + 2]
         v = c_high - high
@@ -937,7 +936,7 @@ def _interval_chain(layers, extra, moved, low, high, start, stop, q, channel, m,
     keys = np.empty(count)
     for side in range(2):
         for e in range(count):
-            c_low, c_high = _color_range(layers[start + e, q], channel, m, color_rows)
+            c_low, c_high = _color_range(colors, entries[sources[start + e, q]], channel, color_rows)
             keys[e] = c_low if side == 0 else -c_high
         order = np.argsort(keys)
         value = behind_low if side == 0 else behind_high
@@ -956,7 +955,9 @@ def _interval_chain(layers, extra, moved, low, high, start, stop, q, channel, m,
 
 
 @njit(cache=True, error_model="numpy")
-def _interval_blend(layers, sources, lengths, extra, moved, chain, background, m, color_rows, low, high):
+def _interval_blend(
+    layers, sources, entries, colors, lengths, extra, moved, chain, background, m, color_rows, low, high
+):
     """Sharpen the interval blend where depth orders are uncertain; ``chain[k]`` numbers the groups."""
     size = np.zeros(chain.size + 2, np.int64)
     for k in range(chain.size):
@@ -984,8 +985,8 @@ def _interval_blend(layers, sources, lengths, extra, moved, chain, background, m
                 while start > 0 and chain[sources[start - 1, q]] == chain[sources[stop - 1, q]]:
                     start -= 1
                 value_low, value_high, suffix_low, suffix_high = _interval_chain(
-                    layers, extra, moved, value_low, value_high, start, stop, q, channel, m, color_rows,
-                    suffix_low, suffix_high,
+                    layers, sources, entries, colors, extra, moved, value_low, value_high, start, stop, q, channel, m,
+                    color_rows, suffix_low, suffix_high,
                 )  # fmt: skip
                 stop = start
             low[channel, q] = max(low[channel, q], value_low)
@@ -993,19 +994,21 @@ def _interval_blend(layers, sources, lengths, extra, moved, chain, background, m
 
 
 @njit(cache=True, error_model="numpy")
-def _blend(
-    layers, lengths, count, layer, extra, moved, background, d, order, m, color_rows,
+def _blend_group(
+    first, layers, sources, entries, colors, lengths, layer, extra, moved, background, d, order, m, color_rows,
     state, radius, low, high, value, s,
 ):  # fmt: skip
-    """Blend the layers back to front, as forms and as intervals (design.md, B7).
+    """Blend the layers of the lanes from ``first`` on back to front, as forms and as intervals (design.md, B7).
 
     ``state`` [3, m, lanes] and ``radius`` [3, lanes] receive the polynomial forms, ``low`` and
-    ``high`` [3, lanes] the intervals; rows _MIN, _MAX, _BRIGHT of ``s`` the range of all colours.
+    ``high`` [3, lanes] the intervals; rows _MIN and _MAX of ``s`` the range of all colours.
     """
     n = value.shape[1]
+    count = 0
     for q in range(n):
         s[_MIN + q] = min(background[0], background[1], background[2])
         s[_MAX + q] = max(background[0], background[1], background[2])
+        count = max(count, lengths[first + q])
     state[:] = 0.0
     radius[:] = 0.0
     for channel in range(3):
@@ -1016,10 +1019,14 @@ def _blend(
     moving = color_rows > 2
     for e in range(count - 1, -1, -1):
         # lane by lane in memory, row by row for the arithmetic
-        for q in range(PIXELS):
-            if e < lengths[q]:
-                for r in range(layer.shape[0]):
-                    layer[r, q] = layers[e, q, r]
+        for q in range(n):
+            lane = first + q
+            if e < lengths[lane]:
+                for r in range(m + 3):
+                    layer[r, q] = layers[e, lane, r]
+                i = entries[sources[e, lane]]
+                for r in range(3 * color_rows):
+                    layer[m + 3 + r, q] = colors[i, r]
             else:
                 for r in range(layer.shape[0]):
                     layer[r, q] = 0.0
@@ -1036,7 +1043,7 @@ def _blend(
         for q in range(n):
             s[_HI + q] = layer[m + 2, q]
         for channel in range(3):
-            start = m + 5 + channel * color_rows
+            start = m + 3 + channel * color_rows
             p = state[channel]
             for q in range(n):
                 s[_C1 + q] = layer[start, q]
@@ -1122,7 +1129,7 @@ def _blend(
             if moved[e]:
                 lower = 2 * channel
                 lift = 2 * channel + 1
-                reorder = extra[e]
+                reorder = extra[e, :, first : first + n]
                 for q in range(n):
                     p[0, q] += 0.5 * (reorder[lift, q] - reorder[lower, q])
                 for q in range(n):
@@ -1131,12 +1138,38 @@ def _blend(
                     top[q] += reorder[lift, q]
                 for q in range(n):
                     bottom[q] -= reorder[lower, q]
-    for q in range(n):
-        s[_BRIGHT + q] = max(1.0, s[_MAX + q], -s[_MIN + q])
+
+
+@njit(cache=True, error_model="numpy")
+def _blend(
+    layers, sources, entries, colors, lengths, layer, extra, moved, background, d, order, m, color_rows,
+    group, group_ends, state, radius, low, high, value, s,
+):  # fmt: skip
+    """`_blend_group` of all lanes; rows _DARKEST and _BRIGHTEST of ``s`` receive the range of all colours.
+
+    ``group`` [3, m, lanes] and ``group_ends`` [3, 3, lanes] are scratch for a group.
+    """
+    n = value.shape[1]
+    for first in range(0, PIXELS, n):
+        _blend_group(
+            first, layers, sources, entries, colors, lengths, layer, extra, moved, background, d, order, m, color_rows,
+            group, group_ends[0], group_ends[1], group_ends[2], value, s,
+        )  # fmt: skip
+        for q in range(n):
+            s[_DARKEST + first + q] = s[_MIN + q]
+            s[_BRIGHTEST + first + q] = s[_MAX + q]
+        for channel in range(3):
+            for k in range(m):
+                for q in range(n):
+                    state[channel, k, first + q] = group[channel, k, q]
+            for q in range(n):
+                radius[channel, first + q] = group_ends[0, channel, q]
+                low[channel, first + q] = group_ends[1, channel, q]
+                high[channel, first + q] = group_ends[2, channel, q]
 
 
 # rows of one channel of the one-parameter blend: coefficients, radius, interval, then the layer's colour
-_P0, _P1, _P2, _PR, _PLO, _PHI, _K0, _K1, _K2, _KR = range(0, 10 * PIXELS, PIXELS)
+_P0, _P1, _P2, _PR, _PLO, _PHI, _K0, _K1, _K2, _KR = range(0, 10 * _GROUP, _GROUP)
 _CHANNEL_ROWS = 10
 
 
@@ -1186,81 +1219,87 @@ def _blend_channel_line(n, s, t):
 
 @njit(cache=True, error_model="numpy")
 def _blend_line(
-    layers, lengths, count, extra, moved, background, color_rows, state, radius, low, high, red, green, blue, s
-):
-    """`_blend` for one parameter and order 2; ``red``, ``green``, ``blue`` are [_CHANNEL_ROWS * lanes] scratch."""
-    n = lengths.shape[0]
-    for q in range(n):
-        s[_MIN + q] = min(background[0], background[1], background[2])
-        s[_MAX + q] = max(background[0], background[1], background[2])
-    for channel in range(3):
-        t = red if channel == 0 else (green if channel == 1 else blue)
-        t[:] = 0.0
-        for q in range(n):
-            t[_P0 + q] = background[channel]
-            t[_PLO + q] = background[channel]
-            t[_PHI + q] = background[channel]
-    for e in range(count - 1, -1, -1):
-        # lane by lane in memory, row by row for the arithmetic
-        for q in range(n):
-            if e < lengths[q]:
-                s[_A0 + q] = layers[e, q, 0]
-                s[_LINEAR + q] = layers[e, q, 1]
-                s[_QUADRATIC + q] = layers[e, q, 2]
-                s[_AR + q] = layers[e, q, 3]
-                s[_LO + q] = layers[e, q, 4]
-                s[_HI + q] = layers[e, q, 5]
-                # a list that has ended keeps the colour of its last layer, with alpha 0
-                red[_K0 + q] = layers[e, q, 8]
-                green[_K0 + q] = layers[e, q, 8 + color_rows]
-                blue[_K0 + q] = layers[e, q, 8 + 2 * color_rows]
-            else:
-                s[_A0 + q] = 0.0
-                s[_LINEAR + q] = 0.0
-                s[_QUADRATIC + q] = 0.0
-                s[_AR + q] = 0.0
-                s[_LO + q] = 0.0
-                s[_HI + q] = 0.0
-        if color_rows > 1:
-            # the last row of a colour is its radius, those between are its slopes
+    layers, sources, entries, colors, lengths, extra, moved, background, color_rows, state, radius, low, high,
+    red, green, blue, s,
+):  # fmt: skip
+    """`_blend` for one parameter and order 2; ``red``, ``green``, ``blue`` [rows * lanes] are scratch for a group."""
+    n = red.size // _CHANNEL_ROWS
+    darkest = min(background[0], background[1], background[2])
+    brightest = max(background[0], background[1], background[2])
+    for first in range(0, PIXELS, n):
+        for channel in range(3):
+            t = red if channel == 0 else (green if channel == 1 else blue)
+            t[:] = 0.0
             for q in range(n):
-                if e < lengths[q]:
-                    red[_KR + q] = layers[e, q, 7 + color_rows]
-                    green[_KR + q] = layers[e, q, 7 + 2 * color_rows]
-                    blue[_KR + q] = layers[e, q, 7 + 3 * color_rows]
-        if color_rows > 2:
-            for q in range(n):
-                if e < lengths[q]:
-                    red[_K1 + q] = layers[e, q, 9]
-                    red[_K2 + q] = layers[e, q, 10]
-                    green[_K1 + q] = layers[e, q, 9 + color_rows]
-                    green[_K2 + q] = layers[e, q, 10 + color_rows]
-                    blue[_K1 + q] = layers[e, q, 9 + 2 * color_rows]
-                    blue[_K2 + q] = layers[e, q, 10 + 2 * color_rows]
-        _blend_channel_line(n, s, red)
-        _blend_channel_line(n, s, green)
-        _blend_channel_line(n, s, blue)
-        if moved[e]:
-            for channel in range(3):
-                t = red if channel == 0 else (green if channel == 1 else blue)
-                for q in range(n):
-                    lower = extra[e, 2 * channel, q]
-                    lift = extra[e, 2 * channel + 1, q]
-                    t[_P0 + q] += 0.5 * (lift - lower)
-                    t[_PR + q] += 0.5 * (lift + lower) * _UP
-                    t[_PHI + q] += lift
-                    t[_PLO + q] -= lower
-    for q in range(n):
-        s[_BRIGHT + q] = max(1.0, s[_MAX + q], -s[_MIN + q])
-    for channel in range(3):
-        t = red if channel == 0 else (green if channel == 1 else blue)
+                t[_P0 + q] = background[channel]
+                t[_PLO + q] = background[channel]
+                t[_PHI + q] = background[channel]
+        deepest = 0
         for q in range(n):
-            state[channel, 0, q] = t[_P0 + q]
-            state[channel, 1, q] = t[_P1 + q]
-            state[channel, 2, q] = t[_P2 + q]
-            radius[channel, q] = t[_PR + q]
-            low[channel, q] = t[_PLO + q]
-            high[channel, q] = t[_PHI + q]
+            s[_MIN + q] = darkest
+            s[_MAX + q] = brightest
+            deepest = max(deepest, lengths[first + q])
+        for e in range(deepest - 1, -1, -1):
+            # lane by lane in memory, row by row for the arithmetic
+            for q in range(n):
+                lane = first + q
+                if e < lengths[lane]:
+                    row = layers[e, lane]
+                    s[_A0 + q] = row[0]
+                    s[_LINEAR + q] = row[1]
+                    s[_QUADRATIC + q] = row[2]
+                    s[_AR + q] = row[3]
+                    s[_LO + q] = row[4]
+                    s[_HI + q] = row[5]
+                    # a list that has ended keeps the colour of its last layer, with alpha 0
+                    color = colors[entries[sources[e, lane]]]
+                    red[_K0 + q] = color[0]
+                    green[_K0 + q] = color[color_rows]
+                    blue[_K0 + q] = color[2 * color_rows]
+                    if color_rows > 1:
+                        # the last row of a colour is its radius, those between are its slopes
+                        red[_KR + q] = color[color_rows - 1]
+                        green[_KR + q] = color[2 * color_rows - 1]
+                        blue[_KR + q] = color[3 * color_rows - 1]
+                    if color_rows > 2:
+                        red[_K1 + q] = color[1]
+                        red[_K2 + q] = color[2]
+                        green[_K1 + q] = color[color_rows + 1]
+                        green[_K2 + q] = color[color_rows + 2]
+                        blue[_K1 + q] = color[2 * color_rows + 1]
+                        blue[_K2 + q] = color[2 * color_rows + 2]
+                else:
+                    s[_A0 + q] = 0.0
+                    s[_LINEAR + q] = 0.0
+                    s[_QUADRATIC + q] = 0.0
+                    s[_AR + q] = 0.0
+                    s[_LO + q] = 0.0
+                    s[_HI + q] = 0.0
+            _blend_channel_line(n, s, red)
+            _blend_channel_line(n, s, green)
+            _blend_channel_line(n, s, blue)
+            if moved[e]:
+                for channel in range(3):
+                    t = red if channel == 0 else (green if channel == 1 else blue)
+                    for q in range(n):
+                        lower = extra[e, 2 * channel, first + q]
+                        lift = extra[e, 2 * channel + 1, first + q]
+                        t[_P0 + q] += 0.5 * (lift - lower)
+                        t[_PR + q] += 0.5 * (lift + lower) * _UP
+                        t[_PHI + q] += lift
+                        t[_PLO + q] -= lower
+        for q in range(n):
+            s[_DARKEST + first + q] = s[_MIN + q]
+            s[_BRIGHTEST + first + q] = s[_MAX + q]
+        for channel in range(3):
+            t = red if channel == 0 else (green if channel == 1 else blue)
+            for q in range(n):
+                state[channel, 0, first + q] = t[_P0 + q]
+                state[channel, 1, first + q] = t[_P1 + q]
+                state[channel, 2, first + q] = t[_P2 + q]
+                radius[channel, first + q] = t[_PR + q]
+                low[channel, first + q] = t[_PLO + q]
+                high[channel, first + q] = t[_PHI + q]
 
 
 @njit(cache=True, error_model="numpy")
@@ -1302,8 +1341,8 @@ def _block(
     listed, x0, y0, tile_x, tile_y, record, box, tiles, depth, delta, depth_error, colors, color_radius,
     slope, direction, camera, rules, errors, background, negligible, d, order, m, antialiased,
     s, y1, y2, poly, value, layer, pixels, layers, sources, lengths, reach, far, first, last, slots, heights,
-    places, pairs, moves, most, extra, moved, line, state, radius, low, high, ray, lower, upper, linear, statistics,
-    marks,
+    places, pairs, moves, most, extra, moved, line, group, group_ends, state, radius, low, high, ray, lower, upper,
+    linear, statistics, marks,
 ):  # fmt: skip
     """Bounds of one block of pixels whose first pixel is (x0, y0). Returns whether the buffers sufficed.
 
@@ -1352,20 +1391,18 @@ def _block(
         _collect_moves(moves, slot_count, places, extra, moved)
     if d == 1 and order == 2:
         _blend_line(
-            layers, lengths, deepest, extra, moved, background, color_rows, state, radius, low, high,
+            layers, sources, listed, colors, lengths, extra, moved, background, color_rows, state, radius, low, high,
             line[0], line[1], line[2], s,
         )  # fmt: skip
     else:
         _blend(
-            layers, lengths, deepest, layer, extra, moved, background, d, order, m, color_rows,
-            state, radius, low, high, value, s,
+            layers, sources, listed, colors, lengths, layer, extra, moved, background, d, order, m, color_rows,
+            group, group_ends, state, radius, low, high, value, s,
         )  # fmt: skip
-    for q in range(PIXELS):
-        s[_C1 + q] = s[_MIN + q]
-        s[_C2 + q] = s[_MAX + q]
     if slot_count > 0:
         _interval_blend(
-            layers, sources, lengths, extra, moved, _chains(last[: listed.size]), background, m, color_rows, low, high
+            layers, sources, listed, colors, lengths, extra, moved, _chains(last[: listed.size]), background, m,
+            color_rows, low, high,
         )
     statistics[1] += deepest
     statistics[2] += pair_count
@@ -1375,15 +1412,14 @@ def _block(
             row = y0 % side + q // BLOCK
             column = x0 % side + q % BLOCK
             # rounding of the program's own sums and products (design.md, B8)
+            bright = max(1.0, s[_BRIGHTEST + q], -s[_DARKEST + q])
             slack = (
-                (3.0 * lengths[q] + 16.0) * (unit + 8.0 * UNIT64) * s[_BRIGHT + q] * 1.01
-                + color_radius
-                + negligible * s[_BRIGHT + q]
+                (3.0 * lengths[q] + 16.0) * (unit + 8.0 * UNIT64) * bright * 1.01 + color_radius + negligible * bright
             )
             # a stop that was ignored shows the background in place of what lies behind (B6)
             rho = s[_RHO + q] * (1.0 + 16.0 * unit)
-            fall = slack + rho * max(0.0, s[_C2 + q] - background[channel])
-            rise = slack + rho * max(0.0, background[channel] - s[_C1 + q])
+            fall = slack + rho * max(0.0, s[_BRIGHTEST + q] - background[channel])
+            rise = slack + rho * max(0.0, background[channel] - s[_DARKEST + q])
             bottom = max(low[channel, q], s[_SLO + q] - radius[channel, q] * _UP) - fall
             top = min(high[channel, q], s[_SHI + q] + radius[channel, q] * _UP) + rise
             if not bottom <= top:
@@ -1416,22 +1452,26 @@ def _pixel_worker(
     side = lower.shape[1]
     tiles_x = int(math.ceil(image_width / side))
     blocks = side // BLOCK
-    rows = m + 5 + colors.shape[1]
+    rows = m + 5
     scratch = np.zeros(_ROWS * PIXELS)
-    planes = np.empty((4 * m + rows, PIXELS))
-    integers = np.empty((2, PIXELS), np.int64)
+    planes = np.empty((3 * m, PIXELS))
+    group_planes = np.empty((2 * m + 3 + colors.shape[1], _GROUP))
+    pixels_ = np.empty(PIXELS, np.uint8)
+    lengths_ = np.empty(PIXELS, np.uint32)
     ray_ = np.empty(3)
     s = borrowed(scratch)
     y1, y2, poly = borrowed(planes[:m]), borrowed(planes[m : 2 * m]), borrowed(planes[2 * m : 3 * m])
-    value, layer = borrowed(planes[3 * m : 4 * m]), borrowed(planes[4 * m :])
-    pixels, lengths, ray = borrowed(integers[0]), borrowed(integers[1]), borrowed(ray_)
+    value, layer = borrowed(group_planes[:m]), borrowed(group_planes[m:])
+    pixels, lengths, ray = borrowed(pixels_), borrowed(lengths_), borrowed(ray_)
     state_ = np.empty((3, m, PIXELS))
-    line_ = np.empty((3, _CHANNEL_ROWS * PIXELS))
+    line_ = np.empty((3, _CHANNEL_ROWS * _GROUP))
     line = borrowed(line_)
     ends = np.empty((3, 3, PIXELS))
+    group_, group_ends_ = np.empty((3, m, _GROUP)), np.empty((3, 3, _GROUP))
+    group, group_ends = borrowed(group_), borrowed(group_ends_)
     state, radius, low, high = borrowed(state_), borrowed(ends[0]), borrowed(ends[1]), borrowed(ends[2])
     layers_ = np.empty((256, PIXELS, rows))
-    sources_ = np.empty((256, PIXELS), np.int64)
+    sources_ = np.empty((256, PIXELS), np.uint32)
     extra_ = np.empty((256, 6, PIXELS))
     moved_ = np.empty(256, np.bool_)
     heights_ = np.empty((64, PIXELS))
@@ -1441,7 +1481,7 @@ def _pixel_worker(
     order_ = np.empty((4, 1024), np.int64)
     pairs_ = np.empty((pair_limit, 2), np.int64)
     block_offsets = np.empty(blocks * blocks + 1, np.int64)
-    block_entries = np.empty(4096, np.int32)
+    block_entries = np.empty(4096, np.uint32)
     for number in range(thread, wanted.size, threads):
         tile = wanted[number]
         tile_x = tile % tiles_x
@@ -1465,12 +1505,13 @@ def _pixel_worker(
                 antialiased, s, y1, y2, poly, value, layer, pixels, borrowed(layers_), borrowed(sources_), lengths,
                 borrowed(reach_), borrowed(order_[0]), borrowed(order_[1]), borrowed(order_[2]), borrowed(order_[3]),
                 borrowed(heights_), borrowed(places_), borrowed(pairs_), borrowed(moves_[0]), borrowed(moves_[1]),
-                borrowed(extra_), borrowed(moved_), line, state, radius, low, high, ray, lower[number], upper[number],
-                linear[min(number, linear.shape[0]) :], statistics[thread], marks,
+                borrowed(extra_), borrowed(moved_), line, group, group_ends, state, radius, low, high, ray,
+                lower[number], upper[number], linear[min(number, linear.shape[0]) :],
+                statistics[thread], marks,
             ):  # fmt: skip
                 capacity = 2 * layers_.shape[0]
                 layers_ = np.empty((capacity, PIXELS, rows))
-                sources_ = np.empty((capacity, PIXELS), np.int64)
+                sources_ = np.empty((capacity, PIXELS), np.uint32)
                 extra_ = np.empty((capacity, 6, PIXELS))
                 moved_ = np.empty(capacity, np.bool_)
                 slot_capacity = 2 * heights_.shape[0]
@@ -1479,8 +1520,9 @@ def _pixel_worker(
                 moves_ = np.empty((2, slot_capacity, 6, PIXELS))
     # the owners of the borrowed arrays live to here
     return (
-        scratch.size + planes.size + integers.size + ray_.size + line_.size + state_.size + ends.size
-        + layers_.size + sources_.size + extra_.size + moved_.size + heights_.size + places_.size + moves_.size
+        scratch.size + planes.size + group_planes.size + group_.size + group_ends_.size + pixels_.size + lengths_.size
+        + ray_.size + line_.size + state_.size + ends.size + layers_.size + sources_.size
+        + extra_.size + moved_.size + heights_.size + places_.size + moves_.size
         + reach_.size + order_.size + pairs_.size
     )  # fmt: skip
 

@@ -202,7 +202,7 @@ def _rasterise_worker(
     state_ = np.empty(5 * PIXELS)
     state = borrowed(state_)
     block_offsets = np.empty(blocks * blocks + 1, np.int64)
-    block_entries = np.empty(4096, np.int32)
+    block_entries = np.empty(4096, np.uint32)
     for number in range(thread, wanted.size, threads):
         t = wanted[number]
         left = (t % tiles_x) * tile
