@@ -9,6 +9,7 @@ are set to zero by whatever passes next.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numba import njit
@@ -33,6 +34,9 @@ class Rows:
     value: Float32
     y: Int64
     x: Int64
+
+    def __getitem__(self, chosen: Any) -> Rows:
+        return Rows(self.value[chosen], self.y[chosen], self.x[chosen])
 
     @staticmethod
     def whole(value: Float32) -> Rows:
@@ -128,29 +132,29 @@ def pass_activation(value, y, x, cell, lower_slope, lower_offset, upper_slope, u
     """
     count, channels, h, w = value.shape
     H, W = lower_slope.shape[2:]
+    sums = np.empty(w)  # by column, so that the loop over columns has no order
     for r in range(count):
-        k, sum0, sum1 = cell[r], 0.0, 0.0
-        first, past = min(w, max(0, -x[r])), max(0, min(w, W - x[r]))
+        k, shift = cell[r], x[r]
+        first, past = min(w, max(0, -shift)), max(0, min(w, W - shift))
+        sums[:] = 0.0
         for c in range(channels):
             for i in range(h):
                 Y = y[r] + i
-                if Y < 0 or Y >= H:
-                    value[r, c, i, :] = 0.0
+                row = value[r, c, i]
+                if Y < 0 or Y >= H or past <= first:
+                    row[:] = 0.0
                     continue
-                value[r, c, i, :first] = 0.0
-                value[r, c, i, past:] = 0.0
-                for j in range(first, past):
-                    X = x[r] + j
-                    a = value[r, c, i, j]
+                row[:first] = 0.0
+                row[past:] = 0.0
+                slope0, slope1 = lower_slope[k, c, Y, first + shift :], upper_slope[k, c, Y, first + shift :]
+                offset0, offset1 = lower_offset[k, c, Y, first + shift :], upper_offset[k, c, Y, first + shift :]
+                part, gathered = row[first:past], sums[first:past]
+                for j in range(past - first):
+                    a = part[j]
                     up = a >= 0.0
-                    slope = lower_slope[k, c, Y, X] if up else upper_slope[k, c, Y, X]
-                    offset = lower_offset[k, c, Y, X] if up else upper_offset[k, c, Y, X]
-                    value[r, c, i, j] = a * slope
-                    if j & 1:
-                        sum0 += np.float64(a) * offset
-                    else:
-                        sum1 += np.float64(a) * offset
-        total[r] += sum0 + sum1
+                    gathered[j] += np.float64(a) * np.float64(offset0[j] if up else offset1[j])
+                    part[j] = a * (slope0[j] if up else slope1[j])
+        total[r] += sums.sum()
 
 
 @njit(cache=True, error_model="numpy")
@@ -158,28 +162,31 @@ def charge(value, y, x, cell, bias, noise, total):
     """Add what a linear layer's bias [C, H, W] gives to rows on its output, less its rounding [m, C, H, W] (N2)."""
     count, channels, h, w = value.shape
     H, W = noise.shape[2:]
+    sums = np.empty(w)
     for r in range(count):
-        k, sum0, sum1 = cell[r], 0.0, 0.0
-        first, past = min(w, max(0, -x[r])), max(0, min(w, W - x[r]))
+        k, shift = cell[r], x[r]
+        first, past = min(w, max(0, -shift)), max(0, min(w, W - shift))
+        sums[:] = 0.0
         for c in range(channels):
             for i in range(h):
                 Y = y[r] + i
-                if Y < 0 or Y >= H:
-                    value[r, c, i, :] = 0.0
+                row = value[r, c, i]
+                if Y < 0 or Y >= H or past <= first:
+                    row[:] = 0.0
                     continue
-                value[r, c, i, :first] = 0.0
-                value[r, c, i, past:] = 0.0
-                for j in range(first, past):
-                    a = np.float64(value[r, c, i, j])
-                    X = x[r] + j
-                    sum0 += a * bias[c, Y, X]
-                    sum1 += abs(a) * noise[k, c, Y, X]
-        total[r] += sum0 - sum1
+                row[:first] = 0.0
+                row[past:] = 0.0
+                here, less = bias[c, Y, first + shift :], noise[k, c, Y, first + shift :]
+                part, gathered = row[first:past], sums[first:past]
+                for j in range(past - first):
+                    a = np.float64(part[j])
+                    gathered[j] += a * here[j] - abs(a) * np.float64(less[j])
+        total[r] += sums.sum()
 
 
 @njit(cache=True, error_model="numpy")
-def reach_image(value, y, x, cell, slopes, offsets, lower, upper, total, plane, box):
-    """Lower bounds of rows on the image (N5).
+def reach(value, y, x, cell, slopes, offsets, lower, upper, total, plane, box):
+    """Lower bounds of rows on a node of which planes and intervals are known (N5).
 
     Args:
         value, y, x, cell: Rows.
