@@ -161,7 +161,7 @@ class _Cells:
         self.good = np.ones(self.count, bool)
         self.flush = np.zeros(self.count)
         self._planes(images, substitution)
-        self.lines: dict[int, list[np.ndarray]] = {}
+        self.lines: dict[int, np.ndarray] = {}
         self.noise: dict[int, Tensor] = {}
         self.biases: dict[int, Tensor] = {}
         #: nodes whose bias and rounding are in those of their only reader
@@ -298,16 +298,23 @@ class _Cells:
             (lines.upper_slope, lines.upper_offset, 1.0),
         ):
             rounded = slope.float().double()
-            moved = offset + side * (((rounded - slope).abs() + unit * slope) * size + room)
+            # the other side of a line with this slope, from the band
+            apart = band.lower_slope - slope
+            ends = apart * z.lower, apart * z.upper
+            if side < 0.0:
+                other = torch.maximum(*ends) + band.upper_offset
+            else:
+                other = torch.minimum(*ends) + band.lower_offset
+            give = ((rounded - slope).abs() + unit * slope + 2.0**-48 * apart.abs()) * size + room
+            give, move = give + 2.0**-48 * (offset.abs() + other.abs()), torch.zeros((), dtype=torch.float64)
             if fold:
                 bias, noise = self.biases[source], self.noise[source]
-                moved = moved + rounded * (bias + side * (noise + 2.0**-48 * bias.abs()))
-            near = moved.float()
-            out = torch.nextafter(near, torch.full_like(near, side * torch.inf))
-            stored += [rounded.float(), torch.where(moved == 0.0, near, out)]
+                give, move = give + rounded * (noise + 2.0**-48 * bias.abs()), rounded * bias
+            stored.append(rounded.float())
+            stored += [_outward(offset + side * give + move, side), _outward(other - side * give + move, -side)]
         if fold:
             self.folded.add(source)
-        self.lines[k] = [t.reshape(self.count, *grid(layer.shape)).contiguous().numpy() for t in stored]
+        self.lines[k] = torch.stack(stored).reshape(6, self.count, *grid(layer.shape)).numpy()
         self.flush += int(np.prod(layer.shape)) * 2 * _FLUSH * size.reshape(self.count, -1).amax(1).numpy()
         return self._within(form, layer.function(z.lower) - room, layer.function(z.upper) + room)
 
@@ -340,28 +347,24 @@ class _Cells:
         center = form.c.reshape(self.count, *shape).numpy()[tuple(where.T)]
         decides = isinstance(layer, LeakyRelu)
         sign = np.where(center >= 0.0, 1.0, -1.0)
-        first = self._one_hot(index, where, sign, decides)
-        left = np.flatnonzero(first.lower < 0.0) if decides else np.arange(len(where))
-        second = _Reached.unknown(len(where), self.d)
-        second.put(left, self._one_hot(index, where[left], -sign[left], decides))
-        low, high = _Reached.chosen(sign > 0.0, first, second), _Reached.chosen(sign > 0.0, second, first)
+        found = self._one_hot(index, where, sign, decides)
+        found.turn(sign < 0.0)
+        left = np.flatnonzero((found.lower < 0.0) & (found.upper > 0.0)) if decides else np.arange(len(where))
+        again = self._one_hot(index, where[left], -sign[left], decides)
+        again.turn(sign[left] > 0.0)
+        found.meet(left, again, sign[left] < 0.0)
         cell, flat = where[:, 0], np.ravel_multi_index(tuple(where[:, 1:].T), shape)
         at = torch.from_numpy(cell), torch.from_numpy(flat)
         c, r = form.c.flatten(1).clone(), form.r.flatten(1).clone()
         a = form.a.flatten(2).movedim(1, -1).clone()
         lower, upper = form.lower.flatten(1).clone(), form.upper.flatten(1).clone()
-        slopes = torch.from_numpy(0.5 * (low.plane[:, :-1] - high.plane[:, :-1]))
-        apart = np.abs(low.plane[:, :-1] + high.plane[:, :-1]).sum(1)
-        center = torch.from_numpy(0.5 * (low.plane[:, -1] - high.plane[:, -1]))
-        radius = 0.5 * (-high.plane[:, -1] - low.plane[:, -1] + apart)
-        size = np.abs(low.plane).sum(1) + np.abs(high.plane).sum(1)
-        radius = torch.from_numpy(np.maximum(radius, 0.0) + 2.0**-48 * size)
+        center, radius = found.middle()
         better = radius < r[at]
-        c[at] = torch.where(better, center, c[at])
-        a[at] = torch.where(better[:, None], slopes, a[at])
+        c[at] = torch.where(better, center[:, -1], c[at])
+        a[at] = torch.where(better[:, None], center[:, :-1], a[at])
         r[at] = torch.where(better, radius, r[at])
-        lower[at] = torch.maximum(lower[at], torch.from_numpy(low.lower))
-        upper[at] = torch.minimum(upper[at], torch.from_numpy(-high.lower))
+        lower[at] = torch.maximum(lower[at], torch.from_numpy(found.lower))
+        upper[at] = torch.minimum(upper[at], torch.from_numpy(found.upper))
         item = layer.shape
         tight = _Form(
             c.reshape(-1, *item),
@@ -390,7 +393,7 @@ class _Cells:
     def _backward(self, index: int, rows: Rows, cell: Int64, decides: bool = False) -> _Reached:
         """Bounds of rows on node ``index``; those that are not negative for certain may stop before the image."""
         found = _Reached.unknown(len(cell), self.d)
-        batch = _Batch({index: rows}, cell, np.zeros(len(cell)), np.arange(len(cell)))
+        batch = _Batch({index: rows}, cell, np.zeros((len(cell), 2)), np.arange(len(cell)))
         self._descend(index, index, batch, found, decides)
         return found
 
@@ -415,7 +418,7 @@ class _Cells:
             here = batch.waiting.pop(at)
             node = self.network.nodes[at - 1]
             if isinstance(node.layer, Activation):
-                pass_activation(here.value, here.y, here.x, batch.cell, *self.lines[at], total=batch.total)
+                pass_activation(here.value, here.y, here.x, batch.cell, self.lines[at], batch.total)
                 parts = [here]
             else:
                 if at == start or at not in self.folded:
@@ -433,14 +436,15 @@ class _Cells:
     def _settle(self, at: int, batch: _Batch, planes: _Planes, found: _Reached) -> None:
         """Bounds of a batch whose rows are all on node ``at``."""
         count = len(batch.cell)
-        plane, box = np.zeros((count, self.d + 1)), np.zeros(count)
+        plane, box = np.zeros((count, 2, self.d + 1)), np.zeros((count, 2))
         rows = batch.waiting.get(at)
         if rows is None:
-            plane[:, -1] = box[:] = batch.total
+            plane[:, :, -1] = box[:] = batch.total
         else:
             reach(rows.value, rows.y, rows.x, batch.cell, *planes, total=batch.total, plane=plane, box=box)
-        plane[:, -1] -= self.flush[batch.cell]
-        box -= self.flush[batch.cell]
+        lost = self.flush[batch.cell][:, None] * np.array([-1.0, 1.0])
+        plane[:, :, -1] += lost
+        box += lost
         found.improve(batch.number, plane, box)
 
     def outputs(self, rows: Any, offset: Float64) -> OutputBounds:
@@ -461,7 +465,7 @@ class _Cells:
                 cell, row = which // len(number), number[which % len(number)]
                 rows = Rows(np.ascontiguousarray(part[row]), np.full(len(which), top), np.full(len(which), left))
                 found = self._backward(index, rows, cell)
-                plane[cell, row], lower[cell, row] = found.plane, found.lower
+                plane[cell, row], lower[cell, row] = found.plane[:, 0], found.lower
         room = 2.0**-48 * (np.abs(plane).sum(-1) + np.abs(offset) + missing) + missing
         lower, b = lower + offset - room, plane[..., -1] + offset - room
         a = plane[..., :-1]
@@ -505,7 +509,7 @@ class _Batch:
     Attributes:
         waiting: By node.
         cell: [R] of every row.
-        total: [R] what rows gathered so far.
+        total: [R, 2] what rows gathered so far, at least and at most.
         number: [R] positions in the result.
     """
 
@@ -525,25 +529,56 @@ class _Batch:
 
 @dataclass
 class _Reached:
-    """What rows are at least: planes [R, d + 1] (slopes, offset) and numbers [R]; NaN and -inf if unknown."""
+    """What rows are at least and at most.
+
+    Attributes:
+        plane: [R, 2, d + 1] slopes and offset of a plane below and one above; NaN if unknown.
+        lower, upper: [R]; infinite if unknown.
+    """
 
     plane: Float64
     lower: Float64
+    upper: Float64
 
     @staticmethod
     def unknown(count: int, d: int) -> _Reached:
-        return _Reached(np.full((count, d + 1), np.nan), np.full(count, -np.inf))
-
-    @staticmethod
-    def chosen(mask: np.ndarray, one: _Reached, two: _Reached) -> _Reached:
-        return _Reached(np.where(mask[:, None], one.plane, two.plane), np.where(mask, one.lower, two.lower))
+        return _Reached(np.full((count, 2, d + 1), np.nan), np.full(count, -np.inf), np.full(count, np.inf))
 
     def put(self, number: Int64, other: _Reached) -> None:
-        self.plane[number], self.lower[number] = other.plane, other.lower
+        self.plane[number], self.lower[number], self.upper[number] = other.plane, other.lower, other.upper
+
+    def turn(self, mask: np.ndarray) -> None:
+        """Negate the rows of ``mask``."""
+        self.plane[mask] = -self.plane[mask][:, ::-1]
+        self.lower[mask], self.upper[mask] = -self.upper[mask], -self.lower[mask]
+
+    def meet(self, number: Int64, other: _Reached, below: np.ndarray) -> None:
+        """Take in other bounds of the rows ``number``, and their planes below or above."""
+        side = np.where(below, 0, 1)
+        self.plane[number, side] = other.plane[np.arange(len(number)), side]
+        self.lower[number] = np.maximum(self.lower[number], other.lower)
+        self.upper[number] = np.minimum(self.upper[number], other.upper)
+
+    def middle(self) -> tuple[Tensor, Tensor]:
+        """[R, d + 1] the plane between, and [R] how far the others are from it at most."""
+        low, high = self.plane[:, 0], self.plane[:, 1]
+        gap = high - low
+        radius = 0.5 * (gap[:, -1] + np.abs(gap[:, :-1]).sum(1))
+        radius = np.maximum(radius, 0.0) + 2.0**-48 * (np.abs(low).sum(1) + np.abs(high).sum(1))
+        return torch.from_numpy(0.5 * (low + high)), torch.from_numpy(radius)
 
     def improve(self, number: Int64, plane: Float64, box: Float64) -> None:
-        """Planes of the latest node; the best number of all: a plane's least value or what the box says."""
-        slopes = np.abs(plane[:, :-1]).sum(1)
-        least = np.fmax(plane[:, -1] - slopes - 2.0**-50 * (np.abs(plane[:, -1]) + slopes), box)
+        """Planes of the latest node; the best numbers of all: a plane's extremes or what the box says."""
+        slopes = np.abs(plane[:, :, :-1]).sum(-1)
+        room = 2.0**-50 * (np.abs(plane[:, :, -1]) + slopes)
         self.plane[number] = plane
+        least = np.fmax(plane[:, 0, -1] - slopes[:, 0] - room[:, 0], box[:, 0])
+        most = np.fmin(plane[:, 1, -1] + slopes[:, 1] + room[:, 1], box[:, 1])
         self.lower[number] = np.fmax(self.lower[number], least)
+        self.upper[number] = np.fmin(self.upper[number], most)
+
+
+def _outward(value: Tensor, side: float) -> Tensor:
+    """The float32 neighbour on one side; zero stays."""
+    near = value.float()
+    return torch.where(value == 0.0, near, torch.nextafter(near, torch.full_like(near, side * torch.inf)))
