@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable
 from pathlib import Path
 
@@ -208,7 +209,7 @@ CASES: dict[str, Build] = {
 }
 #: How much wider than what the attack reached a bound may be, (nominal - bound) / (nominal - reached) with
 #: rounding left out, for narrow sets: a rise means that a rule became looser.
-LEDGER = {"max": 1.6, "max_overlap": 1.7, "max_dilated": 1.6, "gemm": 1.5, "plain": 1.6, "pads": 1.8}
+LEDGER = {"max": 1.6, "max_overlap": 1.7, "max_dilated": 1.6, "gemm": 1.5, "plain": 1.6, "pads": 1.8, "groups": 2.4}
 SHAPE = (3, 7, 8)
 
 
@@ -315,7 +316,7 @@ def test_a_single_image_has_bounds_of_rounding_size(name: str, tmp_path: Path) -
     bounds = bound_outputs(network, ImageSets(zero, x, zero, x, x, x), rows, np.zeros(4))
     y = rows @ run(x.astype(np.float32).reshape(1, *SHAPE))[0].astype(np.float64)
     assert (bounds.lower[0] <= y).all()
-    assert (bounds.lower[0] >= y - 1e-3 * (1 + np.abs(y))).all()
+    assert (bounds.lower[0] >= y - 3e-3 * (1 + np.abs(y))).all()
 
 
 # ---------------------------------------------------------------- mutants: the attack finds wrong rules
@@ -383,11 +384,11 @@ MUTANTS = {
 
 def _caught(name: str, tmp_path: Path, mutate: Callable[[pytest.MonkeyPatch], None]) -> bool:
     """Whether some bound is broken, or a set is seen to contradict itself."""
-    for seed in range(4):
+    for seed, (radius, slack) in itertools.product(range(4), ((0.3, 0.1), (0.1, 0.5), (0.05, 0.01))):
         file = written(name, tmp_path, seed)
         network, run = load_network(file), session(file)
         rows = rows_for(network.output_size)
-        images = image_sets(SHAPE, 1, 2, 0.1, 0.5, seed)
+        images = image_sets(SHAPE, 1, 2, radius, slack, seed)
         least, _ = attack(network, run, images, 0, rows)
         with pytest.MonkeyPatch.context() as patch:
             mutate(patch)
