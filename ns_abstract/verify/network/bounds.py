@@ -1,0 +1,584 @@
+"""Bounds of a network's outputs over sets of images (docs/design.md, N)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from ns_abstract.verify.network.graph import Network
+from ns_abstract.verify.network.layers import Activation, LeakyRelu, Linear, Sum
+from ns_abstract.verify.network.rows import Rows, charge, full, grid, join, pass_activation, reach
+
+Float64 = NDArray[np.float64]
+Int64 = NDArray[np.int64]
+Substitution = Literal["everywhere", "end", "box"]
+
+#: Unit roundoff of float32: of the bounded evaluation, and of rows.
+UNIT = 2.0**-24
+#: Roundings that are charged beside those of a layer's sums: folding of scales into weights, own float64
+#: arithmetic, sums of rows where branches meet.
+_SPARE = 24
+#: Smallest normal number of float32: what a flush to zero may lose.
+_FLUSH = 2.0**-126
+#: Past this a float32 evaluation may overflow.
+_OVERFLOW = 2.0**126
+#: Bytes of rows that are worked on at a time: they should stay in a processor's cache.
+_ROWS_AT_ONCE = 24 << 20
+
+
+@dataclass(frozen=True)
+class ImageSets:
+    """``m`` linear sets of the network's input, flattened to ``n = prod(input_shape)`` numbers.
+
+    For every p in [-1, 1]^d the images x(p) of cell k obey both
+    ``a_lower[k] p + b_lower[k] <= x(p) <= a_upper[k] p + b_upper[k]`` and ``lower[k] <= x(p) <= upper[k]``;
+    the arrays contain whatever rounding produced the images.
+
+    Attributes:
+        a_lower, a_upper: [m, n, d] float64.
+        b_lower, b_upper, lower, upper: [m, n] float64.
+    """
+
+    a_lower: Float64
+    b_lower: Float64
+    a_upper: Float64
+    b_upper: Float64
+    lower: Float64
+    upper: Float64
+
+    def __post_init__(self) -> None:
+        m, n, d = self.a_lower.shape
+        for name in ("a_upper", "b_lower", "b_upper", "lower", "upper"):
+            shape = (m, n, d) if name.startswith("a") else (m, n)
+            if getattr(self, name).shape != shape:
+                raise ValueError(f"{name} {shape} expected, got {getattr(self, name).shape}")
+
+    @property
+    def count(self) -> int:
+        """Number of cells m."""
+        return self.a_lower.shape[0]
+
+    @property
+    def dimensions(self) -> int:
+        """Number of parameters d."""
+        return self.a_lower.shape[2]
+
+    def __getitem__(self, cells: slice) -> ImageSets:
+        return ImageSets(*(getattr(self, name)[cells] for name in self.__dataclass_fields__))
+
+
+@dataclass(frozen=True)
+class OutputBounds:
+    """Lower bounds of ``rows @ y + offset``; minus infinity where nothing is known, never NaN.
+
+    Attributes:
+        lower: [m, k] for every p of the cell.
+        a, b: [m, k, d], [m, k]: ``a p + b`` is a lower bound at p.
+    """
+
+    lower: Float64
+    a: Float64
+    b: Float64
+
+
+def bound_outputs(
+    network: Network,
+    images: ImageSets,
+    rows: Any,
+    offset: Float64,
+    *,
+    substitution: Substitution = "everywhere",
+    memory: int = 1 << 30,
+) -> OutputBounds:
+    """Lower bounds of ``rows @ network(x) + offset`` over every image set.
+
+    Args:
+        network: The network.
+        images: m cells in d parameters.
+        rows: [k, output_size] array or scipy sparse matrix.
+        offset: [k].
+        substitution: Where the parameters' correlation is used: in every intermediate bound
+            ("everywhere"), only in the result ("end"), or not at all ("box").
+        memory: Bytes to stay within, roughly; cells and rows are worked on in parts.
+    """
+    offset = np.asarray(offset, np.float64)
+    if images.a_lower.shape[1] != network.input_size:
+        raise ValueError(f"images of {network.input_size} numbers expected, got {images.a_lower.shape[1]}")
+    if rows.shape != (offset.shape[0], network.output_size):
+        raise ValueError(f"rows {(offset.shape[0], network.output_size)} expected, got {rows.shape}")
+    by_cell = (
+        sum(int(np.prod(network.shape(k))) for k in range(len(network.nodes) + 1)) * 8 * (3 * images.dimensions + 14)
+    )
+    step = max(1, int(0.5 * memory) // by_cell)
+    parts = []
+    for first in range(0, images.count, step):
+        cells = _Cells(network, images[first : first + step], substitution, memory)
+        parts.append(cells.outputs(rows, offset))
+    if not parts:
+        d = images.dimensions
+        return OutputBounds(np.zeros((0, len(offset))), np.zeros((0, len(offset), d)), np.zeros((0, len(offset))))
+    return OutputBounds(*(np.concatenate([getattr(part, name) for part in parts]) for name in ("lower", "a", "b")))
+
+
+@dataclass
+class _Form:
+    """``c + a p + e`` with |e| <= r, and lower, upper: what is known of a node in every cell (N1).
+
+    Attributes:
+        c, r, lower, upper: [m, *shape].
+        a: [m, d, *shape].
+    """
+
+    c: Tensor
+    a: Tensor
+    r: Tensor
+    lower: Tensor
+    upper: Tensor
+
+    @property
+    def size(self) -> Tensor:
+        return torch.maximum(self.lower.abs(), self.upper.abs())
+
+    @staticmethod
+    def ranged(c: Tensor, a: Tensor, r: Tensor) -> _Form:
+        """With the range of the form itself."""
+        reach = (a.abs().sum(1) + r) * (1.0 + 2.0**-40) + c.abs() * 2.0**-50
+        return _Form(c, a, r, c - reach, c + reach)
+
+
+class _Cells:
+    """Bounds of one network over some cells."""
+
+    def __init__(self, network: Network, images: ImageSets, substitution: Substitution, memory: int) -> None:
+        self.network = network
+        self.count, self.d = images.count, images.dimensions
+        self.memory = memory
+        self.good = np.ones(self.count, bool)
+        self.flush = np.zeros(self.count)
+        self._planes(images, substitution)
+        self.lines: dict[int, np.ndarray] = {}
+        self.noise: dict[int, Tensor] = {}
+        self.biases: dict[int, Tensor] = {}
+        #: nodes whose bias and rounding are in those of their only reader
+        self.folded: set[int] = set()
+        #: what rows may stop at
+        self.stops: dict[int, _Planes] = {}
+        self.last = self._forward()
+        if substitution == "end":
+            self._planes(images, "everywhere")
+
+    def _planes(self, images: ImageSets, substitution: Substitution) -> None:
+        """Image sets as rows want them; a cell with a number that is not finite is given up."""
+        shape = grid(self.network.input_shape)
+        fields = [np.asarray(getattr(images, name), np.float64) for name in images.__dataclass_fields__]
+        finite = np.logical_and.reduce([np.isfinite(f).reshape(self.count, -1).all(axis=1) for f in fields])
+        finite &= (fields[4] <= fields[5]).all(axis=1)
+        self.good &= finite
+        a_lower, b_lower, a_upper, b_upper, lower, upper = (
+            np.where(finite.reshape(-1, *[1] * (f.ndim - 1)), f, 0.0) for f in fields
+        )
+        if substitution != "everywhere":
+            a_lower, b_lower, a_upper, b_upper = np.zeros_like(a_lower), lower, np.zeros_like(a_upper), upper
+        self.image = _Planes(
+            np.stack([a_lower, a_upper], 1).reshape(self.count, 2, *shape, self.d),
+            np.stack([b_lower, b_upper], 1).reshape(self.count, 2, *shape),
+            lower.reshape(self.count, *shape),
+            upper.reshape(self.count, *shape),
+        )
+
+    def _image(self) -> _Form:
+        """The image as a form: the middle of its planes."""
+        shape = self.network.input_shape
+        slopes, offsets = torch.from_numpy(self.image.slopes), torch.from_numpy(self.image.offsets)
+        a = slopes.mean(1).movedim(-1, 1)
+        c = offsets.mean(1)
+        spread = 0.5 * (offsets[:, 1] - offsets[:, 0]) + 0.5 * (slopes[:, 1] - slopes[:, 0]).abs().sum(-1)
+        spread = spread.clamp(min=0.0) + 2.0**-50 * (offsets.abs().amax(1) + slopes.abs().amax(1).sum(-1))
+        form = _Form.ranged(c.reshape(-1, *shape), a.reshape(self.count, self.d, *shape), spread.reshape(-1, *shape))
+        lower, upper = torch.from_numpy(self.image.lower), torch.from_numpy(self.image.upper)
+        return self._within(form, lower.reshape(-1, *shape), upper.reshape(-1, *shape))
+
+    def _within(self, form: _Form, lower: Tensor, upper: Tensor) -> _Form:
+        """The form with bounds that are known besides; a cell without values in it is given up."""
+        low, high = torch.maximum(form.lower, lower), torch.minimum(form.upper, upper)
+        fine = (low <= high) & torch.isfinite(form.c) & torch.isfinite(form.r) & torch.isfinite(form.a).all(1)
+        good = fine.reshape(self.count, -1).all(1)
+        self.good &= good.numpy()
+        if bool(good.all()):
+            return _Form(form.c, form.a, form.r, low, high)
+
+        # what is given up must not slow the others down with NaN
+        def clear(t: Tensor) -> Tensor:
+            return torch.where(good.reshape(-1, *[1] * (t.ndim - 1)), t, torch.zeros_like(t))
+
+        return _Form(clear(form.c), clear(form.a), clear(form.r), clear(low), clear(high))
+
+    # ------------------------------------------------------------ forwards
+
+    def _forward(self) -> _Form:
+        """Lines and rounding of every node; returns what is known of the last one."""
+        forms: list[_Form | None] = [self._image()]
+        left = list(self.network.readers)
+        last = len(self.network.nodes)
+        for k, node in enumerate(self.network.nodes, 1):
+            inputs = []
+            for index in node.inputs:
+                form = forms[index]
+                assert form is not None
+                inputs.append(form)
+            if isinstance(node.layer, Activation):
+                # what is known better of the input is also known to its other readers
+                source = node.inputs[0]
+                forms[source] = inputs[0] = self._tighten(source, inputs[0], node.layer)
+                forms.append(self._activate(k, source, node.layer, inputs[0]))
+                if self.network.depth[source] > 1:
+                    self.stops[source] = self._stop(source, inputs[0])
+            else:
+                forms.append(self._combine(k, node.inputs, node.layer, inputs))
+            for index in node.inputs:
+                left[index] -= 1
+                if not left[index] and index != last:
+                    forms[index] = None
+        end = forms[last]
+        assert end is not None
+        return end
+
+    def _combine(self, k: int, sources: tuple[int, ...], layer: Linear, inputs: list[_Form]) -> _Form:
+        """A linear layer (N1, N2)."""
+        m, d = self.count, self.d
+        stacks = [torch.cat([f.c[:, None], f.a], 1).flatten(0, 1) for f in inputs]
+        moved = layer.apply(stacks).reshape(m, 1 + d, *layer.shape)
+        # own float64 rounding is relative to the form, that of the network to its values
+        radii = [torch.cat([f.r + 2.0**-28 * (f.c.abs() + f.a.abs().sum(1)), f.size]) for f in inputs]
+        magnitude = layer.magnitude(radii).reshape(2, m, *layer.shape)
+        bias = layer.bias
+        c, size = moved[:, 0], magnitude[1]
+        if bias is not None:
+            c, size = c + bias, size + bias.abs()
+        count = layer.terms + layer.row_terms + _SPARE + max(self.network.readers[i] for i in sources)
+        noise = size * (count * UNIT / (1.0 - count * UNIT)) + (layer.terms + 1) * _FLUSH
+        form = _Form.ranged(c, moved[:, 1:], magnitude[0] * (1.0 + 2.0**-28) + noise)
+        if float(size.amax()) >= _OVERFLOW:
+            self.good &= (size.reshape(m, -1).amax(1) < _OVERFLOW).numpy()
+        for f, shape in zip(inputs, layer.input_shapes, strict=True):
+            lost = int(np.prod(shape)) * (layer.row_terms + 2) * _FLUSH
+            self.flush += lost * f.size.reshape(m, -1).amax(1).numpy()
+        total = torch.zeros(layer.shape, dtype=torch.float64) if bias is None else bias.expand(layer.shape)
+        if isinstance(layer, Sum):
+            # one charge instead of several
+            for source, sign in zip(sources, layer.signs, strict=True):
+                if source in self.noise and self.network.readers[source] == 1:
+                    total = total + sign * self.biases[source]
+                    noise = noise + self.noise[source]
+                    self.folded.add(source)
+        self.noise[k], self.biases[k] = noise * (1.0 + 2.0**-40), total
+        return self._within(form, form.lower, form.upper)
+
+    def _activate(self, k: int, source: int, layer: Activation, z: _Form) -> _Form:
+        """An activation (N3, N4)."""
+        size = z.size
+        room = layer.error(size) + 2.0**-40 * size
+        band = layer.band(z.lower, z.upper)
+        s = band.lower_slope
+        middle, half = 0.5 * (band.lower_offset + band.upper_offset), 0.5 * (band.upper_offset - band.lower_offset)
+        half = half + 2.0**-50 * middle.abs() + room + 2.0**-48 * s * (z.c.abs() + z.a.abs().sum(1))
+        form = _Form.ranged(s * z.c + middle, s[:, None] * z.a, s * z.r * (1.0 + 2.0**-40) + half)
+        lines = layer.lines(z.lower, z.upper)
+        # the slope as stored, rows' products with it and sums where branches meet
+        unit = (_SPARE + self.network.readers[source]) * UNIT
+        fold = source in self.noise and self.network.readers[source] == 1
+        stored = []
+        for slope, offset, side in (
+            (lines.lower_slope, lines.lower_offset, -1.0),
+            (lines.upper_slope, lines.upper_offset, 1.0),
+        ):
+            rounded = slope.float().double()
+            # the other side of a line with this slope, from the band
+            apart = band.lower_slope - slope
+            ends = apart * z.lower, apart * z.upper
+            if side < 0.0:
+                other = torch.maximum(*ends) + band.upper_offset
+            else:
+                other = torch.minimum(*ends) + band.lower_offset
+            give = ((rounded - slope).abs() + unit * slope + 2.0**-48 * apart.abs()) * size + room
+            give, move = give + 2.0**-48 * (offset.abs() + other.abs()), torch.zeros((), dtype=torch.float64)
+            if fold:
+                bias, noise = self.biases[source], self.noise[source]
+                give, move = give + rounded * (noise + 2.0**-48 * bias.abs()), rounded * bias
+            stored.append(rounded.float())
+            stored += [_outward(offset + side * give + move, side), _outward(other - side * give + move, -side)]
+        if fold:
+            self.folded.add(source)
+        self.lines[k] = torch.stack(stored).reshape(6, self.count, *grid(layer.shape)).numpy()
+        self.flush += int(np.prod(layer.shape)) * 2 * _FLUSH * size.reshape(self.count, -1).amax(1).numpy()
+        return self._within(form, layer.function(z.lower) - room, layer.function(z.upper) + room)
+
+    def _stop(self, index: int, form: _Form) -> _Planes:
+        """What is known of node ``index``, for rows that arrive there."""
+        m, d, shape = self.count, self.d, grid(self.network.shape(index))
+        bias = noise = torch.zeros((), dtype=torch.float64)
+        if index in self.folded:
+            # such rows have gathered bias and rounding already
+            bias, noise = self.biases[index], self.noise[index]
+        room = 2.0**-48 * (form.c.abs() + form.r + form.size + bias.abs() + noise) - noise
+        slopes = form.a.movedim(1, -1).reshape(m, 1, *shape, d).expand(m, 2, *shape, d)
+        offsets = torch.stack([form.c - bias - form.r - room, form.c - bias + form.r + room], 1)
+        lower, upper = form.lower - bias - room, form.upper - bias + room
+        sizes = (m, 2, *shape, d), (m, 2, *shape), (m, *shape), (m, *shape)
+        found = zip((slopes, offsets, lower, upper), sizes, strict=True)
+        return _Planes(*(t.reshape(size).contiguous().numpy() for t, size in found))
+
+    def _tighten(self, index: int, form: _Form, layer: Activation) -> _Form:
+        """Better bounds of the numbers of node ``index`` where they would give better lines (N6)."""
+        if self.network.depth[index] < 2:
+            return form
+        shape = grid(layer.shape)
+        open_ = layer.open(form.lower, form.upper).reshape(self.count, *shape)
+        open_ &= torch.from_numpy(self.good).reshape(-1, 1, 1, 1)
+        where = open_.nonzero().numpy()
+        if not len(where):
+            return form
+        # the likelier side first; what it decides needs no other
+        center = form.c.reshape(self.count, *shape).numpy()[tuple(where.T)]
+        decides = isinstance(layer, LeakyRelu)
+        sign = np.where(center >= 0.0, 1.0, -1.0)
+        found = self._one_hot(index, where, sign, decides)
+        found.turn(sign < 0.0)
+        left = np.flatnonzero((found.lower < 0.0) & (found.upper > 0.0)) if decides else np.arange(len(where))
+        again = self._one_hot(index, where[left], -sign[left], decides)
+        again.turn(sign[left] > 0.0)
+        found.meet(left, again, sign[left] < 0.0)
+        cell, flat = where[:, 0], np.ravel_multi_index(tuple(where[:, 1:].T), shape)
+        at = torch.from_numpy(cell), torch.from_numpy(flat)
+        c, r = form.c.flatten(1).clone(), form.r.flatten(1).clone()
+        a = form.a.flatten(2).movedim(1, -1).clone()
+        lower, upper = form.lower.flatten(1).clone(), form.upper.flatten(1).clone()
+        center, radius = found.middle()
+        better = radius < r[at]
+        c[at] = torch.where(better, center[:, -1], c[at])
+        a[at] = torch.where(better[:, None], center[:, :-1], a[at])
+        r[at] = torch.where(better, radius, r[at])
+        lower[at] = torch.maximum(lower[at], torch.from_numpy(found.lower))
+        upper[at] = torch.minimum(upper[at], torch.from_numpy(found.upper))
+        item = layer.shape
+        tight = _Form(
+            c.reshape(-1, *item),
+            a.movedim(-1, 1).reshape(self.count, self.d, *item),
+            r.reshape(-1, *item),
+            lower.reshape(-1, *item),
+            upper.reshape(-1, *item),
+        )
+        return self._within(tight, tight.lower, tight.upper)
+
+    # ------------------------------------------------------------ backwards
+
+    def _one_hot(self, index: int, where: Int64, sign: Float64, decides: bool) -> _Reached:
+        """Bounds of ``sign`` [R] times single numbers [R, (cell, channel, row, column)] of node ``index``."""
+        channels = grid(self.network.shape(index))[0]
+        found = _Reached.unknown(len(where), self.d)
+        step = max(1, _ROWS_AT_ONCE // (16 * channels))
+        for first in range(0, len(where), step):
+            number = np.arange(first, min(len(where), first + step))
+            cell, channel, y, x = (np.ascontiguousarray(v) for v in where[number].T)
+            value = np.zeros((len(cell), channels, 1, 1), np.float32)
+            value[np.arange(len(cell)), channel, 0, 0] = sign[number]
+            found.put(number, self._backward(index, Rows(value, y, x), cell, decides))
+        return found
+
+    def _backward(self, index: int, rows: Rows, cell: Int64, decides: bool = False) -> _Reached:
+        """Bounds of rows on node ``index``; those that are not negative for certain may stop before the image."""
+        found = _Reached.unknown(len(cell), self.d)
+        batch = _Batch({index: rows}, cell, np.zeros((len(cell), 2)), np.arange(len(cell)))
+        self._descend(index, index, batch, found, decides)
+        return found
+
+    def _descend(self, start: int, at: int, batch: _Batch, found: _Reached, decides: bool) -> None:
+        """Pass a batch from node ``at`` on to the image."""
+        while at > 0:
+            if at not in batch.waiting:
+                at -= 1
+                continue
+            if batch.bytes > min(_ROWS_AT_ONCE, self.memory // 16) and len(batch.cell) > 1:
+                half = len(batch.cell) // 2
+                for part in (slice(0, half), slice(half, None)):
+                    self._descend(start, at, batch[part], found, decides)
+                return
+            if decides and at != start and at in self.stops and len(batch.waiting) == 1:
+                self._settle(at, batch, self.stops[at], found)
+                going_on = found.lower[batch.number] < 0.0
+                if going_on.mean() < 0.75:
+                    batch = batch[going_on]
+                if not len(batch.cell):
+                    return
+            here = batch.waiting.pop(at)
+            node = self.network.nodes[at - 1]
+            if isinstance(node.layer, Activation):
+                pass_activation(here.value, here.y, here.x, batch.cell, self.lines[at], batch.total)
+                parts = [here]
+            else:
+                if at == start or at not in self.folded:
+                    shape = grid(node.layer.shape)
+                    bias = self.biases[at].reshape(shape).contiguous().numpy()
+                    noise = self.noise[at].reshape(self.count, *shape).numpy()
+                    charge(here.value, here.y, here.x, batch.cell, bias, noise, batch.total)
+                parts = node.layer.backward(here)
+            for source, part in zip(node.inputs, parts, strict=True):
+                known = batch.waiting.get(source)
+                shape = self.network.shape(source)
+                batch.waiting[source] = full(part, shape) if known is None else join(known, part, shape)
+        self._settle(0, batch, self.image, found)
+
+    def _settle(self, at: int, batch: _Batch, planes: _Planes, found: _Reached) -> None:
+        """Bounds of a batch whose rows are all on node ``at``."""
+        count = len(batch.cell)
+        plane, box = np.zeros((count, 2, self.d + 1)), np.zeros((count, 2))
+        rows = batch.waiting.get(at)
+        if rows is None:
+            plane[:, :, -1] = box[:] = batch.total
+        else:
+            reach(rows.value, rows.y, rows.x, batch.cell, *planes, total=batch.total, plane=plane, box=box)
+        lost = self.flush[batch.cell][:, None] * np.array([-1.0, 1.0])
+        plane[:, :, -1] += lost
+        box += lost
+        found.improve(batch.number, plane, box)
+
+    def outputs(self, rows: Any, offset: Float64) -> OutputBounds:
+        """Bounds of ``rows @ y + offset`` in every cell."""
+        index = len(self.network.nodes)
+        m, k = self.count, len(offset)
+        plane, lower = np.zeros((m, k, self.d + 1)), np.zeros((m, k))
+        shape = grid(self.network.shape(index))
+        size = self.last.size.reshape(m, -1).numpy()
+        dense = np.asarray(rows.toarray() if hasattr(rows, "toarray") else rows, np.float64)
+        single = dense.astype(np.float32)
+        missing = size @ np.abs(dense - single).T
+        for top, left, height, width, number in _windows(single.reshape(k, *shape)):
+            part = single.reshape(k, *shape)[:, :, top : top + height, left : left + width]
+            step = max(1, _ROWS_AT_ONCE // (4 * shape[0] * height * width))
+            for first in range(0, m * len(number), step):
+                which = np.arange(first, min(m * len(number), first + step))
+                cell, row = which // len(number), number[which % len(number)]
+                rows = Rows(np.ascontiguousarray(part[row]), np.full(len(which), top), np.full(len(which), left))
+                found = self._backward(index, rows, cell)
+                plane[cell, row], lower[cell, row] = found.plane[:, 0], found.lower
+        room = 2.0**-48 * (np.abs(plane).sum(-1) + np.abs(offset) + missing) + missing
+        lower, b = lower + offset - room, plane[..., -1] + offset - room
+        a = plane[..., :-1]
+        known = self.good[:, None] & np.isfinite(lower)
+        usable = self.good[:, None] & np.isfinite(b) & np.isfinite(a).all(-1)
+        return OutputBounds(
+            np.where(known, lower, -np.inf), np.where(usable[..., None], a, 0.0), np.where(usable, b, -np.inf)
+        )
+
+
+def _windows(rows: np.ndarray) -> list[tuple[int, int, int, int, Int64]]:
+    """Windows (top, left, height, width) of rows [k, C, H, W] that are zero elsewhere, and which rows they hold."""
+    used = (rows != 0.0).any(axis=1)
+    groups: dict[tuple[int, int, int, int], list[int]] = {}
+    for k, mask in enumerate(used):
+        ys, xs = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
+        window = (ys[0], xs[0], ys[-1] - ys[0] + 1, xs[-1] - xs[0] + 1) if len(ys) else (0, 0, 1, 1)
+        groups.setdefault(tuple(map(int, window)), []).append(k)  # type: ignore[arg-type]
+    return [(*window, np.array(number)) for window, number in groups.items()]
+
+
+class _Planes(NamedTuple):
+    """What is known of a node, as rows want it.
+
+    Attributes:
+        slopes: [m, 2, C, H, W, d] of the lower and the upper plane.
+        offsets: [m, 2, C, H, W].
+        lower, upper: [m, C, H, W].
+    """
+
+    slopes: Float64
+    offsets: Float64
+    lower: Float64
+    upper: Float64
+
+
+@dataclass
+class _Batch:
+    """Rows under way.
+
+    Attributes:
+        waiting: By node.
+        cell: [R] of every row.
+        total: [R, 2] what rows gathered so far, at least and at most.
+        number: [R] positions in the result.
+    """
+
+    waiting: dict[int, Rows]
+    cell: Int64
+    total: Float64
+    number: Int64
+
+    def __getitem__(self, chosen: Any) -> _Batch:
+        waiting = {k: rows[chosen] for k, rows in self.waiting.items()}
+        return _Batch(waiting, self.cell[chosen], self.total[chosen], self.number[chosen])
+
+    @property
+    def bytes(self) -> int:
+        return sum(rows.value.nbytes for rows in self.waiting.values())
+
+
+@dataclass
+class _Reached:
+    """What rows are at least and at most.
+
+    Attributes:
+        plane: [R, 2, d + 1] slopes and offset of a plane below and one above; NaN if unknown.
+        lower, upper: [R]; infinite if unknown.
+    """
+
+    plane: Float64
+    lower: Float64
+    upper: Float64
+
+    @staticmethod
+    def unknown(count: int, d: int) -> _Reached:
+        return _Reached(np.full((count, 2, d + 1), np.nan), np.full(count, -np.inf), np.full(count, np.inf))
+
+    def put(self, number: Int64, other: _Reached) -> None:
+        self.plane[number], self.lower[number], self.upper[number] = other.plane, other.lower, other.upper
+
+    def turn(self, mask: np.ndarray) -> None:
+        """Negate the rows of ``mask``."""
+        self.plane[mask] = -self.plane[mask][:, ::-1]
+        self.lower[mask], self.upper[mask] = -self.upper[mask], -self.lower[mask]
+
+    def meet(self, number: Int64, other: _Reached, below: np.ndarray) -> None:
+        """Take in other bounds of the rows ``number``, and their planes below or above."""
+        side = np.where(below, 0, 1)
+        self.plane[number, side] = other.plane[np.arange(len(number)), side]
+        self.lower[number] = np.maximum(self.lower[number], other.lower)
+        self.upper[number] = np.minimum(self.upper[number], other.upper)
+
+    def middle(self) -> tuple[Tensor, Tensor]:
+        """[R, d + 1] the plane between, and [R] how far the others are from it at most."""
+        low, high = self.plane[:, 0], self.plane[:, 1]
+        gap = high - low
+        radius = 0.5 * (gap[:, -1] + np.abs(gap[:, :-1]).sum(1))
+        radius = np.maximum(radius, 0.0) + 2.0**-48 * (np.abs(low).sum(1) + np.abs(high).sum(1))
+        return torch.from_numpy(0.5 * (low + high)), torch.from_numpy(radius)
+
+    def improve(self, number: Int64, plane: Float64, box: Float64) -> None:
+        """Planes of the latest node; the best numbers of all: a plane's extremes or what the box says."""
+        slopes = np.abs(plane[:, :, :-1]).sum(-1)
+        room = 2.0**-50 * (np.abs(plane[:, :, -1]) + slopes)
+        self.plane[number] = plane
+        least = np.fmax(plane[:, 0, -1] - slopes[:, 0] - room[:, 0], box[:, 0])
+        most = np.fmin(plane[:, 1, -1] + slopes[:, 1] + room[:, 1], box[:, 1])
+        self.lower[number] = np.fmax(self.lower[number], least)
+        self.upper[number] = np.fmin(self.upper[number], most)
+
+
+def _outward(value: Tensor, side: float) -> Tensor:
+    """The float32 neighbour on one side; zero stays."""
+    near = value.float()
+    return torch.where(value == 0.0, near, torch.nextafter(near, torch.full_like(near, side * torch.inf)))
