@@ -22,7 +22,7 @@ GUARANTEE = (
     "rounding is bounded a priori and charged to the result",
     "not covered: evaluation in reduced precision (TF32, float16, bfloat16, int8), Winograd or FFT convolution",
 )
-_SIGMOIDAL = "sigmoid and tanh are taken to be evaluated within 2^-20 of the exact value (checked, not proved)"
+_SIGMOIDAL = "sigmoid and tanh are taken to be evaluated within 2^-20 of the exact value (assumed, not proved)"
 
 
 @dataclass(frozen=True, eq=False)
