@@ -31,7 +31,7 @@ LEVELS = (
     "cli",
 )
 #: Names of distributions whose modules are called otherwise.
-DISTRIBUTIONS = {"yaml": "pyyaml", "PIL": "pillow", "distributed": "dask"}
+DISTRIBUTIONS = {"yaml": "pyyaml", "PIL": "pillow", "distributed": "dask", "google": "protobuf"}
 JIT = ("njit", "jit", "vectorize", "guvectorize", "cfunc", "stencil")
 
 Finder = Callable[[ast.AST], Iterator[str]]

@@ -1,0 +1,355 @@
+"""Layers from checked weights and attributes, whatever the file they come from."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ns_abstract.errors import InputError
+from ns_abstract.verify.network.graph import Network, Node, as_double, item
+from ns_abstract.verify.network.layers import (
+    Convolution,
+    Gather,
+    Layer,
+    LeakyRelu,
+    Linear,
+    Matrix,
+    Pad,
+    Scale,
+    Shape,
+    Sigmoid,
+    Sum,
+    Tanh,
+)
+
+#: Numbers that one item of a layer may have.
+_LARGEST = 1 << 26
+_ONE = (1, 1)
+
+
+class Builder:
+    """Collects the nodes of one network; every method adds layers and returns the index of the last.
+
+    Errors say what is wrong; the reader of the file adds the file and the node.
+    """
+
+    def __init__(self, path: Path, input_shape: Shape) -> None:
+        self.path = path
+        self._check_size(input_shape)
+        self.input_shape = input_shape
+        self.nodes: list[Node] = []
+
+    def shape(self, index: int) -> Shape:
+        """One item of node ``index``."""
+        return self.nodes[index - 1].layer.shape if index else self.input_shape
+
+    def name(self, index: int, name: str, op: str) -> None:
+        """Call the last layers, up to ``index``, as the file does."""
+        for k in range(index, 0, -1):
+            if self.nodes[k - 1].name:
+                break
+            self.nodes[k - 1] = replace(self.nodes[k - 1], name=name, op=op)
+
+    def network(self, output: int) -> Network:
+        """The network whose output is node ``output``; nodes that it does not need are left out."""
+        needed = {output}
+        for k in range(output, 0, -1):
+            if k in needed:
+                needed.update(self.nodes[k - 1].inputs)
+        numbers = {0: 0}
+        kept = []
+        for k, node in enumerate(self.nodes, 1):
+            if k in needed:
+                kept.append(replace(node, inputs=tuple(numbers[i] for i in node.inputs)))
+                numbers[k] = len(kept)
+        shape = self.shape(output)
+        # the numbers are the same in the shape they had before
+        while kept and type(kept[-1].layer) is Linear and kept[-1].inputs[0] == len(kept) - 1:
+            before = kept[-1].layer.input_shapes[0]
+            kept.pop()
+            if len(shape) == 1 and len(before) == 3:
+                shape = before
+        return Network(self.path, self.input_shape, kept, shape)
+
+    def _check_size(self, shape: Sequence[int]) -> None:
+        if any(v < 1 for v in shape) or int(np.prod([float(v) for v in shape])) > _LARGEST:
+            raise InputError(f"an item of {item(shape)} numbers", fix=f"between 1 and {_LARGEST:,} are supported")
+
+    def _add(self, layer: Layer, *inputs: int) -> int:
+        self._check_size(layer.shape)
+        for name in ("weight", "offset", "factor"):
+            value = getattr(layer, name, None)
+            if isinstance(value, Tensor) and not bool(torch.isfinite(value).all()):
+                raise InputError("holds numbers that are not finite", fix="train the network again")
+            if isinstance(value, Tensor) and value.numel() and float(value.abs().max()) >= 2.0**126:
+                raise InputError("holds numbers that float32 cannot compute with", fix="train the network again")
+        self.nodes.append(Node("", "", layer, inputs))
+        return len(self.nodes)
+
+    # ------------------------------------------------------------ windows
+
+    def check_window(
+        self, x: int, kernel: Any, stride: Any, dilation: Any, pads: Any, ceil: bool = False
+    ) -> tuple[int, int]:
+        """Rows and columns of the result of a window operator."""
+        sizes = []
+        for axis, name in enumerate(("rows", "columns")):
+            n, k, s, d = self.shape(x)[1 + axis], kernel[axis], stride[axis], dilation[axis]
+            if k < 1 or s < 1 or d < 1 or min(pads) < 0 or max(pads) > _LARGEST:
+                raise InputError(
+                    f"kernel_shape {list(kernel)}, strides {list(stride)}, dilations {list(dilation)}, "
+                    f"pads {list(pads)}",
+                    fix="positive numbers and pads of at least 0 expected",
+                )
+            free = n + pads[axis] + pads[axis + 2] - (k - 1) * d - 1
+            if free < 0:
+                raise InputError(f"kernel_shape {list(kernel)} is larger than the {n} {name} with pads {list(pads)}")
+            if ceil and free % s:
+                raise InputError("attribute ceil_mode = 1 is not supported here", fix="choose sizes that divide")
+            sizes.append(free // s + 1)
+        return sizes[0], sizes[1]
+
+    def convolution(
+        self,
+        x: int,
+        weight: np.ndarray,
+        bias: Any,
+        stride: Any,
+        dilation: Any,
+        pads: Any,
+        groups: int,
+        exact: bool = False,
+    ) -> int:
+        """A convolution with weights [Cout, Cin / groups, kh, kw]."""
+        channels = self.shape(x)[0]
+        if groups < 1 or channels != groups * weight.shape[1] or weight.shape[0] % groups:
+            raise InputError(f"weights {item(weight.shape)} with group = {groups} on {channels} channels")
+        if bias is not None and bias.shape != weight.shape[:1]:
+            raise InputError(f"bias {item(bias.shape)} of {weight.shape[0]} channels")
+        size = self.check_window(x, weight.shape[2:], stride, dilation, pads)
+        terms = int(np.prod(weight.shape[1:]))
+        taps = int(np.prod([-(-k // s) for k, s in zip(weight.shape[2:], stride, strict=True)]))
+        layer = Convolution(
+            (self.shape(x),),
+            (weight.shape[0], *size),
+            0 if exact else terms + 1,
+            weight.shape[0] // groups * taps,
+            as_double(weight),
+            None if bias is None else as_double(bias),
+            tuple(stride),
+            tuple(dilation),
+            tuple(pads),
+            groups,
+        )
+        return self._add(layer, x)
+
+    def average_pool(self, x: int, kernel: Any, stride: Any, pads: Any, count_pads: bool) -> int:
+        """Means of windows; pads count as numbers or not."""
+        channels = self.shape(x)[0]
+        self.check_window(x, kernel, stride, _ONE, pads)
+        count = kernel[0] * kernel[1]
+        ones = np.full((channels, 1, *kernel), 1.0 / count)
+        index = self.convolution(x, ones, None, stride, _ONE, pads, channels)
+        if count_pads or not any(pads):
+            return index
+        if any(p >= k for p, k in zip(pads, (*kernel, *kernel), strict=True)):
+            raise InputError(f"pads {list(pads)} of windows {list(kernel)}", fix="pads must be smaller than the window")
+        here = self.nodes[-1].layer
+        assert isinstance(here, Convolution)
+        inside = here.apply([torch.ones((1, *here.input_shapes[0]), dtype=torch.float64)])[0]
+        return self.scale(index, 1.0 / inside.numpy(), None)
+
+    def max_pool(self, x: int, kernel: Any, stride: Any, dilation: Any, pads: Any) -> int:
+        """Maxima of windows, by max(a, b) = b + relu(a - b) over the windows' places (N7)."""
+        channels, *sizes = self.shape(x)
+        found = self.check_window(x, kernel, stride, dilation, pads)
+        taps: list[int] = []
+        if not any(pads):
+            for i, j in np.ndindex(*kernel):
+                one = np.zeros((channels, 1, *kernel))
+                one[:, :, i, j] = 1.0
+                taps.append(self.convolution(x, one, None, stride, dilation, pads, channels, exact=True))
+        else:
+            # a place in the padding is replaced by another of the same window, which changes no maximum
+            places = [
+                self._window_places(n, o, k, s, d, p)
+                for n, o, k, s, d, p in zip(sizes, found, kernel, stride, dilation, pads[:2], strict=True)
+            ]
+            base = np.arange(int(np.prod(self.shape(x)))).reshape(self.shape(x))
+            for i, j in np.ndindex(*kernel):
+                index = base[:, places[0][:, i][:, None], places[1][:, j][None, :]]
+                taps.append(self._gather(x, index, 0.0))
+        while len(taps) > 1:
+            pairs = [self._maximum(a, b) for a, b in zip(taps[::2], taps[1::2], strict=False)]
+            taps = pairs + taps[len(pairs) * 2 :]
+        return taps[0]
+
+    @staticmethod
+    def _window_places(size: int, count: int, kernel: int, stride: int, dilation: int, pad: int) -> np.ndarray:
+        """[count, kernel] positions of a window's places, those outside replaced by the nearest inside."""
+        place = np.arange(count)[:, None] * stride - pad + np.arange(kernel)[None, :] * dilation
+        inside = (place >= 0) & (place < size)
+        if not inside.any(axis=1).all():
+            raise InputError("a window lies in the padding altogether", fix="use smaller pads")
+        first, last = inside.argmax(axis=1), kernel - 1 - inside[:, ::-1].argmax(axis=1)
+        number = np.clip(np.arange(kernel)[None, :], first[:, None], last[:, None])
+        return np.take_along_axis(place, number, axis=1)
+
+    def _maximum(self, a: int, b: int) -> int:
+        less = self.sum((a, b), (1, -1), exact=True)
+        return self.sum((b, self.leaky_relu(less, 0.0)), (1, 1), exact=True)
+
+    # ------------------------------------------------------------ other linear layers
+
+    def matrix(self, x: int, weight: np.ndarray, bias: np.ndarray | None) -> int:
+        """A fully connected layer with weights [out, in]."""
+        shape = self.shape(x)
+        if len(shape) != 1 or weight.shape[1] != shape[0]:
+            raise InputError(f"weights {item(weight.shape)} (out x in) on an item {item(shape)}", fix="flatten before")
+        if bias is not None:
+            try:
+                bias = np.broadcast_to(bias, (1, weight.shape[0]))[0]
+            except ValueError:
+                raise InputError(f"bias {item(bias.shape)} of {weight.shape[0]} outputs") from None
+        layer = Matrix(
+            (shape,),
+            (weight.shape[0],),
+            weight.shape[1] + 3,
+            weight.shape[0],
+            as_double(weight),
+            None if bias is None else as_double(bias),
+        )
+        return self._add(layer, x)
+
+    def scale(self, x: int, factor: np.ndarray, offset: np.ndarray | None) -> int:
+        """``factor * x + offset`` with constants that are spread over a batch of items."""
+        shape = self.shape(x)
+        spread = []
+        for constant in (factor, offset):
+            if constant is None:
+                spread.append(None)
+                continue
+            try:
+                fitted = np.broadcast_to(constant, (1, *shape))[0]
+            except ValueError:
+                raise InputError(f"constant {item(constant.shape)} with an item {item(shape)}") from None
+            spread.append(as_double(fitted))
+        return self._add(Scale((shape,), shape, 3, 1, spread[0], spread[1]), x)
+
+    def batch_norm(
+        self, x: int, scale: np.ndarray, shift: np.ndarray, mean: np.ndarray, variance: np.ndarray, epsilon: float
+    ) -> int:
+        """Batch normalisation with stored statistics."""
+        shape = self.shape(x)
+        parts = [np.asarray(v, np.float64) for v in (scale, shift, mean, variance)]
+        if any(v.shape != shape[:1] for v in parts):
+            raise InputError(f"statistics {[item(v.shape) for v in parts]} of {shape[0]} channels")
+        scale, shift, mean, variance = (v.reshape(-1, *[1] * (len(shape) - 1)) for v in parts)
+        if not (variance + epsilon > 0.0).all():
+            raise InputError("variance + epsilon is not positive", fix="train the network again")
+        factor = scale / np.sqrt(variance + epsilon)
+        # shift - mean * factor may cancel: its parts are charged one after the other
+        index = self.scale(x, factor, -mean * factor)
+        return self.scale(index, np.ones(()), shift)
+
+    def sum(self, inputs: tuple[int, ...], signs: tuple[int, ...], exact: bool = False) -> int:
+        """Sum or difference of equal shapes."""
+        shapes = tuple(self.shape(k) for k in inputs)
+        if len(set(shapes)) != 1:
+            raise InputError(f"shapes {[item(s) for s in shapes]} differ", fix="spreading is not supported")
+        return self._add(Sum(shapes, shapes[0], 0 if exact else len(inputs), 1, signs), *inputs)
+
+    def reshape(self, x: int, shape: Sequence[int]) -> int:
+        """The same numbers in another shape."""
+        if tuple(shape) == self.shape(x):
+            return x
+        return self._add(Linear((self.shape(x),), tuple(shape)), x)
+
+    def _gather(self, x: int, index: np.ndarray, fill: float) -> int:
+        flat = torch.from_numpy(np.ascontiguousarray(index).reshape(-1).astype(np.int64))
+        repeated = int(np.bincount(flat[flat >= 0].numpy(), minlength=1).max())
+        return self._add(Gather((self.shape(x),), index.shape, 0, repeated, flat, fill), x)
+
+    def transpose(self, x: int, order: Sequence[int]) -> int:
+        """Axes of the item in another order."""
+        shape = self.shape(x)
+        if list(order) == list(range(len(shape))):
+            return x
+        return self._gather(x, np.arange(int(np.prod(shape))).reshape(shape).transpose(order), 0.0)
+
+    def slice(self, x: int, chosen: Sequence[slice]) -> int:
+        """Part of the item."""
+        shape = self.shape(x)
+        index = np.arange(int(np.prod(shape))).reshape(shape)[tuple(chosen)]
+        if index.size == 0:
+            raise InputError(f"nothing is left of an item {item(shape)}")
+        return x if index.shape == shape else self._gather(x, index, 0.0)
+
+    def pad(self, x: int, before: Sequence[int], after: Sequence[int], mode: str, value: float) -> int:
+        """Numbers around the item."""
+        shape = self.shape(x)
+        if mode not in ("constant", "reflect", "edge"):
+            raise InputError(f"attribute mode = {mode} is not supported", fix="use constant, reflect or edge")
+        if not np.isfinite(value):
+            raise InputError(f"pads with {value}", fix="use a finite number")
+        if not any(before) and not any(after):
+            return x
+        grown = [n + a + b for n, a, b in zip(shape, before, after, strict=True)]
+        self._check_size(grown)
+        if mode == "constant" and len(shape) == 3 and not before[0] and not after[0]:
+            pads = (before[1], before[2], after[1], after[2])
+            return self._add(Pad((shape,), tuple(grown), 0, 1, pads, value), x)
+        if min(*before, *after) < 0:
+            raise InputError("negative pads are not supported here", fix="slice instead")
+        if mode == "reflect" and any(max(a, b) >= n for n, a, b in zip(shape, before, after, strict=True)):
+            raise InputError("reflected pads are larger than the item", fix="use smaller pads")
+        index = np.arange(int(np.prod(shape))).reshape(shape)
+        widths = list(zip(before, after, strict=True))
+        if mode == "constant":
+            return self._gather(x, np.pad(index, widths, constant_values=-1), value)
+        return self._gather(x, np.pad(index, widths, mode=mode), 0.0)  # type: ignore[call-overload]
+
+    def concat(self, sources: Sequence[int], axis: int) -> int:
+        """Items one after another along ``axis`` of the item: a sum of items with zeros around them."""
+        shapes = [self.shape(k) for k in sources]
+        if any(
+            len(s) != len(shapes[0]) or s[:axis] + s[axis + 1 :] != shapes[0][:axis] + shapes[0][axis + 1 :]
+            for s in shapes
+        ):
+            raise InputError(f"shapes {[item(s) for s in shapes]} do not fit")
+        if len(sources) == 1:
+            return sources[0]
+        total, parts, done = sum(s[axis] for s in shapes), [], 0
+        for source, shape in zip(sources, shapes, strict=True):
+            if axis == 0 and len(shape) == 3:
+                place = np.zeros((total, shape[0], 1, 1))
+                place[done + np.arange(shape[0]), np.arange(shape[0])] = 1.0
+                parts.append(self.convolution(source, place, None, _ONE, _ONE, (0, 0, 0, 0), 1, exact=True))
+            else:
+                before, after = [0] * len(shape), [0] * len(shape)
+                before[axis], after[axis] = done, total - done - shape[axis]
+                parts.append(self.pad(source, before, after, "constant", 0.0))
+            done += shape[axis]
+        return self.sum(tuple(parts), (1,) * len(parts), exact=True)
+
+    # ------------------------------------------------------------ activations
+
+    def leaky_relu(self, x: int, alpha: float) -> int:
+        """``max(z, alpha z)``."""
+        if not 0.0 <= alpha <= 1.0:
+            raise InputError(f"attribute alpha = {alpha} is not supported", fix="between 0 and 1 expected")
+        return self._add(LeakyRelu(self.shape(x), alpha), x)
+
+    def sigmoid(self, x: int) -> int:
+        """The logistic function."""
+        return self._add(Sigmoid(self.shape(x)), x)
+
+    def tanh(self, x: int) -> int:
+        """The hyperbolic tangent."""
+        return self._add(Tanh(self.shape(x)), x)

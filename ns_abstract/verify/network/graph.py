@@ -1,0 +1,130 @@
+"""A network as a list of nodes, checked and ready to be evaluated or bounded."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ns_abstract.verify.network.layers import Layer, Linear, Shape
+
+#: What a certificate about a network covers, whatever the network.
+GUARANTEE = (
+    "the network as the exact function of its stored weights",
+    "every float32 (or more precise) evaluation that computes each layer as sums of products in any order, "
+    "with or without fused multiply-add and with batch normalisation and scales folded or not: "
+    "rounding is bounded a priori and charged to the result",
+    "not covered: evaluation in reduced precision (TF32, float16, bfloat16, int8), Winograd or FFT convolution",
+)
+_SIGMOIDAL = "sigmoid and tanh are taken to be evaluated within 2^-20 of the exact value (checked, not proved)"
+
+
+@dataclass(frozen=True, eq=False)
+class Node:
+    """One layer at its place.
+
+    Attributes:
+        name: As in the file.
+        op: The operator's name in the file.
+        layer: What it computes.
+        inputs: Indices of nodes; 0 is the image.
+    """
+
+    name: str
+    op: str
+    layer: Layer
+    inputs: tuple[int, ...]
+
+
+class Network:
+    """A feed-forward network.
+
+    Args:
+        source: The file.
+        input_shape: One item, without the batch.
+        nodes: In an order in which every node's inputs come before it; node k is ``nodes[k - 1]``.
+        output_shape: One item of the last node, as the file says it.
+    """
+
+    def __init__(self, source: Path, input_shape: Shape, nodes: Sequence[Node], output_shape: Shape) -> None:
+        self.source = source
+        self.input_shape = tuple(input_shape)
+        self.nodes = tuple(nodes)
+        self.output_shape = tuple(output_shape)
+
+    def __getstate__(self) -> dict[str, Any]:
+        kept = ("source", "input_shape", "nodes", "output_shape")
+        return {name: self.__dict__[name] for name in kept}
+
+    @property
+    def input_size(self) -> int:
+        """Numbers of one image."""
+        return int(np.prod(self.input_shape))
+
+    @property
+    def output_size(self) -> int:
+        """Numbers of one output."""
+        return int(np.prod(self.output_shape))
+
+    @property
+    def guarantee(self) -> tuple[str, ...]:
+        """What certificates about this network cover, and what they do not."""
+        sigmoidal = any(node.op in {"Sigmoid", "Tanh"} for node in self.nodes)
+        return (*GUARANTEE, _SIGMOIDAL) if sigmoidal else GUARANTEE
+
+    def shape(self, index: int) -> Shape:
+        """One item of node ``index``."""
+        return self.nodes[index - 1].layer.shape if index else self.input_shape
+
+    @cached_property
+    def readers(self) -> tuple[int, ...]:
+        """How many inputs read each node."""
+        counts = [0] * (len(self.nodes) + 1)
+        for node in self.nodes:
+            for index in node.inputs:
+                counts[index] += 1
+        return tuple(counts)
+
+    @cached_property
+    def depth(self) -> tuple[int, ...]:
+        """Layers that mix numbers on the longest way from the image to each node."""
+        depths = [0]
+        for node in self.nodes:
+            mixes = isinstance(node.layer, Linear) and node.layer.mixes
+            depths.append(max(depths[index] for index in node.inputs) + mixes)
+        return tuple(depths)
+
+    def __call__(self, images: Tensor) -> Tensor:
+        """[B, *input_shape] to [B, output_size], in the images' dtype, differentiable."""
+        if tuple(images.shape[1:]) != self.input_shape:
+            raise ValueError(f"images [B, {', '.join(map(str, self.input_shape))}] expected, got {tuple(images.shape)}")
+        values: list[Tensor | None] = [images]
+        left = list(self.readers)
+        for node in self.nodes:
+            values.append(node.layer([self._needed(values[index]) for index in node.inputs]))
+            for index in node.inputs:
+                left[index] -= 1
+                if not left[index]:
+                    values[index] = None
+        return self._needed(values[-1]).reshape(images.shape[0], -1)
+
+    @staticmethod
+    def _needed(value: Tensor | None) -> Tensor:
+        assert value is not None
+        return value
+
+
+def item(shape: Sequence[int]) -> str:
+    """A shape for messages."""
+    return "x".join(map(str, shape)) if shape else "a number"
+
+
+def as_double(array: np.ndarray) -> Tensor:
+    """A constant as a float64 tensor of its own."""
+    return torch.from_numpy(np.array(array, np.float64))

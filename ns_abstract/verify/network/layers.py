@@ -1,0 +1,390 @@
+"""One table of layer rules: what a layer computes, what it does to forms, and how rows pass it backwards.
+
+A layer is linear (`Linear` and the classes built on it) or acts on every number by itself (`Activation`).
+A linear layer has three faces that share one matrix W: the concrete ``W x + bias``, its magnitude
+``|W| x`` (for radii and for rounding), and its transpose ``rows W`` on windows of rows
+(`ns_abstract.verify.network.rows`). An activation has its concrete value and lines that enclose it over
+an interval. Labels N1, N2, ... are those of docs/design.md.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import ClassVar
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+from ns_abstract.verify.network.rows import Rows, full, grid, unflatten
+
+Shape = tuple[int, ...]
+#: Room for rounding of the lines of an activation, computed with float64: a few operations.
+_LINE = 2.0**-48
+
+
+@dataclass(frozen=True, eq=False)
+class Linear:
+    """A linear layer; the base class passes its input on in another shape.
+
+    Attributes:
+        input_shapes: One item of every input.
+        shape: One item of the output.
+        terms: Roundings that one output may suffer in float32 (length of its sum of products, and what
+            may be folded into it); 0 if it is exact.
+        row_terms: Length of the longest sum when a row passes backwards.
+    """
+
+    input_shapes: tuple[Shape, ...]
+    shape: Shape
+    terms: int = 0
+    row_terms: int = 0
+    #: Whether one output depends on several inputs, so that their radii add up.
+    mixes: ClassVar[bool] = False
+
+    @property
+    def bias(self) -> Tensor | None:
+        """[*shape] or broadcastable to it; None: zero."""
+        return None
+
+    def apply(self, inputs: Sequence[Tensor]) -> Tensor:
+        """``W x`` for inputs [B, *input_shapes[i]]."""
+        return inputs[0].reshape(-1, *self.shape)
+
+    def magnitude(self, inputs: Sequence[Tensor]) -> Tensor:
+        """``|W| x``."""
+        return self.apply(inputs)
+
+    def backward(self, rows: Rows) -> list[Rows]:
+        """Rows on every input for rows on the output; may reuse their memory."""
+        return [unflatten(rows, self.shape, self.input_shapes[0])]
+
+    def __call__(self, inputs: Sequence[Tensor]) -> Tensor:
+        value = self.apply(inputs)
+        return value if self.bias is None else value + self.bias.to(value.dtype)
+
+
+@dataclass(frozen=True, eq=False)
+class Convolution(Linear):
+    """Two-dimensional convolution with zero padding; average pooling and selections are such, too.
+
+    Attributes:
+        weight: [Cout, Cin / groups, kh, kw] float64.
+        offset: [Cout] float64 or None.
+        stride, dilation: (rows, columns).
+        pads: top, left, bottom, right.
+        groups: As in ONNX.
+    """
+
+    weight: Tensor = field(default_factory=lambda: torch.zeros(0))
+    offset: Tensor | None = None
+    stride: tuple[int, int] = (1, 1)
+    dilation: tuple[int, int] = (1, 1)
+    pads: tuple[int, int, int, int] = (0, 0, 0, 0)
+    groups: int = 1
+    mixes: ClassVar[bool] = True
+
+    @property
+    def bias(self) -> Tensor | None:
+        return None if self.offset is None else self.offset[:, None, None]
+
+    def _convolve(self, x: Tensor, weight: Tensor) -> Tensor:
+        top, left, bottom, right = self.pads
+        padding: tuple[int, int] = (top, left)
+        if (top, left) != (bottom, right):
+            x, padding = functional.pad(x, (left, right, top, bottom)), (0, 0)
+        return functional.conv2d(x, weight.to(x.dtype), None, self.stride, padding, self.dilation, self.groups)
+
+    def apply(self, inputs: Sequence[Tensor]) -> Tensor:
+        return self._convolve(inputs[0], self.weight)
+
+    def magnitude(self, inputs: Sequence[Tensor]) -> Tensor:
+        return self._convolve(inputs[0], self.weight.abs())
+
+    def backward(self, rows: Rows) -> list[Rows]:
+        value = functional.conv_transpose2d(
+            torch.from_numpy(rows.value),
+            self.weight.float(),
+            stride=self.stride,
+            groups=self.groups,
+            dilation=self.dilation,
+        ).numpy()
+        y, x = rows.y * self.stride[0] - self.pads[0], rows.x * self.stride[1] - self.pads[1]
+        return [full(Rows(value, y, x), self.input_shapes[0])]
+
+
+@dataclass(frozen=True, eq=False)
+class Matrix(Linear):
+    """A fully connected layer on a vector; ``weight`` [out, in], ``offset`` [out] or None, float64."""
+
+    weight: Tensor = field(default_factory=lambda: torch.zeros(0))
+    offset: Tensor | None = None
+    mixes: ClassVar[bool] = True
+
+    @property
+    def bias(self) -> Tensor | None:
+        return self.offset
+
+    def apply(self, inputs: Sequence[Tensor]) -> Tensor:
+        return inputs[0] @ self.weight.to(inputs[0].dtype).T
+
+    def magnitude(self, inputs: Sequence[Tensor]) -> Tensor:
+        return inputs[0] @ self.weight.abs().to(inputs[0].dtype).T
+
+    def backward(self, rows: Rows) -> list[Rows]:
+        whole = full(rows, self.shape, force=True)
+        count = whole.value.shape[0]
+        value = torch.from_numpy(whole.value).reshape(count, -1) @ self.weight.float()
+        return [Rows.whole(value.numpy().reshape(count, *grid(self.input_shapes[0])))]
+
+
+@dataclass(frozen=True, eq=False)
+class Scale(Linear):
+    """``factor * x + offset`` with constants; both [*shape] float64 (batch normalisation, Mul, Add, ...)."""
+
+    factor: Tensor = field(default_factory=lambda: torch.zeros(0))
+    offset: Tensor | None = None
+
+    @property
+    def bias(self) -> Tensor | None:
+        return self.offset
+
+    def apply(self, inputs: Sequence[Tensor]) -> Tensor:
+        return inputs[0] * self.factor.to(inputs[0].dtype)
+
+    def magnitude(self, inputs: Sequence[Tensor]) -> Tensor:
+        return inputs[0] * self.factor.abs().to(inputs[0].dtype)
+
+    def backward(self, rows: Rows) -> list[Rows]:
+        rows.scale(self.factor.float().expand(self.shape).reshape(grid(self.shape)).numpy())
+        return [rows]
+
+
+@dataclass(frozen=True, eq=False)
+class Sum(Linear):
+    """``sum_i signs[i] x_i``, signs 1 or -1."""
+
+    signs: tuple[int, ...] = (1, 1)
+    mixes: ClassVar[bool] = True
+
+    def apply(self, inputs: Sequence[Tensor]) -> Tensor:
+        total = inputs[0] if self.signs[0] > 0 else -inputs[0]
+        for value, sign in zip(inputs[1:], self.signs[1:], strict=True):
+            total = total + value if sign > 0 else total - value
+        return total
+
+    def magnitude(self, inputs: Sequence[Tensor]) -> Tensor:
+        total = inputs[0]
+        for value in inputs[1:]:
+            total = total + value
+        return total
+
+    def backward(self, rows: Rows) -> list[Rows]:
+        # rows are changed in place further on, so every input gets its own
+        return [Rows(rows.value * np.float32(sign), rows.y, rows.x) for sign in self.signs]
+
+
+@dataclass(frozen=True, eq=False)
+class Pad(Linear):
+    """A constant around the map: ``pads`` top, left, bottom, right (negative ones cut), and its ``value``."""
+
+    pads: tuple[int, int, int, int] = (0, 0, 0, 0)
+    value: float = 0.0
+
+    @property
+    def bias(self) -> Tensor | None:
+        if self.value == 0.0:
+            return None
+        inside = self.apply([torch.ones((1, *self.input_shapes[0]), dtype=torch.float64)])[0]
+        return self.value * (1.0 - inside)
+
+    def apply(self, inputs: Sequence[Tensor]) -> Tensor:
+        top, left, bottom, right = self.pads
+        return functional.pad(inputs[0], (left, right, top, bottom))
+
+    def backward(self, rows: Rows) -> list[Rows]:
+        return [full(Rows(rows.value, rows.y - self.pads[0], rows.x - self.pads[1]), self.input_shapes[0])]
+
+
+@dataclass(frozen=True, eq=False)
+class Gather(Linear):
+    """Numbers of the input in another order.
+
+    Attributes:
+        index: [prod(shape)] flat positions in the input; -1 stands for ``fill``.
+        fill: A constant.
+    """
+
+    index: Tensor = field(default_factory=lambda: torch.zeros(0, dtype=torch.int64))
+    fill: float = 0.0
+
+    @property
+    def bias(self) -> Tensor | None:
+        if self.fill == 0.0 or not bool((self.index < 0).any()):
+            return None
+        return (self.fill * (self.index < 0).double()).reshape(self.shape)
+
+    def apply(self, inputs: Sequence[Tensor]) -> Tensor:
+        chosen = inputs[0].flatten(1)[:, self.index.clamp(min=0)]
+        return (chosen * (self.index >= 0).to(chosen.dtype)).reshape(-1, *self.shape)
+
+    def backward(self, rows: Rows) -> list[Rows]:
+        whole = full(rows, self.shape, force=True)
+        count = whole.value.shape[0]
+        value = torch.zeros((count, int(np.prod(self.input_shapes[0]))), dtype=torch.float32)
+        kept = self.index >= 0
+        value.index_add_(1, self.index[kept], torch.from_numpy(whole.value).reshape(count, -1)[:, kept])
+        return [Rows.whole(value.numpy().reshape(count, *grid(self.input_shapes[0])))]
+
+
+@dataclass(frozen=True)
+class Lines:
+    """Lines that enclose an activation over an interval: ``slope * z + offset``, float64, broadcast like z."""
+
+    lower_slope: Tensor
+    lower_offset: Tensor
+    upper_slope: Tensor
+    upper_offset: Tensor
+
+
+@dataclass(frozen=True, eq=False)
+class Activation:
+    """A monotone function of every number by itself; ``shape`` is one item."""
+
+    shape: Shape
+
+    def error(self, size: Tensor) -> Tensor | float:
+        """How far a float32 evaluation may be from the function of a number of at most ``size``."""
+        return 0.0
+
+    def function(self, z: Tensor) -> Tensor:
+        """The concrete value."""
+        raise AssertionError
+
+    def open(self, lower: Tensor, upper: Tensor) -> Tensor:
+        """Where better bounds of the input would give better lines."""
+        raise AssertionError
+
+    def lines(self, lower: Tensor, upper: Tensor) -> Lines:
+        """A lower and an upper line over [lower, upper], each the best by itself (N4)."""
+        raise AssertionError
+
+    def band(self, lower: Tensor, upper: Tensor) -> Lines:
+        """Two parallel lines (N3): the same tensor is both slopes."""
+        raise AssertionError
+
+    def __call__(self, inputs: Sequence[Tensor]) -> Tensor:
+        return self.function(inputs[0])
+
+
+@dataclass(frozen=True, eq=False)
+class LeakyRelu(Activation):
+    """``max(z, alpha z)`` with 0 <= alpha <= 1; ReLU for alpha = 0."""
+
+    alpha: float = 0.0
+
+    def function(self, z: Tensor) -> Tensor:
+        return torch.relu(z) if self.alpha == 0.0 else torch.where(z >= 0.0, z, z * self.alpha)
+
+    def error(self, size: Tensor) -> Tensor | float:
+        # the constant and the product are rounded
+        return 2.0**-22 * self.alpha * size if self.alpha else 0.0
+
+    def open(self, lower: Tensor, upper: Tensor) -> Tensor:
+        return (lower < 0.0) & (upper > 0.0)
+
+    def _chord(self, lower: Tensor, upper: Tensor) -> tuple[Tensor, Tensor]:
+        """Slope and offset of an upper line: the chord where open, the function itself elsewhere."""
+        ends = self.function(lower), self.function(upper)
+        slope = (ends[1] - ends[0]) / (upper - lower)
+        low, high = torch.full_like(lower, self.alpha), torch.ones_like(lower)
+        slope = torch.where(upper <= 0.0, low, torch.where(lower >= 0.0, high, slope.clamp(self.alpha, 1.0)))
+        # convex: above both ends is above everywhere between
+        offset = torch.maximum(ends[0] - slope * lower, ends[1] - slope * upper)
+        size = slope * torch.maximum(lower.abs(), upper.abs())
+        return slope, torch.where(self.open(lower, upper), offset + _LINE * size, torch.zeros_like(offset))
+
+    def lines(self, lower: Tensor, upper: Tensor) -> Lines:
+        slope, offset = self._chord(lower, upper)
+        # any line alpha..1 through the origin is below; the larger area is cut off by the steeper half
+        below = torch.where(upper > -lower, torch.ones_like(lower), torch.full_like(lower, self.alpha))
+        below = torch.where(self.open(lower, upper), below, slope)
+        return Lines(below, torch.zeros_like(offset), slope, offset)
+
+    def band(self, lower: Tensor, upper: Tensor) -> Lines:
+        slope, offset = self._chord(lower, upper)
+        return Lines(slope, torch.zeros_like(offset), slope, offset)
+
+
+class _Sigmoidal(Activation):
+    """An increasing function that is convex below 0 and concave above, with a slope that falls away from 0."""
+
+    #: torch's float64 function is within this of the true one.
+    room: ClassVar[float] = 2.0**-46
+
+    def error(self, size: Tensor) -> Tensor | float:
+        return 2.0**-20
+
+    def slope(self, z: Tensor) -> Tensor:
+        raise AssertionError
+
+    def open(self, lower: Tensor, upper: Tensor) -> Tensor:
+        return lower < upper
+
+    def band(self, lower: Tensor, upper: Tensor) -> Lines:
+        # with the least slope in the interval (at an end), f(z) - slope z does not decrease
+        slope = torch.minimum(self.slope(lower), self.slope(upper)) * (1.0 - 2.0**-30)
+        room = self.room + _LINE * slope * torch.maximum(lower.abs(), upper.abs())
+        low, high = self.function(lower) - slope * lower, self.function(upper) - slope * upper
+        return Lines(slope, low - room, slope, high + room)
+
+    def lines(self, lower: Tensor, upper: Tensor) -> Lines:
+        band = self.band(lower, upper)
+        width = upper - lower
+        middle = 0.5 * (lower + upper)
+        ends = self.function(lower), self.function(upper)
+        chord = torch.where(width > 0.0, (ends[1] - ends[0]) / width, torch.zeros_like(width))
+        tangent = self.slope(middle)
+        size = torch.maximum(lower.abs(), upper.abs())
+        room = self.room + _LINE * (chord.abs() + tangent) * size
+        # a chord is on the inner side of a curve and a tangent on the outer, whatever the rounding of
+        # their slopes: offsets are taken from the ends and, for the tangent, from where it touches
+        chord_low = torch.minimum(ends[0] - chord * lower, ends[1] - chord * upper) - room
+        chord_high = torch.maximum(ends[0] - chord * lower, ends[1] - chord * upper) + room
+        # a slope that is wrong by 2^-44 moves the tangent by that times the distance
+        touch = self.function(middle) - tangent * middle
+        slack = room + 2.0**-44 * tangent * width
+        convex, concave = upper <= 0.0, lower >= 0.0
+        return Lines(
+            torch.where(convex, tangent, torch.where(concave, chord, band.lower_slope)),
+            torch.where(convex, touch - slack, torch.where(concave, chord_low, band.lower_offset)),
+            torch.where(convex, chord, torch.where(concave, tangent, band.upper_slope)),
+            torch.where(convex, chord_high, torch.where(concave, touch + slack, band.upper_offset)),
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Sigmoid(_Sigmoidal):
+    """``1 / (1 + exp(-z))``."""
+
+    def function(self, z: Tensor) -> Tensor:
+        return torch.sigmoid(z)
+
+    def slope(self, z: Tensor) -> Tensor:
+        return torch.sigmoid(z) * torch.sigmoid(-z)
+
+
+@dataclass(frozen=True, eq=False)
+class Tanh(_Sigmoidal):
+    """Hyperbolic tangent."""
+
+    def function(self, z: Tensor) -> Tensor:
+        return torch.tanh(z)
+
+    def slope(self, z: Tensor) -> Tensor:
+        return 1.0 / torch.cosh(z).square()
+
+
+Layer = Linear | Activation

@@ -1,0 +1,71 @@
+"""Loading a network from a file, and comparing it with another program that reads the same file."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import onnxruntime
+import torch
+
+from ns_abstract.errors import InputError
+from ns_abstract.verify.network.graph import Network
+from ns_abstract.verify.network.onnx_file import read_onnx
+
+#: A reading that differs more than this, relative to the largest output, is wrong and not rounded.
+_DIFFERENCE = 2.0**-10
+_IMAGES = 3
+
+
+def load_network(path: Path) -> Network:
+    """The network in an .onnx file, compared with the program that usually runs such a file.
+
+    Raises:
+        InputError: The file cannot be read, uses what is not supported, or computes something else elsewhere.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise InputError("does not exist", file=path, fix="check the path")
+    if path.suffix == ".onnx":
+        network = read_onnx(path)
+        run = _onnxruntime(path)
+    else:
+        raise InputError(f"has the ending {path.suffix!r}", file=path, fix="give an .onnx file")
+    generator = np.random.default_rng(0)
+    for k in range(_IMAGES):
+        image = generator.uniform(0.0, 1.0 + k, (1, *network.input_shape)).astype(np.float32)
+        expected = run(image).reshape(-1).astype(np.float64)
+        found = network(torch.from_numpy(image).double())[0].numpy()
+        if expected.shape != found.shape:
+            raise InputError(f"has {expected.size} outputs when run, {found.size} when read", file=path)
+        if not np.isfinite(expected).all():
+            raise InputError("computes numbers that are not finite", file=path, fix="train the network again")
+        difference = float(np.abs(expected - found).max())
+        if not difference <= _DIFFERENCE * max(1.0, float(np.abs(expected).max())):
+            raise InputError(
+                f"computes something else when run: outputs differ by {difference:.3g}",
+                file=path,
+                fix="export the network again in evaluation mode, or report the file",
+            )
+    return network
+
+
+def _onnxruntime(path: Path):
+    """Runs the model in onnxruntime on one image [1, ...]."""
+    options = onnxruntime.SessionOptions()
+    options.log_severity_level = 4
+    options.intra_op_num_threads = options.inter_op_num_threads = 1
+    try:
+        session = onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
+        name = session.get_inputs()[0].name
+    except Exception as error:
+        raise InputError(f"onnxruntime refuses it: {error}", file=path, fix="export the network again") from None
+    double = session.get_inputs()[0].type == "tensor(double)"
+
+    def run(image: np.ndarray) -> np.ndarray:
+        try:
+            return np.asarray(session.run(None, {name: image.astype(np.float64) if double else image})[0])
+        except Exception as error:
+            raise InputError(f"onnxruntime fails: {error}", file=path, fix="export the network again") from None
+
+    return run

@@ -1,0 +1,222 @@
+"""Rows of coefficients on windows of a map: what passes backwards through a network.
+
+A row is one linear function of the numbers at a node. In a convolutional network it depends on a window of
+the map only, its receptive field, so that is what is stored: ``value`` [R, C, h, w] float32 and the window's
+first row and column ``y``, ``x`` [R], which may lie outside the map. Coefficients outside mean nothing and
+are set to zero by whatever passes next.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+Float32 = NDArray[np.float32]
+Float64 = NDArray[np.float64]
+Int64 = NDArray[np.int64]
+
+
+def grid(shape: tuple[int, ...]) -> tuple[int, int, int]:
+    """(channels, rows, columns) of an item: a vector is one row of one channel."""
+    if len(shape) == 3:
+        return shape[0], shape[1], shape[2]
+    return 1, 1, int(np.prod(shape, dtype=np.int64))
+
+
+@dataclass
+class Rows:
+    """Windows of rows; see the module."""
+
+    value: Float32
+    y: Int64
+    x: Int64
+
+    @staticmethod
+    def whole(value: Float32) -> Rows:
+        """Rows that cover their map [R, C, H, W]."""
+        zero = np.zeros(value.shape[0], np.int64)
+        return Rows(np.ascontiguousarray(value), zero, zero)
+
+    def covers(self, shape: tuple[int, ...]) -> bool:
+        """Whether the rows are those of the whole map of ``shape``."""
+        return self.value.shape[1:] == grid(shape) and not (self.y.any() or self.x.any())
+
+    def scale(self, factor: Float32) -> None:
+        """Multiply by ``factor`` [C, H, W] in place."""
+        _scale(self.value, self.y, self.x, factor)
+
+
+def join(one: Rows, two: Rows, shape: tuple[int, ...]) -> Rows:
+    """Sum of two sets of rows on a node of ``shape``."""
+    if one.covers(shape) or two.covers(shape):
+        one, two = full(one, shape, force=True), full(two, shape, force=True)
+        one.value += two.value
+        return one
+    dy, dx = two.y - one.y, two.x - one.x
+    assert dy.min() == dy.max() and dx.min() == dx.max(), "windows of one node move together"
+    top, left = min(0, int(dy[0])), min(0, int(dx[0]))
+    (h, w), (h2, w2) = one.value.shape[2:], two.value.shape[2:]
+    height, width = max(h, int(dy[0]) + h2) - top, max(w, int(dx[0]) + w2) - left
+    target = one.value
+    if (height, width) != (h, w):
+        target = np.zeros((*one.value.shape[:2], height, width), np.float32)
+        target[:, :, -top : h - top, -left : w - left] = one.value
+    row, column = int(dy[0]) - top, int(dx[0]) - left
+    target[:, :, row : row + h2, column : column + w2] += two.value
+    return full(Rows(target, one.y + top, one.x + left), shape)
+
+
+def shifted(rows: Rows, height: int, width: int) -> Rows:
+    """The same rows on the whole map."""
+    value = np.zeros((*rows.value.shape[:2], height, width), np.float32)
+    _place(rows.value, rows.y, rows.x, value)
+    return Rows.whole(value)
+
+
+def full(rows: Rows, shape: tuple[int, ...], force: bool = False) -> Rows:
+    """Rows on the whole map of ``shape``, if their windows are no smaller than it (or always)."""
+    _, height, width = grid(shape)
+    if rows.covers(shape):
+        return rows
+    if force or rows.value.shape[2] * rows.value.shape[3] >= height * width:
+        return shifted(rows, height, width)
+    return rows
+
+
+def unflatten(rows: Rows, shape: tuple[int, ...], before: tuple[int, ...]) -> Rows:
+    """Rows on an item of ``before`` for rows on the same numbers seen as ``shape``."""
+    if grid(shape) == grid(before):
+        return rows
+    whole = full(rows, shape, force=True)
+    return Rows.whole(whole.value.reshape(whole.value.shape[0], *grid(before)))
+
+
+@njit(cache=True, error_model="numpy")
+def _place(value, y, x, target):
+    """Copy windows to where they lie in ``target`` [R, C, H, W]."""
+    count, channels, h, w = value.shape
+    H, W = target.shape[2:]
+    for r in range(count):
+        first, past = max(0, -x[r]), min(w, W - x[r])
+        for c in range(channels):
+            for i in range(max(0, -y[r]), min(h, H - y[r])):
+                for j in range(first, past):
+                    target[r, c, y[r] + i, x[r] + j] = value[r, c, i, j]
+
+
+@njit(cache=True, error_model="numpy")
+def _scale(value, y, x, factor):
+    count, channels, h, w = value.shape
+    H, W = factor.shape[1:]
+    for r in range(count):
+        for c in range(channels):
+            for i in range(h):
+                for j in range(w):
+                    Y, X = y[r] + i, x[r] + j
+                    value[r, c, i, j] *= factor[c, Y, X] if 0 <= Y < H and 0 <= X < W else np.float32(0.0)
+
+
+@njit(cache=True, error_model="numpy")
+def pass_activation(value, y, x, cell, lower_slope, lower_offset, upper_slope, upper_offset, total):
+    """Rows [R, C, h, w] on an activation's output become rows on its input, in place (N4).
+
+    A coefficient that is not negative takes the lower line, a negative one the upper. ``total`` [R]
+    gathers the offsets; lines are [m, C, H, W] float32, ``cell`` [R] tells which.
+    """
+    count, channels, h, w = value.shape
+    H, W = lower_slope.shape[2:]
+    for r in range(count):
+        k, sum0, sum1 = cell[r], 0.0, 0.0
+        first, past = min(w, max(0, -x[r])), max(0, min(w, W - x[r]))
+        for c in range(channels):
+            for i in range(h):
+                Y = y[r] + i
+                if Y < 0 or Y >= H:
+                    value[r, c, i, :] = 0.0
+                    continue
+                value[r, c, i, :first] = 0.0
+                value[r, c, i, past:] = 0.0
+                for j in range(first, past):
+                    X = x[r] + j
+                    a = value[r, c, i, j]
+                    up = a >= 0.0
+                    slope = lower_slope[k, c, Y, X] if up else upper_slope[k, c, Y, X]
+                    offset = lower_offset[k, c, Y, X] if up else upper_offset[k, c, Y, X]
+                    value[r, c, i, j] = a * slope
+                    if j & 1:
+                        sum0 += np.float64(a) * offset
+                    else:
+                        sum1 += np.float64(a) * offset
+        total[r] += sum0 + sum1
+
+
+@njit(cache=True, error_model="numpy")
+def charge(value, y, x, cell, bias, noise, total):
+    """Add what a linear layer's bias [C, H, W] gives to rows on its output, less its rounding [m, C, H, W] (N2)."""
+    count, channels, h, w = value.shape
+    H, W = noise.shape[2:]
+    for r in range(count):
+        k, sum0, sum1 = cell[r], 0.0, 0.0
+        first, past = min(w, max(0, -x[r])), max(0, min(w, W - x[r]))
+        for c in range(channels):
+            for i in range(h):
+                Y = y[r] + i
+                if Y < 0 or Y >= H:
+                    value[r, c, i, :] = 0.0
+                    continue
+                value[r, c, i, :first] = 0.0
+                value[r, c, i, past:] = 0.0
+                for j in range(first, past):
+                    a = np.float64(value[r, c, i, j])
+                    X = x[r] + j
+                    sum0 += a * bias[c, Y, X]
+                    sum1 += abs(a) * noise[k, c, Y, X]
+        total[r] += sum0 - sum1
+
+
+@njit(cache=True, error_model="numpy")
+def reach_image(value, y, x, cell, slopes, offsets, lower, upper, total, plane, box):
+    """Lower bounds of rows on the image (N5).
+
+    Args:
+        value, y, x, cell: Rows.
+        slopes: [m, 2, C, H, W, d] of the lower and upper planes.
+        offsets: [m, 2, C, H, W].
+        lower, upper: [m, C, H, W].
+        total: [R] what the rows gathered on their way.
+        plane: [R, d + 1] becomes slopes and offset of a plane below.
+        box: [R] becomes a lower bound from ``lower`` and ``upper`` alone.
+    """
+    count, channels, h, w = value.shape
+    H, W, d = slopes.shape[3:]
+    for r in range(count):
+        k = cell[r]
+        constant, low, size = 0.0, 0.0, 0.0
+        for c in range(channels):
+            for i in range(h):
+                Y = y[r] + i
+                if Y < 0 or Y >= H:
+                    continue
+                for j in range(w):
+                    X = x[r] + j
+                    a = np.float64(value[r, c, i, j])
+                    if X < 0 or X >= W or a == 0.0:
+                        continue
+                    side = 0 if a > 0.0 else 1
+                    b = a * offsets[k, side, c, Y, X]
+                    constant += b
+                    size += abs(b)
+                    for l in range(d):
+                        s = a * slopes[k, side, c, Y, X, l]
+                        plane[r, l] += s
+                        size += abs(s)
+                    e = a * (lower[k, c, Y, X] if a > 0.0 else upper[k, c, Y, X])
+                    low += e
+                    size += abs(e)
+        # sums of at most 2^24 products
+        room = 2.0**-28 * size + 2.0**-48 * abs(total[r])
+        plane[r, d] = total[r] + constant - room
+        box[r] = total[r] + low - room
