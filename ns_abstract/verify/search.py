@@ -343,7 +343,10 @@ class Search:
             if bound is not None and bound > 0.0:
                 if cell.broken:
                     # a proof and a counterexample cannot both be right
-                    raise ContradictionError(cell.box, bound, cell.poses[cell.worst], cell.margins[cell.worst])
+                    raise ContradictionError(
+                        f"internal error: margin proved to be at least {bound} on {cell.box.lower} to "
+                        f"{cell.box.upper}, found {cell.margins[cell.worst]} at {cell.poses[cell.worst].tolist()}"
+                    )
                 leaves.append(Leaf(cell.cell, "certified", bound, 0.0))
                 continue
             hopeless = cell.broken == len(cell.margins) and not self.every_unit
@@ -382,12 +385,6 @@ class Search:
 
 class ContradictionError(RuntimeError):
     """A cell was proved although a pose in it breaks the property: the program has a fault."""
-
-    def __init__(self, box: ParameterBox, bound: float, values: np.ndarray, margin: float) -> None:
-        super().__init__(
-            f"internal error: margin proved to be at least {bound} on {box.lower} to {box.upper}, "
-            f"found {margin} at {values.tolist()}"
-        )
 
 
 #: What may go wrong in one cell without ending the run; lack of memory and a user's mistake do end it.
