@@ -220,11 +220,11 @@ class Cluster:
         if not self._futures:
             return []
         try:
-            finished = wait_for(list(self._futures), timeout=seconds, return_when="FIRST_COMPLETED").done
+            waited: Any = wait_for(list(self._futures), timeout=seconds, return_when="FIRST_COMPLETED")
         except TimeoutError:
             return []
-        results = [(self._futures[future], future.result()) for future in finished]
-        for future in finished:
+        results = [(self._futures[future], future.result()) for future in waited.done]
+        for future in waited.done:
             del self._futures[future]
         return results
 
@@ -246,15 +246,15 @@ def connected(address: str | None, workers: int = 1) -> Iterator[Any]:
         InputError: Dask is missing or its scheduler does not answer.
     """
     try:
-        import dask
+        from dask import config
         from distributed import Client
     except ImportError:
         raise InputError("needs the package dask", field="--engine", fix="pip install 'ns-abstract[cluster]'") from None
     try:
         if address is None:
             name = "distributed.nanny.pre-spawn-environ"
-            kept = {key: value for key, value in dask.config.get(name, {}).items() if key != _TRIM}
-            with dask.config.set({name: kept}):
+            kept = {key: value for key, value in config.get(name, {}).items() if key != _TRIM}
+            with config.set({name: kept}):
                 client: Any = Client(n_workers=workers, threads_per_worker=1, dashboard_address=None)
         else:
             client = Client(address, timeout=_CONNECT)

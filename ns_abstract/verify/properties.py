@@ -210,8 +210,9 @@ class Truth:
         parts = {f"camera.{n}": camera[k] for k, n in enumerate("xyz")}
         parts |= {f"object.{n}": seen[k] for k, n in enumerate("xyz")}
         parts["distance"] = camera.norm()
+        numbers = [torch.tensor(0.0 if isinstance(c, str) else c, dtype=pose.dtype) for c in self.components]
         return torch.stack(
-            [parts[c] * self.scale if isinstance(c, str) else torch.tensor(c, dtype=pose.dtype) for c in self.components]
+            [parts[c] * self.scale if isinstance(c, str) else n for c, n in zip(self.components, numbers, strict=True)]
         )
 
 
@@ -265,7 +266,7 @@ class RegressionClaim(Claim):
             return float((np.array(self.absolute) * (1.0 - _CHARGE) - error).min())
         length = float(np.sqrt((error * error).sum())) * (1.0 + _CHARGE)
         if self.absolute is not None:
-            return self.absolute[0] * (1.0 - _CHARGE) - length * (1.0 + _CHARGE)
+            return float(min(self.absolute)) * (1.0 - _CHARGE) - length * (1.0 + _CHARGE)
         assert self.relative is not None
         nearest = np.where((low <= 0.0) & (high >= 0.0), 0.0, np.minimum(np.abs(low), np.abs(high)))
         reach = self.relative * float(np.sqrt((nearest * nearest).sum())) * (1.0 - _CHARGE)
@@ -566,9 +567,8 @@ def _regression(root: dict[str, Any], outputs: int, common: dict[str, Any]) -> P
     elif target == "distance":
         target = [target]
     if not isinstance(target, list) or not all(is_number(v) or v in _COMPONENTS for v in target):
-        raise _fail(
-            "target", root.get("target"), f"write camera, object, distance, or a list of numbers or {', '.join(_COMPONENTS)}"
-        )
+        names = ", ".join(_COMPONENTS)
+        raise _fail("target", root.get("target"), f"write camera, object, distance, or a list of numbers or {names}")
     if len(target) != outputs:
         raise InputError(
             f"{len(target)} values, the network has {outputs} outputs", field="target", fix="write one value by output"
@@ -582,18 +582,19 @@ def _regression(root: dict[str, Any], outputs: int, common: dict[str, Any]) -> P
     tolerance = root.get("tolerance")
     if not isinstance(tolerance, dict) or len(tolerance) != 1 or not set(tolerance) <= {"absolute", "relative"}:
         raise _fail("tolerance", tolerance, 'write {"relative": 0.2} or {"absolute": 0.1}')
-    (name, value), absolute, relative = *tolerance.items(), None, None
-    values = value if isinstance(value, list) and name == "absolute" else [value]
+    absolute: tuple[float, ...] | None = None
+    relative: float | None = None
+    name, value = next(iter(tolerance.items()))
+    values: list[Any] = value if isinstance(value, list) and name == "absolute" else [value]
     if not all(is_number(v) and v > 0 for v in values) or len(values) not in (1, outputs):
         more = f" or {outputs} of them" if name == "absolute" else ""
         raise _fail(f"tolerance.{name}", value, f"write a number above 0{more}")
     if name == "absolute":
         absolute = tuple(float(v) for v in values)
     else:
-        relative = float(value)
-    truth = Truth(
-        tuple(v if isinstance(v, str) else float(v) for v in target), (*map(float, origin),), float(scale)  # pyright: ignore[reportArgumentType]
-    )
+        relative = float(values[0])
+    x, y, z = (float(v) for v in origin)
+    truth = Truth(tuple(v if isinstance(v, str) else float(v) for v in target), (x, y, z), float(scale))
     return Regression(truth=truth, absolute=absolute, relative=relative, **common)
 
 
@@ -620,7 +621,7 @@ def _detection(root: dict[str, Any], outputs: int, height: int, width: int, comm
             raise _fail("box", box, "write [x0, y0, x1, y1] in pixels of the network's input")
         if iou is None:
             raise InputError("given without iou", field="box", fix="write an iou, or remove the box")
-        box = tuple(float(v) for v in box)
+        box = (float(box[0]), float(box[1]), float(box[2]), float(box[3]))
     return Detection(
         label=label,
         confidence=float(confidence),  # pyright: ignore[reportArgumentType]

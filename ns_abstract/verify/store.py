@@ -321,7 +321,7 @@ class Store:
         rows = self._base.execute(
             "SELECT frame, total, certified, falsified, unknown, poses, holding FROM search_frames ORDER BY frame"
         )
-        return [Tally(frame, int(t), int(c), int(f), int(u), poses, holding) for frame, t, c, f, u, poses, holding in rows]
+        return [Tally(row[0], *map(int, row[1:])) for row in rows]
 
     def leaves(self, frame: int, verdict: Verdict | None = None) -> list[dict[str, Any]]:
         """A frame's rows of ``cells`` in order of their lower ends, JSON read."""
