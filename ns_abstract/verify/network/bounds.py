@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 import torch
@@ -12,8 +11,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ns_abstract.verify.network.graph import Network
-from ns_abstract.verify.network.layers import Activation, Linear
-from ns_abstract.verify.network.rows import Rows, charge, full, grid, join, pass_activation, reach_image
+from ns_abstract.verify.network.layers import Activation, LeakyRelu, Linear, Sum
+from ns_abstract.verify.network.rows import Rows, charge, full, grid, join, pass_activation, reach
 
 Float64 = NDArray[np.float64]
 Int64 = NDArray[np.int64]
@@ -112,7 +111,9 @@ def bound_outputs(
         raise ValueError(f"images of {network.input_size} numbers expected, got {images.a_lower.shape[1]}")
     if rows.shape != (offset.shape[0], network.output_size):
         raise ValueError(f"rows {(offset.shape[0], network.output_size)} expected, got {rows.shape}")
-    by_cell = sum(int(np.prod(network.shape(k))) for k in range(len(network.nodes) + 1)) * 8 * (images.dimensions + 9)
+    by_cell = (
+        sum(int(np.prod(network.shape(k))) for k in range(len(network.nodes) + 1)) * 8 * (3 * images.dimensions + 14)
+    )
     step = max(1, int(0.5 * memory) // by_cell)
     parts = []
     for first in range(0, images.count, step):
@@ -160,16 +161,19 @@ class _Cells:
         self.good = np.ones(self.count, bool)
         self.flush = np.zeros(self.count)
         self._planes(images, substitution)
-        self.lines: dict[int, list[np.ndarray]] = {}
-        self.noise: dict[int, np.ndarray] = {}
-        self.biases: dict[int, np.ndarray] = {}
-        self._row_bytes: dict[int, int] = {}
+        self.lines: dict[int, np.ndarray] = {}
+        self.noise: dict[int, Tensor] = {}
+        self.biases: dict[int, Tensor] = {}
+        #: nodes whose bias and rounding are in those of their only reader
+        self.folded: set[int] = set()
+        #: what rows may stop at
+        self.stops: dict[int, _Planes] = {}
         self.last = self._forward()
         if substitution == "end":
             self._planes(images, "everywhere")
 
     def _planes(self, images: ImageSets, substitution: Substitution) -> None:
-        """Image sets in the order that rows want; a cell with a number that is not finite is given up."""
+        """Image sets as rows want them; a cell with a number that is not finite is given up."""
         shape = grid(self.network.input_shape)
         fields = [np.asarray(getattr(images, name), np.float64) for name in images.__dataclass_fields__]
         finite = np.logical_and.reduce([np.isfinite(f).reshape(self.count, -1).all(axis=1) for f in fields])
@@ -180,22 +184,24 @@ class _Cells:
         )
         if substitution != "everywhere":
             a_lower, b_lower, a_upper, b_upper = np.zeros_like(a_lower), lower, np.zeros_like(a_upper), upper
-        self.slopes = np.stack([a_lower, a_upper], 1).reshape(self.count, 2, *shape, self.d)
-        self.offsets = np.stack([b_lower, b_upper], 1).reshape(self.count, 2, *shape)
-        self.lower, self.upper = lower.reshape(self.count, *shape), upper.reshape(self.count, *shape)
+        self.image = _Planes(
+            np.stack([a_lower, a_upper], 1).reshape(self.count, 2, *shape, self.d),
+            np.stack([b_lower, b_upper], 1).reshape(self.count, 2, *shape),
+            lower.reshape(self.count, *shape),
+            upper.reshape(self.count, *shape),
+        )
 
     def _image(self) -> _Form:
         """The image as a form: the middle of its planes."""
         shape = self.network.input_shape
-        slopes, offsets = torch.from_numpy(self.slopes), torch.from_numpy(self.offsets)
+        slopes, offsets = torch.from_numpy(self.image.slopes), torch.from_numpy(self.image.offsets)
         a = slopes.mean(1).movedim(-1, 1)
         c = offsets.mean(1)
         spread = 0.5 * (offsets[:, 1] - offsets[:, 0]) + 0.5 * (slopes[:, 1] - slopes[:, 0]).abs().sum(-1)
         spread = spread.clamp(min=0.0) + 2.0**-50 * (offsets.abs().amax(1) + slopes.abs().amax(1).sum(-1))
         form = _Form.ranged(c.reshape(-1, *shape), a.reshape(-1, self.d, *shape), spread.reshape(-1, *shape))
-        return self._within(
-            form, torch.from_numpy(self.lower).reshape(-1, *shape), torch.from_numpy(self.upper).reshape(-1, *shape)
-        )
+        lower, upper = torch.from_numpy(self.image.lower), torch.from_numpy(self.image.upper)
+        return self._within(form, lower.reshape(-1, *shape), upper.reshape(-1, *shape))
 
     def _within(self, form: _Form, lower: Tensor, upper: Tensor) -> _Form:
         """The form with bounds that are known besides; a cell without values in it is given up."""
@@ -227,10 +233,13 @@ class _Cells:
                 inputs.append(form)
             if isinstance(node.layer, Activation):
                 # what is known better of the input is also known to its other readers
-                forms[node.inputs[0]] = inputs[0] = self._tighten(node.inputs[0], inputs[0], node.layer)
-                forms.append(self._activate(k, node.layer, inputs[0]))
+                source = node.inputs[0]
+                forms[source] = inputs[0] = self._tighten(source, inputs[0], node.layer)
+                forms.append(self._activate(k, source, node.layer, inputs[0]))
+                if self.network.depth[source] > 1:
+                    self.stops[source] = self._stop(source, inputs[0])
             else:
-                forms.append(self._combine(k, node.layer, inputs, [self.network.readers[i] for i in node.inputs]))
+                forms.append(self._combine(k, node.inputs, node.layer, inputs))
             for index in node.inputs:
                 left[index] -= 1
                 if not left[index] and index != last:
@@ -239,7 +248,7 @@ class _Cells:
         assert end is not None
         return end
 
-    def _combine(self, k: int, layer: Linear, inputs: list[_Form], readers: list[int]) -> _Form:
+    def _combine(self, k: int, sources: tuple[int, ...], layer: Linear, inputs: list[_Form]) -> _Form:
         """A linear layer (N1, N2)."""
         m, d = self.count, self.d
         stacks = [torch.cat([f.c[:, None], f.a], 1).flatten(0, 1) for f in inputs]
@@ -251,7 +260,7 @@ class _Cells:
         c, size = moved[:, 0], magnitude[1]
         if bias is not None:
             c, size = c + bias, size + bias.abs()
-        count = layer.terms + layer.row_terms + _SPARE + max(readers)
+        count = layer.terms + layer.row_terms + _SPARE + max(self.network.readers[i] for i in sources)
         noise = size * (count * UNIT / (1.0 - count * UNIT)) + (layer.terms + 1) * _FLUSH
         form = _Form.ranged(c, moved[:, 1:], magnitude[0] * (1.0 + 2.0**-28) + noise)
         if float(size.amax()) >= _OVERFLOW:
@@ -259,12 +268,18 @@ class _Cells:
         for f, shape in zip(inputs, layer.input_shapes, strict=True):
             lost = int(np.prod(shape)) * (layer.row_terms + 2) * _FLUSH
             self.flush += lost * f.size.reshape(m, -1).amax(1).numpy()
-        self.noise[k] = (noise * (1.0 + 2.0**-20)).float().reshape(m, *grid(layer.shape)).numpy()
-        whole = torch.zeros(layer.shape, dtype=torch.float64) if bias is None else bias.expand(layer.shape)
-        self.biases[k] = whole.reshape(grid(layer.shape)).contiguous().numpy()
+        total = torch.zeros(layer.shape, dtype=torch.float64) if bias is None else bias.expand(layer.shape)
+        if isinstance(layer, Sum):
+            # one charge instead of several
+            for source, sign in zip(sources, layer.signs, strict=True):
+                if source in self.noise and self.network.readers[source] == 1:
+                    total = total + sign * self.biases[source]
+                    noise = noise + self.noise[source]
+                    self.folded.add(source)
+        self.noise[k], self.biases[k] = noise * (1.0 + 2.0**-40), total
         return self._within(form, form.lower, form.upper)
 
-    def _activate(self, k: int, layer: Activation, z: _Form) -> _Form:
+    def _activate(self, k: int, source: int, layer: Activation, z: _Form) -> _Form:
         """An activation (N3, N4)."""
         size = z.size
         room = layer.error(size) + 2.0**-40 * size
@@ -274,23 +289,49 @@ class _Cells:
         half = half + 2.0**-50 * middle.abs() + room + 2.0**-48 * s * (z.c.abs() + z.a.abs().sum(1))
         form = _Form.ranged(s * z.c + middle, s[:, None] * z.a, s * z.r * (1.0 + 2.0**-40) + half)
         lines = layer.lines(z.lower, z.upper)
+        # the slope as stored, rows' products with it and sums where branches meet
+        unit = (_SPARE + self.network.readers[source]) * UNIT
+        fold = source in self.noise and self.network.readers[source] == 1
         stored = []
         for slope, offset, side in (
             (lines.lower_slope, lines.lower_offset, -1.0),
             (lines.upper_slope, lines.upper_offset, 1.0),
         ):
-            rounded = slope.float()
-            # the slope as stored, rows' products with it and sums where branches meet
-            give = (rounded - slope).abs() + (
-                _SPARE + self.network.readers[self.network.nodes[k - 1].inputs[0]]
-            ) * UNIT * slope
-            moved = offset + side * (give * size + room)
-            near = moved.float()
-            out = torch.nextafter(near, torch.full_like(near, side * torch.inf))
-            stored += [rounded, torch.where(moved == 0.0, near, out)]
-        self.lines[k] = [t.reshape(self.count, *grid(layer.shape)).contiguous().numpy() for t in stored]
+            rounded = slope.float().double()
+            # the other side of a line with this slope, from the band
+            apart = band.lower_slope - slope
+            ends = apart * z.lower, apart * z.upper
+            if side < 0.0:
+                other = torch.maximum(*ends) + band.upper_offset
+            else:
+                other = torch.minimum(*ends) + band.lower_offset
+            give = ((rounded - slope).abs() + unit * slope + 2.0**-48 * apart.abs()) * size + room
+            give, move = give + 2.0**-48 * (offset.abs() + other.abs()), torch.zeros((), dtype=torch.float64)
+            if fold:
+                bias, noise = self.biases[source], self.noise[source]
+                give, move = give + rounded * (noise + 2.0**-48 * bias.abs()), rounded * bias
+            stored.append(rounded.float())
+            stored += [_outward(offset + side * give + move, side), _outward(other - side * give + move, -side)]
+        if fold:
+            self.folded.add(source)
+        self.lines[k] = torch.stack(stored).reshape(6, self.count, *grid(layer.shape)).numpy()
         self.flush += int(np.prod(layer.shape)) * 2 * _FLUSH * size.reshape(self.count, -1).amax(1).numpy()
         return self._within(form, layer.function(z.lower) - room, layer.function(z.upper) + room)
+
+    def _stop(self, index: int, form: _Form) -> _Planes:
+        """What is known of node ``index``, for rows that arrive there."""
+        m, d, shape = self.count, self.d, grid(self.network.shape(index))
+        bias = noise = torch.zeros((), dtype=torch.float64)
+        if index in self.folded:
+            # such rows have gathered bias and rounding already
+            bias, noise = self.biases[index], self.noise[index]
+        room = 2.0**-48 * (form.c.abs() + form.r + form.size + bias.abs() + noise) - noise
+        slopes = form.a.movedim(1, -1).reshape(m, 1, *shape, d).expand(m, 2, *shape, d)
+        offsets = torch.stack([form.c - bias - form.r - room, form.c - bias + form.r + room], 1)
+        lower, upper = form.lower - bias - room, form.upper - bias + room
+        sizes = (m, 2, *shape, d), (m, 2, *shape), (m, *shape), (m, *shape)
+        found = zip((slopes, offsets, lower, upper), sizes, strict=True)
+        return _Planes(*(t.reshape(size).contiguous().numpy() for t, size in found))
 
     def _tighten(self, index: int, form: _Form, layer: Activation) -> _Form:
         """Better bounds of the numbers of node ``index`` where they would give better lines (N6)."""
@@ -302,25 +343,28 @@ class _Cells:
         where = open_.nonzero().numpy()
         if not len(where):
             return form
-        low = self._one_hot(index, where, 1.0)
-        high = self._one_hot(index, where, -1.0)
+        # the likelier side first; what it decides needs no other
+        center = form.c.reshape(self.count, *shape).numpy()[tuple(where.T)]
+        decides = isinstance(layer, LeakyRelu)
+        sign = np.where(center >= 0.0, 1.0, -1.0)
+        found = self._one_hot(index, where, sign, decides)
+        found.turn(sign < 0.0)
+        left = np.flatnonzero((found.lower < 0.0) & (found.upper > 0.0)) if decides else np.arange(len(where))
+        again = self._one_hot(index, where[left], -sign[left], decides)
+        again.turn(sign[left] > 0.0)
+        found.meet(left, again, sign[left] < 0.0)
         cell, flat = where[:, 0], np.ravel_multi_index(tuple(where[:, 1:].T), shape)
         at = torch.from_numpy(cell), torch.from_numpy(flat)
         c, r = form.c.flatten(1).clone(), form.r.flatten(1).clone()
         a = form.a.flatten(2).movedim(1, -1).clone()
         lower, upper = form.lower.flatten(1).clone(), form.upper.flatten(1).clone()
-        slopes = torch.from_numpy(0.5 * (low.plane[:, :-1] - high.plane[:, :-1]))
-        apart = np.abs(low.plane[:, :-1] + high.plane[:, :-1]).sum(1)
-        center = torch.from_numpy(0.5 * (low.plane[:, -1] - high.plane[:, -1]))
-        radius = 0.5 * (-high.plane[:, -1] - low.plane[:, -1] + apart)
-        size = np.abs(low.plane).sum(1) + np.abs(high.plane).sum(1)
-        radius = torch.from_numpy(np.maximum(radius, 0.0) + 2.0**-48 * size)
+        center, radius = found.middle()
         better = radius < r[at]
-        c[at] = torch.where(better, center, c[at])
-        a[at] = torch.where(better[:, None], slopes, a[at])
+        c[at] = torch.where(better, center[:, -1], c[at])
+        a[at] = torch.where(better[:, None], center[:, :-1], a[at])
         r[at] = torch.where(better, radius, r[at])
-        lower[at] = torch.maximum(lower[at], torch.from_numpy(low.lower))
-        upper[at] = torch.minimum(upper[at], torch.from_numpy(-high.lower))
+        lower[at] = torch.maximum(lower[at], torch.from_numpy(found.lower))
+        upper[at] = torch.minimum(upper[at], torch.from_numpy(found.upper))
         item = layer.shape
         tight = _Form(
             c.reshape(-1, *item),
@@ -333,79 +377,75 @@ class _Cells:
 
     # ------------------------------------------------------------ backwards
 
-    def _one_hot(self, index: int, where: Int64, sign: float) -> _Reached:
-        """Bounds of ``sign`` times single numbers [R, (cell, channel, row, column)] of node ``index``."""
+    def _one_hot(self, index: int, where: Int64, sign: Float64, decides: bool) -> _Reached:
+        """Bounds of ``sign`` [R] times single numbers [R, (cell, channel, row, column)] of node ``index``."""
         channels = grid(self.network.shape(index))[0]
-        parts = []
-        step = self._rows_at_once(index, (1, 1))
+        found = _Reached.unknown(len(where), self.d)
+        step = max(1, _ROWS_AT_ONCE // (16 * channels))
         for first in range(0, len(where), step):
-            cell, channel, y, x = where[first : first + step].T
+            number = np.arange(first, min(len(where), first + step))
+            cell, channel, y, x = (np.ascontiguousarray(v) for v in where[number].T)
             value = np.zeros((len(cell), channels, 1, 1), np.float32)
-            value[np.arange(len(cell)), channel] = sign
-            rows = Rows(value, np.ascontiguousarray(y), np.ascontiguousarray(x))
-            parts.append(self._backward(index, rows, np.ascontiguousarray(cell)))
-        return _Reached.joined(parts)
+            value[np.arange(len(cell)), channel, 0, 0] = sign[number]
+            found.put(number, self._backward(index, Rows(value, y, x), cell, decides))
+        return found
 
-    def _rows_at_once(self, index: int, window: tuple[int, int]) -> int:
-        """Rows that fit: what one row on node ``index`` needs is found by passing one of zeros back."""
-        channels, height, width = grid(self.network.shape(index))
-        rows = Rows(np.zeros((1, channels, *window), np.float32), np.full(1, height // 2), np.full(1, width // 2))
-        if window == (height, width):
-            rows = Rows.whole(rows.value)
-        largest = 0
-        for _, _, live in self._walk(index, rows, np.zeros(1, np.int64), np.zeros(1)):
-            largest = max(largest, live)
-        return max(1, min(_ROWS_AT_ONCE, self.memory // 4) // max(1, 2 * largest))
+    def _backward(self, index: int, rows: Rows, cell: Int64, decides: bool = False) -> _Reached:
+        """Bounds of rows on node ``index``; those that are not negative for certain may stop before the image."""
+        found = _Reached.unknown(len(cell), self.d)
+        batch = _Batch({index: rows}, cell, np.zeros((len(cell), 2)), np.arange(len(cell)))
+        self._descend(index, index, batch, found, decides)
+        return found
 
-    def _backward(self, index: int, rows: Rows, cell: Int64) -> _Reached:
-        """Bounds of rows on node ``index``."""
-        count = len(cell)
-        total = np.zeros(count)
-        image = None
-        for at, found, _ in self._walk(index, rows, cell, total):
-            image = found if at == 0 else None
-        plane, box = np.zeros((count, self.d + 1)), np.zeros(count)
-        if image is None:
-            plane[:, -1] = box[:] = total
-        else:
-            reach_image(
-                image.value,
-                image.y,
-                image.x,
-                cell,
-                self.slopes,
-                self.offsets,
-                self.lower,
-                self.upper,
-                total,
-                plane,
-                box,
-            )
-        plane[:, -1] -= self.flush[cell]
-        box -= self.flush[cell]
-        return _Reached.from_planes(plane, box)
-
-    def _walk(self, index: int, rows: Rows, cell: Int64, total: Float64) -> Iterator[tuple[int, Rows, int]]:
-        """Pass rows from node ``index`` to the image; yields (node, its rows, bytes that are held)."""
-        waiting = {index: rows}
-        for at in range(index, 0, -1):
-            here = waiting.pop(at, None)
-            if here is None:
+    def _descend(self, start: int, at: int, batch: _Batch, found: _Reached, decides: bool) -> None:
+        """Pass a batch from node ``at`` on to the image."""
+        while at > 0:
+            if at not in batch.waiting:
+                at -= 1
                 continue
+            if batch.bytes > min(_ROWS_AT_ONCE, self.memory // 16) and len(batch.cell) > 1:
+                half = len(batch.cell) // 2
+                for part in (slice(0, half), slice(half, None)):
+                    self._descend(start, at, batch[part], found, decides)
+                return
+            if decides and at != start and at in self.stops and len(batch.waiting) == 1:
+                self._settle(at, batch, self.stops[at], found)
+                going_on = found.lower[batch.number] < 0.0
+                if going_on.mean() < 0.75:
+                    batch = batch[going_on]
+                if not len(batch.cell):
+                    return
+            here = batch.waiting.pop(at)
             node = self.network.nodes[at - 1]
             if isinstance(node.layer, Activation):
-                pass_activation(here.value, here.y, here.x, cell, *self.lines[at], total=total)
-                found = [here]
+                pass_activation(here.value, here.y, here.x, batch.cell, self.lines[at], batch.total)
+                parts = [here]
             else:
-                charge(here.value, here.y, here.x, cell, self.biases[at], self.noise[at], total)
-                found = node.layer.backward(here)
-            for source, part in zip(node.inputs, found, strict=True):
-                known = waiting.get(source)
+                if at == start or at not in self.folded:
+                    shape = grid(node.layer.shape)
+                    bias = self.biases[at].reshape(shape).contiguous().numpy()
+                    noise = self.noise[at].reshape(self.count, *shape).numpy()
+                    charge(here.value, here.y, here.x, batch.cell, bias, noise, batch.total)
+                parts = node.layer.backward(here)
+            for source, part in zip(node.inputs, parts, strict=True):
+                known = batch.waiting.get(source)
                 shape = self.network.shape(source)
-                waiting[source] = full(part, shape) if known is None else join(known, part, shape)
-            yield at, here, sum(r.value.nbytes for r in waiting.values()) + here.value.nbytes
-        if 0 in waiting:
-            yield 0, waiting[0], waiting[0].value.nbytes
+                batch.waiting[source] = full(part, shape) if known is None else join(known, part, shape)
+        self._settle(0, batch, self.image, found)
+
+    def _settle(self, at: int, batch: _Batch, planes: _Planes, found: _Reached) -> None:
+        """Bounds of a batch whose rows are all on node ``at``."""
+        count = len(batch.cell)
+        plane, box = np.zeros((count, 2, self.d + 1)), np.zeros((count, 2))
+        rows = batch.waiting.get(at)
+        if rows is None:
+            plane[:, :, -1] = box[:] = batch.total
+        else:
+            reach(rows.value, rows.y, rows.x, batch.cell, *planes, total=batch.total, plane=plane, box=box)
+        lost = self.flush[batch.cell][:, None] * np.array([-1.0, 1.0])
+        plane[:, :, -1] += lost
+        box += lost
+        found.improve(batch.number, plane, box)
 
     def outputs(self, rows: Any, offset: Float64) -> OutputBounds:
         """Bounds of ``rows @ y + offset`` in every cell."""
@@ -417,12 +457,15 @@ class _Cells:
         dense = np.asarray(rows.toarray() if hasattr(rows, "toarray") else rows, np.float64)
         single = dense.astype(np.float32)
         missing = size @ np.abs(dense - single).T
-        step = self._rows_at_once(index, shape[1:])
-        for first in range(0, m * k, step):
-            number = np.arange(first, min(m * k, first + step))
-            cell, row = number // k, number % k
-            found = self._backward(index, Rows.whole(single[row].reshape(-1, *shape)), cell)
-            plane[cell, row], lower[cell, row] = found.plane, found.lower
+        for top, left, height, width, number in _windows(single.reshape(k, *shape)):
+            part = single.reshape(k, *shape)[:, :, top : top + height, left : left + width]
+            step = max(1, _ROWS_AT_ONCE // (4 * shape[0] * height * width))
+            for first in range(0, m * len(number), step):
+                which = np.arange(first, min(m * len(number), first + step))
+                cell, row = which // len(number), number[which % len(number)]
+                rows = Rows(np.ascontiguousarray(part[row]), np.full(len(which), top), np.full(len(which), left))
+                found = self._backward(index, rows, cell)
+                plane[cell, row], lower[cell, row] = found.plane[:, 0], found.lower
         room = 2.0**-48 * (np.abs(plane).sum(-1) + np.abs(offset) + missing) + missing
         lower, b = lower + offset - room, plane[..., -1] + offset - room
         a = plane[..., :-1]
@@ -433,21 +476,109 @@ class _Cells:
         )
 
 
+def _windows(rows: np.ndarray) -> list[tuple[int, int, int, int, Int64]]:
+    """Windows (top, left, height, width) of rows [k, C, H, W] that are zero elsewhere, and which rows they hold."""
+    used = (rows != 0.0).any(axis=1)
+    groups: dict[tuple[int, int, int, int], list[int]] = {}
+    for k, mask in enumerate(used):
+        ys, xs = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
+        window = (ys[0], xs[0], ys[-1] - ys[0] + 1, xs[-1] - xs[0] + 1) if len(ys) else (0, 0, 1, 1)
+        groups.setdefault(tuple(map(int, window)), []).append(k)  # type: ignore[arg-type]
+    return [(*window, np.array(number)) for window, number in groups.items()]
+
+
+class _Planes(NamedTuple):
+    """What is known of a node, as rows want it.
+
+    Attributes:
+        slopes: [m, 2, C, H, W, d] of the lower and the upper plane.
+        offsets: [m, 2, C, H, W].
+        lower, upper: [m, C, H, W].
+    """
+
+    slopes: Float64
+    offsets: Float64
+    lower: Float64
+    upper: Float64
+
+
+@dataclass
+class _Batch:
+    """Rows under way.
+
+    Attributes:
+        waiting: By node.
+        cell: [R] of every row.
+        total: [R, 2] what rows gathered so far, at least and at most.
+        number: [R] positions in the result.
+    """
+
+    waiting: dict[int, Rows]
+    cell: Int64
+    total: Float64
+    number: Int64
+
+    def __getitem__(self, chosen: Any) -> _Batch:
+        waiting = {k: rows[chosen] for k, rows in self.waiting.items()}
+        return _Batch(waiting, self.cell[chosen], self.total[chosen], self.number[chosen])
+
+    @property
+    def bytes(self) -> int:
+        return sum(rows.value.nbytes for rows in self.waiting.values())
+
+
 @dataclass
 class _Reached:
-    """What rows are at least: planes [R, d + 1] (slopes, offset) and numbers [R]."""
+    """What rows are at least and at most.
+
+    Attributes:
+        plane: [R, 2, d + 1] slopes and offset of a plane below and one above; NaN if unknown.
+        lower, upper: [R]; infinite if unknown.
+    """
 
     plane: Float64
     lower: Float64
+    upper: Float64
 
     @staticmethod
-    def from_planes(plane: Float64, box: Float64) -> _Reached:
-        """The better of a plane's least value and what is known from the box."""
-        slopes = np.abs(plane[:, :-1]).sum(1)
-        least = plane[:, -1] - slopes - 2.0**-50 * (np.abs(plane[:, -1]) + slopes)
-        lower = np.fmax(least, box)
-        return _Reached(plane, np.where(np.isnan(lower), -np.inf, lower))
+    def unknown(count: int, d: int) -> _Reached:
+        return _Reached(np.full((count, 2, d + 1), np.nan), np.full(count, -np.inf), np.full(count, np.inf))
 
-    @staticmethod
-    def joined(parts: list[_Reached]) -> _Reached:
-        return _Reached(np.concatenate([p.plane for p in parts]), np.concatenate([p.lower for p in parts]))
+    def put(self, number: Int64, other: _Reached) -> None:
+        self.plane[number], self.lower[number], self.upper[number] = other.plane, other.lower, other.upper
+
+    def turn(self, mask: np.ndarray) -> None:
+        """Negate the rows of ``mask``."""
+        self.plane[mask] = -self.plane[mask][:, ::-1]
+        self.lower[mask], self.upper[mask] = -self.upper[mask], -self.lower[mask]
+
+    def meet(self, number: Int64, other: _Reached, below: np.ndarray) -> None:
+        """Take in other bounds of the rows ``number``, and their planes below or above."""
+        side = np.where(below, 0, 1)
+        self.plane[number, side] = other.plane[np.arange(len(number)), side]
+        self.lower[number] = np.maximum(self.lower[number], other.lower)
+        self.upper[number] = np.minimum(self.upper[number], other.upper)
+
+    def middle(self) -> tuple[Tensor, Tensor]:
+        """[R, d + 1] the plane between, and [R] how far the others are from it at most."""
+        low, high = self.plane[:, 0], self.plane[:, 1]
+        gap = high - low
+        radius = 0.5 * (gap[:, -1] + np.abs(gap[:, :-1]).sum(1))
+        radius = np.maximum(radius, 0.0) + 2.0**-48 * (np.abs(low).sum(1) + np.abs(high).sum(1))
+        return torch.from_numpy(0.5 * (low + high)), torch.from_numpy(radius)
+
+    def improve(self, number: Int64, plane: Float64, box: Float64) -> None:
+        """Planes of the latest node; the best numbers of all: a plane's extremes or what the box says."""
+        slopes = np.abs(plane[:, :, :-1]).sum(-1)
+        room = 2.0**-50 * (np.abs(plane[:, :, -1]) + slopes)
+        self.plane[number] = plane
+        least = np.fmax(plane[:, 0, -1] - slopes[:, 0] - room[:, 0], box[:, 0])
+        most = np.fmin(plane[:, 1, -1] + slopes[:, 1] + room[:, 1], box[:, 1])
+        self.lower[number] = np.fmax(self.lower[number], least)
+        self.upper[number] = np.fmin(self.upper[number], most)
+
+
+def _outward(value: Tensor, side: float) -> Tensor:
+    """The float32 neighbour on one side; zero stays."""
+    near = value.float()
+    return torch.where(value == 0.0, near, torch.nextafter(near, torch.full_like(near, side * torch.inf)))

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import ClassVar
 
 import numpy as np
@@ -90,6 +91,10 @@ class Convolution(Linear):
     def bias(self) -> Tensor | None:
         return None if self.offset is None else self.offset[:, None, None]
 
+    @cached_property
+    def _single(self) -> Tensor:
+        return self.weight.float()
+
     def _convolve(self, x: Tensor, weight: Tensor) -> Tensor:
         top, left, bottom, right = self.pads
         padding: tuple[int, int] = (top, left)
@@ -106,7 +111,7 @@ class Convolution(Linear):
     def backward(self, rows: Rows) -> list[Rows]:
         value = functional.conv_transpose2d(
             torch.from_numpy(rows.value),
-            self.weight.float(),
+            self._single,
             stride=self.stride,
             groups=self.groups,
             dilation=self.dilation,
@@ -127,6 +132,10 @@ class Matrix(Linear):
     def bias(self) -> Tensor | None:
         return self.offset
 
+    @cached_property
+    def _single(self) -> Tensor:
+        return self.weight.float()
+
     def apply(self, inputs: Sequence[Tensor]) -> Tensor:
         return inputs[0] @ self.weight.to(inputs[0].dtype).T
 
@@ -136,7 +145,7 @@ class Matrix(Linear):
     def backward(self, rows: Rows) -> list[Rows]:
         whole = full(rows, self.shape, force=True)
         count = whole.value.shape[0]
-        value = torch.from_numpy(whole.value).reshape(count, -1) @ self.weight.float()
+        value = torch.from_numpy(whole.value).reshape(count, -1) @ self._single
         return [Rows.whole(value.numpy().reshape(count, *grid(self.input_shapes[0])))]
 
 
@@ -183,7 +192,10 @@ class Sum(Linear):
 
     def backward(self, rows: Rows) -> list[Rows]:
         # rows are changed in place further on, so every input gets its own
-        return [Rows(rows.value * np.float32(sign), rows.y, rows.x) for sign in self.signs]
+        copies = [Rows(rows.value * np.float32(sign), rows.y, rows.x) for sign in self.signs[1:]]
+        if self.signs[0] < 0:
+            np.negative(rows.value, out=rows.value)
+        return [rows, *copies]
 
 
 @dataclass(frozen=True, eq=False)

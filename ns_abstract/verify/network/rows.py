@@ -9,6 +9,7 @@ are set to zero by whatever passes next.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numba import njit
@@ -33,6 +34,9 @@ class Rows:
     value: Float32
     y: Int64
     x: Int64
+
+    def __getitem__(self, chosen: Any) -> Rows:
+        return Rows(self.value[chosen], self.y[chosen], self.x[chosen])
 
     @staticmethod
     def whole(value: Float32) -> Rows:
@@ -120,81 +124,97 @@ def _scale(value, y, x, factor):
 
 
 @njit(cache=True, error_model="numpy")
-def pass_activation(value, y, x, cell, lower_slope, lower_offset, upper_slope, upper_offset, total):
+def pass_activation(value, y, x, cell, lines, total):
     """Rows [R, C, h, w] on an activation's output become rows on its input, in place (N4).
 
-    A coefficient that is not negative takes the lower line, a negative one the upper. ``total`` [R]
-    gathers the offsets; lines are [m, C, H, W] float32, ``cell`` [R] tells which.
+    Args:
+        value, y, x, cell: Rows and which cell each belongs to [R].
+        lines: [6, m, C, H, W] float32: slope, lower and upper offset for coefficients that are not negative;
+            slope, upper and lower offset for negative ones.
+        total: [R, 2] gathers what the rows are at least and at most.
     """
     count, channels, h, w = value.shape
-    H, W = lower_slope.shape[2:]
+    H, W = lines.shape[3:]
+    # by column, so that the loop over columns has no order
+    least, most = np.empty(w), np.empty(w)
     for r in range(count):
-        k, sum0, sum1 = cell[r], 0.0, 0.0
-        first, past = min(w, max(0, -x[r])), max(0, min(w, W - x[r]))
+        k, shift = cell[r], x[r]
+        first, past = min(w, max(0, -shift)), max(0, min(w, W - shift))
+        least[:] = 0.0
+        most[:] = 0.0
         for c in range(channels):
             for i in range(h):
                 Y = y[r] + i
-                if Y < 0 or Y >= H:
-                    value[r, c, i, :] = 0.0
+                row = value[r, c, i]
+                if Y < 0 or Y >= H or past <= first:
+                    row[:] = 0.0
                     continue
-                value[r, c, i, :first] = 0.0
-                value[r, c, i, past:] = 0.0
-                for j in range(first, past):
-                    X = x[r] + j
-                    a = value[r, c, i, j]
-                    up = a >= 0.0
-                    slope = lower_slope[k, c, Y, X] if up else upper_slope[k, c, Y, X]
-                    offset = lower_offset[k, c, Y, X] if up else upper_offset[k, c, Y, X]
-                    value[r, c, i, j] = a * slope
-                    if j & 1:
-                        sum0 += np.float64(a) * offset
-                    else:
-                        sum1 += np.float64(a) * offset
-        total[r] += sum0 + sum1
+                row[:first] = 0.0
+                row[past:] = 0.0
+                X = first + shift
+                slope0, low0, high0 = lines[0, k, c, Y, X:], lines[1, k, c, Y, X:], lines[2, k, c, Y, X:]
+                slope1, low1, high1 = lines[3, k, c, Y, X:], lines[4, k, c, Y, X:], lines[5, k, c, Y, X:]
+                part, down, up = row[first:past], least[first:past], most[first:past]
+                for j in range(past - first):
+                    a = part[j]
+                    b = np.float64(a)
+                    positive = a >= 0.0
+                    down[j] += b * np.float64(low0[j] if positive else low1[j])
+                    up[j] += b * np.float64(high0[j] if positive else high1[j])
+                    part[j] = a * (slope0[j] if positive else slope1[j])
+        total[r, 0] += least.sum()
+        total[r, 1] += most.sum()
 
 
 @njit(cache=True, error_model="numpy")
 def charge(value, y, x, cell, bias, noise, total):
-    """Add what a linear layer's bias [C, H, W] gives to rows on its output, less its rounding [m, C, H, W] (N2)."""
+    """Add what a linear layer's bias [C, H, W] gives to rows on its output, and its rounding [m, C, H, W] (N2)."""
     count, channels, h, w = value.shape
     H, W = noise.shape[2:]
+    moved, shaken = np.empty(w), np.empty(w)
     for r in range(count):
-        k, sum0, sum1 = cell[r], 0.0, 0.0
-        first, past = min(w, max(0, -x[r])), max(0, min(w, W - x[r]))
+        k, shift = cell[r], x[r]
+        first, past = min(w, max(0, -shift)), max(0, min(w, W - shift))
+        moved[:] = 0.0
+        shaken[:] = 0.0
         for c in range(channels):
             for i in range(h):
                 Y = y[r] + i
-                if Y < 0 or Y >= H:
-                    value[r, c, i, :] = 0.0
+                row = value[r, c, i]
+                if Y < 0 or Y >= H or past <= first:
+                    row[:] = 0.0
                     continue
-                value[r, c, i, :first] = 0.0
-                value[r, c, i, past:] = 0.0
-                for j in range(first, past):
-                    a = np.float64(value[r, c, i, j])
-                    X = x[r] + j
-                    sum0 += a * bias[c, Y, X]
-                    sum1 += abs(a) * noise[k, c, Y, X]
-        total[r] += sum0 - sum1
+                row[:first] = 0.0
+                row[past:] = 0.0
+                X = first + shift
+                bias_here, noise_here = bias[c, Y, X:], noise[k, c, Y, X:]
+                part, move, shake = row[first:past], moved[first:past], shaken[first:past]
+                for j in range(past - first):
+                    a = np.float64(part[j])
+                    move[j] += a * bias_here[j]
+                    shake[j] += abs(a) * noise_here[j]
+        total[r, 0] += moved.sum() - shaken.sum()
+        total[r, 1] += moved.sum() + shaken.sum()
 
 
 @njit(cache=True, error_model="numpy")
-def reach_image(value, y, x, cell, slopes, offsets, lower, upper, total, plane, box):
-    """Lower bounds of rows on the image (N5).
+def reach(value, y, x, cell, slopes, offsets, lower, upper, total, plane, box):
+    """Bounds of rows on a node of which planes and intervals are known (N5).
 
     Args:
         value, y, x, cell: Rows.
         slopes: [m, 2, C, H, W, d] of the lower and upper planes.
         offsets: [m, 2, C, H, W].
         lower, upper: [m, C, H, W].
-        total: [R] what the rows gathered on their way.
-        plane: [R, d + 1] becomes slopes and offset of a plane below.
-        box: [R] becomes a lower bound from ``lower`` and ``upper`` alone.
+        total: [R, 2] what the rows gathered on their way.
+        plane: [R, 2, d + 1] becomes slopes and offset of planes below and above.
+        box: [R, 2] becomes a lower and an upper bound from ``lower`` and ``upper`` alone.
     """
     count, channels, h, w = value.shape
     H, W, d = slopes.shape[3:]
     for r in range(count):
         k = cell[r]
-        constant, low, size = 0.0, 0.0, 0.0
+        below, above, low, high, size = 0.0, 0.0, 0.0, 0.0, 0.0
         for c in range(channels):
             for i in range(h):
                 Y = y[r] + i
@@ -206,17 +226,20 @@ def reach_image(value, y, x, cell, slopes, offsets, lower, upper, total, plane, 
                     if X < 0 or X >= W or a == 0.0:
                         continue
                     side = 0 if a > 0.0 else 1
-                    b = a * offsets[k, side, c, Y, X]
-                    constant += b
-                    size += abs(b)
+                    b0, b1 = a * offsets[k, side, c, Y, X], a * offsets[k, 1 - side, c, Y, X]
+                    below += b0
+                    above += b1
+                    size += abs(b0) + abs(b1)
                     for l in range(d):
-                        s = a * slopes[k, side, c, Y, X, l]
-                        plane[r, l] += s
-                        size += abs(s)
-                    e = a * (lower[k, c, Y, X] if a > 0.0 else upper[k, c, Y, X])
-                    low += e
-                    size += abs(e)
+                        s0, s1 = a * slopes[k, side, c, Y, X, l], a * slopes[k, 1 - side, c, Y, X, l]
+                        plane[r, 0, l] += s0
+                        plane[r, 1, l] += s1
+                        size += abs(s0) + abs(s1)
+                    e0, e1 = a * lower[k, c, Y, X], a * upper[k, c, Y, X]
+                    low += e0 if a > 0.0 else e1
+                    high += e1 if a > 0.0 else e0
+                    size += abs(e0) + abs(e1)
         # sums of at most 2^24 products
-        room = 2.0**-28 * size + 2.0**-48 * abs(total[r])
-        plane[r, d] = total[r] + constant - room
-        box[r] = total[r] + low - room
+        room = 2.0**-28 * size + 2.0**-48 * (abs(total[r, 0]) + abs(total[r, 1]))
+        plane[r, 0, d], box[r, 0] = total[r, 0] + below - room, total[r, 0] + low - room
+        plane[r, 1, d], box[r, 1] = total[r, 1] + above + room, total[r, 1] + high + room
