@@ -6,6 +6,7 @@ image in [0, 1] that the renderer gives, not its rounding to 8 bits in a file (d
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -127,7 +128,9 @@ class Preprocess:
         """[m, H, W, 3, ...] as [m, n, ...] in the layout's order."""
         if self.layout == "NCHW":
             array = np.moveaxis(array, array.ndim - 1 - after, 1)
-        return np.ascontiguousarray(array).reshape(array.shape[0], -1, *array.shape[array.ndim - after :])
+        rest = array.shape[array.ndim - after :]
+        # spelled out: -1 has no meaning where a set has no parameters
+        return np.ascontiguousarray(array).reshape(array.shape[0], math.prod(array.shape[1 : array.ndim - after]), *rest)
 
 
 def parse_preprocess(value: Any) -> Preprocess:

@@ -31,7 +31,7 @@ CREATE TABLE cells(frame INTEGER, lower TEXT, upper TEXT, verdict TEXT, margin R
 CREATE TABLE search_state(key TEXT PRIMARY KEY, value TEXT);
 CREATE TABLE search_frames(frame INTEGER PRIMARY KEY, units TEXT, coarse TEXT, lower TEXT, upper TEXT, total TEXT,
   certified TEXT, falsified TEXT, unknown TEXT, poses INTEGER, holding INTEGER);
-CREATE TABLE search_blocks(id INTEGER PRIMARY KEY, frame INTEGER, volume REAL, depth INTEGER, cells TEXT);
+CREATE TABLE search_blocks(id INTEGER PRIMARY KEY AUTOINCREMENT, frame INTEGER, volume REAL, depth INTEGER, cells TEXT);
 CREATE TABLE search_reasons(reason TEXT PRIMARY KEY, cells INTEGER);
 CREATE TABLE search_trace(seconds REAL, cells INTEGER, certified REAL, falsified REAL, unknown REAL);
 """
