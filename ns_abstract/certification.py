@@ -150,7 +150,13 @@ class NetworkModel:
         return self.preprocess.sets((linear[0], linear[1], linear[2], linear[3]), lower, upper)
 
     def bound(self, images: ImageSets, query: Query) -> OutputBounds:
-        return bound_outputs(self.network, images, query.rows, query.offset, memory=self.memory)
+        d = images.dimensions
+        if not d:
+            # a single pose is a set whose one parameter moves nothing
+            still = np.zeros((*images.b_lower.shape, 1))
+            images = dataclasses.replace(images, a_lower=still, a_upper=still)
+        found = bound_outputs(self.network, images, query.rows, query.offset, memory=self.memory)
+        return found if d else dataclasses.replace(found, a=found.a[..., :0])
 
 
 class Certification:

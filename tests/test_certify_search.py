@@ -474,11 +474,20 @@ def test_damaged_store_and_second_command(tmp_path: Path) -> None:
         open_store(tmp_path, resume=True)
     store.close()
     (tmp_path / "cells.sqlite").write_bytes(b"no database" * 1000)
-    with pytest.raises(InputError, match="damaged"):
+    with pytest.raises(InputError, match="cannot be used"):
         open_store(tmp_path, resume=True)
     (tmp_path / "cells.sqlite").write_bytes(b"")
     with pytest.raises(InputError):
         open_store(tmp_path, resume=True)
+    open_store(tmp_path).close()
+
+
+def test_others_may_read_while_cells_come_in(tmp_path: Path) -> None:
+    store, search = open_store(tmp_path), search_of()
+    fill(store, search, 3)
+    assert len(cells_of(tmp_path)) == store.count > 0
+    fill(store, search)
+    store.close()
 
 
 def test_fractions_are_a_measure(tmp_path: Path) -> None:

@@ -130,7 +130,8 @@ class Preprocess:
             array = np.moveaxis(array, array.ndim - 1 - after, 1)
         rest = array.shape[array.ndim - after :]
         # spelled out: -1 has no meaning where a set has no parameters
-        return np.ascontiguousarray(array).reshape(array.shape[0], math.prod(array.shape[1 : array.ndim - after]), *rest)
+        count = math.prod(array.shape[1 : array.ndim - after])
+        return np.ascontiguousarray(array).reshape(array.shape[0], count, *rest)
 
 
 def parse_preprocess(value: Any) -> Preprocess:

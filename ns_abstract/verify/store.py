@@ -9,6 +9,7 @@ Tables ``parameters`` and ``cells`` are for readers; ``search_*`` are the search
 
 from __future__ import annotations
 
+import fcntl
 import json
 import math
 import sqlite3
@@ -16,7 +17,7 @@ import time
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 from ns_abstract.errors import InputError
 from ns_abstract.sets.box import ParameterBox
@@ -95,38 +96,24 @@ class Store:
         *,
         resume: bool,
     ) -> None:
+        self._base: Any = None
         self._names, self._fixed = [name for name, _ in parameters], fixed
         self.file = folder / NAME
         try:
             folder.mkdir(parents=True, exist_ok=True)
-            fresh = not (resume and self.file.exists())
-            if fresh:
-                for suffix in ("", "-wal", "-shm"):
-                    Path(f"{self.file}{suffix}").unlink(missing_ok=True)
-            self._base = sqlite3.connect(self.file, isolation_level=None)
-            # a second command on the same folder is turned away, not interleaved
-            self._base.execute("PRAGMA locking_mode=EXCLUSIVE")
-            self._base.execute("PRAGMA journal_mode=WAL")
-            self._base.execute("PRAGMA synchronous=NORMAL")
-            if fresh:
-                with self._transaction():
-                    for statement in _SCHEMA.split(";\n"):
-                        self._base.execute(statement)
-                    self._put("version", VERSION)
-                    self._put("fingerprint", dict(fingerprint))
-                    self._base.executemany(
-                        "INSERT INTO parameters VALUES (?, ?, ?)", [(k, *names) for k, names in enumerate(parameters)]
-                    )
-            self._check(fingerprint)
+            self._lock = _locked(folder / f".{NAME}.lock")
         except OSError as error:
             raise InputError(
                 f"cannot be written: {error.strerror}", file=folder, field="--output-dir", fix="choose another folder"
             ) from None
-        except sqlite3.OperationalError as error:
-            fix = "wait until the other command has ended" if "locked" in str(error) else "choose another --output-dir"
-            raise InputError(f"cannot be used: {error}", file=self.file, fix=fix) from None
-        except sqlite3.DatabaseError as error:
-            raise InputError(f"damaged: {error}", file=self.file, fix="run without --resume") from None
+        try:
+            fresh = self._open_base(fingerprint, parameters, resume)
+        except BaseException as error:
+            self.close()
+            if isinstance(error, sqlite3.DatabaseError):
+                fix = "run without --resume" if resume else "choose another --output-dir"
+                raise InputError(f"cannot be used: {error}", file=self.file, fix=fix) from None
+            raise
         self.resumed = not fresh
         if self.resumed:
             with self._transaction():
@@ -138,6 +125,27 @@ class Store:
                 self._put("open_rows", [])
         self._begun = time.perf_counter()
         self._before = float(self._get("seconds") or 0.0)
+
+    def _open_base(self, fingerprint: Mapping[str, Any], parameters: Sequence[tuple[str, str]], resume: bool) -> bool:
+        """Open the file; whether it is a new one."""
+        fresh = not (resume and self.file.exists())
+        if fresh:
+            for suffix in ("", "-wal", "-shm"):
+                Path(f"{self.file}{suffix}").unlink(missing_ok=True)
+        self._base = sqlite3.connect(self.file, isolation_level=None)
+        # others may read while cells come in, and a kill leaves whole transactions
+        self._base.execute("PRAGMA journal_mode=WAL")
+        self._base.execute("PRAGMA synchronous=NORMAL")
+        if fresh:
+            with self._transaction():
+                for statement in _SCHEMA.split(";\n"):
+                    self._base.execute(statement)
+                self._put("version", VERSION)
+                self._put("fingerprint", dict(fingerprint))
+                rows = [(k, *names) for k, names in enumerate(parameters)]
+                self._base.executemany("INSERT INTO parameters VALUES (?, ?, ?)", rows)
+        self._check(fingerprint)
+        return fresh
 
     def _check(self, fingerprint: Mapping[str, Any]) -> None:
         if self._get("version") != VERSION:
@@ -154,7 +162,9 @@ class Store:
 
     def close(self) -> None:
         """Close the file; the write-ahead log is folded into it."""
-        self._base.close()
+        if self._base is not None:
+            self._base.close()
+        self._lock.close()
 
     # ---------------------------------------------------------------- small helpers
 
@@ -341,6 +351,26 @@ class Store:
             if verdict in (None, kind)
         ]
         return sorted(found, key=lambda row: row["lower"])
+
+
+def _locked(file: Path) -> BinaryIO:
+    """The open file, locked as long as it is open, also against a command that is killed later.
+
+    Raises:
+        InputError: Another command holds it.
+    """
+    stream = open(file, "ab")  # noqa: SIM115 (open as long as the store)
+    try:
+        fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        stream.close()
+        raise InputError(
+            "locked by a command that is still running",
+            file=file.parent,
+            field="--output-dir",
+            fix="wait for it, or choose another folder",
+        ) from None
+    return stream
 
 
 class _Transaction:
