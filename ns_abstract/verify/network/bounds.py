@@ -199,7 +199,7 @@ class _Cells:
         c = offsets.mean(1)
         spread = 0.5 * (offsets[:, 1] - offsets[:, 0]) + 0.5 * (slopes[:, 1] - slopes[:, 0]).abs().sum(-1)
         spread = spread.clamp(min=0.0) + 2.0**-50 * (offsets.abs().amax(1) + slopes.abs().amax(1).sum(-1))
-        form = _Form.ranged(c.reshape(-1, *shape), a.reshape(-1, self.d, *shape), spread.reshape(-1, *shape))
+        form = _Form.ranged(c.reshape(-1, *shape), a.reshape(self.count, self.d, *shape), spread.reshape(-1, *shape))
         lower, upper = torch.from_numpy(self.image.lower), torch.from_numpy(self.image.upper)
         return self._within(form, lower.reshape(-1, *shape), upper.reshape(-1, *shape))
 
@@ -368,7 +368,7 @@ class _Cells:
         item = layer.shape
         tight = _Form(
             c.reshape(-1, *item),
-            a.movedim(-1, 1).reshape(-1, self.d, *item),
+            a.movedim(-1, 1).reshape(self.count, self.d, *item),
             r.reshape(-1, *item),
             lower.reshape(-1, *item),
             upper.reshape(-1, *item),

@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ns_abstract.verify.network.layers import Layer, Linear, Shape
+from ns_abstract.verify.network.layers import Layer, Linear, Shape, Sigmoid, Tanh
 
 #: What a certificate about a network covers, whatever the network.
 GUARANTEE = (
@@ -75,7 +75,7 @@ class Network:
     @property
     def guarantee(self) -> tuple[str, ...]:
         """What certificates about this network cover, and what they do not."""
-        sigmoidal = any(node.op in {"Sigmoid", "Tanh"} for node in self.nodes)
+        sigmoidal = any(isinstance(node.layer, (Sigmoid, Tanh)) for node in self.nodes)
         return (*GUARANTEE, _SIGMOIDAL) if sigmoidal else GUARANTEE
 
     def shape(self, index: int) -> Shape:

@@ -9,6 +9,7 @@ import onnxruntime
 import torch
 
 from ns_abstract.errors import InputError
+from ns_abstract.verify.network.exported import read_exported
 from ns_abstract.verify.network.graph import Network
 from ns_abstract.verify.network.onnx_file import read_onnx
 
@@ -18,7 +19,7 @@ _IMAGES = 3
 
 
 def load_network(path: Path) -> Network:
-    """The network in an .onnx file, compared with the program that usually runs such a file.
+    """The network in an .onnx or a .pt2 file, compared with the program that usually runs such a file.
 
     Raises:
         InputError: The file cannot be read, uses what is not supported, or computes something else elsewhere.
@@ -29,12 +30,19 @@ def load_network(path: Path) -> Network:
     if path.suffix == ".onnx":
         network = read_onnx(path)
         run = _onnxruntime(path)
+    elif path.suffix == ".pt2":
+        network, run = read_exported(path)
     else:
-        raise InputError(f"has the ending {path.suffix!r}", file=path, fix="give an .onnx file")
+        raise InputError(
+            f"has the ending {path.suffix!r}", file=path, fix="give an .onnx file or a .pt2 file of torch.export"
+        )
     generator = np.random.default_rng(0)
     for k in range(_IMAGES):
         image = generator.uniform(0.0, 1.0 + k, (1, *network.input_shape)).astype(np.float32)
-        expected = run(image).reshape(-1).astype(np.float64)
+        try:
+            expected = run(image).reshape(-1).astype(np.float64)
+        except Exception as error:  # the other program's own
+            raise InputError(f"cannot be run: {error}", file=path, fix="export the network again") from None
         found = network(torch.from_numpy(image).double())[0].numpy()
         if expected.shape != found.shape:
             raise InputError(f"has {expected.size} outputs when run, {found.size} when read", file=path)
@@ -63,9 +71,6 @@ def _onnxruntime(path: Path):
     double = session.get_inputs()[0].type == "tensor(double)"
 
     def run(image: np.ndarray) -> np.ndarray:
-        try:
-            return np.asarray(session.run(None, {name: image.astype(np.float64) if double else image})[0])
-        except Exception as error:
-            raise InputError(f"onnxruntime fails: {error}", file=path, fix="export the network again") from None
+        return np.asarray(session.run(None, {name: image.astype(np.float64) if double else image})[0])
 
     return run

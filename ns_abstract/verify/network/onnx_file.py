@@ -27,13 +27,18 @@ def read_onnx(path: Path) -> Network:
     Raises:
         InputError: The file cannot be read, or uses what is not supported; names node, operator and attribute.
     """
-    model = _parse(path)
+    model = parse_model(path)
     opset = _opset(model, path)
     reader = _Reader(path, model.graph, opset)
     return reader.network()
 
 
-def _parse(path: Path) -> onnx.ModelProto:
+def parse_model(path: Path) -> onnx.ModelProto:
+    """The messages of an ONNX file, without data that lie in other files.
+
+    Raises:
+        InputError: The file cannot be read.
+    """
     try:
         model = onnx.load(str(path), load_external_data=False)
     except OSError as error:

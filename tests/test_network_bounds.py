@@ -1,0 +1,288 @@
+"""Bounds of networks: an exact oracle, degenerate and extreme sets, modes, parts and dense or sparse rows."""
+
+from __future__ import annotations
+
+import itertools
+from fractions import Fraction
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from onnx_files import OnnxFile, attack, image_sets, session
+
+from ns_abstract.errors import InputError
+from ns_abstract.verify.network import ImageSets, Network, bound_outputs, load_network
+from ns_abstract.verify.network import bounds as module
+
+Vector = list[Fraction]
+SHAPE = (2, 4, 4)
+
+
+def mlp(folder: Path, seed: int, scale: float = 1.0) -> tuple[Network, list[tuple[np.ndarray, np.ndarray]], Path]:
+    """A 3-5-4-2 ReLU network and its weights."""
+    from onnx import numpy_helper
+
+    f = OnnxFile((3,), seed)
+    f.gemm(3, 5, scale)
+    f.node("Relu")
+    f.gemm(5, 4)
+    f.node("Relu")
+    f.gemm(4, 2)
+    file = f.write(folder / "mlp.onnx")
+    arrays = [numpy_helper.to_array(c) for c in f.constants]
+    return load_network(file), list(zip(arrays[::2], arrays[1::2], strict=True)), file
+
+
+def affine(weight: np.ndarray, bias: np.ndarray, x: Vector) -> Vector:
+    return [
+        sum((Fraction(float(w)) * v for w, v in zip(row, x, strict=True)), Fraction(float(b)))
+        for row, b in zip(weight, bias, strict=True)
+    ]
+
+
+def exact_least(layers: list[tuple[np.ndarray, np.ndarray]], b: np.ndarray, a: np.ndarray, row: np.ndarray) -> Fraction:
+    """The least ``row @ y`` over x = b + a p, p in [-1, 1], in exact arithmetic.
+
+    Along a line every number is piecewise linear in p; it is followed from kink to kink.
+    """
+
+    def pieces(ends: list[Fraction]) -> list[Fraction]:
+        """All p where some number of some layer changes sign."""
+        cuts = sorted(set(ends))
+        for depth in range(len(layers) - 1):
+            found = list(cuts)
+            for low, high in itertools.pairwise(cuts):
+                z0, z1 = (before(p, depth) for p in (low, high))
+                for u, v in zip(z0, z1, strict=True):
+                    if (u < 0) != (v < 0) and u != v:
+                        found.append(low + (high - low) * u / (u - v))
+            cuts = sorted(set(found))
+        return cuts
+
+    def before(p: Fraction, depth: int) -> Vector:
+        x = [Fraction(float(v)) + Fraction(float(s)) * p for v, s in zip(b, a, strict=True)]
+        for weight, bias in layers[:depth]:
+            x = [max(v, Fraction(0)) for v in affine(weight, bias, x)]
+        return affine(*layers[depth], x)
+
+    def value(p: Fraction) -> Fraction:
+        return sum((Fraction(float(r)) * v for r, v in zip(row, before(p, len(layers) - 1), strict=True)), Fraction(0))
+
+    return min(value(p) for p in pieces([Fraction(-1), Fraction(1)]))
+
+
+@pytest.mark.parametrize("radius", [0.0, 1e-6, 0.1, 1.0, 30.0])
+def test_bounds_lie_below_the_exact_minimum(radius: float, tmp_path: Path) -> None:
+    gaps, spans = 0.0, 0.0
+    for seed in range(6):
+        network, layers, _ = mlp(tmp_path, seed)
+        rng = np.random.default_rng(seed)
+        b, a = rng.normal(size=(1, 3)), radius * rng.normal(size=(1, 3, 1))
+        reach = np.abs(a[..., 0])
+        rows = rng.normal(size=(3, 2))
+        images = ImageSets(a, b, a, b, np.nextafter(b - reach, -np.inf), np.nextafter(b + reach, np.inf))
+        found = bound_outputs(network, images, rows, np.zeros(3))
+        middle = rows @ network(torch.from_numpy(b))[0].numpy()
+        for k, row in enumerate(rows):
+            least = exact_least(layers, b[0], a[0, :, 0], row)
+            # the network's float32 rounding is inside, so the exact value is, too
+            assert Fraction(float(found.lower[0, k])) <= least
+            gaps, spans = gaps + middle[k] - found.lower[0, k], spans + middle[k] - float(least)
+    if radius <= 1e-6:
+        assert gaps <= spans + 18 * 2e-5
+    else:
+        assert gaps <= {0.1: 1.1, 1.0: 1.7, 30.0: 3.7}[radius] * spans
+
+
+def test_the_oracle_finds_kinks() -> None:
+    """|p| = relu(p) + relu(-p) is least at 0, which no end of the interval is."""
+    one = np.array([[1.0], [-1.0]]), np.zeros(2)
+    two = np.array([[1.0, 1.0]]), np.zeros(1)
+    assert exact_least([one, two], np.array([0.25]), np.array([1.0]), np.array([1.0])) == 0
+
+
+def test_modes_are_ordered_on_average(tmp_path: Path) -> None:
+    """Correlation helps; single bounds may be worse, as lines with less area are not always the better ones."""
+    gains = []
+    for seed in range(4):
+        f = OnnxFile(SHAPE, seed)
+        for _ in range(3):
+            f.conv(int(f.shape[0]) if f.last == "image" else 4, 4, pads=[1, 1, 1, 1])
+            f.node("Relu")
+        f.node("Flatten")
+        f.gemm(64, 3)
+        network = load_network(f.write(tmp_path / "net.onnx"))
+        images = image_sets(SHAPE, 3, 2, 0.3, 0.01, seed)
+        rows = np.random.default_rng(seed).normal(size=(5, 3))
+        box, end, everywhere = (
+            bound_outputs(network, images, rows, np.zeros(5), substitution=s).lower
+            for s in ("box", "end", "everywhere")
+        )
+        assert (end >= box).all()
+        gains.append((everywhere - end).mean())
+        assert ((everywhere >= end - 0.02 * (1 + np.abs(end))).mean()) > 0.9
+    assert min(gains) > 0.0
+
+
+def test_a_point_and_a_constant_image(tmp_path: Path) -> None:
+    network, _, file = mlp(tmp_path, 1)
+    for x in (np.zeros((1, 3)), np.full((1, 3), 0.5), np.array([[1e-30, -1e-38, 3e-45]])):
+        zero = np.zeros((1, 3, 0))
+        x = x.astype(np.float32).astype(np.float64)
+        found = bound_outputs(network, ImageSets(zero, x, zero, x, x, x), np.eye(2), np.zeros(2))
+        y = session(file)(x.astype(np.float32))[0]
+        assert (found.lower[0] <= y).all()
+        assert (found.lower[0] >= y - 1e-4).all()
+        assert found.a.shape == (1, 2, 0)
+
+
+def test_no_cells_and_zero_rows(tmp_path: Path) -> None:
+    network, _, _ = mlp(tmp_path, 0)
+    images = image_sets((3,), 2, 1, 0.1, 0.1)
+    none = bound_outputs(network, images[0:0], np.eye(2), np.zeros(2))
+    assert none.lower.shape == (0, 2) and none.a.shape == (0, 2, 1)
+    zero = bound_outputs(network, images, np.zeros((1, 2)), np.array([3.0]))
+    assert (zero.lower <= 3.0).all() and (zero.lower > 3.0 - 1e-9).all()
+
+
+def test_dead_units_and_large_weights(tmp_path: Path) -> None:
+    for scale in (1e-30, 1e4, 1e10):
+        network, _, file = mlp(tmp_path, 3, scale)
+        images = image_sets((3,), 3, 2, 0.2, 0.1)
+        found = bound_outputs(network, images, np.eye(2), np.zeros(2))
+        for cell in range(3):
+            least, _ = attack(network, session(file), images, cell, np.eye(2))
+            assert (found.lower[cell] <= least).all()
+            assert np.isfinite(found.lower[cell]).all()
+    f = OnnxFile((3,))
+    f.node("Gemm", f.last, f.constant(np.zeros((4, 3))), f.constant(np.full(4, -1.0)), transB=1)
+    f.node("Relu")
+    f.gemm(4, 2)
+    network = load_network(f.write(tmp_path / "dead.onnx"))
+    found = bound_outputs(network, images, np.eye(2), np.zeros(2))
+    np.testing.assert_allclose(found.lower[0], network(torch.zeros(1, 3))[0].numpy(), atol=1e-5)
+
+
+def test_weights_that_overflow(tmp_path: Path) -> None:
+    f = OnnxFile((3,))
+    f.node("Gemm", f.last, f.constant(np.full((4, 3), 1e30)), transB=1)
+    f.node("Relu")
+    f.node("Gemm", f.last, f.constant(np.full((2, 4), 1e-30)), transB=1)
+    network = load_network(f.write(tmp_path / "large.onnx"))
+    images = image_sets((3,), 1, 1, 0.1, 0.1)
+    found = bound_outputs(network, images, np.eye(2), np.zeros(2))
+    assert not np.isnan(found.lower).any()
+    far = ImageSets(*(1e10 * getattr(images, name) for name in images.__dataclass_fields__))
+    found = bound_outputs(network, far, np.eye(2), np.zeros(2))
+    assert (found.lower == -np.inf).all() and (found.b == -np.inf).all() and (found.a == 0.0).all()
+    f.node("Gemm", f.last, f.constant(np.full((1, 2), 2e38)), transB=1)
+    with pytest.raises(InputError, match="float32"):
+        load_network(f.write(tmp_path / "larger.onnx"))
+
+
+@pytest.mark.parametrize("damage", ["nan", "inf", "crossed", "nan plane", "disjoint"])
+def test_a_bad_cell_is_unknown_and_leaves_the_others_alone(damage: str, tmp_path: Path) -> None:
+    network, _, _ = mlp(tmp_path, 2)
+    images = image_sets((3,), 3, 2, 0.2, 0.1)
+    fields = {name: getattr(images, name).copy() for name in images.__dataclass_fields__}
+    if damage == "nan":
+        fields["lower"][1, 2] = np.nan
+    elif damage == "inf":
+        fields["upper"][1, 2] = np.inf
+    elif damage == "crossed":
+        fields["lower"][1], fields["upper"][1] = images.upper[1], images.lower[1]
+    elif damage == "nan plane":
+        fields["a_upper"][1, 0, 1] = np.nan
+    else:
+        fields["b_lower"][1] += 50.0
+        fields["b_upper"][1] += 50.0
+    good = bound_outputs(network, images, np.eye(2), np.zeros(2))
+    found = bound_outputs(network, ImageSets(**fields), np.eye(2), np.zeros(2))
+    assert (found.lower[1] == -np.inf).all()
+    assert (found.lower[[0, 2]] == good.lower[[0, 2]]).all()
+    assert not np.isnan(found.a).any() and not np.isnan(found.b).any()
+
+
+def test_parts_change_nothing_but_rounding(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    f = OnnxFile(SHAPE)
+    f.conv(2, 4, pads=[1, 1, 1, 1])
+    f.node("Relu")
+    f.conv(4, 4, pads=[1, 1, 1, 1])
+    f.node("Relu")
+    f.conv(4, 3)
+    network = load_network(f.write(tmp_path / "net.onnx"))
+    images = image_sets(SHAPE, 5, 2, 0.3, 0.1)
+    rows = np.random.default_rng(0).normal(size=(6, network.output_size))
+    rows[:3] = np.eye(3, network.output_size, 4)
+    whole = bound_outputs(network, images, rows, np.zeros(6))
+    tiny = bound_outputs(network, images, rows, np.zeros(6), memory=1)
+    monkeypatch.setattr(module, "_ROWS_AT_ONCE", 1)
+    single = bound_outputs(network, images, rows, np.zeros(6))
+    one = [bound_outputs(network, images[k : k + 1], rows[[0, 4]], np.zeros(2)).lower[0] for k in range(5)]
+    for other in (tiny.lower, single.lower):
+        np.testing.assert_allclose(whole.lower, other, rtol=1e-4, atol=1e-4)
+    np.testing.assert_allclose(whole.lower[:, [0, 4]], np.stack(one), rtol=1e-4, atol=1e-4)
+
+
+def test_sparse_rows(tmp_path: Path) -> None:
+    sparse = pytest.importorskip("scipy.sparse", reason="scipy is not installed")
+    network, _, _ = mlp(tmp_path, 2)
+    images = image_sets((3,), 2, 2, 0.2, 0.1)
+    rows = np.array([[0.0, 1.0], [0.0, 0.0], [0.3, 0.0]])
+    dense = bound_outputs(network, images, rows, np.ones(3))
+    found = bound_outputs(network, images, sparse.csr_array(rows), np.ones(3))
+    assert (dense.lower == found.lower).all()
+
+
+def test_rows_that_float32_cannot_hold(tmp_path: Path) -> None:
+    """Rows are rounded to float32 on the way; what that loses is charged."""
+    network, _, file = mlp(tmp_path, 2)
+    images = image_sets((3,), 1, 1, 1e-9, 1e-9)
+    rows = np.array([[1.0 + 2.0**-30, -1.0 / 3.0], [1e-42, 1e-60], [1e25, -1e25]])
+    found = bound_outputs(network, images, rows, np.zeros(3))
+    least, _ = attack(network, session(file), images, 0, rows)
+    assert (found.lower[0] <= least).all() and np.isfinite(found.lower).all()
+
+
+def test_wrong_shapes_are_errors(tmp_path: Path) -> None:
+    network, _, _ = mlp(tmp_path, 2)
+    images = image_sets((3,), 1, 1, 0.1, 0.1)
+    with pytest.raises(ValueError, match="rows"):
+        bound_outputs(network, images, np.eye(3), np.zeros(3))
+    with pytest.raises(ValueError, match="images"):
+        bound_outputs(network, image_sets((4,), 1, 1, 0.1, 0.1), np.eye(2), np.zeros(2))
+    with pytest.raises(ValueError, match="b_lower"):
+        ImageSets(
+            images.a_lower,
+            images.b_lower[:, 1:],
+            *(getattr(images, n) for n in ("a_upper", "b_upper", "lower", "upper")),
+        )
+    with pytest.raises(ValueError, match="images"):
+        network(torch.zeros(3))
+
+
+def test_float32_rounding_is_needed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Without its charge, runs in float32 break the bounds of single images."""
+    broken = {True: 0, False: 0}
+    rng = np.random.default_rng(0)
+    f = OnnxFile((40,))
+    f.gemm(40, 60, 3.0)
+    f.node("Relu")
+    f.gemm(60, 30, 3.0)
+    f.node("Relu")
+    f.gemm(30, 4)
+    file = f.write(tmp_path / "net.onnx")
+    network, run = load_network(file), session(file)
+    x = rng.normal(size=(40, 40)).astype(np.float32)
+    y = run(x).astype(np.float64)
+    zero, b = np.zeros((40, 40, 1)), x.astype(np.float64)
+    images = ImageSets(zero, b, zero, b, b, b)
+    rows = np.concatenate([np.eye(4), -np.eye(4)])
+    for charged in (True, False):
+        if not charged:
+            monkeypatch.setattr(module, "UNIT", 0.0)
+        lower = bound_outputs(network, images, rows, np.zeros(8)).lower
+        broken[charged] = int((lower > y @ rows.T).sum())
+    assert broken[True] == 0
+    assert broken[False] > 0

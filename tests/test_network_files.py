@@ -1,0 +1,275 @@
+"""Files of networks: what is refused and how it is said, and torch.export as a second way in."""
+
+from __future__ import annotations
+
+import json
+import pickle
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import onnx
+import pytest
+import torch
+from onnx import TensorProto, helper, numpy_helper
+from onnx_files import OnnxFile, attack, image_sets, session
+
+from ns_abstract.errors import InputError
+from ns_abstract.verify.network import bound_outputs, load_network
+
+SHAPE = (2, 4, 4)
+
+
+def refused(file: Path, *words: str) -> None:
+    with pytest.raises(InputError) as error:
+        load_network(file)
+    text = str(error.value)
+    assert text.startswith(str(file))
+    assert "\n" not in text
+    for word in words:
+        assert word in text, text
+
+
+def small() -> OnnxFile:
+    f = OnnxFile(SHAPE)
+    f.conv(2, 2)
+    f.node("Relu")
+    return f
+
+
+def _weight(f: OnnxFile, value: float) -> None:
+    array = numpy_helper.to_array(f.constants[0]).copy()
+    array.flat[3] = value
+    f.constants[0].CopyFrom(numpy_helper.from_array(array, f.constants[0].name))
+
+
+BAD: dict[str, tuple[Callable[[OnnxFile], object], tuple[str, ...]]] = {
+    "operator": (lambda f: f.node("Softmax", axis=1), ("Softmax_v2", "Softmax", "leave it out")),
+    "activation": (lambda f: f.node("Erf"), ("Erf_v2", "not supported")),
+    "group": (lambda f: f.conv(2, 2, k=1, groups=1) and f.nodes[-1].attribute[0].__setattr__("i", 3), ("group = 3",)),
+    "ceil": (
+        lambda f: (
+            f.node("MaxPool", kernel_shape=[2, 2], strides=[1, 2], pads=[0, 0, 1, 1], ceil_mode=1)
+            and f.node("MaxPool", kernel_shape=[2, 2], strides=[2, 2], ceil_mode=1)
+        ),
+        ("ceil_mode",),
+    ),
+    "flatten axis": (lambda f: f.node("Flatten", axis=2), ("axis = 2",)),
+    "transposed batch": (lambda f: f.node("Transpose", perm=[1, 0, 2, 3]), ("perm", "batch")),
+    "gemm": (lambda f: f.node("Flatten") and f.node("Gemm", f.last, f.weights(8, 3), transA=1), ("transA = 1",)),
+    "alpha": (lambda f: f.node("LeakyRelu", alpha=-0.5), ("alpha = -0.5",)),
+    "product": (lambda f: f.node("Mul", f.last, f.last), ("Mul", "depend on the image")),
+    "division": (lambda f: f.node("Div", f.last, f.constant(0.0)), ("zero",)),
+    "huge pads": (
+        lambda f: f.node("Pad", f.last, f.constant([0, 0, 0, 0, 0, 0, 1 << 28, 1 << 28], np.int64)),
+        ("numbers",),
+    ),
+    "huge conv pads": (lambda f: f.conv(2, 2, pads=[1 << 20, 1 << 20, 1 << 20, 1 << 20]), ("numbers",)),
+    "negative variance": (
+        lambda f: f.node(
+            "BatchNormalization", f.last, f.weights(2), f.weights(2), f.weights(2), f.constant([-1.0, 1.0])
+        ),
+        ("variance",),
+    ),
+    "training": (
+        lambda f: f.node("Dropout", f.last, f.constant(0.5), f.constant(True, np.bool_)),
+        ("Dropout", "training"),
+    ),
+    "reshape": (lambda f: f.node("Reshape", f.last, f.constant([4, 2], np.int64)), ("batch",)),
+    "infinite weight": (lambda f: _weight(f, np.inf), ("initializer c0", "not finite")),
+    "nan weight": (lambda f: _weight(f, np.nan), ("initializer c0", "not finite")),
+    "two inputs": (lambda f: f.node("Add", f.last, "other"), ("other",)),
+    "concat batch": (lambda f: f.node("Concat", f.last, f.last, axis=0), ("axis = 0",)),
+    "unknown attribute": (lambda f: f.node("Relu", slope=2.0), ("slope",)),
+}
+
+
+@pytest.mark.parametrize("name", BAD)
+def test_refuses(name: str, tmp_path: Path) -> None:
+    damage, words = BAD[name]
+    f = small()
+    damage(f)
+    refused(f.write(tmp_path / "net.onnx"), *words)
+
+
+def test_files_that_are_no_networks(tmp_path: Path) -> None:
+    refused(tmp_path / "none.onnx", "does not exist")
+    for name, data in (("a.onnx", b"\x00\xffgarbage"), ("b.onnx", b""), ("c.pt2", b"PK\x03\x04zip"), ("d.txt", b"")):
+        (tmp_path / name).write_bytes(data)
+        refused(tmp_path / name)
+
+
+def test_refuses_free_sizes_and_large_batches(tmp_path: Path) -> None:
+    f = OnnxFile(SHAPE, batch=4)
+    f.node("Relu")
+    refused(f.write(tmp_path / "net.onnx"), "input image", "batch")
+    f = OnnxFile((2, "H", 4))  # type: ignore[arg-type]
+    f.node("Relu")
+    refused(f.write(tmp_path / "net.onnx"), "input image", "sizes fixed")
+
+
+def test_refuses_old_operator_sets_and_two_outputs(tmp_path: Path) -> None:
+    f = small()
+    f.opset = 5
+    refused(f.write(tmp_path / "net.onnx"), "operator set 5")
+    model = small().model()
+    model.graph.output.append(helper.make_tensor_value_info("v0", TensorProto.FLOAT, None))
+    (tmp_path / "net.onnx").write_bytes(model.SerializeToString())
+    refused(tmp_path / "net.onnx", "2 outputs")
+
+
+def _external(folder: Path, location: str, **extra: str) -> Path:
+    model = small().model()
+    tensor = model.graph.initializer[0]
+    data = tensor.raw_data
+    (folder / "weights.bin").write_bytes(data)
+    tensor.ClearField("raw_data")
+    tensor.data_location = TensorProto.EXTERNAL
+    for key, value in {"location": location, **extra}.items():
+        entry = tensor.external_data.add()
+        entry.key, entry.value = key, value
+    (folder / "net.onnx").write_bytes(model.SerializeToString())
+    return folder / "net.onnx"
+
+
+def test_external_data(tmp_path: Path) -> None:
+    inside = tmp_path / "model"
+    inside.mkdir()
+    network = load_network(_external(inside, "weights.bin"))
+    assert network.output_shape == (2, 2, 2)
+    (tmp_path / "secret.bin").write_bytes((inside / "weights.bin").read_bytes())
+    refused(_external(inside, "../secret.bin"), "outside the model's folder")
+    refused(_external(inside, str(tmp_path / "secret.bin")), "outside the model's folder")
+    (inside / "link.bin").symlink_to(tmp_path / "secret.bin")
+    refused(_external(inside, "link.bin"), "outside the model's folder")
+    refused(_external(inside, "missing.bin"), "missing.bin")
+    refused(_external(inside, "weights.bin", offset="1000000"), "initializer c0")
+
+
+def test_a_claim_of_a_huge_tensor_is_refused(tmp_path: Path) -> None:
+    model = small().model()
+    model.graph.initializer[0].dims[:] = [1 << 20, 1 << 20, 3, 3]
+    (tmp_path / "net.onnx").write_bytes(model.SerializeToString())
+    refused(tmp_path / "net.onnx", "initializer c0", "numbers")
+
+
+def test_a_reading_that_computes_something_else_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from ns_abstract.verify.network.layers import Convolution
+
+    file = small().write(tmp_path / "net.onnx")
+    monkeypatch.setattr(Convolution, "bias", None)
+    refused(file, "computes something else")
+
+
+# ---------------------------------------------------------------- torch.export
+
+
+class Small(torch.nn.Module):
+    def __init__(self) -> None:
+        super().__init__()
+        torch.manual_seed(0)
+        self.conv = torch.nn.Conv2d(2, 4, 3, padding=1)
+        self.norm = torch.nn.BatchNorm2d(4)
+        self.norm.running_mean, self.norm.running_var = torch.randn(4), torch.rand(4) + 0.5
+        self.act = torch.nn.ReLU(inplace=True)
+        self.pool = torch.nn.MaxPool2d(2)
+        self.mean = torch.nn.AdaptiveAvgPool2d(1)
+        self.line = torch.nn.Linear(4, 3)
+
+    def forward(self, x: torch.Tensor) -> torch.Tensor:
+        y = self.act(self.norm(self.conv(x)))
+        y = y + torch.nn.functional.leaky_relu(y - 0.1, 0.2)
+        y = torch.cat([y[:, :2], torch.sigmoid(y[:, 2:])], 1)
+        return 2.0 * self.line(torch.flatten(self.mean(self.pool(y)), 1))
+
+
+def exported(module: torch.nn.Module, file: Path, batch: bool = True) -> Path:
+    shapes = ({0: torch.export.Dim("batch")},) if batch else None
+    count = 2 if batch else 1
+    torch.export.save(torch.export.export(module.eval(), (torch.randn(count, *SHAPE),), dynamic_shapes=shapes), file)
+    return file
+
+
+@pytest.mark.parametrize("batch", [True, False])
+def test_exported_network(tmp_path: Path, batch: bool) -> None:
+    module = Small()
+    network = load_network(exported(module, tmp_path / "net.pt2", batch))
+    x = torch.randn(5, *SHAPE)
+    with torch.no_grad():
+        torch.testing.assert_close(network(x), module(x), rtol=1e-5, atol=1e-5)
+
+    def run(images: np.ndarray) -> np.ndarray:
+        with torch.no_grad():
+            return module(torch.from_numpy(images)).numpy()
+
+    images = image_sets(SHAPE, 1, 2, 0.2, 0.1)
+    rows = np.eye(3)
+    least, _ = attack(network, run, images, 0, rows)
+    lower = bound_outputs(network, images, rows, np.zeros(3)).lower[0]
+    assert (lower <= least).all() and np.isfinite(lower).all()
+
+
+class Exponential(torch.nn.Module):
+    def forward(self, x: torch.Tensor) -> torch.Tensor:
+        return torch.exp(x)
+
+
+class ReadAgain(torch.nn.Module):
+    def forward(self, x: torch.Tensor) -> torch.Tensor:
+        y = 2.0 * x
+        z = torch.nn.functional.relu_(y)
+        return y + z
+
+
+def test_exported_networks_that_are_refused(tmp_path: Path) -> None:
+    refused(exported(Exponential(), tmp_path / "exp.pt2"), "aten.exp", "not supported")
+    file, bad = exported(ReadAgain(), tmp_path / "again.pt2"), tmp_path / "bad.pt2"
+    load_network(file)
+    with zipfile.ZipFile(file) as old, zipfile.ZipFile(bad, "w") as new:
+        for info in old.infolist():
+            data = old.read(info)
+            if info.filename.endswith("models/model.json"):
+                model = json.loads(data)
+                # the tracer itself never writes this: a value that was changed in place is read again
+                model["graph_module"]["graph"]["nodes"][-1]["inputs"][1]["arg"] = {"as_tensor": {"name": "mul"}}
+                data = json.dumps(model).encode()
+            new.writestr(info.filename, data)
+    refused(bad, "changed in place")
+
+
+class Bomb:
+    def __reduce__(self):
+        return (Path.touch, (Path("unpickled"),))
+
+
+def test_nothing_is_unpickled(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    file = exported(Small(), tmp_path / "net.pt2")
+    bad = tmp_path / "bad.pt2"
+    with zipfile.ZipFile(file) as old, zipfile.ZipFile(bad, "w") as new:
+        for info in old.infolist():
+            data = old.read(info)
+            if info.filename.endswith(".pt") or info.filename.endswith("weight_0"):
+                data = pickle.dumps(Bomb())
+            if info.filename.endswith("model_weights_config.json"):
+                config = json.loads(data)
+                for entry in config["config"].values():
+                    entry["use_pickle"] = entry["path_name"] == "weight_0"
+                data = json.dumps(config).encode()
+            new.writestr(info.filename, data)
+    refused(bad, "pickled")
+    assert not (tmp_path / "unpickled").exists()
+
+
+def test_networks_are_pickled_for_other_processes(tmp_path: Path) -> None:
+    file = small().write(tmp_path / "net.onnx")
+    network = load_network(file)
+    images = image_sets(SHAPE, 2, 1, 0.1, 0.1)
+    rows = np.eye(network.output_size)
+    before = bound_outputs(network, images, rows, np.zeros(len(rows)))
+    again = pickle.loads(pickle.dumps(network))
+    after = bound_outputs(again, images, rows, np.zeros(len(rows)))
+    assert (before.lower == after.lower).all()
+    assert session(file)(np.zeros((1, *SHAPE), np.float32)).shape == (1, 8)
+    assert onnx.__version__
