@@ -149,7 +149,7 @@ def attack(case: Case, folder: Path, frame: int = 0, poses: int = 6) -> tuple[in
     def compare(image: np.ndarray, values: np.ndarray, proved: float) -> None:
         nonlocal comparisons, violations, slack
         inputs = job.property.preprocess.apply(torch.from_numpy(image.astype(np.float32))[None]).numpy()
-        outputs = torch.from_numpy(session.run(None, {"image": inputs})[0]).double()
+        outputs = torch.from_numpy(session.run(None, {session.get_inputs()[0].name: inputs})[0]).double().reshape(1, -1)
         margin = float(claim.margin(outputs, torch.from_numpy(values)[None])[0])
         comparisons += 1
         violations += not margin >= proved

@@ -216,10 +216,7 @@ class _Run:
         counts = {kind: sum(row["verdict"] == kind for row in rows) for kind in ("certified", "falsified", "unknown")}
         # cells that an ended command has left open stand as unknown without a margin or a time
         left = sum(row["verdict"] == "unknown" and row["seconds"] == 0.0 for row in rows)
-        broken = sorted(
-            (row for row in rows if row["verdict"] == "falsified"),
-            key=lambda row: -np.inf if row["margin"] is None else row["margin"],
-        )
+        broken = _worst(rows)
         proven = [row["margin"] for row in rows if row["verdict"] == "certified"]
         total = self.job.partitions(self.grids[tally.frame])
         return {
@@ -274,9 +271,9 @@ class _Run:
             margin, frame, row = min(proven, key=lambda item: item[:2])
             pose = [0.5 * (a + b) for a, b in zip(row["lower"], row["upper"], strict=True)]
             wanted.append(("worst certified", f"frame {frame}, margin at least {margin:.4g}", frame, pose))
-        broken = [(r["margin"], k, r) for k, found in rows.items() for r in found if r["verdict"] == "falsified"]
-        broken.sort(key=lambda item: (-np.inf if item[0] is None else item[0], item[1]))
-        for margin, frame, row in broken[:_IMAGES]:
+        broken = [(_depth(row), frame, row) for frame, found in rows.items() for row in _worst(found)]
+        for _, frame, row in sorted(broken, key=lambda item: item[:2])[:_IMAGES]:
+            margin = row["margin"]
             text = f"frame {frame}, margin {'not a number' if margin is None else f'{margin:.4g}'}"
             wanted.append(("counterexample", text, frame, row["counterexample"]))
         found = []
@@ -286,6 +283,17 @@ class _Run:
             image = pictures.image(np.array([known[name] for name in pictures.box.names]))
             found.append({"title": title, "text": text, "png": preview(to_bytes(image), _PIXELS)})
         return found
+
+
+def _depth(row: Mapping[str, Any]) -> float:
+    """The margin of a counterexample; what is no number is worse than all."""
+    return -np.inf if row["margin"] is None else row["margin"]
+
+
+def _worst(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Falsified cells, worst first; neighbours may share their counterexample, which counts once."""
+    found = sorted((row for row in rows if row["verdict"] == "falsified"), key=_depth)
+    return list({tuple(row["counterexample"]): row for row in reversed(found)}.values())[::-1]
 
 
 def certify_path(options: Certify, stop: Callable[[], bool], budget: float) -> bool:
