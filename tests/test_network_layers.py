@@ -302,7 +302,7 @@ def test_narrow_sets_have_tight_bounds(name: str, tmp_path: Path) -> None:
         single = bound_outputs(network, ImageSets(zero, middle, zero, middle, middle, middle), rows, np.zeros(4))
         moves = nominal - least > 1e-4
         assert (nominal - lower)[~moves].max(initial=0.0) < 1e-2
-        worst = max(worst, float(((single.lower[0] - lower) / (nominal - least))[moves].max(initial=0.0)))
+        worst = max(worst, float(((single.lower[0] - lower)[moves] / (nominal - least)[moves]).max(initial=0.0)))
     assert 0.0 < worst <= LEDGER.get(name, 1.4), worst
 
 

@@ -240,7 +240,12 @@ class Builder:
             except ValueError:
                 raise InputError(f"constant {item(constant.shape)} with an item {item(shape)}") from None
             spread.append(as_double(fitted))
-        return self._add(Scale((shape,), shape, 3, 1, spread[0], spread[1]), x)
+        return self._add(Scale((shape,), shape, 3 + self._fused(x), 1, spread[0], spread[1]), x)
+
+    def _fused(self, *inputs: int) -> int:
+        """Roundings of sums that a program may start with what is added behind them (N2)."""
+        layers = [self.nodes[k - 1].layer for k in inputs if k]
+        return max((layer.terms for layer in layers if isinstance(layer, Linear)), default=0)
 
     def batch_norm(
         self, x: int, scale: np.ndarray, shift: np.ndarray, mean: np.ndarray, variance: np.ndarray, epsilon: float
@@ -263,7 +268,7 @@ class Builder:
         shapes = tuple(self.shape(k) for k in inputs)
         if len(set(shapes)) != 1:
             raise InputError(f"shapes {[item(s) for s in shapes]} differ", fix="spreading is not supported")
-        return self._add(Sum(shapes, shapes[0], 0 if exact else len(inputs), 1, signs), *inputs)
+        return self._add(Sum(shapes, shapes[0], 0 if exact else len(inputs) + self._fused(*inputs), 1, signs), *inputs)
 
     def reshape(self, x: int, shape: Sequence[int]) -> int:
         """The same numbers in another shape."""
