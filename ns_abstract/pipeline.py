@@ -42,6 +42,7 @@ class Settings:
         arithmetic: "float32" or "real".
         seed: Of the random witnesses.
         memory_limit: GiB.
+        resize: Height and width in pixels that pictures are rendered with, in place of the path's.
     """
 
     load_config: Path
@@ -52,6 +53,7 @@ class Settings:
     arithmetic: str = "float32"
     seed: int = 0
     memory_limit: float | None = None
+    resize: tuple[int, int] | None = None
 
 
 class Job:
@@ -60,19 +62,24 @@ class Job:
     Args:
         settings: What to bound.
         perturbation: For every entry of the path, in place of what the files say.
+        default: For entries of which the files say nothing; without it they are an error.
 
     Raises:
         InputError: A file, a field or an option cannot be used.
     """
 
-    def __init__(self, settings: Settings, perturbation: Perturbation | None = None) -> None:
+    def __init__(
+        self, settings: Settings, perturbation: Perturbation | None = None, default: Perturbation | None = None
+    ) -> None:
         self.settings = settings
         self.rasteriser: Rasteriser = RASTERISERS[settings.renderer]
         self.arithmetic = arithmetic_named(settings.arithmetic)
         self.path: CameraPath = load_camera_path(settings.camera_path_filename, settings.downscale_factor)
+        if settings.resize is not None:
+            self.path = replace(self.path, cameras=tuple(c.resized(*settings.resize) for c in self.path.cameras))
         self.scene: SplatScene = load_scene(settings.load_config)
         given = (perturbation,) * self.frame_count if perturbation is not None else None
-        self.perturbations: tuple[Perturbation, ...] = given or self._perturbations()
+        self.perturbations: tuple[Perturbation, ...] = given or self._perturbations(default)
         # a set that cannot be made is found before hours of work
         self.pose_sets = tuple(self.pose_set(k, p) for k, p in enumerate(self.perturbations))
         self.splats: Splats = activate(self.scene, self.rasteriser)
@@ -83,7 +90,7 @@ class Job:
         """Entries of the camera path."""
         return len(self.path.cameras)
 
-    def _perturbations(self) -> tuple[Perturbation, ...]:
+    def _perturbations(self, default: Perturbation | None) -> tuple[Perturbation, ...]:
         scale = self.scene.dataparser.scale
         file = self.settings.perturbation_filename
         count = len(self.path.cameras)
@@ -92,6 +99,9 @@ class Job:
         found = []
         for k in range(count):
             value = self.path.perturbation_of(k)
+            if value is None and default is not None:
+                found.append(default)
+                continue
             if value is None:
                 raise InputError(
                     f"no perturbation for entry {k}",

@@ -19,6 +19,7 @@ LEVELS = (
     "errors",
     "atomic",
     "jsonio",
+    "engines",
     "arithmetic",
     "sets",
     "methods",
@@ -27,6 +28,7 @@ LEVELS = (
     "report",
     "verify",
     "pipeline",
+    "certification",
     "bench",
     "cli",
 )

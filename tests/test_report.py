@@ -654,7 +654,7 @@ def test_page_shows_the_widest():
 @given(low=st.floats(1e-12, 1e6), span=st.floats(1.0, 1e9))
 @settings(deadline=None, max_examples=100)
 def test_log_axis(low, span):
-    axis = page._Axis(low, low * span, 50.0, 400.0, log=True)
+    axis = page.Axis(low, low * span, 50.0, 400.0, log=True)
     ticks = axis.ticks()
     assert ticks == sorted(set(ticks)) and 1 <= len(ticks) <= 16
     assert all(50.0 - 1e-6 <= axis(tick) <= 400.0 + 1e-6 for tick in [*ticks, low, low * span])
@@ -663,6 +663,6 @@ def test_log_axis(low, span):
 @given(high=st.floats(1e-9, 1e9))
 @settings(deadline=None, max_examples=50)
 def test_linear_axis(high):
-    axis = page._Axis(0.0, high, 200.0, 20.0, log=False)
+    axis = page.Axis(0.0, high, 200.0, 20.0, log=False)
     ticks = axis.ticks()
     assert 3 <= len(ticks) <= 8 and ticks[0] == 0.0 and all(20.0 - 1e-6 <= axis(tick) <= 200.0 for tick in ticks)

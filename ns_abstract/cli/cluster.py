@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
-import secrets
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
+from ns_abstract.engines import Cluster, spread
 from ns_abstract.errors import InputError
 from ns_abstract.pipeline import Job, Settings
 from ns_abstract.refine.engine import Goal
@@ -18,10 +17,6 @@ if TYPE_CHECKING:
 
 #: Seconds between looks at results and at a request to stop.
 _PATIENCE = 0.5
-#: Time that a scheduler is given to answer.
-_CONNECT = "10s"
-#: Times a frame is tried again when its worker dies.
-_RETRIES = 3
 
 _jobs: dict[Settings, Job] = {}
 
@@ -49,33 +44,6 @@ def bound_frame(
     return job.bound(index, goal, keep_leaves=keep_leaves)
 
 
-@contextmanager
-def connected(address: str | None) -> Iterator[Any]:
-    """A client of the scheduler at ``address``, or of a cluster on this machine if None.
-
-    Raises:
-        InputError: Dask is missing or its scheduler does not answer.
-    """
-    try:
-        from distributed import Client
-    except ImportError:
-        raise InputError("needs the package dask", field="--engine", fix="pip install 'ns-abstract[cluster]'") from None
-    try:
-        if address is None:
-            # one worker: its kernels use every core
-            client: Any = Client(n_workers=1, threads_per_worker=1, dashboard_address=None)
-        else:
-            client = Client(address, timeout=_CONNECT)
-    except (OSError, ValueError, TypeError) as error:
-        raise InputError(
-            f"no scheduler answers at {address} ({type(error).__name__})",
-            field="--scheduler-address",
-            fix="start one with `dask scheduler` and workers with `dask worker HOST:PORT --nthreads 1`",
-        ) from None
-    with client:
-        yield client
-
-
 def bound_on_cluster(
     client: Any, job: Job, options: Render, pending: list[int], budget: float, stop: Callable[[], bool]
 ) -> Iterator[FrameResult]:
@@ -85,46 +53,22 @@ def bound_on_cluster(
     thread of the cluster worked on one frame at a time.
 
     Args:
-        client: Of `connected`.
+        client: Of `ns_abstract.engines.connected`.
         job: What is bounded.
         options: The command's options.
         pending: Frames to bound.
         budget: Seconds for all of them.
         stop: Asked twice a second; true gives up what is not finished.
     """
-    from distributed import wait
-
     if not pending:
         return
-    workers = max(1, sum(client.nthreads().values()))
-    rounds = -(-len(pending) // workers)
+    engine = Cluster(client)
+    rounds = -(-len(pending) // engine.threads)
     goal = job.goal(options.target_ratio, budget / rounds)
     settings, fingerprint = _with_whole_paths(job.settings), job.fingerprint
-    # a scheduler serves several commands: equal keys would hand one the results of another
-    command = secrets.token_hex(8)
-    waiting = {
-        client.submit(
-            bound_frame,
-            settings,
-            fingerprint,
-            index,
-            goal,
-            options.save_cells,
-            key=f"frame-{index}-{command}",
-            retries=_RETRIES,
-        )
-        for index in pending
-    }
-    while waiting and not stop():
-        try:
-            finished = wait(waiting, timeout=_PATIENCE, return_when="FIRST_COMPLETED").done
-        except TimeoutError:
-            continue
-        for future in finished:
-            waiting.discard(future)
-            yield future.result()
-    for future in waiting:
-        future.cancel()
+    tasks = [(k, (bound_frame, (settings, fingerprint, k, goal, options.save_cells))) for k in pending]
+    for _, result in spread(engine, tasks, _PATIENCE, stop):
+        yield result
 
 
 def _with_whole_paths(settings: Settings) -> Settings:

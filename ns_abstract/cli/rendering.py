@@ -60,7 +60,7 @@ def render_path(options: Render, stop: Callable[[], bool], seconds_by_frame: flo
     with ExitStack() as stack:
         client = None
         if options.engine == "dask":
-            from ns_abstract.cli.cluster import connected
+            from ns_abstract.engines import connected
 
             client = stack.enter_context(connected(options.scheduler_address))
         run = make_run(job, options, frames, problems)

@@ -17,7 +17,7 @@ _CURVE_POINTS = 200
 #: Frames whose details are unfolded.
 _OPEN_FRAMES = 4
 
-_STYLE = """
+STYLE = """
 :root { color-scheme: light dark; --paper: #fbfbf9; --card: #ffffff; --ink: #1c1d20; --soft: #5c6066; --line: #dcdcd6;
   --outer: #c0430f; --inner: #1769aa; --band: rgba(192, 67, 15, .13); --good: #1d7440; --fair: #9a6400; --bad: #b3261e; }
 @media (prefers-color-scheme: dark) { :root { --paper: #131417; --card: #1b1d21; --ink: #e8e8e4; --soft: #a0a4ab;
@@ -99,21 +99,27 @@ def render_page(document: Mapping[str, Any], pictures: Mapping[int, Mapping[str,
             _frame(entry, pictures[entry["index"]], sampled=sampled, opened=position < _OPEN_FRAMES)
             for position, entry in enumerate(shown)
         ]
-    body += [_plan(document), _table(document), _numbers(document), _files(document), _reproduce(document)]
+    body += [_plan(document), _table(document), _numbers(document), _files(document), reproduce(document)]
+    return whole_page(f"Abstract images of {name}", body)
+
+
+def whole_page(title: str, body: Sequence[str], more_style: str = "") -> str:
+    """A page of ``body``'s parts, with the style sheet and no way to load anything."""
     return (
         '<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
         '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
         # the browser itself then refuses scripts and everything from elsewhere
         '<meta http-equiv="Content-Security-Policy" content="default-src \'none\'; img-src data:; '
         "style-src 'unsafe-inline'\">\n"
-        f"<title>Abstract images of {escape(name)}</title>\n<style>{_STYLE}</style>\n</head>\n<body>\n"
+        f"<title>{escape(title)}</title>\n<style>{STYLE}{more_style}</style>\n</head>\n<body>\n"
         + "\n".join(part for part in body if part)
         + "\n</body>\n</html>\n"
     )
 
 
-def _count(count: int, noun: str) -> str:
-    return f"{count} {noun}{'' if count == 1 else 's'}"
+def counted(number_of: int, noun: str) -> str:
+    """A number of things in words."""
+    return f"{number_of:,} {noun}{'' if number_of == 1 else 's'}"
 
 
 def _program(document: Mapping[str, Any]) -> str:
@@ -127,13 +133,13 @@ def _verdict(document: Mapping[str, Any], name: str) -> str:
     sampled = document["guarantee"] == "sampled"
     frames = document["frames"]
     if sampled:
-        kind, title = "bad", f"No guarantee: rendered samples of {_count(asked, 'frame')}"
+        kind, title = "bad", f"No guarantee: rendered samples of {counted(asked, 'frame')}"
     elif not bounded:
-        kind, title = "bad", f"No bounds yet: 0 of {_count(asked, 'frame')}"
+        kind, title = "bad", f"No bounds yet: 0 of {counted(asked, 'frame')}"
     elif missing:
-        kind, title = "fair", f"Bounds for {bounded} of {_count(asked, 'frame')}"
+        kind, title = "fair", f"Bounds for {bounded} of {counted(asked, 'frame')}"
     else:
-        kind, title = "good", f"Bounds for all {_count(asked, 'frame')}" if asked > 1 else "Bounds for the frame"
+        kind, title = "good", f"Bounds for all {counted(asked, 'frame')}" if asked > 1 else "Bounds for the frame"
     lines = []
     if sampled:
         lines.append(
@@ -164,7 +170,7 @@ def _verdict(document: Mapping[str, Any], name: str) -> str:
     partial = [entry for entry in frames if entry["status"] == "partial"]
     if partial:
         lines.append(
-            f"{_count(len(partial), 'frame')} ended before the target ratio; such bounds hold, but could be tighter."
+            f"{counted(len(partial), 'frame')} ended before the target ratio; such bounds hold, but could be tighter."
         )
     state = {
         "running": "The command was still running, or was killed, when this page was written.",
@@ -183,7 +189,8 @@ def _verdict(document: Mapping[str, Any], name: str) -> str:
     )
 
 
-def _uri(data: bytes) -> str:
+def uri(data: bytes) -> str:
+    """A PNG as an address that needs no file."""
     return "data:image/png;base64," + base64.b64encode(data).decode()
 
 
@@ -204,7 +211,7 @@ def _frame(entry: Mapping[str, Any], pictures: Mapping[str, bytes], *, sampled: 
     )  # fmt: skip
     small = ' class="pixels"' if max(entry["height"], entry["width"]) <= 256 else ""
     images = "".join(
-        f'<figure><img{small} src="{_uri(pictures[key])}" alt="{label} of frame {entry["index"]}">'
+        f'<figure><img{small} src="{uri(pictures[key])}" alt="{label} of frame {entry["index"]}">'
         f"<figcaption><b>{label}</b><br>{text}</figcaption></figure>"
         for key, label, text in captions
     )
@@ -239,7 +246,7 @@ def _gradient() -> str:
     return ", ".join(color_stops())
 
 
-class _Axis:
+class Axis:
     """One axis of a plot: data to SVG units, and where its ticks stand."""
 
     def __init__(self, low: float, high: float, start: float, end: float, *, log: bool) -> None:
@@ -275,8 +282,8 @@ class _Axis:
         return found
 
 
-def _plot(
-    x: _Axis | None, y: _Axis, labels: tuple[str, str], marks: str, *, size: tuple[int, int], title: str,
+def draw_plot(
+    x: Axis | None, y: Axis, labels: tuple[str, str], marks: str, *, size: tuple[int, int], title: str,
 ) -> str:  # fmt: skip
     """An SVG with axes, ``marks`` above them; without ``x`` the marks bring their own labels."""
     width, height = size
@@ -300,14 +307,16 @@ def _plot(
     )
 
 
-def _line(points: list[tuple[float, float]], kind: str, dots: bool) -> str:
+def draw_line(points: list[tuple[float, float]], kind: str, dots: bool) -> str:
+    """A curve through points in SVG units, of a class of the style sheet."""
     path = f'<path class="{kind}" d="M' + "L".join(f"{a:.1f},{b:.1f}" for a, b in points) + '"/>' if points else ""
     if dots:
         path += "".join(f'<circle class="{kind}" cx="{a:.1f}" cy="{b:.1f}" r="3"/>' for a, b in points)
     return path
 
 
-def _legend(entries: Sequence[tuple[str, str]], right: float) -> str:
+def draw_legend(entries: Sequence[tuple[str, str]], right: float) -> str:
+    """Labels of (class, text) from the right end on."""
     parts, x = [], right
     for kind, label in reversed(entries):
         parts.append(f'<text class="{kind}" x="{x:.1f}" y="12" text-anchor="end">{label}</text>')
@@ -325,18 +334,18 @@ def _curve(trace: Sequence[Mapping[str, float]]) -> str:
     if not outer:
         return '<p class="soft">No progress over time was recorded for this frame.</p>'
     values = [value for _, value in outer + inner]
-    x = _Axis(min(t for t, _ in outer + inner), max(t for t, _ in outer + inner), 52, 408, log=True)
-    y = _Axis(min(values), max(values), 216, 26, log=True)
+    x = Axis(min(t for t, _ in outer + inner), max(t for t, _ in outer + inner), 52, 408, log=True)
+    y = Axis(min(values), max(values), 216, 26, log=True)
     upper = [(x(t), y(v)) for t, v in outer]
     lower = [(x(t), y(v)) for t, v in inner]
     band = ""
     if len(upper) > 1 and len(lower) > 1:
         band = '<path class="band" d="M' + "L".join(f"{a:.1f},{b:.1f}" for a, b in upper + lower[::-1]) + 'Z"/>'
     dots = len(kept) <= 25
-    marks = band + _line(upper, "outer", dots) + _line(lower, "inner", dots)
-    marks += _legend((("outer", "bounds (MPG)"), ("inner", "witness MPG")), 408)
+    marks = band + draw_line(upper, "outer", dots) + draw_line(lower, "inner", dots)
+    marks += draw_legend((("outer", "bounds (MPG)"), ("inner", "witness MPG")), 408)
     labels = ("seconds of work (log)", "mean pixel gap (log)")
-    return _plot(x, y, labels, marks, size=(420, 256), title="Mean pixel gap against run time")
+    return draw_plot(x, y, labels, marks, size=(420, 256), title="Mean pixel gap against run time")
 
 
 def _overview(document: Mapping[str, Any]) -> str:
@@ -345,8 +354,8 @@ def _overview(document: Mapping[str, Any]) -> str:
     if len(frames) < 2:
         return ""
     sampled = document["guarantee"] == "sampled"
-    x = _Axis(-0.5, len(frames) - 0.5, 52, 988, log=False)
-    y = _Axis(0.0, 1.05 * max(entry["mpg"] for entry in frames), 176, 26, log=False)
+    x = Axis(-0.5, len(frames) - 0.5, 52, 988, log=False)
+    y = Axis(0.0, 1.05 * max(entry["mpg"] for entry in frames), 176, 26, log=False)
     half = min(14.0, 0.42 * (x(1) - x(0)))
     every = math.ceil(len(frames) / 24)
     marks = ""
@@ -361,8 +370,8 @@ def _overview(document: Mapping[str, Any]) -> str:
         )
         if k % every == 0:
             marks += f'<text x="{at:.1f}" y="{y.start + 15:.1f}" text-anchor="middle">{entry["index"]}</text>'
-    marks += _legend((("outer", "bounds (MPG)"), ("inner", "witness MPG")), 988)
-    plot = _plot(
+    marks += draw_legend((("outer", "bounds (MPG)"), ("inner", "witness MPG")), 988)
+    plot = draw_plot(
         None, y, ("frame", "mean pixel gap"), marks, size=(1000, 216), title="Mean pixel gap of every frame"
     )  # fmt: skip
     text = "Samples only: the true mean gaps may be larger." if sampled else "The true mean gap lies in the bar."
@@ -434,7 +443,8 @@ def _files(document: Mapping[str, Any]) -> str:
     return f"<h2>How to read the files</h2><pre>{escape(code)}</pre>{cells}{extra}"
 
 
-def _reproduce(document: Mapping[str, Any]) -> str:
+def reproduce(document: Mapping[str, Any]) -> str:
+    """Command line, versions and fingerprints."""
     command = " ".join(shlex.quote(str(part)) for part in document["command"])
     rows = [("scene", document["scene"]), ("renderer", document["renderer"]), ("settings", document["settings"])]
     rows += [("packages", document["packages"]), ("fingerprint", document["fingerprint"])]

@@ -81,6 +81,23 @@ class Camera:
         )
 
 
+    def resized(self, height: int, width: int) -> Camera:
+        """The camera that shows the same picture with other pixels, as if it had been resized.
+
+        Each direction has its own factor, so another aspect ratio squeezes the picture.
+        """
+        down, across = height / self.height, width / self.width
+        return Camera(
+            camera_to_world=self.camera_to_world,
+            fx=self.fx * across,
+            fy=self.fy * down,
+            cx=self.cx * across,
+            cy=self.cy * down,
+            width=width,
+            height=height,
+        )
+
+
 @dataclass(frozen=True, eq=False)
 class CameraPath:
     """The cameras of a path and the perturbations written beside them.

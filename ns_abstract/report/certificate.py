@@ -1,0 +1,165 @@
+"""``report.json`` of ``ns-abstract-certify``, and the figures in it."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from ns_abstract.atomic import write_atomic
+from ns_abstract.errors import InputError
+from ns_abstract.report.record import guarantee_text, plain, versions
+
+VERSION = 1
+
+METRICS = {
+    "certified": "part of the parameter volume where the property is proved for every image",
+    "falsified": "part in cells with a pose, stored and rendered again, whose image breaks the property",
+    "unknown": "the rest: neither proved nor broken on the finest cells, or not examined before the end",
+    "not_examined": "part of unknown whose cells were still to be examined",
+    "sampled_right": "part of evenly spread poses at whose images the property holds; says nothing about others",
+    "margin": "how far the property is from failing; proved from below in certified cells",
+    "PCP-S": "parts of the fixed partition where no sample breaks the property (certified ones cannot be broken)",
+    "PCP-V": "parts of the fixed partition that are certified as a whole",
+}
+
+
+def now() -> str:
+    """UTC time as ISO 8601."""
+    return time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime())
+
+
+@dataclass(frozen=True)
+class CertifiedRun:
+    """What a command certifies; all mappings must have a JSON form.
+
+    Attributes:
+        guarantee: "float32-sound" or "real-sound", of the images.
+        network_guarantee: What holds of the network, one sentence each.
+        renderer: ``name`` and ``version`` of the bounded program.
+        scene: ``name``, and whatever describes the scene.
+        model: The network: ``name``, ``sha256``, shapes.
+        property: Content of PROP.json.
+        sentence: The property in words, as the end of "on every image ...".
+        settings: The command's options.
+        fingerprint: What results of a resumed run must agree in.
+        command: The command line.
+        plan: What was left out and why, one sentence each.
+        limits: Conditions on the guarantee, one sentence each.
+    """
+
+    guarantee: str
+    network_guarantee: tuple[str, ...]
+    renderer: Mapping[str, str]
+    scene: Mapping[str, Any]
+    model: Mapping[str, Any]
+    property: Mapping[str, Any]
+    sentence: str
+    settings: Mapping[str, Any]
+    fingerprint: Mapping[str, Any]
+    command: tuple[str, ...]
+    plan: tuple[str, ...] = ()
+    limits: tuple[str, ...] = ()
+    started: str = field(default_factory=now)
+
+
+def coverage(frames: Sequence[Mapping[str, Any]]) -> dict[str, float]:
+    """Mean over the frames' sets: certified, falsified, unknown (with what was not examined), not_examined."""
+    names = ("certified", "falsified", "unknown", "not_examined")
+    return {name: sum(entry["coverage"][name] for entry in frames) / max(1, len(frames)) for name in names}
+
+
+def verdict(frames: Sequence[Mapping[str, Any]]) -> str:
+    """Of all sets together: falsified if any pose breaks the property, certified if all is proved, else unknown."""
+    if any(entry["cells"]["falsified"] for entry in frames):
+        return "falsified"
+    # the parts are quotients of whole numbers: nothing open is exactly 0
+    done = frames and all(e["coverage"]["unknown"] == 0.0 and e["cells"]["certified"] for e in frames)
+    return "certified" if done else "unknown"
+
+
+def certificate_document(
+    run: CertifiedRun,
+    frames: Sequence[Mapping[str, Any]],
+    *,
+    state: str,
+    trace: Sequence[Mapping[str, float]],
+    seconds: float,
+    effort: Mapping[str, float],
+    reasons: Mapping[str, int],
+) -> dict[str, Any]:
+    """Content of report.json.
+
+    Args:
+        run: What was certified.
+        frames: One mapping by frame: index, parameters, coverage, cells, sampled, partition, least_margin,
+            counterexamples.
+        state: "running", "done", "budget" or "interrupted".
+        trace: Fractions over time.
+        seconds: Wall time, earlier runs included.
+        effort: Figures of the work done.
+        reasons: Why cells are unknown, and how many.
+    """
+    covered = coverage(frames)
+    poses = sum(entry["sampled"]["poses"] for entry in frames)
+    right = sum(entry["sampled"]["right"] for entry in frames)
+    parts = [entry["partition"] for entry in frames if entry["partition"] is not None]
+    total = sum(part["partitions"] for part in parts)
+    return plain(
+        {
+            "version": VERSION,
+            "verdict": verdict(frames),
+            "property": run.property,
+            "property_text": run.sentence,
+            "guarantee": run.guarantee,
+            "guarantee_text": guarantee_text(run.guarantee, run.renderer["name"]),
+            "network_guarantee": run.network_guarantee,
+            "renderer": run.renderer,
+            "scene": run.scene,
+            "model": run.model,
+            "coverage": covered,
+            "sampled": {"poses": poses, "right": right, "sampled_right": right / poses if poses else None},
+            "certified_of_sampled_right": covered["certified"] * poses / right if right else None,
+            "partitions": {
+                "partitions": total,
+                "PCP-S": sum(part["right"] for part in parts) / total,
+                "PCP-V": sum(part["certified"] for part in parts) / total,
+            }
+            if total
+            else None,
+            "frames": frames,
+            "trace": trace,
+            "seconds": seconds,
+            "effort": effort,
+            "unknown_because": reasons,
+            "plan": run.plan,
+            "limits": run.limits,
+            "state": state,
+            "metrics": METRICS,
+            "settings": run.settings,
+            "fingerprint": run.fingerprint,
+            "command": run.command,
+            "packages": versions(),
+            "started": run.started,
+            "updated": now(),
+        }
+    )
+
+
+def write_certificate(folder: Path, document: Mapping[str, Any], page: str) -> None:
+    """Write report.json and report.html.
+
+    Raises:
+        InputError: The folder cannot be written.
+    """
+    text = json.dumps(document, indent=1, allow_nan=False, ensure_ascii=False)
+    try:
+        write_atomic(folder / "report.json", lambda stream: stream.write(f"{text}\n".encode()))
+        write_atomic(folder / "report.html", lambda stream: stream.write(page.encode()))
+    except OSError as error:
+        raise InputError(
+            f"cannot be written: {error.strerror}", file=folder, field="--output-dir", fix="choose another folder"
+        ) from None

@@ -1,0 +1,349 @@
+"""``report.html`` of ``ns-abstract-certify``: the verdict first, then where, why and how long."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from html import escape
+from typing import Any
+
+from ns_abstract.report.figures import interval, number
+from ns_abstract.report.page import Axis, counted, draw_line, draw_plot, reproduce, uri, whole_page
+
+_STYLE = """
+svg .certified { fill: var(--good); } svg .falsified { fill: var(--bad); } svg .unknown { fill: #9aa0a6; }
+svg text.certified, svg text.falsified, svg text.unknown { stroke: none; }
+svg path.c-certified, svg path.c-falsified, svg path.c-unknown { fill: none; stroke-width: 2; }
+svg path.c-certified { stroke: var(--good); } svg path.c-falsified { stroke: var(--bad); }
+svg path.c-unknown { stroke: #9aa0a6; }
+.key i { display: inline-block; width: .8em; height: .8em; margin: 0 .35em 0 1em; border-radius: 2px; }
+.certified-back { background: var(--good); } .falsified-back { background: var(--bad); }
+.unknown-back { background: #9aa0a6; }
+"""
+_VERDICTS = ("certified", "falsified", "unknown")
+_COLUMNS = ("cells certified", "falsified", "unknown", "open", "sampled right", "least proven margin")
+#: Most frames drawn one by one.
+_MOST_ROWS = 200
+_MOST_POINTS = 400
+
+
+def percent(part: float | None) -> str:
+    """A fraction for people; never 100 % or 0 % where it is not."""
+    if part is None:
+        return "–"
+    text = f"{100.0 * part:.2f}"
+    if part < 1.0 and text == "100.00":
+        return "> 99.99 %"
+    if part > 0.0 and text == "0.00":
+        return "< 0.01 %"
+    return f"{text} %"
+
+
+def certificate_page(
+    document: Mapping[str, Any],
+    cells: Mapping[int, Sequence[Mapping[str, Any]]],
+    pictures: Sequence[Mapping[str, Any]],
+) -> str:
+    """The page of a certificate.
+
+    Args:
+        document: Content of report.json.
+        cells: By frame, rows lower, upper, verdict in the order of ``document``'s parameters.
+        pictures: ``title``, ``text`` and ``png`` of images to show, in order.
+
+    Returns:
+        HTML, self-contained; every text of the document is escaped.
+    """
+    name = str(document["scene"].get("name", "scene"))
+    body = [
+        _verdict(document, name),
+        _map(document, cells),
+        _pictures(pictures),
+        _counterexamples(document),
+        _time(document),
+        _frames(document),
+        _guarantee(document),
+        _files(),
+        reproduce(document),
+    ]
+    return whole_page(f"Certificate of {name}", body, _STYLE)
+
+
+def _verdict(document: Mapping[str, Any], name: str) -> str:
+    covered, model = document["coverage"], str(document["model"].get("name", "the network"))
+    titles = {
+        "certified": ("good", "Certified: the property holds on every image"),
+        "falsified": ("bad", f"Falsified; certified on {percent(covered['certified'])} of the poses"),
+        "unknown": ("fair", f"Undecided; certified on {percent(covered['certified'])} of the poses"),
+    }
+    kind, title = titles[document["verdict"]]
+    lines = [
+        f"For every camera pose in the green part ({percent(covered['certified'])} of the set, by volume): render "
+        f"<b>{escape(name)}</b> with {escape(' '.join(map(str, document['renderer'].values())))} and show the image to "
+        f"<b>{escape(model)}</b>; then {escape(document['property_text'])}.",
+        f"Falsified: {percent(covered['falsified'])}, cells with a pose whose image was rendered again and breaks the "
+        f"property. Unknown: {percent(covered['unknown'])}"
+        + (
+            f", of which {percent(covered['not_examined'])} were not examined before the end."
+            if covered["not_examined"]
+            else "."
+        ),
+    ]
+    sampled = document["sampled"]
+    if sampled["poses"]:
+        lines.append(
+            f"Sampling {sampled['poses']:,} evenly spread poses, the property holds at "
+            f"{percent(sampled['sampled_right'])} of them"
+            + (
+                f"; {percent(min(1.0, document['certified_of_sampled_right']))} of that share is certified."
+                if document["certified_of_sampled_right"] is not None
+                else "."
+            )
+        )
+    parts = document["partitions"]
+    if parts:
+        lines.append(
+            f"Fixed partition of {parts['partitions']:,} parts: PCP-V {percent(parts['PCP-V'])} certified, PCP-S "
+            f"{percent(parts['PCP-S'])} right under sampling."
+        )
+    state = {
+        "running": "The command was still running, or was killed, when this page was written.",
+        "interrupted": "The command was interrupted; go on with --resume.",
+        "budget": "The time budget ended first; go on with --resume.",
+    }.get(document["state"])
+    if state:
+        lines.append(state)
+    key = "".join(f'<i class="{kind}-back"></i>{kind}' for kind in _VERDICTS)
+    return (
+        f'<p class="soft">Certificate of {escape(model)} on {escape(name)}</p><div class="verdict {kind}">'
+        f"<h1>{escape(title)}</h1>{''.join(f'<p>{line}</p>' for line in lines)}"
+        f'<p class="soft key">{key}</p></div>'
+    )
+
+
+def _merged(rows: Sequence[Mapping[str, Any]], axis: int) -> list[tuple[float, float, str]]:
+    """Neighbouring cells of one verdict along one parameter as one span."""
+    spans: list[tuple[float, float, str]] = []
+    for row in rows:
+        low, high, kind = row["lower"][axis], row["upper"][axis], row["verdict"]
+        if spans and spans[-1][2] == kind and spans[-1][1] == low:
+            spans[-1] = (spans[-1][0], high, kind)
+        else:
+            spans.append((low, high, kind))
+    return spans
+
+
+def _map(document: Mapping[str, Any], cells: Mapping[int, Sequence[Mapping[str, Any]]]) -> str:
+    """Where: rings of one azimuth, strips of one other parameter, maps of two, bars of more."""
+    frames = document["frames"][:_MOST_ROWS]
+    drawn, bars = [], []
+    for entry in frames:
+        free = [k for k, p in enumerate(entry["parameters"]) if p["lower"] < p["upper"]]
+        rows, parameters = cells.get(entry["index"], ()), entry["parameters"]
+        if rows and len(free) == 1 and parameters[free[0]]["name"] == "azimuth":
+            drawn.append(_figure(_ring(_merged(rows, free[0]), parameters[free[0]]), entry, "seen from the axis's tip"))
+        elif rows and len(free) == 1:
+            drawn.append(_figure(_strip(_merged(rows, free[0]), parameters[free[0]]), entry, ""))
+        elif rows and len(free) == 2:
+            drawn.append(_figure(_plane(rows, [parameters[k] for k in free], free), entry, ""))
+        else:
+            bars.append(entry)
+    text = "".join(drawn)
+    if bars:
+        text += _bars(bars)
+    more = len(document["frames"]) - len(frames)
+    note = f"<p>{counted(more, 'further frame')} in the table below.</p>" if more > 0 else ""
+    return f'<h2>Where</h2><div class="below">{text}</div>{note}'
+
+
+def _figure(svg: str, entry: Mapping[str, Any], note: str) -> str:
+    covered = entry["coverage"]
+    about = ", ".join(f"{kind} {percent(covered[kind])}" for kind in _VERDICTS)
+    return f"<figure>{svg}<figcaption><b>frame {entry['index']}</b> {about} {note}</figcaption></figure>"
+
+
+def _svg(width: int, height: int, title: str, marks: str) -> str:
+    return (
+        f'<svg role="img" viewBox="0 0 {width} {height}" width="{width}" height="{height}">'
+        f"<title>{escape(title)}</title>{marks}</svg>"
+    )
+
+
+def _ring(spans: Sequence[tuple[float, float, str]], parameter: Mapping[str, Any]) -> str:
+    """Azimuth 0 to the right, counter-clockwise."""
+    middle, inner, outer = 170.0, 92.0, 138.0
+    marks = []
+    for low, high, kind in spans:
+        pieces = max(1, math.ceil((high - low) / 2.0))
+        for k in range(pieces):
+            start = low + (high - low) * k / pieces
+            end = low + (high - low) * (k + 1) / pieces
+            corners = [
+                (middle + r * math.cos(a), middle - r * math.sin(a))
+                for r, a in ((outer, start), (outer, end), (inner, end), (inner, start))
+            ]
+            (a, b), (c, d), (e, f), (g, h) = corners
+            marks.append(
+                f'<path class="{kind}" d="M{a:.2f},{b:.2f}A{outer},{outer} 0 0 0 {c:.2f},{d:.2f}L{e:.2f},{f:.2f}'
+                f'A{inner},{inner} 0 0 1 {g:.2f},{h:.2f}Z"/>'
+            )
+    for degrees in range(0, 360, 45):
+        angle = math.radians(degrees)
+        x, y = middle + 155 * math.cos(angle), middle - 155 * math.sin(angle) + 4
+        marks.append(f'<text x="{x:.1f}" y="{y:.1f}" text-anchor="middle">{degrees}°</text>')
+    marks.append(f'<text x="{middle}" y="{middle + 4}" text-anchor="middle">{escape(parameter["name"])}</text>')
+    return _svg(340, 340, "Verdicts around the orbit", "".join(marks))
+
+
+def _strip(spans: Sequence[tuple[float, float, str]], parameter: Mapping[str, Any]) -> str:
+    low, high = parameter["lower"], parameter["upper"]
+    axis = Axis(low, high, 20, 700, log=False)
+    marks = [
+        f'<rect class="{kind}" x="{axis(a):.2f}" y="8" width="{max(0.3, axis(b) - axis(a)):.2f}" height="34"/>'
+        for a, b, kind in spans
+    ]
+    marks += [
+        f'<text x="{axis(tick):.1f}" y="58" text-anchor="middle">{number(tick, 3)}</text>' for tick in axis.ticks()
+    ]
+    label = escape(f"{parameter['name']} ({parameter['unit']})")
+    marks.append(f'<text x="360" y="74" text-anchor="middle">{label}</text>')
+    return _svg(720, 80, f"Verdicts along {parameter['name']}", "".join(marks))
+
+
+def _plane(rows: Sequence[Mapping[str, Any]], parameters: Sequence[Mapping[str, Any]], free: Sequence[int]) -> str:
+    x = Axis(parameters[0]["lower"], parameters[0]["upper"], 52, 340, log=False)
+    y = Axis(parameters[1]["lower"], parameters[1]["upper"], 300, 20, log=False)
+    i, j = free
+    marks = "".join(
+        f'<rect class="{row["verdict"]}" x="{x(row["lower"][i]):.2f}" y="{y(row["upper"][j]):.2f}" '
+        f'width="{x(row["upper"][i]) - x(row["lower"][i]):.2f}" '
+        f'height="{y(row["lower"][j]) - y(row["upper"][j]):.2f}"/>'
+        for row in rows
+    )
+    labels = (escape(parameters[0]["name"]), escape(parameters[1]["name"]))
+    return draw_plot(x, y, labels, marks, size=(352, 340), title="Verdicts over two parameters")
+
+
+def _bars(entries: Sequence[Mapping[str, Any]]) -> str:
+    """One stacked bar by frame."""
+    step, width = 14, 600
+    marks = []
+    for row, entry in enumerate(entries):
+        left = 60.0
+        marks.append(f'<text x="54" y="{row * step + 11}" text-anchor="end">{entry["index"]}</text>')
+        for kind in _VERDICTS:
+            size = width * entry["coverage"][kind]
+            marks.append(
+                f'<rect class="{kind}" x="{left:.2f}" y="{row * step + 1}" width="{size:.2f}" height="{step - 2}"/>'
+            )
+            left += size
+    svg = _svg(680, len(entries) * step + 4, "Parts of each frame's set", "".join(marks))
+    return f"<figure>{svg}<figcaption>parts of each frame's set, by frame</figcaption></figure>"
+
+
+def _pictures(pictures: Sequence[Mapping[str, Any]]) -> str:
+    if not pictures:
+        return ""
+    figures = "".join(
+        f'<figure><img class="pixels" src="{uri(entry["png"])}" alt="{escape(entry["title"])}">'
+        f"<figcaption><b>{escape(entry['title'])}</b><br>{escape(entry['text'])}</figcaption></figure>"
+        for entry in pictures
+    )
+    return f'<h2>Images</h2><div class="images">{figures}</div>'
+
+
+def _counterexamples(document: Mapping[str, Any]) -> str:
+    found = [(entry["index"], example) for entry in document["frames"] for example in entry["counterexamples"]]
+    total = sum(entry["cells"]["falsified"] for entry in document["frames"])
+    if not total:
+        return ""
+    rows = "".join(
+        f"<tr><td>{index}</td><td>{number(example['margin'])}</td>"
+        f'<td class="left">{escape(", ".join(f"{k} = {v!r}" for k, v in example["values"].items()))}</td></tr>'
+        for index, example in found
+    )
+    return (
+        f"<h2>Counterexamples</h2><p>{counted(total, 'cell')} with a pose that breaks the property; the worst of each "
+        "frame are here, all are in cells.sqlite, their images in the folder counterexamples.</p>"
+        '<div class="wide"><table><thead><tr><th>frame</th><th>margin</th><th class="left">pose</th></tr></thead>'
+        f"<tbody>{rows}</tbody></table></div>"
+    )
+
+
+def _time(document: Mapping[str, Any]) -> str:
+    trace = document["trace"]
+    stride = max(1, math.ceil(len(trace) / _MOST_POINTS))
+    points = [p for k, p in enumerate(trace) if k % stride == 0 or k == len(trace) - 1]
+    effort = document["effort"]
+    text = (
+        f"<h2>Time</h2><p>{number(document['seconds'])} s of wall time, {number(effort['worker_seconds'])} s of work; "
+        f"the network was bounded on {counted(int(effort['cells_bounded']), 'cell')}.</p>"
+    )
+    if len(points) < 2:
+        return text
+    x = Axis(0.0, max(p["seconds"] for p in points), 52, 628, log=False)
+    y = Axis(0.0, 1.0, 216, 26, log=False)
+    marks = "".join(
+        draw_line([(x(p["seconds"]), y(p[kind])) for p in points], f"c-{kind}", False) for kind in _VERDICTS
+    )
+    return text + draw_plot(
+        x, y, ("seconds", "part of the set"), marks, size=(640, 256), title="Certified, falsified and unknown over time"
+    )
+
+
+def _frames(document: Mapping[str, Any]) -> str:
+    def row(entry: Mapping[str, Any]) -> str:
+        covered, cells = entry["coverage"], entry["cells"]
+        box = " · ".join(
+            interval(p["name"], p["unit"], p["lower"], p["upper"])
+            for p in entry["parameters"]
+            if p["lower"] < p["upper"]
+        )
+        parts = "".join(f"<td>{percent(covered[kind])}</td>" for kind in _VERDICTS)
+        counts = "".join(f"<td>{cells[kind]}</td>" for kind in (*_VERDICTS, "open"))
+        return (
+            f'<tr><td>{entry["index"]}</td><td class="left">{escape(box or "one pose")}</td>{parts}{counts}'
+            f"<td>{percent(entry['sampled']['sampled_right'])}</td><td>{number(entry['least_margin'])}</td></tr>"
+        )
+
+    head = "".join(
+        f"<th>{name}</th>"
+        for name in (*_VERDICTS, *_COLUMNS)
+    )
+    reasons = "".join(
+        f"<li>{escape(reason)}: {counted(cells, 'cell')}</li>" for reason, cells in document["unknown_because"].items()
+    )
+    return (
+        f'<h2>Frames</h2><div class="wide"><table><thead><tr><th>frame</th><th class="left">set</th>{head}</tr></thead>'
+        f"<tbody>{''.join(map(row, document['frames']))}</tbody></table></div>"
+        + (f"<p>Why cells are unknown:</p><ul>{reasons}</ul>" if reasons else "")
+    )
+
+
+def _guarantee(document: Mapping[str, Any]) -> str:
+    lines = [
+        f"Images: guarantee <b>{escape(document['guarantee'])}</b>, each {escape(document['guarantee_text'])}.",
+        "What is bounded is the float image in [0, 1], not its rounding to 8 bits in a file; preprocessing in float32 "
+        "is part of it. Resizing means rendering at the network's resolution.",
+        "Network: " + escape("; ".join(document["network_guarantee"])) + ".",
+        *(escape(limit) for limit in document["limits"]),
+    ]
+    plan = "".join(f"<li>{escape(line)}</li>" for line in document["plan"])
+    terms = "".join(f"<dt>{escape(key)}</dt><dd>{escape(text)}</dd>" for key, text in document["metrics"].items())
+    return (
+        "<h2>What is guaranteed</h2>"
+        + "".join(f"<p>{line}</p>" for line in lines)
+        + (f"<p>Left out or set aside:</p><ul>{plan}</ul>" if plan else "")
+        + f"<h2>What the numbers mean</h2><dl>{terms}</dl>"
+    )
+
+
+def _files() -> str:
+    code = (
+        "import json, sqlite3\n"
+        'base = sqlite3.connect("cells.sqlite")\n'
+        'base.execute("SELECT name, unit FROM parameters ORDER BY position").fetchall()\n'
+        'for frame, lower, upper, verdict, margin, seconds, example in base.execute("SELECT * FROM cells"):\n'
+        "    lower, upper = json.loads(lower), json.loads(upper)   # a box of the parameters"
+    )
+    return f"<h2>How to read the files</h2><pre>{escape(code)}</pre>"

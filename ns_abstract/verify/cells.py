@@ -1,0 +1,136 @@
+"""Cells of a set of poses on an integer grid, so that they tile it exactly (docs/design.md, V6)."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from ns_abstract.errors import InputError
+from ns_abstract.sets.box import ParameterBox
+
+#: Halvings of a first cell along each parameter.
+HALVINGS = 10
+#: Most first cells of a frame.
+_MOST_FIRST = 1 << 16
+#: Most grid units of a frame's fixed partition.
+_MOST_UNITS = 10**9
+
+
+@dataclass(frozen=True)
+class Cell:
+    """Units ``first[k]`` to ``past[k]`` (exclusive) of the grid along each parameter; empty for a single pose."""
+
+    first: tuple[int, ...]
+    past: tuple[int, ...]
+
+    @property
+    def volume(self) -> int:
+        """Number of grid units."""
+        return math.prod(b - a for a, b in zip(self.first, self.past, strict=True))
+
+
+@dataclass(frozen=True)
+class Grid:
+    """A frame's parameters cut into ``units[k]`` equal parts each; the cells consist of whole units.
+
+    Attributes:
+        box: The set.
+        units: Parts along each parameter: the finest cells there are.
+        coarse: Parts along each parameter that the search begins with.
+    """
+
+    box: ParameterBox
+    units: tuple[int, ...]
+    coarse: tuple[int, ...]
+
+    @classmethod
+    def adaptive(cls, box: ParameterBox, coarse: Sequence[int]) -> Grid:
+        """A grid whose units are first cells halved `HALVINGS` times."""
+        return cls(box, tuple(n << HALVINGS for n in coarse), tuple(coarse))
+
+    @classmethod
+    def fixed(cls, box: ParameterBox, partitions: Sequence[int], coarse: Sequence[int]) -> Grid:
+        """The grid of a fixed partition, as in the paper.
+
+        Raises:
+            InputError: The partition does not fit the parameters.
+        """
+        if len(partitions) != box.dimensions:
+            raise InputError(
+                f"{len(partitions)} numbers, the set has {box.dimensions} parameters: {', '.join(box.names) or 'none'}",
+                field="partitions",
+                fix="write one number by parameter",
+            )
+        if math.prod(partitions) > _MOST_UNITS:
+            raise InputError(f"found {math.prod(partitions)} partitions", field="partitions", fix="write fewer")
+        return cls(box, tuple(partitions), tuple(min(n, c) for n, c in zip(partitions, coarse, strict=True)))
+
+    @property
+    def volume(self) -> int:
+        """Number of units."""
+        return math.prod(self.units)
+
+    def end(self, axis: int, position: int) -> float:
+        """The parameter's value at a grid line."""
+        low, high = self.box.lower[axis], self.box.upper[axis]
+        return high if position == self.units[axis] else low + (high - low) * (position / self.units[axis])
+
+    def box_of(self, cell: Cell) -> ParameterBox:
+        """The cell as a box of parameters; neighbours share their ends exactly."""
+        box = self.box
+        for axis, (first, past) in enumerate(zip(cell.first, cell.past, strict=True)):
+            box = box.replace(axis, self.end(axis, first), self.end(axis, past))
+        return box
+
+    def roots(self) -> list[Cell]:
+        """The first cells, in order."""
+        lines = [
+            [n * i // c for i in range(c + 1)] for n, c in zip(self.units, self.coarse, strict=True)
+        ]
+        spans = [list(itertools.pairwise(line)) for line in lines]
+        return [
+            Cell(tuple(a for a, _ in part), tuple(b for _, b in part)) for part in itertools.product(*spans)
+        ]
+
+    def split(self, cell: Cell, slopes: np.ndarray, parts: int) -> list[Cell]:
+        """The cell cut along the parameter with the largest slope that has more than one unit; empty if none has.
+
+        Args:
+            cell: What to cut.
+            slopes: [d] what a cut along each parameter may gain.
+            parts: Into how many, fewer where there are fewer units.
+        """
+        sizes = np.array(cell.past, np.int64) - np.array(cell.first, np.int64)
+        free = np.flatnonzero(sizes > 1)
+        if not free.size:
+            return []
+        gains = np.where(np.isfinite(slopes), slopes, 0.0)[free]
+        # without slopes the longest in units, which halves all of them in turn
+        order = np.lexsort((-sizes[free], -gains))
+        axis = int(free[order[0]])
+        first, size = cell.first[axis], int(sizes[axis])
+        parts = min(parts, size)
+        lines = [first + size * i // parts for i in range(parts + 1)]
+        return [
+            Cell(
+                (*cell.first[:axis], low, *cell.first[axis + 1 :]),
+                (*cell.past[:axis], high, *cell.past[axis + 1 :]),
+            )
+            for low, high in itertools.pairwise(lines)
+        ]
+
+
+def coarse_parts(motion: np.ndarray, pixels: float) -> tuple[int, ...]:
+    """Parts along each parameter such that the picture moves by at most ``pixels`` over a part.
+
+    Fewer where there would be too many; in several parameters the search finds by itself where fine cells
+    are needed, so it begins with large ones.
+    """
+    counts = [max(1, math.ceil(m / pixels)) if np.isfinite(m) else 1 for m in motion]
+    while math.prod(counts) > _MOST_FIRST:
+        counts[int(np.argmax(counts))] //= 2
+    return tuple(counts)

@@ -1,0 +1,183 @@
+"""From rendered pictures to a network's input: concretely, and for linear sets of pictures.
+
+Resizing is done by the renderer, which draws at the network's resolution. What is bounded is the float
+image in [0, 1] that the renderer gives, not its rounding to 8 bits in a file (docs/design.md, V1).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+
+from ns_abstract.arithmetic.units import UNIT64
+from ns_abstract.errors import InputError
+from ns_abstract.jsonio import is_number, show
+
+if TYPE_CHECKING:
+    from ns_abstract.verify.network import ImageSets
+
+_KEYS = ("resize", "mean", "std", "layout", "channels", "range")
+_UNIT32 = 2.0**-24
+#: Roundings of one float32 evaluation of V1, in units of the largest numbers met, and some to spare.
+_ROUNDINGS = 10.0
+
+
+@dataclass(frozen=True)
+class Preprocess:
+    """``y = (low + x (high - low) - mean) / std`` per channel, in the network's order of channels.
+
+    Attributes:
+        resize: Height and width of the network's input, or None where the camera path has them already.
+        mean, std: Three numbers each, for the channels as the network sees them.
+        layout: "NCHW" or "NHWC".
+        channels: "RGB" or "BGR".
+        range: What the picture's 0 and 1 become before mean and std.
+    """
+
+    resize: tuple[int, int] | None = None
+    mean: tuple[float, ...] = (0.0, 0.0, 0.0)
+    std: tuple[float, ...] = (1.0, 1.0, 1.0)
+    layout: str = "NCHW"
+    channels: str = "RGB"
+    range: tuple[float, float] = (0.0, 1.0)
+
+    def size(self, input_shape: tuple[int, ...]) -> tuple[int, int]:
+        """Height and width of a network's input of this layout.
+
+        Raises:
+            InputError: The input is no picture with three channels, or ``resize`` says something else.
+        """
+        shape = input_shape if self.layout == "NCHW" else input_shape[-1:] + input_shape[:-1]
+        if len(shape) != 3 or shape[0] != 3:
+            raise InputError(
+                f"the network's input is {list(input_shape)}, not three channels in layout {self.layout}",
+                field="preprocess.layout",
+                fix="write the network's layout, or use a network of RGB pictures",
+            )
+        size = (shape[1], shape[2])
+        if self.resize not in (None, size):
+            raise InputError(
+                f"found {list(self.resize or ())}, the network's input has {size[0]} rows and {size[1]} columns",
+                field="preprocess.resize",
+                fix=f"write [{size[0]}, {size[1]}]",
+            )
+        return size
+
+    def _constants(self) -> tuple[np.ndarray, np.ndarray, float, float]:
+        low, high = self.range
+        return np.array(self.mean), np.array(self.std), low, high - low
+
+    def apply(self, images: torch.Tensor) -> torch.Tensor:
+        """Network inputs [B, *input_shape] from pictures [B, H, W, 3] (RGB in [0, 1]), in their dtype."""
+        if self.channels == "BGR":
+            images = images.flip(-1)
+        mean, std, low, scale = self._constants()
+        constants = [torch.tensor(v, dtype=images.dtype) for v in (low, scale, mean, std)]
+        values = (images * constants[1] + constants[0] - constants[2]) / constants[3]
+        return values.permute(0, 3, 1, 2) if self.layout == "NCHW" else values
+
+    def sets(
+        self,
+        linear: tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray],
+        lower: np.ndarray,
+        upper: np.ndarray,
+    ) -> ImageSets:
+        """Linear sets of network inputs from those of pictures (docs/design.md, V1).
+
+        Args:
+            linear: A_lower [m, H, W, 3, d], b_lower [m, H, W, 3], A_upper, b_upper of m cells.
+            lower, upper: [m, H, W, 3] interval bounds.
+
+        Returns:
+            Sets that hold every float32 evaluation of `apply`, too.
+        """
+        from ns_abstract.verify.network import ImageSets
+
+        mean, std, low, scale = self._constants()
+        a_lower, b_lower, a_upper, b_upper = (np.asarray(v, np.float64) for v in linear)
+        factor = scale / std
+        size = (abs(scale) + abs(low) + np.abs(mean)) / std
+
+        def move(b: np.ndarray, a: np.ndarray | None, sign: float) -> np.ndarray:
+            b = self._ordered(b, 0)
+            value = (b * scale + low - mean) / std
+            charge = _ROUNDINGS * _UNIT32 * size + 8.0 * UNIT64 * np.abs(b * factor)
+            if a is not None:
+                charge = charge + 8.0 * UNIT64 * np.abs(a).sum(axis=-1)
+            return self._flat(value + sign * charge, 0)
+
+        slopes = [self._ordered(a, 1) * factor[:, None] for a in (a_lower, a_upper)]
+        return ImageSets(
+            a_lower=self._flat(slopes[0], 1),
+            b_lower=move(b_lower, slopes[0], -1.0),
+            a_upper=self._flat(slopes[1], 1),
+            b_upper=move(b_upper, slopes[1], 1.0),
+            lower=move(np.asarray(lower, np.float64), None, -1.0),
+            upper=move(np.asarray(upper, np.float64), None, 1.0),
+        )
+
+    def _ordered(self, array: np.ndarray, after: int) -> np.ndarray:
+        """Channels as the network has them; ``after``: axes behind the one of channels."""
+        return np.flip(array, array.ndim - 1 - after) if self.channels == "BGR" else array
+
+    def _flat(self, array: np.ndarray, after: int) -> np.ndarray:
+        """[m, H, W, 3, ...] as [m, n, ...] in the layout's order."""
+        if self.layout == "NCHW":
+            array = np.moveaxis(array, array.ndim - 1 - after, 1)
+        rest = array.shape[array.ndim - after :]
+        # spelled out: -1 has no meaning where a set has no parameters
+        count = math.prod(array.shape[1 : array.ndim - after])
+        return np.ascontiguousarray(array).reshape(array.shape[0], count, *rest)
+
+
+def parse_preprocess(value: Any) -> Preprocess:
+    """Check the object under the key ``preprocess`` of a property file.
+
+    Raises:
+        InputError: A key is unknown, or a value cannot be used.
+    """
+
+    def fail(name: str, found: Any, fix: str) -> InputError:
+        return InputError(f"found {show(found)}", field=f"preprocess{name}", fix=fix)
+
+    if not isinstance(value, dict):
+        raise fail("", value, "write an object")
+    for key in value:
+        if key not in _KEYS:
+            raise InputError("unknown key", field=f"preprocess.{key}", fix=f"the keys are {', '.join(_KEYS)}")
+
+    def numbers(name: str, count: int, default: tuple[float, ...]) -> tuple[float, ...]:
+        found = value.get(name, list(default))
+        if not (isinstance(found, list) and len(found) == count and all(is_number(v) for v in found)):
+            raise fail(f".{name}", found, f"write {count} finite numbers")
+        return tuple(float(v) for v in found)
+
+    def choice(name: str, choices: tuple[str, str]) -> str:
+        found = value.get(name, choices[0])
+        if found not in choices or not isinstance(found, str):
+            raise fail(f".{name}", found, f"write {' or '.join(choices)}")
+        return found
+
+    resize = value.get("resize")
+    if resize is not None and not (
+        isinstance(resize, list) and len(resize) == 2 and all(type(v) is int and 1 <= v <= 16384 for v in resize)
+    ):
+        raise fail(".resize", resize, "write [height, width] in pixels")
+    std = numbers("std", 3, (1.0, 1.0, 1.0))
+    if not min(std) > 0.0:
+        raise fail(".std", value["std"], "write three numbers above 0")
+    ends = numbers("range", 2, (0.0, 1.0))
+    if not ends[0] < ends[1]:
+        raise fail(".range", value["range"], "write the smaller end first")
+    return Preprocess(
+        resize=None if resize is None else (resize[0], resize[1]),
+        mean=numbers("mean", 3, (0.0, 0.0, 0.0)),
+        std=std,
+        layout=choice("layout", ("NCHW", "NHWC")),
+        channels=choice("channels", ("RGB", "BGR")),
+        range=(ends[0], ends[1]),
+    )

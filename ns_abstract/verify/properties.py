@@ -1,0 +1,633 @@
+"""What a network is to do on every image of a set: the property file, its concrete check, and its proof.
+
+A property is a margin, a function of the network's outputs and the pose: it holds where the margin is
+above 0 (docs/design.md, V2-V5). ``Property`` is what the file says; ``bind`` makes it a ``Claim`` about
+one frame's set of poses, which knows the margin of concrete outputs, the linear rows whose lower bounds are
+needed for a proof, and what they prove.
+"""
+
+from __future__ import annotations
+
+import math
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+
+from ns_abstract.arithmetic.forms import FormArray
+from ns_abstract.errors import InputError
+from ns_abstract.jsonio import is_number, load_json, show
+from ns_abstract.sets.box import ParameterBox
+from ns_abstract.sets.poses import PoseSet
+from ns_abstract.sets.twin import pose_twin
+from ns_abstract.verify.preprocess import Preprocess, parse_preprocess
+from ns_abstract.verify.vnnlib import UnsafeSet, load_vnnlib
+
+if TYPE_CHECKING:
+    from ns_abstract.verify.network import OutputBounds
+
+#: Relative charge for the few float64 operations of a proof's last steps, each at most 2^-53 (V2).
+_CHARGE = 2.0**-44
+_CLASSES, _ANCHORS = 20, 5
+#: Anchors of the VOC TinyYOLO head, widths and heights in grid cells.
+ANCHORS = ((1.19, 1.98), (2.79, 4.59), (4.53, 8.92), (8.06, 5.29), (10.32, 10.65))
+_HEAD = _ANCHORS * (1 + _CLASSES + 4)
+#: Boxes looked at in a proof of a detection: the best of each cell's sample, and in all.
+_BEST, _CANDIDATES = 2, 6
+_COMPONENTS = ("camera.x", "camera.y", "camera.z", "object.x", "object.y", "object.z", "distance")
+
+
+@dataclass(frozen=True)
+class Query:
+    """Linear functions ``rows @ y + offset`` of the outputs whose lower bounds a proof needs.
+
+    Attributes:
+        rows: [k, output_size].
+        offset: [k].
+        about: What the claim needs to read the bounds.
+    """
+
+    rows: np.ndarray
+    offset: np.ndarray
+    about: Any = None
+
+
+class Claim(ABC):
+    """A property of one frame's set of poses."""
+
+    @abstractmethod
+    def margin(self, outputs: torch.Tensor, values: torch.Tensor) -> torch.Tensor:
+        """[B] margins of outputs [B, n] at parameter values [B, d]; the property holds where above 0."""
+
+    @abstractmethod
+    def query(self, outputs: np.ndarray) -> Query:
+        """The bounds that a proof needs, given outputs [s, n] seen inside the cells."""
+
+    @abstractmethod
+    def proved(self, query: Query, bounds: OutputBounds, boxes: Sequence[ParameterBox]) -> np.ndarray:
+        """[m] lower bounds of the margin over the cells ``boxes``; -inf where nothing is known."""
+
+
+class Property(ABC):
+    """What a property file says."""
+
+    preprocess: Preprocess
+    partitions: tuple[int, ...] | None
+
+    @abstractmethod
+    def sentence(self) -> str:
+        """The property in words, as the end of "on every image ..."."""
+
+    @abstractmethod
+    def bind(self, pose_set: PoseSet, nominal: Callable[[], np.ndarray]) -> Claim:
+        """The claim about a frame; ``nominal`` gives outputs [n] at the middle of the set.
+
+        Raises:
+            InputError: The property makes no sense for this frame.
+        """
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What was set aside, one sentence each."""
+        return ()
+
+
+# ---------------------------------------------------------------- linear properties
+
+
+@dataclass(frozen=True)
+class LinearClaim(Claim):
+    """Margin ``min over groups of max over the group's rows of rows @ y + offset`` (V2)."""
+
+    rows: np.ndarray
+    offset: np.ndarray
+    groups: tuple[tuple[int, ...], ...]
+
+    def margin(self, outputs: torch.Tensor, values: torch.Tensor) -> torch.Tensor:
+        found = outputs @ torch.from_numpy(self.rows).to(outputs.dtype).T
+        found = found + torch.from_numpy(self.offset).to(outputs.dtype)
+        return torch.stack([found[:, list(group)].amax(dim=1) for group in self.groups]).amin(dim=0)
+
+    def query(self, outputs: np.ndarray) -> Query:
+        return Query(self.rows, self.offset)
+
+    def proved(self, query: Query, bounds: OutputBounds, boxes: Sequence[ParameterBox]) -> np.ndarray:
+        # a maximum of lower bounds would ignore NaN in one order of arguments and not in the other
+        lower = np.where(np.isnan(bounds.lower), -np.inf, bounds.lower)
+        return np.min([lower[:, list(group)].max(axis=1) for group in self.groups], axis=0)
+
+
+@dataclass(frozen=True)
+class Classification(Property):
+    """The logit of ``label`` is the largest."""
+
+    label: int
+    classes: int
+    preprocess: Preprocess = field(default_factory=Preprocess)
+    partitions: tuple[int, ...] | None = None
+
+    def sentence(self) -> str:
+        return f"output {self.label} is larger than each of the other {self.classes - 1}"
+
+    def bind(self, pose_set: PoseSet, nominal: Callable[[], np.ndarray]) -> Claim:
+        others = [k for k in range(self.classes) if k != self.label]
+        rows = np.zeros((len(others), self.classes))
+        rows[:, self.label] = 1.0
+        rows[np.arange(len(others)), others] = -1.0
+        return LinearClaim(rows, np.zeros(len(others)), tuple((k,) for k in range(len(others))))
+
+
+@dataclass(frozen=True)
+class VnnLib(Property):
+    """No output is in the unsafe set of a VNN-LIB file."""
+
+    file: Path
+    unsafe: UnsafeSet
+    preprocess: Preprocess = field(default_factory=Preprocess)
+    partitions: tuple[int, ...] | None = None
+
+    def sentence(self) -> str:
+        return f"the outputs are outside the unsafe set of {self.file.name}"
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        count = self.unsafe.inputs
+        if not count:
+            return ()
+        return (f"{count} assertions on inputs set aside: the images of the scene take their place",)
+
+    def bind(self, pose_set: PoseSet, nominal: Callable[[], np.ndarray]) -> Claim:
+        return LinearClaim(self.unsafe.rows, self.unsafe.offset, self.unsafe.groups)
+
+
+# ---------------------------------------------------------------- regression
+
+
+@dataclass(frozen=True)
+class Truth:
+    """True values as functions of the pose.
+
+    Attributes:
+        components: A number, or one of ``camera.x`` ... (position minus origin, world axes), ``object.x``
+            ... (origin seen from the camera, its own axes: x right, y up, z back), ``distance``.
+        origin: World point, normalised frame.
+        scale: Multiplies what is not a number: units of the network per normalised unit.
+    """
+
+    components: tuple[float | str, ...]
+    origin: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    scale: float = 1.0
+
+    def forms(self, pose_set: PoseSet, box: ParameterBox) -> FormArray:
+        """[c] forms of order 1 that enclose the values over a cell."""
+        poses = pose_set.enclosure(box, 1)
+        # OpenCV to OpenGL camera axes
+        flip = np.array([1.0, -1.0, -1.0])
+        camera = poses.position - np.array(self.origin)
+        parts: dict[str, FormArray] = {}
+        if any(isinstance(c, str) and c.startswith("object") for c in self.components):
+            seen = (poses.rotation @ (np.array(self.origin) - poses.origin) + poses.offset) * flip
+            parts |= {f"object.{name}": seen[k] for k, name in enumerate("xyz")}
+        parts |= {f"camera.{name}": camera[k] for k, name in enumerate("xyz")}
+        if "distance" in self.components:
+            parts["distance"] = camera.square().sum(0).sqrt()
+        basis = poses.position.basis
+        columns = [
+            (parts[c] * self.scale if isinstance(c, str) else FormArray.constant(basis, c)).data.reshape(-1, 1)
+            for c in self.components
+        ]
+        return FormArray(basis, np.ascontiguousarray(np.concatenate(columns, axis=1)), (len(columns),))
+
+    def at(self, pose: torch.Tensor) -> torch.Tensor:
+        """[c] values at a camera-to-world pose [3, 4]."""
+        origin = torch.tensor(self.origin, dtype=pose.dtype)
+        camera = pose[:, 3] - origin
+        seen = -(pose[:, :3].T @ camera)
+        parts = {f"camera.{n}": camera[k] for k, n in enumerate("xyz")}
+        parts |= {f"object.{n}": seen[k] for k, n in enumerate("xyz")}
+        parts["distance"] = camera.norm()
+        numbers = [torch.tensor(0.0 if isinstance(c, str) else c, dtype=pose.dtype) for c in self.components]
+        return torch.stack(
+            [parts[c] * self.scale if isinstance(c, str) else n for c, n in zip(self.components, numbers, strict=True)]
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class RegressionClaim(Claim):
+    """Outputs are close to the truth (V3)."""
+
+    truth: Truth
+    absolute: tuple[float, ...] | None
+    relative: float | None
+    pose_set: PoseSet
+
+    def margin(self, outputs: torch.Tensor, values: torch.Tensor) -> torch.Tensor:
+        pose = pose_twin(self.pose_set)
+        truth = torch.stack([self.truth.at(pose(v.to(torch.float64))) for v in values]).to(outputs.dtype)
+        error = outputs - truth
+        if self.relative is not None:
+            return self.relative * truth.norm(dim=1) - error.norm(dim=1)
+        assert self.absolute is not None
+        if len(self.absolute) == 1:
+            return self.absolute[0] - error.norm(dim=1)
+        return (torch.tensor(self.absolute, dtype=outputs.dtype) - error.abs()).amin(dim=1)
+
+    def query(self, outputs: np.ndarray) -> Query:
+        unit = np.eye(outputs.shape[1])
+        return Query(np.concatenate([unit, -unit]), np.zeros(2 * len(unit)))
+
+    def proved(self, query: Query, bounds: OutputBounds, boxes: Sequence[ParameterBox]) -> np.ndarray:
+        found = np.full(len(boxes), -np.inf)
+        for cell, box in enumerate(boxes):
+            with np.errstate(all="ignore"):
+                margin = self._cell(bounds.lower[cell], bounds.a[cell], bounds.b[cell], box)
+            found[cell] = margin if math.isfinite(margin) else -np.inf
+        return found
+
+    def _cell(self, lower: np.ndarray, a: np.ndarray, b: np.ndarray, box: ParameterBox) -> float:
+        truth = self.truth.forms(self.pose_set, box)
+        count, signs = len(self.truth.components), np.array([[1.0], [-1.0]])
+        low, high = truth.bounds()
+        # lower bounds of y - t and t - y: from both ranges, and from both lines
+        ranges = lower.reshape(2, count) - np.stack([high, -low])
+        a, b = a.reshape(2, count, -1), b.reshape(2, count)
+        slope = a - signs[..., None] * truth.linear.T
+        size = np.abs(b) + np.abs(truth.center) + np.abs(a).sum(-1) + np.abs(truth.linear).sum(0) + truth.radius
+        lines = b - signs * truth.center - truth.radius - np.abs(slope).sum(axis=-1) - _CHARGE * size
+        ranges -= _CHARGE * (np.abs(lower.reshape(2, count)) + np.abs(high) + np.abs(low))
+        # fmax: where one says nothing the other holds
+        sides = np.fmax(ranges, lines)
+        error = np.maximum(-sides[0], -sides[1]).clip(min=0.0)
+        if self.absolute is not None and len(self.absolute) > 1:
+            return float((np.array(self.absolute) * (1.0 - _CHARGE) - error).min())
+        length = float(np.sqrt((error * error).sum())) * (1.0 + _CHARGE)
+        if self.absolute is not None:
+            return float(min(self.absolute)) * (1.0 - _CHARGE) - length * (1.0 + _CHARGE)
+        assert self.relative is not None
+        nearest = np.where((low <= 0.0) & (high >= 0.0), 0.0, np.minimum(np.abs(low), np.abs(high)))
+        reach = self.relative * float(np.sqrt((nearest * nearest).sum())) * (1.0 - _CHARGE)
+        return reach - length - _CHARGE * (reach + length)
+
+
+@dataclass(frozen=True)
+class Regression(Property):
+    """Outputs within a tolerance of the truth."""
+
+    truth: Truth
+    absolute: tuple[float, ...] | None
+    relative: float | None
+    preprocess: Preprocess = field(default_factory=Preprocess)
+    partitions: tuple[int, ...] | None = None
+
+    def sentence(self) -> str:
+        names = ", ".join(c if isinstance(c, str) else f"{c:g}" for c in self.truth.components)
+        if self.relative is not None:
+            return f"the outputs are closer to ({names}) than {self.relative:g} times its length"
+        assert self.absolute is not None
+        if len(self.absolute) == 1:
+            return f"the outputs are closer to ({names}) than {self.absolute[0]:g} (Euclidean length)"
+        return f"each output is closer to its value of ({names}) than {', '.join(f'{v:g}' for v in self.absolute)}"
+
+    def bind(self, pose_set: PoseSet, nominal: Callable[[], np.ndarray]) -> Claim:
+        return RegressionClaim(self.truth, self.absolute, self.relative, pose_set)
+
+
+# ---------------------------------------------------------------- detection
+
+
+def decode(outputs: torch.Tensor, stride: float) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """The VOC TinyYOLO head, after Redmon and Farhadi's YOLOv2 (V4).
+
+    Args:
+        outputs: [B, 125 g g]: channels of [125, g, g] are 5 objectness logits, 5 x 20 class logits and
+            5 x 4 numbers tx, ty, tw, th, each by anchor.
+        stride: Pixels by grid cell.
+
+    Returns:
+        Objectness [B, 5, g, g], class probabilities [B, 5, 20, g, g], and boxes [B, 5, 4, g, g] as
+        x0, y0, x1, y1 in pixels: centres at ``(sigmoid(t) + cell) stride``, sides
+        ``anchor exp(t) stride``.
+    """
+    grid = math.isqrt(outputs.shape[1] // _HEAD)
+    head = outputs.reshape(-1, _HEAD, grid, grid)
+    objectness = torch.sigmoid(head[:, :_ANCHORS])
+    logits = head[:, _ANCHORS : _ANCHORS * (1 + _CLASSES)].reshape(-1, _ANCHORS, _CLASSES, grid, grid)
+    t = head[:, _ANCHORS * (1 + _CLASSES) :].reshape(-1, _ANCHORS, 4, grid, grid)
+    steps = torch.arange(grid, dtype=outputs.dtype)
+    centre = torch.stack([torch.sigmoid(t[:, :, 0]) + steps, torch.sigmoid(t[:, :, 1]) + steps[:, None]], dim=2)
+    anchors = torch.tensor(ANCHORS, dtype=outputs.dtype)[None, :, :, None, None]
+    half = 0.5 * anchors * torch.exp(t[:, :, 2:])
+    return objectness, torch.softmax(logits, dim=2), stride * torch.cat([centre - half, centre + half], dim=2)
+
+
+@dataclass(frozen=True)
+class DetectionClaim(Claim):
+    """Some box has score and overlap above their thresholds (V4).
+
+    Attributes:
+        label: Class, or None: objectness alone.
+        confidence: Threshold of objectness times class probability.
+        iou: Threshold of the overlap with ``box``, or None: anywhere.
+        box: x0, y0, x1, y1 in pixels, or None.
+        stride: Pixels by grid cell.
+        grid: Grid cells on a side.
+    """
+
+    label: int | None
+    confidence: float
+    iou: float | None
+    box: tuple[float, float, float, float] | None
+    stride: float
+    grid: int
+
+    def margins(self, outputs: torch.Tensor) -> torch.Tensor:
+        """[B, 5 g g] margins box by box."""
+        objectness, classes, boxes = decode(outputs, self.stride)
+        score = objectness if self.label is None else objectness * classes[:, :, self.label]
+        margin = score - self.confidence
+        if self.iou is not None:
+            assert self.box is not None
+            x0, y0, x1, y1 = boxes.unbind(2)
+            across = (x1.clamp(max=self.box[2]) - x0.clamp(min=self.box[0])).clamp(min=0.0)
+            down = (y1.clamp(max=self.box[3]) - y0.clamp(min=self.box[1])).clamp(min=0.0)
+            common = across * down
+            whole = (x1 - x0) * (y1 - y0) + (self.box[2] - self.box[0]) * (self.box[3] - self.box[1]) - common
+            margin = torch.minimum(margin, common / whole - self.iou)
+        return margin.reshape(len(outputs), -1)
+
+    def margin(self, outputs: torch.Tensor, values: torch.Tensor) -> torch.Tensor:
+        return self.margins(outputs).amax(dim=1)
+
+    def query(self, outputs: np.ndarray) -> Query:
+        with torch.no_grad():
+            margins = self.margins(torch.from_numpy(np.asarray(outputs, np.float64))).numpy()
+        margins = np.where(np.isnan(margins), -np.inf, margins)
+        ranks = np.argsort(-margins, axis=1, kind="stable")[:, :_BEST]
+        chosen = list(dict.fromkeys(ranks.T.ravel().tolist()))[:_CANDIDATES]
+        rows = [self._rows(number) for number in chosen]
+        return Query(np.concatenate(rows), np.zeros(sum(map(len, rows))), tuple(chosen))
+
+    def _rows(self, number: int) -> np.ndarray:
+        """Objectness; class logit minus each other; tx, ty, tw, th and their negatives."""
+        plane = self.grid * self.grid
+        anchor, place = divmod(number, plane)
+
+        def at(channel: int) -> int:
+            return channel * plane + place
+
+        width = _HEAD * plane
+        columns: list[tuple[int, int | None]] = [(at(anchor), None)]
+        if self.label is not None:
+            first = _ANCHORS + anchor * _CLASSES
+            columns += [(at(first + self.label), at(first + k)) for k in range(_CLASSES) if k != self.label]
+        rows = np.zeros((len(columns), width))
+        for row, (plus, minus) in zip(rows, columns, strict=True):
+            row[plus] = 1.0
+            if minus is not None:
+                row[minus] = -1.0
+        if self.iou is None:
+            return rows
+        sides = np.zeros((4, width))
+        sides[np.arange(4), [at(_ANCHORS * (1 + _CLASSES) + 4 * anchor + k) for k in range(4)]] = 1.0
+        return np.concatenate([rows, sides, -sides])
+
+    def proved(self, query: Query, bounds: OutputBounds, boxes: Sequence[ParameterBox]) -> np.ndarray:
+        size = len(query.rows) // len(query.about)
+        found = np.full(len(boxes), -np.inf)
+        for k, number in enumerate(query.about):
+            lower = bounds.lower[:, k * size : (k + 1) * size]
+            with np.errstate(all="ignore"):
+                margin = self._candidate(np.where(np.isnan(lower), -np.inf, lower), number)
+            found = np.fmax(found, np.where(np.isfinite(margin), margin, -np.inf))
+        return found
+
+    def _candidate(self, lower: np.ndarray, number: int) -> np.ndarray:
+        """[m] lower bounds of one box's margin."""
+        score = _sigmoid(lower[:, 0])[0]
+        count = 1
+        if self.label is not None:
+            count += _CLASSES - 1
+            # probability 1 / (1 + sum of exp(other - own)), each difference at its largest
+            score = score / (1.0 + np.exp(-lower[:, 1:count]).sum(axis=1)) * (1.0 - _CHARGE)
+        margin = score - self.confidence - _CHARGE * (score + self.confidence)
+        if self.iou is None:
+            return margin
+        return np.minimum(margin, self._overlap(lower[:, count : count + 4], -lower[:, count + 4 :], number))
+
+    def _overlap(self, low: np.ndarray, high: np.ndarray, number: int) -> np.ndarray:
+        """[m] lower bounds of the overlap minus its threshold, from ranges [m, 4] of tx, ty, tw, th."""
+        assert self.iou is not None and self.box is not None
+        anchor, place = divmod(number, self.grid * self.grid)
+        row, column = divmod(place, self.grid)
+        common, area_high = np.ones(len(low)), np.ones(len(low))
+        for axis, step in ((0, column), (1, row)):
+            centre_low = (_sigmoid(low[:, axis])[0] + step) * self.stride
+            centre_high = (_sigmoid(high[:, axis])[1] + step) * self.stride
+            factor = ANCHORS[anchor][axis] * self.stride
+            side_low, side_high = factor * np.exp(low[:, 2 + axis]), factor * np.exp(high[:, 2 + axis])
+            charge = _CHARGE * (centre_high + side_high + abs(self.box[axis]) + abs(self.box[2 + axis]))
+            first, last = self.box[axis], self.box[2 + axis]
+            # the overlap of an interval of centre c and side s with [first, last]: each of the four ways
+            # that it can be cut is monotone in s and monotone in c
+            ways = [
+                side_low,
+                np.full(len(low), last - first),
+                centre_low + 0.5 * side_low - first,
+                last - centre_high + 0.5 * side_low,
+            ]
+            common = common * (np.min(ways, axis=0) - charge).clip(min=0.0)
+            area_high = area_high * (side_high + charge)
+        reference = (self.box[2] - self.box[0]) * (self.box[3] - self.box[1])
+        # common / (area + reference - common) grows with the common part and falls with the area
+        union = area_high + reference - common
+        return common / (union * (1.0 + _CHARGE)) - self.iou - _CHARGE
+
+
+def _sigmoid(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Lower and upper bounds of the sigmoid of float64 numbers."""
+    value = 1.0 / (1.0 + np.exp(-x))
+    return value * (1.0 - _CHARGE), np.minimum(value * (1.0 + _CHARGE), 1.0)
+
+
+@dataclass(frozen=True)
+class Detection(Property):
+    """A box of the class is found on every image."""
+
+    label: int | None
+    confidence: float
+    iou: float | None
+    box: tuple[float, float, float, float] | None
+    grid: int
+    stride: float
+    preprocess: Preprocess = field(default_factory=Preprocess)
+    partitions: tuple[int, ...] | None = None
+
+    def sentence(self) -> str:
+        what = "objectness" if self.label is None else f"score of class {self.label}"
+        where = ""
+        if self.iou is not None:
+            reference = "the best box at the middle of the set" if self.box is None else f"the box {list(self.box)}"
+            where = f" and an overlap (IoU) above {self.iou:g} with {reference}"
+        return f"the detector finds a box with {what} above {self.confidence:g}{where}"
+
+    def bind(self, pose_set: PoseSet, nominal: Callable[[], np.ndarray]) -> Claim:
+        box = self.box
+        if self.iou is not None and box is None:
+            anywhere = DetectionClaim(self.label, self.confidence, None, None, self.stride, self.grid)
+            outputs = torch.from_numpy(np.asarray(nominal(), np.float64))[None]
+            best = int(anywhere.margins(outputs).argmax())
+            found = decode(outputs, self.stride)[2].movedim(2, -1).reshape(-1, 4)[best].tolist()
+            box = (found[0], found[1], found[2], found[3])
+        return DetectionClaim(self.label, self.confidence, self.iou, box, self.stride, self.grid)
+
+
+# ---------------------------------------------------------------- the file
+
+_COMMON = ("type", "preprocess", "partitions")
+_KEYS = {
+    "classification": ("label",),
+    "regression": ("target", "tolerance", "origin", "scale"),
+    "detection": ("class", "iou", "confidence", "box"),
+    "vnnlib": ("file",),
+}
+
+
+def load_property(path: Path, input_shape: tuple[int, ...], output_shape: tuple[int, ...]) -> Property:
+    """Read PROP.json for a network with these shapes (one item each, without batch).
+
+    Raises:
+        InputError: The file or a field in it cannot be used.
+    """
+    root = load_json(path, "property file")
+    try:
+        return _parse(root, path, input_shape, math.prod(output_shape))
+    except InputError as error:
+        raise error.within(path) from None
+
+
+def _fail(name: str, found: Any, fix: str) -> InputError:
+    return InputError(f"found {show(found)}", field=name, fix=fix)
+
+
+def _parse(root: Any, path: Path, input_shape: tuple[int, ...], outputs: int) -> Property:
+    if not isinstance(root, dict):
+        raise InputError(f"the top level is {show(root)}, not an object", fix='write {"type": ...}')
+    kind = root.get("type")
+    if not isinstance(kind, str) or kind not in _KEYS:
+        raise InputError(
+            "missing" if kind is None else f"found {show(kind)}", field="type", fix=f"write one of {', '.join(_KEYS)}"
+        )
+    allowed = (*_COMMON, *_KEYS[kind])
+    for key in root:
+        if key not in allowed:
+            raise InputError("unknown key", field=key, fix=f"the keys of a {kind} are {', '.join(allowed)}")
+    preprocess = parse_preprocess(root.get("preprocess", {}))
+    height, width = preprocess.size(input_shape)
+    common: dict[str, Any] = {"preprocess": preprocess, "partitions": _partitions(root)}
+    if kind == "classification":
+        return _classification(root, outputs, common)
+    if kind == "regression":
+        return _regression(root, outputs, common)
+    if kind == "detection":
+        return _detection(root, outputs, height, width, common)
+    name = root.get("file")
+    if not isinstance(name, str) or not name:
+        raise _fail("file", name, "write the name of a VNN-LIB file, relative to this one")
+    file = path.parent / name
+    return VnnLib(file=file, unsafe=load_vnnlib(file, outputs), **common)
+
+
+def _partitions(root: dict[str, Any]) -> tuple[int, ...] | None:
+    value = root.get("partitions")
+    if value is None:
+        return None
+    counts = value if isinstance(value, list) else [value]
+    if not counts or not all(type(v) is int and 1 <= v <= 10**9 for v in counts):
+        raise _fail("partitions", value, "write a number of parts, or a list with one by parameter")
+    return tuple(counts)
+
+
+def _classification(root: dict[str, Any], outputs: int, common: dict[str, Any]) -> Property:
+    label = root.get("label")
+    if outputs < 2:
+        raise InputError(f"the network has {outputs} output", field="type", fix="use a classifier")
+    if type(label) is not int or not 0 <= label < outputs:
+        raise _fail("label", label, f"write an integer from 0 to {outputs - 1}, the number of an output")
+    return Classification(label=label, classes=outputs, **common)
+
+
+def _regression(root: dict[str, Any], outputs: int, common: dict[str, Any]) -> Property:
+    target = root.get("target")
+    if target in ("camera", "object"):
+        target = [f"{target}.{axis}" for axis in "xyz"]
+    elif target == "distance":
+        target = [target]
+    if not isinstance(target, list) or not all(is_number(v) or v in _COMPONENTS for v in target):
+        names = ", ".join(_COMPONENTS)
+        raise _fail("target", root.get("target"), f"write camera, object, distance, or a list of numbers or {names}")
+    if len(target) != outputs:
+        raise InputError(
+            f"{len(target)} values, the network has {outputs} outputs", field="target", fix="write one value by output"
+        )
+    origin = root.get("origin", [0.0, 0.0, 0.0])
+    if not (isinstance(origin, list) and len(origin) == 3 and all(is_number(v) for v in origin)):
+        raise _fail("origin", origin, "write three finite numbers, a point of the normalised frame")
+    scale = root.get("scale", 1.0)
+    if not is_number(scale) or scale == 0:
+        raise _fail("scale", scale, "write a finite number other than 0")
+    tolerance = root.get("tolerance")
+    if not isinstance(tolerance, dict) or len(tolerance) != 1 or not set(tolerance) <= {"absolute", "relative"}:
+        raise _fail("tolerance", tolerance, 'write {"relative": 0.2} or {"absolute": 0.1}')
+    absolute: tuple[float, ...] | None = None
+    relative: float | None = None
+    name, value = next(iter(tolerance.items()))
+    values: list[Any] = value if isinstance(value, list) and name == "absolute" else [value]
+    if not all(is_number(v) and v > 0 for v in values) or len(values) not in (1, outputs):
+        more = f" or {outputs} of them" if name == "absolute" else ""
+        raise _fail(f"tolerance.{name}", value, f"write a number above 0{more}")
+    if name == "absolute":
+        absolute = tuple(float(v) for v in values)
+    else:
+        relative = float(values[0])
+    x, y, z = (float(v) for v in origin)
+    truth = Truth(tuple(v if isinstance(v, str) else float(v) for v in target), (x, y, z), float(scale))
+    return Regression(truth=truth, absolute=absolute, relative=relative, **common)
+
+
+def _detection(root: dict[str, Any], outputs: int, height: int, width: int, common: dict[str, Any]) -> Property:
+    grid = math.isqrt(outputs // _HEAD)
+    if outputs != _HEAD * grid * grid or grid == 0 or height != width or height % grid:
+        raise InputError(
+            f"{outputs} outputs of a {height} x {width} picture are no VOC TinyYOLO head",
+            field="type",
+            fix=f"use a network with outputs [{_HEAD}, g, g] and square pictures with a multiple of g pixels",
+        )
+    for name in ("class", "iou"):
+        if name not in root:
+            raise InputError("missing", field=name, fix="write a number, or null")
+    label, iou, confidence, box = root["class"], root["iou"], root.get("confidence"), root.get("box")
+    if label is not None and (type(label) is not int or not 0 <= label < _CLASSES):
+        raise _fail("class", label, f"write an integer from 0 to {_CLASSES - 1}, or null for objectness alone")
+    for name, value in (("iou", iou), ("confidence", confidence)):
+        if not (name == "iou" and value is None) and not (is_number(value) and 0 < value < 1):
+            raise _fail(name, value, "write a number between 0 and 1")
+    if box is not None:
+        good = isinstance(box, list) and len(box) == 4 and all(is_number(v) for v in box)
+        if not good or not (box[0] < box[2] and box[1] < box[3]):
+            raise _fail("box", box, "write [x0, y0, x1, y1] in pixels of the network's input")
+        if iou is None:
+            raise InputError("given without iou", field="box", fix="write an iou, or remove the box")
+        box = (float(box[0]), float(box[1]), float(box[2]), float(box[3]))
+    return Detection(
+        label=label,
+        confidence=float(confidence),  # pyright: ignore[reportArgumentType]
+        iou=None if iou is None else float(iou),
+        box=box,
+        grid=grid,
+        stride=height / grid,
+        **common,
+    )

@@ -1,0 +1,417 @@
+"""The search for a proof or a counterexample, one block of cells at a time (docs/design.md, V6).
+
+What becomes of a block depends on the block alone, so the result is the same in whatever order, on however
+many machines and after however many interruptions blocks are examined.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, Literal, Protocol
+
+import numpy as np
+import torch
+
+from ns_abstract.errors import InputError
+from ns_abstract.sets.box import ParameterBox
+from ns_abstract.verify.cells import Cell, Grid
+from ns_abstract.verify.properties import Claim, Query
+
+if TYPE_CHECKING:
+    from ns_abstract.verify.network import ImageSets, OutputBounds
+
+Verdict = Literal["certified", "falsified", "unknown"]
+
+#: Cells examined together.
+BLOCK = 8
+#: Mean width of the linear sets, as a part of the range of a pixel, from which on a cell that can be cut is cut
+#: without asking the network.
+_HOPELESS = 0.1
+#: A cell is cut into four where its bound misses by more than so many times the margin that samples show.
+_FAR = 4.0
+#: Corners sampled before and after a cell's bounds are known, and random poses besides.
+_EARLY, _LATE, _RANDOM = 2, 4, 2
+#: Steps of the ascent to a counterexample.
+_STEPS = 6
+_FIRST_STEP = 0.25
+
+
+class Scene(Protocol):
+    """One frame's pictures, at the network's resolution."""
+
+    box: ParameterBox
+
+    def image(self, values: np.ndarray) -> np.ndarray:
+        """Concrete picture [H, W, 3] float32 at parameter values [d]."""
+        ...
+
+    def sets(self, box: ParameterBox) -> tuple[tuple[np.ndarray, ...], np.ndarray, np.ndarray, np.ndarray]:
+        """(A_lower, b_lower, A_upper, b_upper) [H, W, 3, d] and [H, W, 3], lower, upper, and slopes [d]."""
+        ...
+
+    def twin(self, values: torch.Tensor) -> torch.Tensor:
+        """Picture [H, W, 3] at parameter values [d], differentiable."""
+        ...
+
+
+class Model(Protocol):
+    """A network with its preprocessing."""
+
+    def outputs(self, images: np.ndarray) -> np.ndarray:
+        """[B, n] outputs that the deployed program gives for pictures [B, H, W, 3]."""
+        ...
+
+    def differentiable(self, images: torch.Tensor) -> torch.Tensor:
+        """[B, n] outputs for pictures [B, H, W, 3], differentiable."""
+        ...
+
+    def input_sets(self, linear: tuple[np.ndarray, ...], lower: np.ndarray, upper: np.ndarray) -> ImageSets:
+        """Sets of the network's input; see `ns_abstract.verify.preprocess.Preprocess.sets`."""
+        ...
+
+    def bound(self, images: ImageSets, query: Query) -> OutputBounds:
+        """Bounds of the query's rows over the sets."""
+        ...
+
+
+@dataclass(frozen=True)
+class Leaf:
+    """A cell that is done with.
+
+    Attributes:
+        cell: The cell.
+        verdict: "certified", "falsified" or "unknown".
+        margin: Proven lower bound of the margin; that of the counterexample; or the best bound, or None.
+        seconds: Time spent on it.
+        counterexample: Parameter values, or None.
+        image: [H, W, 3] float32 picture of the counterexample, or None.
+        outputs: [n] what the network says about it, or None.
+        reason: Why nothing is known, or "".
+    """
+
+    cell: Cell
+    verdict: Verdict
+    margin: float | None
+    seconds: float
+    counterexample: tuple[float, ...] | None = None
+    image: np.ndarray | None = field(default=None, repr=False)
+    outputs: np.ndarray | None = field(default=None, repr=False)
+    reason: str = ""
+
+
+@dataclass(frozen=True)
+class Findings:
+    """What became of a block.
+
+    Attributes:
+        leaves: Cells that are done with.
+        blocks: Cells to examine next.
+        samples: Whether the property holds at the middle of each cell.
+        bounded: Cells whose network bounds were computed.
+        seconds: Time spent.
+    """
+
+    leaves: tuple[Leaf, ...]
+    blocks: tuple[tuple[Cell, ...], ...]
+    samples: tuple[tuple[Cell, bool], ...]
+    bounded: int
+    seconds: float
+
+
+@dataclass
+class _Seen:
+    """Concrete poses of one cell."""
+
+    cell: Cell
+    box: ParameterBox
+    poses: list[np.ndarray] = field(default_factory=list)
+    margins: list[float] = field(default_factory=list)
+
+    @property
+    def worst(self) -> int:
+        """The pose with the smallest margin; NaN is smaller than any."""
+        return int(np.argmin(np.where(np.isnan(self.margins), -np.inf, self.margins)))
+
+    @property
+    def broken(self) -> int:
+        """Poses at which the property fails."""
+        return sum(not margin > 0.0 for margin in self.margins)
+
+
+class Search:
+    """Examines blocks of one frame.
+
+    Args:
+        scene: The frame's pictures.
+        model: The network.
+        claim: What is to hold.
+        grid: The frame's cells.
+        every_unit: Whether each unit of the grid needs a verdict of its own where the property fails (PCP-S).
+    """
+
+    def __init__(self, scene: Scene, model: Model, claim: Claim, grid: Grid, *, every_unit: bool = False) -> None:
+        self.scene, self.model, self.claim, self.grid, self.every_unit = scene, model, claim, grid, every_unit
+
+    def margins(self, poses: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+        """[s] concrete margins and [s, n] outputs at parameter values."""
+        images = np.stack([self.scene.image(values) for values in poses])
+        outputs = np.asarray(self.model.outputs(images), np.float64)
+        with torch.no_grad():
+            margin = self.claim.margin(torch.from_numpy(outputs), torch.from_numpy(np.stack(poses)))
+        return margin.numpy(), outputs
+
+    def examine(self, block: Sequence[Cell]) -> Findings:
+        """Examine the cells.
+
+        Raises:
+            ContradictionError: A cell was proved and has a counterexample: the program has a fault.
+        """
+        begin = time.perf_counter()
+        seen = [_Seen(cell, self.grid.box_of(cell)) for cell in block]
+        outputs = self._sample(seen, self._early)
+        bounded: dict[int, float] = {}
+        reasons: dict[int, str] = {}
+        slopes = np.zeros((len(seen), self.grid.box.dimensions))
+        open_cells = [k for k, cell in enumerate(seen) if not cell.broken]
+        if open_cells:
+            self._bound([seen[k] for k in open_cells], outputs, open_cells, bounded, reasons, slopes)
+        proved = {k for k in open_cells if bounded.get(k, -math.inf) > 0.0}
+        self._sample([seen[k] for k in sorted(proved)], self._attack)
+        failing = [seen[k] for k in open_cells if k not in proved]
+        self._sample(failing, self._late)
+        self._ascend(failing)
+        leaves, children = self._settle(seen, bounded, reasons, slopes)
+        seconds = time.perf_counter() - begin
+        blocks = [tuple(children[i : i + BLOCK]) for i in range(0, len(children), BLOCK)]
+        share = seconds / len(seen)
+        return Findings(
+            leaves=tuple(_timed(leaf, share) for leaf in leaves),
+            blocks=tuple(blocks),
+            samples=tuple((cell.cell, cell.margins[0] > 0.0) for cell in seen),
+            bounded=len(bounded),
+            seconds=seconds,
+        )
+
+    # ---------------------------------------------------------------- concrete poses
+
+    def _early(self, cell: _Seen) -> list[np.ndarray]:
+        """The middle and two opposite corners."""
+        box = cell.box
+        if not box.dimensions:
+            return [box.middle]
+        return [box.middle, np.array(box.lower), np.array(box.upper)][: 1 + _EARLY]
+
+    def _attack(self, cell: _Seen) -> list[np.ndarray]:
+        """A random pose: no proof is believed without."""
+        return list(cell.box.sample(1, _generator(cell.cell))) if cell.box.dimensions else []
+
+    def _late(self, cell: _Seen) -> list[np.ndarray]:
+        """Corners and random poses that no sample has been yet."""
+        box = cell.box
+        if not box.dimensions:
+            return []
+        generator = _generator(cell.cell)
+        poses = [np.where(generator.random(box.dimensions) < 0.5, box.lower, box.upper) for _ in range(_LATE)]
+        known = {pose.tobytes() for pose in cell.poses}
+        fresh = [*poses, *box.sample(_RANDOM, generator)]
+        return [pose for pose in {p.tobytes(): p for p in fresh}.values() if pose.tobytes() not in known]
+
+    def _sample(self, cells: Sequence[_Seen], choose: Callable[[_Seen], list[np.ndarray]]) -> list[np.ndarray]:
+        """Add poses to the cells; returns the outputs at each cell's first new one."""
+        chosen = [choose(cell) for cell in cells]
+        unique = {pose.tobytes(): pose for poses in chosen for pose in poses}
+        if not unique:
+            return []
+        margins, outputs = self.margins(list(unique.values()))
+        place = {key: k for k, key in enumerate(unique)}
+        for cell, poses in zip(cells, chosen, strict=True):
+            cell.poses += poses
+            cell.margins += [float(margins[place[pose.tobytes()]]) for pose in poses]
+        return [outputs[place[poses[0].tobytes()]] for poses in chosen if poses]
+
+    def _ascend(self, cells: Sequence[_Seen]) -> None:
+        """Projected gradient descent of the margin in the cell that came closest to a counterexample.
+
+        With one parameter, samples do better than gradients.
+        """
+        d = self.grid.box.dimensions
+        hopeful = [cell for cell in cells if not cell.broken]
+        if d < 2 or not hopeful:
+            return
+        cell = min(hopeful, key=lambda c: c.margins[c.worst])
+        found = self._descend(cell)
+        if found is not None:
+            margins, _ = self.margins([found])
+            cell.poses.append(found)
+            cell.margins.append(float(margins[0]))
+
+    def _descend(self, cell: _Seen) -> np.ndarray | None:
+        low, high = (torch.tensor(v, dtype=torch.float64) for v in (cell.box.lower, cell.box.upper))
+
+        def evaluate(scaled: torch.Tensor) -> tuple[float, torch.Tensor]:
+            scaled = scaled.detach().requires_grad_(True)
+            values = low + 0.5 * (scaled + 1.0) * (high - low)
+            outputs = self.model.differentiable(self.scene.twin(values)[None])
+            margin = self.claim.margin(outputs, values[None])[0]
+            slope = torch.zeros_like(scaled)
+            if margin.requires_grad:
+                (slope,) = torch.autograd.grad(margin, scaled)
+            return float(margin.detach()), slope
+
+        start = torch.from_numpy(cell.poses[cell.worst])
+        scaled = (2.0 * (start - low) / (high - low) - 1.0).clamp(-1.0, 1.0)
+        best, slope = evaluate(scaled)
+        step, moved = _FIRST_STEP, False
+        for _ in range(_STEPS):
+            free = torch.where(((scaled <= -1.0) & (slope > 0)) | ((scaled >= 1.0) & (slope < 0)), 0.0, slope)
+            length = float(free.norm())
+            if not 0.0 < length < math.inf or best <= 0.0:
+                break
+            trial = (scaled - step * free / length).clamp(-1.0, 1.0)
+            value, trial_slope = evaluate(trial)
+            if value < best:
+                scaled, best, slope, step, moved = trial, value, trial_slope, min(2.0 * step, 1.0), True
+            else:
+                step *= 0.25
+        return cell.box.at(scaled.detach().numpy()) if moved else None
+
+    # ---------------------------------------------------------------- bounds
+
+    def _bound(
+        self,
+        cells: Sequence[_Seen],
+        outputs: Sequence[np.ndarray],
+        numbers: Sequence[int],
+        bounded: dict[int, float],
+        reasons: dict[int, str],
+        slopes: np.ndarray,
+    ) -> None:
+        """Lower bounds of the margin by cell; what fails leaves a reason and no bound."""
+        kept: list[int] = []
+        parts: list[Any] = []
+        for number, cell in zip(numbers, cells, strict=True):
+            try:
+                linear, lower, upper, slope = self.scene.sets(cell.box)
+            except InputError:
+                raise
+            except _FAILURES as error:
+                reasons[number] = _told(error)
+                continue
+            slopes[number] = slope
+            if not _sane(linear, lower, upper):
+                reasons[number] = "the image's bounds are not finite or cross"
+            elif self._splittable(cell.cell) and _slack(linear, lower, upper) > _HOPELESS:
+                reasons[number] = "the image's bounds are too wide"
+            else:
+                kept.append(number)
+                parts.append((*linear, lower, upper, cell.box))
+        if not kept:
+            return
+        *arrays, boxes = zip(*parts, strict=True)
+        stacked = [np.stack(values) for values in arrays]
+        try:
+            query = self.claim.query(np.stack([outputs[number] for number in kept]))
+            sets = self.model.input_sets(tuple(stacked[:4]), stacked[4], stacked[5])
+            found = self.claim.proved(query, self.model.bound(sets, query), boxes)
+        except InputError:
+            raise
+        except _FAILURES as error:
+            reasons.update(dict.fromkeys(kept, _told(error)))
+            return
+        for number, margin in zip(kept, np.asarray(found, np.float64).tolist(), strict=True):
+            # infinite or NaN bounds prove nothing
+            if math.isfinite(margin):
+                bounded[number] = margin
+            else:
+                reasons[number] = "the network's bounds are not finite"
+
+    def _splittable(self, cell: Cell) -> bool:
+        return cell.volume > 1
+
+    # ---------------------------------------------------------------- verdicts
+
+    def _settle(
+        self, seen: Sequence[_Seen], bounded: dict[int, float], reasons: dict[int, str], slopes: np.ndarray
+    ) -> tuple[list[Leaf], list[Cell]]:
+        leaves: list[Leaf] = []
+        children: list[Cell] = []
+        for number, cell in enumerate(seen):
+            bound = bounded.get(number)
+            if bound is not None and bound > 0.0:
+                if cell.broken:
+                    # a proof and a counterexample cannot both be right
+                    raise ContradictionError(
+                        f"internal error: margin proved to be at least {bound} on {cell.box.lower} to "
+                        f"{cell.box.upper}, found {cell.margins[cell.worst]} at {cell.poses[cell.worst].tolist()}"
+                    )
+                leaves.append(Leaf(cell.cell, "certified", bound, 0.0))
+                continue
+            hopeless = cell.broken == len(cell.margins) and not self.every_unit
+            if self._splittable(cell.cell) and not hopeless:
+                children += self.grid.split(cell.cell, slopes[number], self._parts(cell, bound))
+            elif cell.broken:
+                leaves.append(self._counterexample(cell))
+            else:
+                leaves.append(Leaf(cell.cell, "unknown", bound, 0.0, reason=reasons.get(number, "the finest cell")))
+        return leaves, children
+
+    def _parts(self, cell: _Seen, bound: float | None) -> int:
+        if cell.broken or bound is None:
+            return 4
+        margin = min(cell.margins)
+        return 4 if margin - bound > _FAR * margin else 2
+
+    def _counterexample(self, cell: _Seen) -> Leaf:
+        """The worst pose, rendered and classified once more."""
+        values = cell.poses[cell.worst]
+        image = self.scene.image(values)
+        margins, outputs = self.margins([values])
+        margin = float(margins[0])
+        if margin > 0.0 or not cell.box.contains(values):
+            return Leaf(cell.cell, "unknown", None, 0.0, reason="a counterexample was not confirmed")
+        return Leaf(
+            cell.cell,
+            "falsified",
+            margin if math.isfinite(margin) else None,
+            0.0,
+            counterexample=tuple(values.tolist()),
+            image=image,
+            outputs=outputs[0],
+        )
+
+
+class ContradictionError(RuntimeError):
+    """A cell was proved although a pose in it breaks the property: the program has a fault."""
+
+
+#: What may go wrong in one cell without ending the run; lack of memory and a user's mistake do end it.
+_FAILURES = (ArithmeticError, ValueError, IndexError, KeyError, TypeError, RuntimeError, AssertionError)
+
+
+def _told(error: Exception) -> str:
+    return " ".join(f"{type(error).__name__}: {error}".split())[:200]
+
+
+def _timed(leaf: Leaf, seconds: float) -> Leaf:
+    return Leaf(
+        leaf.cell, leaf.verdict, leaf.margin, seconds, leaf.counterexample, leaf.image, leaf.outputs, leaf.reason
+    )
+
+
+def _generator(cell: Cell) -> np.random.Generator:
+    return np.random.default_rng([*cell.first, *cell.past])
+
+
+def _sane(linear: tuple[np.ndarray, ...], lower: np.ndarray, upper: np.ndarray) -> bool:
+    """Whether all is finite, and the bounds do not cross."""
+    return bool(all(np.isfinite(v).all() for v in (*linear, lower, upper)) and (lower <= upper).all())
+
+
+def _slack(linear: tuple[np.ndarray, ...], lower: np.ndarray, upper: np.ndarray) -> float:
+    """Mean width of the sets in p, by pixel and channel."""
+    a_lower, b_lower, a_upper, b_upper = (np.asarray(v, np.float64) for v in linear)
+    wide = b_upper - b_lower + np.abs(a_upper - a_lower).sum(axis=-1)
+    return float(np.minimum(wide, np.asarray(upper, np.float64) - lower).mean())

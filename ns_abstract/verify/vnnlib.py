@@ -1,0 +1,219 @@
+"""VNN-LIB files (version 1): which outputs of a network are unsafe.
+
+Only what the format's users write is read: ``declare-const``, and ``assert`` of ``<=``, ``>=``, ``and``,
+``or`` over linear expressions of the outputs. Bounds of the inputs are set aside: the images of the scene
+take their place.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ns_abstract.errors import InputError
+from ns_abstract.jsonio import read_text
+
+_LIMIT = 64 << 20
+_TOKEN = re.compile(r'\s+|;[^\n]*|(?P<text>[()]|"[^"]*"|[^\s();"]+)|(?P<bad>.)', re.DOTALL)
+_VARIABLE = re.compile(r"([XY])_(\d+)")
+#: Most conjunctions that a file's assertions may multiply out to.
+_CONJUNCTIONS = 10_000
+_DEPTH = 200
+
+#: Coefficients of outputs by number, and a constant.
+_Linear = tuple[dict[int, float], float]
+#: ``rows @ y + offset <= 0`` for all rows of a list: one way to be unsafe.
+_Conjunction = list[_Linear]
+
+
+@dataclass(frozen=True)
+class UnsafeSet:
+    """Outputs y are unsafe if ``rows[g] @ y + offset[g] <= 0`` holds for every row of some group g.
+
+    Attributes:
+        rows: [k, n].
+        offset: [k].
+        groups: Row numbers of each group.
+        inputs: Number of assertions on inputs that were set aside.
+    """
+
+    rows: np.ndarray
+    offset: np.ndarray
+    groups: tuple[tuple[int, ...], ...]
+    inputs: int
+
+
+def load_vnnlib(path: Path, output_size: int) -> UnsafeSet:
+    """Read a VNN-LIB file.
+
+    Args:
+        path: The file.
+        output_size: Number of the network's outputs.
+
+    Raises:
+        InputError: The file cannot be read or says something that is not understood.
+    """
+    text = read_text(path, "VNN-LIB file", _LIMIT)
+    try:
+        return _parse(_expressions(text), output_size)
+    except InputError as error:
+        raise error.within(path) from None
+
+
+def _expressions(text: str) -> list[Any]:
+    """Nested lists of tokens."""
+    stack: list[list[Any]] = [[]]
+    for match in _TOKEN.finditer(text):
+        token = match["text"]
+        if match["bad"]:
+            line = text.count("\n", 0, match.start()) + 1
+            raise InputError(f"unexpected {match['bad']!r} in line {line}", fix="close the string or remove the sign")
+        if token == "(":
+            stack.append([])
+            if len(stack) > _DEPTH:
+                raise InputError(f"nested more than {_DEPTH} deep", fix="remove the nesting")
+        elif token == ")":
+            if len(stack) == 1:
+                line = text.count("\n", 0, match.start()) + 1
+                raise InputError(f"a bracket too many in line {line}", fix="remove it")
+            done = stack.pop()
+            stack[-1].append(done)
+        elif token:
+            stack[-1].append(token)
+    if len(stack) > 1:
+        raise InputError("a bracket is never closed", fix="add the missing )")
+    return stack[0]
+
+
+def _show(expression: Any) -> str:
+    text = f"({' '.join(map(_show, expression))})" if isinstance(expression, list) else str(expression)
+    return text if len(text) <= 60 else f"{text[:57]}..."
+
+
+def _fail(expression: Any, fix: str) -> InputError:
+    return InputError(f"not understood: {_show(expression)}", fix=fix)
+
+
+def _parse(expressions: list[Any], output_size: int) -> UnsafeSet:
+    declared: set[str] = set()
+    unsafe: list[_Conjunction] = [[]]
+    inputs = 0
+    for expression in expressions:
+        head = expression[0] if isinstance(expression, list) and expression else None
+        if head == "declare-const" and len(expression) == 3:
+            _, name, kind = expression
+            if not (isinstance(name, str) and _VARIABLE.fullmatch(name)) or kind != "Real":
+                raise _fail(expression, "declare X_0, X_1, ..., Y_0, Y_1, ... as Real")
+            declared.add(name)
+        elif head == "assert" and len(expression) == 2:
+            names = {name[0] for name in _names(expression[1])}
+            if names == {"X"}:
+                inputs += 1
+                continue
+            ways = _ways(expression[1], declared, output_size)
+            if len(unsafe) * len(ways) > _CONJUNCTIONS:
+                raise InputError(f"more than {_CONJUNCTIONS} combinations of cases", fix="use fewer assertions of (or")
+            unsafe = [[*old, *new] for old in unsafe for new in ways]
+        else:
+            raise _fail(expression, "use declare-const and assert of VNN-LIB version 1")
+    if not any(unsafe):
+        raise InputError("no assertion on an output", fix="assert which outputs are unsafe")
+    rows: list[np.ndarray] = []
+    offsets: list[float] = []
+    known: dict[tuple[Any, float], int] = {}
+    groups = []
+    for conjunction in unsafe:
+        group = []
+        for coefficients, constant in conjunction:
+            key = (tuple(sorted(coefficients.items())), constant)
+            if key not in known:
+                known[key] = len(rows)
+                row = np.zeros(output_size)
+                for index, value in coefficients.items():
+                    row[index] = value
+                rows.append(row)
+                offsets.append(constant)
+            group.append(known[key])
+        groups.append(tuple(group))
+    return UnsafeSet(np.array(rows), np.array(offsets), tuple(groups), inputs)
+
+
+def _names(expression: Any) -> set[str]:
+    """Variables of an expression."""
+    if isinstance(expression, list):
+        return {name for part in expression for name in _names(part)}
+    return {expression} if _VARIABLE.fullmatch(expression) else set()
+
+
+def _ways(expression: Any, declared: set[str], size: int) -> list[_Conjunction]:
+    """The expression as a disjunction of conjunctions."""
+    head = expression[0] if isinstance(expression, list) and expression else None
+    if head == "or" and len(expression) > 1:
+        return [way for part in expression[1:] for way in _ways(part, declared, size)]
+    if head == "and" and len(expression) > 1:
+        ways: list[_Conjunction] = [[]]
+        for part in expression[1:]:
+            more = _ways(part, declared, size)
+            if len(ways) * len(more) > _CONJUNCTIONS:
+                raise InputError(f"more than {_CONJUNCTIONS} combinations of cases", fix="use fewer nested (or")
+            ways = [[*old, *new] for old in ways for new in more]
+        return ways
+    if head in ("<=", ">=") and len(expression) == 3:
+        left, right = (_linear(part, declared, size) for part in expression[1:])
+        low, high = (left, right) if head == "<=" else (right, left)
+        return [[_sum(low, high, -1.0)]]
+    raise _fail(expression, "use <=, >=, and, or of version 1")
+
+
+def _sum(first: _Linear, second: _Linear, factor: float) -> _Linear:
+    coefficients = dict(first[0])
+    for index, value in second[0].items():
+        coefficients[index] = coefficients.get(index, 0.0) + factor * value
+    return coefficients, first[1] + factor * second[1]
+
+
+def _linear(expression: Any, declared: set[str], size: int) -> _Linear:
+    if isinstance(expression, str):
+        return _atom(expression, declared, size)
+    head, parts = (expression[0], expression[1:]) if expression else (None, [])
+    terms = [_linear(part, declared, size) for part in parts]
+    if head == "+" and terms:
+        total = terms[0]
+        for term in terms[1:]:
+            total = _sum(total, term, 1.0)
+        return total
+    if head == "-" and len(terms) == 1:
+        return _sum(({}, 0.0), terms[0], -1.0)
+    if head == "-" and terms:
+        total = terms[0]
+        for term in terms[1:]:
+            total = _sum(total, term, -1.0)
+        return total
+    if head == "*" and len(terms) == 2 and not all(term[0] for term in terms):
+        factor, other = (terms[0][1], terms[1]) if not terms[0][0] else (terms[1][1], terms[0])
+        return _sum(({}, 0.0), other, factor)
+    raise _fail(expression, "write a linear expression of outputs")
+
+
+def _atom(text: str, declared: set[str], size: int) -> _Linear:
+    match = _VARIABLE.fullmatch(text)
+    if match is None:
+        try:
+            value = float(text)
+        except ValueError:
+            raise _fail(text, "write a number or a variable such as Y_0") from None
+        if not np.isfinite(value):
+            raise _fail(text, "write a finite number")
+        return {}, value
+    if text not in declared:
+        raise InputError(f"{text} is not declared", fix=f"add (declare-const {text} Real)")
+    if match[1] == "X":
+        raise InputError(f"an assertion joins {text} with outputs", fix="assert inputs and outputs apart")
+    index = int(match[2])
+    if index >= size:
+        raise InputError(f"{text}: the network has the outputs Y_0 to Y_{size - 1}", fix="use the network's file")
+    return {index: 1.0}, 0.0

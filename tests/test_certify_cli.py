@@ -1,0 +1,682 @@
+"""``ns-abstract-certify`` from outside: verdicts that are attacked, exit codes, kills, engines, reports."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import os
+import re
+import signal
+import sqlite3
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import onnxruntime
+import pytest
+import torch
+from certifying import classifier, linear
+from conftest import Inputs, write_json
+
+from ns_abstract import certification
+from ns_abstract.certification import Certification, CertifySettings, examine_block
+from ns_abstract.cli import certify as certify_command
+from ns_abstract.cli.certify import Certify, certify
+from ns_abstract.demo.writing import write_demo
+from ns_abstract.engines import Here, Processes
+from ns_abstract.errors import InputError
+from ns_abstract.methods.splat.reference import Reference
+from ns_abstract.verify.network import OutputBounds
+
+MODULE = "ns_abstract.cli.certify"
+SIZE = 16
+RUNS = Path(os.environ.get("NS_ABSTRACT_SHARED", "../shared")) / "runs"
+PRE = {"resize": [SIZE, SIZE], "mean": [0.4, 0.45, 0.5], "std": [0.25, 0.25, 0.3]}
+SWEEP = {"version": 1, "translation": {"x": 0.15}}
+
+
+class Case:
+    """Files of one certification."""
+
+    def __init__(self, folder: Path, blobs: Inputs, net: Path, prop: Any, spec: Any = SWEEP) -> None:
+        folder.mkdir(exist_ok=True)
+        self.blobs, self.net = blobs, net
+        self.prop = write_json(folder / "prop.json", prop)
+        self.spec = None if spec is None else write_json(folder / "spec.json", spec)
+
+    def values(self, output: Path, **more: Any) -> dict[str, Any]:
+        found = {
+            "load_config": self.blobs.config, "camera_path_filename": self.blobs.path, "model": self.net,
+            "property": self.prop, "output_dir": output, "perturbation_filename": self.spec, "frames": (0,),
+            "workers": 1,
+        }  # fmt: skip
+        return found | more
+
+    def options(self, output: Path, **more: Any) -> list[str]:
+        found = []
+        for name, value in self.values(output, **more).items():
+            if value is None or value is False:
+                continue
+            found.append(f"--{name.replace('_', '-')}")
+            if value is not True:
+                found += map(str, value if isinstance(value, tuple) else [value])
+        return found
+
+    def run(self, output: Path, **more: Any) -> dict[str, Any]:
+        assert certify(Certify(**self.values(output, **more))) == 0
+        return report(output)
+
+    @property
+    def job(self) -> Certification:
+        return Certification(CertifySettings(self.blobs.config, self.blobs.path, self.net, self.prop, self.spec))
+
+
+def report(folder: Path) -> dict[str, Any]:
+    return json.loads((folder / "report.json").read_text())
+
+
+def cells(folder: Path) -> list[tuple[Any, ...]]:
+    with sqlite3.connect(folder / "cells.sqlite") as base:
+        rows = base.execute("SELECT frame, lower, upper, verdict, margin, counterexample FROM cells").fetchall()
+    return sorted(rows, key=lambda row: (row[0], json.loads(row[1])))
+
+
+def environment() -> dict[str, str]:
+    return os.environ | {"PYTHONPATH": str(Path(certify_command.__file__).resolve().parents[2])}
+
+
+def start(options: list[str], **more: Any) -> subprocess.Popen[str]:
+    return subprocess.Popen(
+        [sys.executable, "-m", MODULE, *options], text=True, env=environment(), stderr=subprocess.PIPE, **more
+    )
+
+
+@pytest.fixture(scope="session")
+def net(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return classifier(tmp_path_factory.mktemp("net") / "net.onnx", SIZE)
+
+
+@pytest.fixture(scope="session")
+def bright(blobs: Inputs, net: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, float, float]:
+    """A network ``y = (contrast, threshold)`` whose sign flips inside the set, and the range of the contrast."""
+    folder = tmp_path_factory.mktemp("bright")
+    row = np.zeros((3, SIZE, SIZE))
+    row[:, :, : SIZE // 2], row[:, :, SIZE // 2 :] = 1.0, -1.0
+    rows = np.stack([row.reshape(-1), 0.0 * row.reshape(-1)]) / row.size
+    file = linear(folder / "net.onnx", rows, np.zeros(2), SIZE)
+    case = Case(folder / "case", blobs, file, {"type": "classification", "label": 0, "preprocess": PRE})
+    pictures = case.job.pictures(0)
+    images = np.stack([pictures.image(np.array([x])) for x in np.linspace(-0.15, 0.15, 31)])
+    contrast = case.job.model.outputs(images)[:, 0]
+    threshold = float(np.quantile(contrast, 0.4))
+    return linear(folder / "net.onnx", rows, np.array([0.0, threshold]), SIZE), float(contrast.min()), threshold
+
+
+@pytest.fixture(scope="session")
+def planted(blobs: Inputs, bright: tuple[Path, float, float], tmp_path_factory: pytest.TempPathFactory) -> Case:
+    folder = tmp_path_factory.mktemp("planted")
+    return Case(folder, blobs, bright[0], {"type": "classification", "label": 0, "preprocess": PRE})
+
+
+@pytest.fixture(scope="session")
+def finished(planted: Case, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """An uninterrupted run of the planted violation."""
+    folder = tmp_path_factory.mktemp("finished") / "out"
+    planted.run(folder)
+    return folder
+
+
+def attack(case: Case, folder: Path, frame: int = 0, poses: int = 6) -> tuple[int, int, float]:
+    """Certified cells attacked by two renderers: random poses, ends, and descent through renderer and network.
+
+    Returns:
+        Comparisons, violations, and the least slack between a margin found and the one proved.
+    """
+    job = case.job
+    pictures = job.pictures(frame)
+    claim = job.claim(pictures)
+    reference = Reference(job.job.scene, job.job.rasteriser)
+    names = [name for name, _ in job.parameters]
+    order = [names.index(name) for name in pictures.box.names]
+    session = onnxruntime.InferenceSession(str(case.net), providers=["CPUExecutionProvider"])
+    rng = np.random.default_rng(7)
+    comparisons, violations, slack = 0, 0, np.inf
+
+    def compare(image: np.ndarray, values: np.ndarray, proved: float) -> None:
+        nonlocal comparisons, violations, slack
+        inputs = job.property.preprocess.apply(torch.from_numpy(image.astype(np.float32))[None]).numpy()
+        outputs = torch.from_numpy(session.run(None, {session.get_inputs()[0].name: inputs})[0]).double().reshape(1, -1)
+        margin = float(claim.margin(outputs, torch.from_numpy(values)[None])[0])
+        comparisons += 1
+        violations += not margin >= proved
+        slack = min(slack, margin - proved)
+
+    for index, lower, upper, verdict, proved, _ in cells(folder):
+        if verdict != "certified" or index != frame:
+            continue
+        low, high = (np.array(json.loads(ends))[order] for ends in (lower, upper))
+        values = [low, high, *rng.uniform(low, high, (poses, len(low)))] if len(low) else [low]
+        middle = torch.from_numpy(0.5 * (low + high)).requires_grad_(True)
+        if len(low):
+            margin = claim.margin(job.model.differentiable(pictures.twin(middle)[None]), middle[None])[0]
+            (slope,) = torch.autograd.grad(margin, middle)
+            values.append(np.where(slope.numpy() > 0, low, high))
+        for number, pose in enumerate(values):
+            compare(pictures.image(pose), pose, proved)
+            if number < 2:
+                image = reference.image(pictures.frame.camera, torch.from_numpy(pictures.pose_set.pose(pose)))
+                compare(image.detach().numpy(), pose, proved)
+    return comparisons, violations, slack
+
+
+# ---------------------------------------------------------------- verdicts
+
+
+def test_planted_violation(planted: Case, finished: Path, bright: tuple[Path, float, float]) -> None:
+    """The set holds poses whose images break the property: they are found, and no cell with one is certified."""
+    document = report(finished)
+    assert document["verdict"] == "falsified" and document["state"] == "done"
+    covered = document["coverage"]
+    assert sum(covered[k] for k in ("certified", "falsified", "unknown")) == pytest.approx(1.0)
+    assert covered["certified"] > 0.3 and covered["falsified"] > 0.1 and covered["unknown"] < 0.02
+    pictures = planted.job.pictures(0)
+    broken = [
+        x for x in np.linspace(-0.15, 0.15, 301)
+        if not np.subtract(*planted.job.model.outputs(pictures.image(np.array([x]))[None])[0]) > 0.0
+    ]  # fmt: skip
+    assert broken
+    for x in broken:
+        kinds = {
+            row[3] for row in cells(finished) if json.loads(row[1])[0] <= x <= json.loads(row[2])[0]
+        }
+        assert "certified" not in kinds
+
+
+def test_every_certified_cell_is_attacked(planted: Case, finished: Path) -> None:
+    comparisons, violations, slack = attack(planted, finished)
+    assert comparisons > 100 and violations == 0
+    # the proofs are not idle: somewhere the margin found comes close to the one proved
+    assert 0.0 <= slack < 0.05
+
+
+def test_counterexamples_are_stored_and_break_the_property(planted: Case, finished: Path) -> None:
+    rows = [row for row in cells(finished) if row[3] == "falsified"]
+    files = sorted((finished / "counterexamples").iterdir())
+    assert len(files) == len(rows) > 0
+    pictures = planted.job.pictures(0)
+    stored = set()
+    for file in files:
+        with np.load(file, allow_pickle=False) as found:
+            np.testing.assert_array_equal(pictures.image(found["values"]), found["image"])
+            np.testing.assert_array_equal(planted.job.model.outputs(found["image"][None])[0], found["outputs"])
+            assert found["outputs"][0] <= found["outputs"][1] and float(found["margin"]) <= 0.0
+            np.testing.assert_array_equal(pictures.pose_set.pose(found["values"]), found["camera_to_world"])
+            assert list(found["names"]) == ["x"]
+            stored.add(tuple(found["values"].tolist()))
+    assert stored == {tuple(json.loads(row[5])) for row in rows}
+
+
+def test_random_network(blobs: Inputs, net: Path, tmp_path: Path) -> None:
+    """Two parameters, a network with two layers of ReLU; the label is the one of the middle."""
+    spec = {"version": 1, "translation": {"x": 0.004}, "rotation": {"yaw": 0.004}}
+    case = Case(tmp_path / "case", blobs, net, {"type": "classification", "label": 0, "preprocess": PRE}, spec)
+    pictures = case.job.pictures(0)
+    label = int(case.job.model.outputs(pictures.image(pictures.box.middle)[None])[0].argmax())
+    case = Case(tmp_path / "case", blobs, net, {"type": "classification", "label": label, "preprocess": PRE}, spec)
+    document = case.run(tmp_path / "out", time_budget=60.0)
+    assert document["coverage"]["certified"] > 0.2
+    comparisons, violations, _ = attack(case, tmp_path / "out", poses=3)
+    assert comparisons and violations == 0
+
+
+def test_unsound_network_bounds_are_caught_by_the_attack(
+    planted: Case, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The attack of these tests can fail: bounds raised a little are noticed."""
+    real = certification.bound_outputs
+
+    def raised(*arguments: Any, **more: Any) -> OutputBounds:
+        found = real(*arguments, **more)
+        return OutputBounds(found.lower + 2e-2, found.a, found.b + 2e-2)
+
+    monkeypatch.setattr(certification, "bound_outputs", raised)
+    certification._opened.clear()
+    try:
+        assert certify(Certify(**planted.values(tmp_path / "out"))) == 0
+    except RuntimeError as error:
+        # its own attack noticed it first
+        assert "internal error" in str(error)
+        return
+    finally:
+        certification._opened.clear()
+    assert attack(planted, tmp_path / "out")[1] > 0
+
+
+@pytest.mark.parametrize("kind", ["nan", "infinite", "crossed", "raises"])
+def test_broken_bounds_never_certify(kind: str, planted: Case, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    real = certification.bound_outputs
+
+    def broken(network: Any, images: Any, *arguments: Any, **more: Any) -> OutputBounds:
+        if kind == "raises":
+            raise ArithmeticError("planted")
+        if kind == "crossed":
+            object.__setattr__(images, "lower", images.upper + 1.0)
+            return real(network, images, *arguments, **more)
+        value = np.nan if kind == "nan" else np.inf
+        found = real(network, images, *arguments, **more)
+        return OutputBounds(np.full_like(found.lower, value), found.a * value, found.b * value)
+
+    monkeypatch.setattr(certification, "bound_outputs", broken)
+    certification._opened.clear()
+    assert certify(Certify(**planted.values(tmp_path / "out", time_budget=5.0))) == 0
+    certification._opened.clear()
+    document = report(tmp_path / "out")
+    assert document["coverage"]["certified"] == 0.0
+    assert {row[3] for row in cells(tmp_path / "out")} <= {"falsified", "unknown"}
+
+
+def test_single_poses_and_paths_without_a_perturbation(
+    blobs: Inputs, bright: tuple[Path, float, float], tmp_path: Path
+) -> None:
+    prop = {"type": "classification", "label": 0, "preprocess": PRE}
+    case = Case(tmp_path / "case", blobs, bright[0], prop, None)
+    document = case.run(tmp_path / "out", frames=None)
+    assert len(document["frames"]) == 3
+    found = cells(tmp_path / "out")
+    assert [row[0] for row in found] == [0, 1, 2]
+    assert {(row[1], row[2]) for row in found} == {("[]", "[]")}
+    assert {row[3] for row in found} <= {"certified", "falsified"}
+    for row in found:
+        pictures = case.job.pictures(row[0])
+        margin = -np.diff(case.job.model.outputs(pictures.image(np.zeros(0))[None])[0])[0]
+        assert (row[3] == "certified") == (margin > 0.0)
+        assert row[4] == pytest.approx(margin, abs=2e-3)
+    assert "one pose" in (tmp_path / "out" / "report.html").read_text()
+
+
+def test_segments_have_one_table_of_parameters(
+    blobs: Inputs, bright: tuple[Path, float, float], tmp_path: Path
+) -> None:
+    """The last entry of a path has no segment behind it; its cells are listed with the parameter at 0."""
+    spec = {"version": 1, "sweep": "segments", "translation": {"z": 0.001}}
+    case = Case(
+        tmp_path / "case", blobs, bright[0], {"type": "classification", "label": 0, "preprocess": PRE}, spec
+    )
+    case.run(tmp_path / "out", frames=(1, 2), time_budget=2.0)
+    with sqlite3.connect(tmp_path / "out" / "cells.sqlite") as base:
+        assert [row[1] for row in base.execute("SELECT * FROM parameters ORDER BY position")] == ["z", "segment"]
+    sides = [(row[0], json.loads(row[1]), json.loads(row[2])) for row in cells(tmp_path / "out")]
+    assert {frame for frame, *_ in sides} == {1, 2}
+    assert all(low[1] == high[1] == 0.0 for frame, low, high in sides if frame == 2)
+
+
+def test_partitions(
+    blobs: Inputs, bright: tuple[Path, float, float], tmp_path: Path
+) -> None:
+    prop = {"type": "classification", "label": 0, "preprocess": PRE, "partitions": 300}
+    case = Case(tmp_path / "case", blobs, bright[0], prop)
+    document = case.run(tmp_path / "out")
+    parts = document["partitions"]
+    assert parts["partitions"] == 300 and 0.3 < parts["PCP-V"] <= parts["PCP-S"] < 1.0
+    width = 0.3 / 300
+    pictures = case.job.pictures(0)
+    right = 0
+    for number in range(300):
+        x = [-0.15 + width * (number + t) for t in (0.0, 0.5, 1.0)]
+        y = case.job.model.outputs(np.stack([pictures.image(np.array([v]).clip(-0.15, 0.15)) for v in x]))
+        right += bool((y[:, 0] > y[:, 1]).all())
+    assert abs(right / 300 - parts["PCP-S"]) <= 2.5 / 300
+    for _, lower, upper, verdict, *_ in cells(tmp_path / "out"):
+        size = (json.loads(upper)[0] - json.loads(lower)[0]) / width
+        assert round(size) == pytest.approx(size) and (verdict == "certified" or round(size) == 1)
+
+
+# ---------------------------------------------------------------- long runs
+
+
+def test_same_again(planted: Case, finished: Path, tmp_path: Path) -> None:
+    planted.run(tmp_path / "out")
+    assert cells(tmp_path / "out") == cells(finished)
+
+
+def test_killed_run_resumed_equals_an_uninterrupted_one(planted: Case, finished: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "out"
+    kills = 0
+    for round_ in range(40):
+        process = start(planted.options(folder, resume=round_ > 0))
+        deadline = time.monotonic() + 120
+        known = settled(folder)
+        # killed as soon as it has stored something new
+        while process.poll() is None and settled(folder) < known + 2 and time.monotonic() < deadline:
+            time.sleep(0.02)
+        if process.poll() is not None:
+            assert process.returncode == 0, process.stderr and process.stderr.read()
+            break
+        process.send_signal(signal.SIGKILL)
+        process.wait()
+        kills += 1
+        if kills == 3:
+            assert certify(Certify(**planted.values(folder, resume=True))) == 0
+            break
+    assert kills >= 2
+    assert cells(folder) == cells(finished)
+    one, other = report(folder), report(finished)
+    for key in ("verdict", "coverage", "sampled"):
+        assert one[key] == other[key]
+    assert one["frames"] == other["frames"]
+
+
+def settled(folder: Path) -> int:
+    """Blocks stored so far, read without disturbing the command: pages of the write-ahead log."""
+    return sum((folder / f"cells.sqlite{suffix}").stat().st_size // 16384 for suffix in ("", "-wal")
+               if (folder / f"cells.sqlite{suffix}").exists())  # fmt: skip
+
+
+def test_interrupt_leaves_what_is_finished(planted: Case, finished: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "out"
+    process = start(planted.options(folder, workers=2))
+    deadline = time.monotonic() + 120
+    while process.poll() is None and settled(folder) < 3 and time.monotonic() < deadline:
+        time.sleep(0.02)
+    process.send_signal(signal.SIGINT)
+    _, said = process.communicate(timeout=120)
+    if process.returncode == 0:
+        pytest.skip("the command was quicker than the signal")
+    assert process.returncode == 3 and "Traceback" not in said, said
+    assert report(folder)["state"] == "interrupted"
+    covered = sum(json.loads(row[2])[0] - json.loads(row[1])[0] for row in cells(folder))
+    assert covered == pytest.approx(0.3)
+    planted.run(folder, resume=True)
+    assert cells(folder) == cells(finished)
+
+
+def test_budget_ends_with_a_result_and_is_continued(planted: Case, finished: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "out"
+    assert certify(Certify(**planted.values(folder, time_budget=1e-6))) == 0
+    first = report(folder)
+    assert first["state"] == "budget" and first["verdict"] != "certified"
+    assert first["coverage"]["not_examined"] > 0.0 and first["frames"][0]["cells"]["open"] > 0
+    # a second frame without any result is not done
+    assert certify(Certify(**planted.values(tmp_path / "two", time_budget=1e-6, frames=(0, 1)))) == 3
+    planted.run(folder, resume=True)
+    assert cells(folder) == cells(finished)
+
+
+def test_resume_refuses_other_inputs(planted: Case, net: Path, finished: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "out"
+    certify(Certify(**planted.values(folder, time_budget=1e-6)))
+    before = cells(folder)
+    for change in ({"model": net}, {"arithmetic": "real"}, {"perturbation_filename": None}):
+        with pytest.raises(InputError) as caught:
+            certify(Certify(**planted.values(folder, resume=True, **change)))
+        assert caught.value.field == "--resume"
+    assert [row[:3] for row in cells(folder)] == [row[:3] for row in before]
+
+
+def test_processes_equal_one_process(planted: Case, finished: Path, tmp_path: Path) -> None:
+    planted.run(tmp_path / "out", workers=2)
+    assert cells(tmp_path / "out") == cells(finished)
+
+
+def sleep_or_die(marker: str, number: int) -> int:
+    """Kills its process the first time it is asked for number 3."""
+    file = Path(marker)
+    if number == 3 and not file.exists():
+        file.write_text("died")
+        os.kill(os.getpid(), signal.SIGKILL)
+    return number * number
+
+
+def die(number: int) -> int:
+    os._exit(7)
+
+
+def test_killed_worker_loses_nothing_and_counts_nothing_twice(tmp_path: Path) -> None:
+    engine = Processes(2)
+    try:
+        for number in range(8):
+            engine.submit(number, sleep_or_die, str(tmp_path / "marker"), number)
+        found: list[tuple[int, int]] = []
+        deadline = time.monotonic() + 120
+        while len(found) < 8 and time.monotonic() < deadline:
+            found += engine.collect(1.0)
+        assert sorted(found) == [(n, n * n) for n in range(8)] and (tmp_path / "marker").exists()
+        assert engine.collect(0.1) == []
+    finally:
+        engine.close()
+
+
+def test_worker_that_always_dies_is_an_error() -> None:
+    engine = Processes(1)
+    try:
+        engine.submit(0, die, 0)
+        with pytest.raises(InputError, match="ended 4 times"):
+            for _ in range(100):
+                engine.collect(1.0)
+    finally:
+        engine.close()
+
+
+def test_engine_here() -> None:
+    engine = Here()
+    engine.submit(1, divmod, 7, 2)
+    assert engine.collect(0.0) == [(1, (3, 1))] and engine.collect(0.0) == []
+
+
+needs_dask = pytest.mark.skipif(importlib.util.find_spec("distributed") is None, reason="dask is not installed")
+
+
+@needs_dask
+def test_two_dask_workers_equal_one_process(planted: Case, finished: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "out"
+    process = start(planted.options(folder, workers=2, engine="dask"), cwd=tmp_path)
+    _, said = process.communicate(timeout=400)
+    assert process.returncode == 0, said
+    assert cells(folder) == cells(finished)
+
+
+@needs_dask
+def test_dask_worker_killed(planted: Case, finished: Path, tmp_path: Path) -> None:
+    from ns_abstract.engines import Cluster, connected
+    from ns_abstract.verify.store import Store
+
+    job = planted.job
+    settings, grid = job.settings.absolute(), job.grid(0)
+    store = Store(tmp_path / "out", job.fingerprint, job.parameters, job.fixed, resume=False)
+    store.begin(0, grid, job.first_blocks(grid))
+    with connected(None, 2) as client:
+        engine = Cluster(client)
+        flying: dict[int, Any] = {}
+        killed = False
+        while True:
+            for block in store.pending(set(flying), engine.capacity - len(flying)):
+                flying[block.number] = block
+                engine.submit(block.number, examine_block, settings, job.fingerprint, 0, grid, block.cells)
+            if not flying:
+                break
+            if not killed and store.count:
+                killed = True
+                os.kill(next(iter(client.run(os.getpid).values())), signal.SIGKILL)
+            for number, findings in engine.collect(0.5):
+                assert store.settle(flying.pop(number), findings, grid)
+        engine.close()
+    assert killed
+    store.close()
+    assert cells(tmp_path / "out") == cells(finished)
+
+
+@needs_dask
+def test_cluster_on_this_machine_keeps_torch_quick() -> None:
+    from ns_abstract.engines import connected
+
+    with connected(None, 1) as client:
+        (found,) = client.run(lambda: os.environ.get("MALLOC_TRIM_THRESHOLD_")).values()
+        assert found is None
+        (threads,) = client.run(lambda: os.environ.get("OMP_NUM_THREADS")).values()
+        assert threads == "1"
+
+
+# ---------------------------------------------------------------- reports
+
+
+def test_report(planted: Case, finished: Path) -> None:
+    document = report(finished)
+    for key in (
+        "version", "verdict", "guarantee", "guarantee_text", "network_guarantee", "renderer", "scene", "model",
+        "property", "coverage", "sampled", "frames", "trace", "seconds", "plan", "settings", "fingerprint", "command",
+    ):  # fmt: skip
+        assert key in document, key
+    assert document["guarantee"] == "float32-sound" and document["model"]["input"] == [3, SIZE, SIZE]
+    assert document["property"]["type"] == "classification"
+    (frame,) = document["frames"]
+    assert frame["parameters"] == [{"name": "x", "unit": "normalised units", "lower": -0.15, "upper": 0.15}]
+    assert frame["least_margin"] > 0.0 and frame["counterexamples"][0]["margin"] <= 0.0
+    assert frame["counterexamples"][0]["values"].keys() == {"x"}
+    volumes = dict.fromkeys(("certified", "falsified", "unknown"), 0.0)
+    for _, lower, upper, verdict, *_ in cells(finished):
+        volumes[verdict] += (json.loads(upper)[0] - json.loads(lower)[0]) / 0.3
+    for kind, volume in volumes.items():
+        assert document["coverage"][kind] == pytest.approx(volume)
+    assert document["trace"][-1]["certified"] == pytest.approx(document["coverage"]["certified"])
+
+
+def test_page(finished: Path) -> None:
+    page = (finished / "report.html").read_text()
+    assert page.index("Falsified; certified on") < page.index("<h2>")
+    for part in (
+        "<svg", 'class="certified"', 'class="falsified"', "Counterexamples", "What is guaranteed", "data:image/png",
+        "not its rounding to 8 bits", "every float32", "worst certified", "cells.sqlite", "How to reproduce",
+    ):  # fmt: skip
+        assert part in page, part
+    assert not re.search(r"<script|https?://", page)
+
+
+def test_ring_strip_plane_and_bars() -> None:
+    from ns_abstract.report import certificate_page as page
+
+    covered = {"certified": 0.5, "falsified": 0.25, "unknown": 0.25, "not_examined": 0.0}
+
+    def entry(index: int, *names: str) -> dict[str, Any]:
+        sides = [{"name": n, "unit": "rad", "lower": 0.0, "upper": 6.0} for n in names]
+        return {"index": index, "parameters": sides, "coverage": covered}
+
+    def rows(d: int) -> list[dict[str, Any]]:
+        kinds = ("certified", "certified", "falsified", "unknown")
+        return [
+            {"lower": [1.5 * k] + [0.0] * (d - 1), "upper": [1.5 * (k + 1)] + [6.0] * (d - 1), "verdict": kind}
+            for k, kind in enumerate(kinds)
+        ]
+
+    frames = [entry(0, "azimuth"), entry(1, "x"), entry(2, "x", "y"), entry(3, "x", "y", "z")]
+    drawn = page._map({"frames": frames}, {k: rows(max(1, k)) for k in range(4)})
+    assert drawn.count("<svg") == 4
+    for title in ("Verdicts around the orbit", "Verdicts along x", "Verdicts over two parameters", "Parts of each"):
+        assert title in drawn
+    # neighbours of one verdict are one span
+    assert page._merged(rows(1), 0) == [(0.0, 3.0, "certified"), (3.0, 4.5, "falsified"), (4.5, 6.0, "unknown")]
+    assert [page.percent(p) for p in (1.0, 0.999999, 1e-9, 0.0, 0.12345)] == [
+        "100.00 %", "> 99.99 %", "< 0.01 %", "0.00 %", "12.35 %",
+    ]  # fmt: skip
+
+
+def test_foreign_text_is_escaped(
+    blobs: Inputs, bright: tuple[Path, float, float], tmp_path: Path
+) -> None:
+    net = tmp_path / "<b>net&.onnx"
+    net.write_bytes(bright[0].read_bytes())
+    prop = {"type": "classification", "label": 0, "preprocess": PRE}
+    Case(tmp_path / "case", blobs, net, prop, None).run(tmp_path / "out")
+    page = (tmp_path / "out" / "report.html").read_text()
+    assert "<b>net&.onnx" not in page and "&lt;b&gt;net&amp;.onnx" in page
+
+
+# ---------------------------------------------------------------- the command line
+
+
+@pytest.fixture
+def call(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Callable[[list[str]], tuple[int, str]]:
+    def run(options: list[str]) -> tuple[int, str]:
+        monkeypatch.setattr(sys, "argv", ["command", *options])
+        capsys.readouterr()
+        with pytest.raises(SystemExit) as leave:
+            certify_command.main()
+        return int(leave.value.code or 0), capsys.readouterr().err
+
+    return run
+
+
+MISTAKES: dict[str, tuple[dict[str, Any], tuple[str, ...]]] = {
+    "budget": ({"time_budget": -1}, ("--time-budget",)),
+    "workers": ({"workers": 0}, ("--workers",)),
+    "memory": ({"memory_limit": -1}, ("--memory-limit",)),
+    "address": ({"scheduler_address": "h:1"}, ("--scheduler-address", "--engine dask")),
+    "frame": ({"frames": (9,)}, ("--frames",)),
+    "no model": ({"model": Path("none.onnx")}, ("none.onnx",)),
+    "model of another kind": ({"model": Path(__file__)}, ("test_certify_cli.py",)),
+    "no property": ({"property": Path("none.json")}, ("none.json", "property file")),
+    "no run": ({"load_config": Path("none.yml")}, ("none.yml",)),
+}
+
+
+@pytest.mark.parametrize("name", MISTAKES)
+def test_mistake_is_one_line(name: str, planted: Case, call: Callable[..., tuple[int, str]], tmp_path: Path) -> None:
+    changes, fragments = MISTAKES[name]
+    code, said = call(planted.options(tmp_path / "out", **changes))
+    assert code == 2 and said.count("\n") == 1 and said.startswith("error: ") and "; " in said, said
+    for fragment in fragments:
+        assert fragment in said
+
+
+def test_size_that_does_not_fit(
+    blobs: Inputs, net: Path, call: Callable[..., tuple[int, str]], tmp_path: Path
+) -> None:
+    case = Case(tmp_path / "case", blobs, net, {"type": "classification", "label": 0})
+    code, said = call(case.options(tmp_path / "out"))
+    assert code == 2 and "prop.json" in said and "preprocess.resize" in said and f"[{SIZE}, {SIZE}]" in said
+
+
+def test_partition_that_does_not_fit(
+    blobs: Inputs, net: Path, call: Callable[..., tuple[int, str]], tmp_path: Path
+) -> None:
+    prop = {"type": "classification", "label": 0, "preprocess": PRE, "partitions": [3, 4]}
+    code, said = call(Case(tmp_path / "case", blobs, net, prop).options(tmp_path / "out"))
+    assert code == 2 and "prop.json: partitions" in said
+
+
+def test_help_is_quick_and_light() -> None:
+    shown = subprocess.run(
+        [sys.executable, "-X", "importtime", "-m", MODULE, "--help"],
+        capture_output=True, text=True, check=True, env=environment(), timeout=60,
+    )  # fmt: skip
+    for option in ("--model", "--property", "--time-budget", "--engine", "--scheduler-address", "--resume"):
+        assert option in shown.stdout
+    loaded = {line.rpartition("|")[2].strip().split(".")[0] for line in shown.stderr.splitlines()}
+    assert not loaded & {"torch", "numba", "onnx", "onnxruntime", "numpy", "matplotlib"}
+
+
+# ---------------------------------------------------------------- whole scenes
+
+
+def test_demo_from_end_to_end(tmp_path: Path) -> None:
+    """The demo's orbit, a random network, the label of the middle: some part is certified and nothing wrongly."""
+    config, files = write_demo(tmp_path / "demo")
+    net = classifier(tmp_path / "net.onnx", 32, seed=3, gain=2.0)
+    pre = {"resize": [32, 32], "mean": [0.5, 0.5, 0.5], "std": [0.25, 0.25, 0.25]}
+    orbit = json.loads(files["orbit"].read_text())
+    orbit["perturbation"]["orbit"]["azimuth"] = [0.0, 0.02]
+    path = write_json(tmp_path / "orbit.json", orbit)
+    inputs = Inputs(config, path, tmp_path / "unused")
+    prop = {"type": "classification", "label": 0, "preprocess": pre}
+    case = Case(tmp_path / "case", inputs, net, prop, None)
+    pictures = case.job.pictures(0)
+    label = int(case.job.model.outputs(pictures.image(pictures.box.middle)[None])[0].argmax())
+    case = Case(tmp_path / "case", inputs, net, prop | {"label": label}, None)
+    document = case.run(tmp_path / "out", time_budget=60.0)
+    assert document["coverage"]["certified"] > 0.0
+    comparisons, violations, _ = attack(case, tmp_path / "out", poses=2)
+    assert comparisons and violations == 0
+    assert "Verdicts around the orbit" in (tmp_path / "out" / "report.html").read_text()
