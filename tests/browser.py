@@ -48,9 +48,7 @@ class Browser:
         program = chromium()
         assert program is not None
         command = [program, *_FLAGS, f"--user-data-dir={self.profile}", f"--window-size={self.size[0]},{self.size[1]}"]
-        self.process = subprocess.Popen(
-            [*command, "about:blank"], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
-        )
+        self.process = subprocess.Popen([*command, "about:blank"], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
         try:
             note = self.profile / "DevToolsActivePort"
             until(lambda: note.exists() and note.read_text().count("\n"), 60, "Chromium's start")

@@ -75,7 +75,7 @@ def view(options: View) -> int:
             f"the package {error.name} is missing", field="nerfstudio", fix="pip install 'ns-abstract[nerfstudio]'"
         ) from None
     try:
-        serve(options)
+        serve(options.load_config, options.vis, vars(options.viewer))
     except KeyboardInterrupt:
         # the way to end a viewer
         pass

@@ -98,18 +98,13 @@ class AbstractOutputs(_Base):
         # the viewer follows attributes of modules: a plain reference from the panel would lead it in circles
         here = weakref.ref(self)
 
-        def model() -> AbstractOutputs:
-            found = here()
-            assert found is not None
-            return found
-
         self.abstract = AbstractPanel(
             options.radii,
             options.viewer_seconds,
-            attached=lambda: model()._attached(),
-            refine=lambda seconds: model()._background.more(seconds),
+            attached=lambda: (model := here()) and model._attached(),
+            refine=lambda seconds: (model := here()) and model._background.more(seconds),
         )
-        self._background = Background(lambda: model()._news())
+        self._background = Background(lambda: (model := here()) and model._news())
         self._source: Source | None = None
         self._evaluating = False
         self._problems: list[str] | None = None
@@ -184,4 +179,3 @@ class AbstractOutputs(_Base):
             metrics["abstract_mpg_witness"] = float(witness.mean())
             images["abstract"] = torch.cat([outputs["abstract_lower"], outputs["abstract_upper"]], dim=1)
         return metrics, images
-

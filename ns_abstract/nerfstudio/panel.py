@@ -31,15 +31,15 @@ from ns_abstract.sets.perturbation import ROTATIONS, TRANSLATIONS
 from ns_abstract.viewer.background import Status
 from ns_abstract.viewer.views import Snapshot, View
 
-#: Right ends of the sliders: normalised units, and radians.
-MOST_TRANSLATION, MOST_ROTATION = 0.1, 0.1
+#: Right ends of the sliders, in thousandths.
+_MOST = 100.0
 _HINTS = {
-    "x": "sideways, scene units",
-    "y": "up and down, scene units",
-    "z": "forward and back, scene units",
-    "yaw": "turn left and right, radians",
-    "pitch": "look up and down, radians",
-    "roll": "tilt, radians",
+    "x": "sideways, thousandths of a scene unit",
+    "y": "up and down, thousandths of a scene unit",
+    "z": "forward and back, thousandths of a scene unit",
+    "yaw": "turn left and right, milliradians",
+    "pitch": "look up and down, milliradians",
+    "roll": "tilt, milliradians",
 }
 
 
@@ -71,7 +71,7 @@ class Attached(ViewerControl):
         attached: Called once, when the viewer is there.
     """
 
-    def __init__(self, attached: Callable[[], None]) -> None:
+    def __init__(self, attached: Callable[[], object]) -> None:
         self._attached = attached
         self._present = threading.Event()
 
@@ -115,20 +115,19 @@ class AbstractPanel(torch.nn.Module):
         self,
         radii: dict[str, float],
         seconds: float,
-        attached: Callable[[], None],
-        refine: Callable[[float], None],
+        attached: Callable[[], object],
+        refine: Callable[[float], object],
     ) -> None:
         super().__init__()
         self._refine = refine
         self._last: View | None = None
         self._figures = Figures("Abstract images: no view yet")
         self._sliders: dict[str, ViewerSlider] = {}
-        for names, most in ((TRANSLATIONS, MOST_TRANSLATION), (ROTATIONS, MOST_ROTATION)):
-            for name in names:
-                start = radii.get(name, 0.0)
-                self._sliders[name] = ViewerSlider(
-                    f"± {name}", start, 0.0, max(most, start), 0.001, hint=f"Radius of the set: {_HINTS[name]}"
-                )
+        for name in (*TRANSLATIONS, *ROTATIONS):
+            start = 1000.0 * radii.get(name, 0.0)
+            self._sliders[name] = ViewerSlider(
+                f"± {name}", start, 0.0, max(_MOST, start), 0.1, hint=f"Radius of the set: {_HINTS[name]}"
+            )
         self._seconds = ViewerNumber("seconds", seconds, hint="Time for every view, and for every press of refine")
         self._file = ViewerText("file", "", hint="Where to write the camera with its set; empty: in the run's folder")
         self.control = Attached(attached)
@@ -151,8 +150,8 @@ class AbstractPanel(torch.nn.Module):
 
     @property
     def radii(self) -> dict[str, float]:
-        """What the sliders say."""
-        return {name: float(slider.value) for name, slider in self._sliders.items()}
+        """What the sliders say, in scene units and radians."""
+        return {name: float(slider.value) / 1000.0 for name, slider in self._sliders.items()}
 
     @property
     def seconds(self) -> float:

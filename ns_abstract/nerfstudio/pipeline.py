@@ -32,7 +32,7 @@ class AbstractPipeline(VanillaPipeline):
         # "val" is what ns-train asks for
         evaluating = test_mode != "val"
         parser = getattr(config.datamanager, "dataparser", None)
-        if evaluating and hasattr(parser, "load_3D_points"):
+        if evaluating and parser is not None and hasattr(parser, "load_3D_points"):
             # the points would need open3d, and the checkpoint replaces them
             parser.load_3D_points = False
         with lpips_weights(download=not evaluating):

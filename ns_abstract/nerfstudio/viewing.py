@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import tempfile
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any, Literal
 
 import numpy as np
 import yaml
@@ -26,26 +26,28 @@ from ns_abstract.nerfstudio.nerf import AbstractNerfModelConfig
 from ns_abstract.nerfstudio.pipeline import AbstractPipeline
 from ns_abstract.nerfstudio.splat import AbstractSplatfactoModelConfig
 
-if TYPE_CHECKING:
-    from ns_abstract.cli.viewer import View
-
 _FIX_DATA = "start the command in the folder that ns-train was started in, or put the data set back"
 
 
-def view(options: View) -> None:
+def view(load_config: Path, vis: Literal["viewer", "viewer_legacy"], options: dict[str, Any]) -> None:
     """Open the run and serve the viewer until the process is interrupted.
+
+    Args:
+        load_config: config.yml, or a .ply.
+        vis: Which of nerfstudio's viewers.
+        options: Of its ``ViewerConfig``.
 
     Raises:
         InputError: The run cannot be opened.
     """
     with tempfile.TemporaryDirectory(prefix="ns-abstract-viewer-") as scratch:
-        config_file = options.load_config
+        config_file = load_config
         if config_file.suffix.lower() == ".ply":
             config_file = run_of_ply(config_file, Path(scratch))
         config, pipeline, step = open_run(config_file)
         chunk = config.viewer.num_rays_per_chunk
-        config.vis = options.vis
-        config.viewer = ViewerConfig(**vars(options.viewer), num_rays_per_chunk=chunk)
+        config.vis = vis
+        config.viewer = ViewerConfig(**options, num_rays_per_chunk=chunk)
         _start_viewer(config, pipeline, step)
 
 
@@ -120,4 +122,3 @@ def _find_data(config: TrainerConfig, file: Path) -> None:
                     config.data = found
                 return
     raise InputError(f"no data set {named}", file=file, field="pipeline.datamanager.data", fix=_FIX_DATA)
-

@@ -109,7 +109,7 @@ class Background:
         reserve: Whether a second worker is kept ready.
     """
 
-    def __init__(self, changed: Callable[[], None] = lambda: None, *, reserve: bool = True) -> None:
+    def __init__(self, changed: Callable[[], object] = lambda: None, *, reserve: bool = True) -> None:
         self.changed = changed
         self.problems: tuple[str, ...] = ()
         self._reserve = reserve

@@ -167,7 +167,9 @@ class SplatSource:
         means = self.splats.means
         middle = np.median(means, axis=0)
         distance = 4.0 * float(np.median(np.linalg.norm(means - middle, axis=1))) + 0.1
-        pose = np.concatenate([np.eye(3), (middle + [0.0, 0.0, distance])[:, None]], axis=1)
+        pose = np.eye(3, 4)
+        pose[:, 3] = middle
+        pose[2, 3] += distance
         camera = Camera(pose, 32.0, 32.0, 16.0, 16.0, 32, 32)
         for radii in ({"x": 1e-4}, {"x": 1e-4, "yaw": 1e-4}):
             self.frame(camera, perturbation_of(radii)).warm_up()

@@ -92,9 +92,7 @@ class Worker:
     def _bound(self, number: int, camera: Camera, perturbation: Any, seconds: float, about: tuple[Any, ...]) -> bool:
         """Refine one size; False if a newer message waits."""
         assert self.source is not None
-        refinement = Refinement(
-            self.source.frame(camera, perturbation), 0, self._goal(seconds), stopped=self._stopped
-        )
+        refinement = Refinement(self.source.frame(camera, perturbation), 0, self._goal(seconds), stopped=self._stopped)
         refinement.progress = _Teller(self, number, refinement)
         self.refinement, self.about = refinement, about
         refinement.run()
