@@ -53,7 +53,7 @@ class View:
     def fits(self, height: int, width: int) -> bool:
         """Whether a picture of ``height`` x ``width`` pixels shows this view, its sides rounded to whole pixels."""
         camera = self.camera
-        slack = 1.0 / min(height, width, camera.height, camera.width)
+        slack = 2.0 / min(height, width, camera.height, camera.width)
         return abs(width * camera.height / (height * camera.width) - 1.0) <= slack
 
     def stages(self, seconds: float, known: int = 0) -> list[tuple[Camera, float]]:
