@@ -80,6 +80,7 @@ def opened(nerfstudio: SimpleNamespace, config_file: Path) -> tuple[Any, Any]:
 @pytest.fixture
 def model(opened: tuple[Any, Any]) -> Iterator[Any]:
     found = opened[1].model
+    found._source = None
     yield found
     found._background.close()
     found.set_crop(None)
@@ -379,13 +380,13 @@ def test_viewer_finds_the_panel_and_works_in_the_background(
 
 
 def test_render_thread_survives_interrupts(
-    viewer: Any, model: Any, nerfstudio: SimpleNamespace, monkeypatch: pytest.MonkeyPatch
+    model: Any, nerfstudio: SimpleNamespace, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A camera move raises an exception at any traced line; compiled code must not meet it."""
     from nerfstudio.viewer.render_state_machine import RenderStateMachine
     from nerfstudio.viewer_legacy.server.viewer_utils import IOChangeException, SetTrace
 
-    machine = RenderStateMachine(viewer, 10.0, Machine().client)  # type: ignore[arg-type]
+    machine = RenderStateMachine(SimpleNamespace(), 10.0, Machine().client)  # type: ignore[arg-type]
     camera = cameras(nerfstudio)
     inside: list[Any] = []
     original = Renderer.layers

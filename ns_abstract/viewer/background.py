@@ -123,13 +123,15 @@ class Background:
         self._answered = True
         self._failures: dict[_Key, str] = {}
         self._closed = False
-        atexit.register(self.close)
 
     # --- what is asked -------------------------------------------------------------------------
 
     def show(self, source: Source) -> None:
         """Bound views of ``source`` from now on; the workers start and compile."""
         with self._lock:
+            self._closed = False
+            atexit.unregister(self.close)
+            atexit.register(self.close)
             token = 0 if self._source is None else self._source[0] + 1
             self._source = token, source
             self._wanted, self._answered = None, True
@@ -178,7 +180,7 @@ class Background:
             return Status("idle" if self._answered else "working")
 
     def close(self) -> None:
-        """End the workers."""
+        """End the workers; `show` starts new ones."""
         with self._lock:
             self._closed = True
             workers, self._workers = self._workers, []
