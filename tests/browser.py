@@ -10,6 +10,7 @@ import subprocess
 import time
 import urllib.request
 from collections.abc import Callable
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
@@ -40,7 +41,7 @@ class Browser:
 
     def __init__(self, url: str, profile: Path, width: int = 1280, height: int = 800) -> None:
         self.url, self.profile, self.size = url, profile, (width, height)
-        self.numbers = itertools.count()
+        self.numbers, self.stack = itertools.count(), ExitStack()
 
     def __enter__(self) -> Browser:
         from websockets.sync.client import connect
@@ -55,7 +56,7 @@ class Browser:
             port = note.read_text().split("\n")[0]
             with urllib.request.urlopen(f"http://127.0.0.1:{port}/json/list", timeout=30) as answer:
                 tab = next(entry for entry in json.load(answer) if entry["type"] == "page")
-            self.socket = connect(tab["webSocketDebuggerUrl"], max_size=None)
+            self.socket = self.stack.enter_context(connect(tab["webSocketDebuggerUrl"], max_size=None))
             self.call("Page.navigate", url=self.url)
         except BaseException:
             self.process.kill()
@@ -63,7 +64,7 @@ class Browser:
         return self
 
     def __exit__(self, *_: Any) -> None:
-        self.socket.close()
+        self.stack.close()
         self.process.terminate()
         self.process.wait(30)
 
@@ -101,7 +102,7 @@ class Browser:
     def place(self, expression: str) -> tuple[float, float]:
         """Middle of the element that a JavaScript expression gives, scrolled into view."""
         box = self.ask(
-            f"(() => {{ const e = {expression}; if (!e) return null; e.scrollIntoView({{block: 'center'}});"
+            f"(() => {{ const e = {expression}; if (!e) return null; e.scrollIntoView({{block: 'nearest'}});"
             " const r = e.getBoundingClientRect(); return [r.x + r.width / 2, r.y + r.height / 2]; })()"
         )
         assert box is not None, expression

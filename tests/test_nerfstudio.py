@@ -6,6 +6,7 @@ import dataclasses
 import importlib
 import json
 import shutil
+import subprocess
 import sys
 import threading
 import time
@@ -18,7 +19,7 @@ import numpy as np
 import pytest
 from browser import until
 from conftest import blob_scene, ring
-from nerfstudio_runs import command, environment, free_port, lpips_cache, needs_nerfstudio
+from nerfstudio_runs import BIN, Server, command, environment, free_port, lpips_cache, needs_nerfstudio
 from PIL import Image
 
 from ns_abstract.cli.viewer import Viewer
@@ -47,6 +48,13 @@ OUTPUTS = ["abstract_lower", "abstract_upper", "abstract_gap", "abstract_witness
 def nerfstudio() -> SimpleNamespace:
     """nerfstudio's modules and this package's beside them."""
     torchvision_operators.autoload()
+    # nerfstudio's other way of registration, for when this package is not installed
+    found = [
+        f"{n}=ns_abstract.nerfstudio.methods:{n.replace('-', '_')}" for n in ("abstract-nerf", "abstract-splatfacto")
+    ]
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("NERFSTUDIO_METHOD_CONFIGS", ",".join(found))
+        importlib.import_module("nerfstudio.configs.method_configs")
     names = ("loading", "methods", "nerf", "outputs", "panel", "pipeline", "splat", "viewing")
     modules = {name: importlib.import_module(f"ns_abstract.nerfstudio.{name}") for name in names}
     modules["method_configs"] = importlib.import_module("nerfstudio.configs.method_configs")
@@ -470,6 +478,20 @@ def test_nerf_has_the_chosen_size(nerfstudio: SimpleNamespace) -> None:
 # ---------------------------------------------------------------- nerfstudio's own commands
 
 
+@pytest.mark.parametrize("first", ["splat", "nerf"])
+def test_registration_does_not_depend_on_what_is_imported_first(folder: Path, first: str) -> None:
+    code = (
+        f"import ns_abstract.nerfstudio.{first}\n"
+        "from nerfstudio.configs.method_configs import all_methods\n"
+        "assert {'abstract-nerf', 'abstract-splatfacto'} <= set(all_methods)"
+    )
+    done = subprocess.run(
+        [sys.executable, "-W", "ignore", "-c", code],
+        env=environment(folder), capture_output=True, text=True, timeout=300, check=False,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+
+
 _TRAIN = [
     "--machine.device-type", "cpu", "--vis", "tensorboard", "--max-num-iterations", "3", "--steps-per-save", "2",
     "--steps-per-eval-image", "100000", "--steps-per-eval-batch", "100000", "--steps-per-eval-all-images", "100000",
@@ -490,6 +512,17 @@ def test_train_and_open(nerfstudio: SimpleNamespace, folder: Path, method: str) 
     assert width == (16 if method == "abstract-nerf" else 256)
     found = pipeline.model.get_outputs_for_camera(cameras(nerfstudio, height=6, width=6))
     assert found["rgb_fine"].shape == (6, 6, 3)
+
+
+def test_stock_viewer_starts(nerfstudio: SimpleNamespace, folder: Path, config_file: Path) -> None:
+    config = abstract_run(nerfstudio, folder, config_file)
+    program = BIN / "ns-viewer"
+    if not program.exists():
+        pytest.skip("ns-viewer is not installed")
+    with Server([program, "--load-config", config.relative_to(folder)], free_port(), folder, folder) as server:
+        assert server.url
+        time.sleep(3.0)
+        assert server.process.poll() is None and "Traceback" not in server.said(), server.said()
 
 
 def test_eval_reports_abstract_figures(nerfstudio: SimpleNamespace, folder: Path, config_file: Path) -> None:
