@@ -96,8 +96,16 @@ def check_samples(inputs: Inputs, folder: Path, index: int, **settings: Any) -> 
 # ---------------------------------------------------------------- help
 
 
-@pytest.mark.parametrize("module", [MODULE, "ns_abstract.cli.demo"])
-def test_help_is_quick_and_light(module: str) -> None:
+@pytest.mark.parametrize(
+    ("module", "option"),
+    [
+        (MODULE, "--output-dir"),
+        ("ns_abstract.cli.demo", "--output-dir"),
+        ("ns_abstract.cli.viewer", "--viewer.websocket-port"),
+        ("ns_abstract.cli.export", "mp4"),
+    ],
+)
+def test_help_is_quick_and_light(module: str, option: str) -> None:
     seconds = []
     for _ in range(3):
         start = time.perf_counter()
@@ -106,7 +114,7 @@ def test_help_is_quick_and_light(module: str) -> None:
         if seconds[-1] < 2.0:
             break
     assert shown.returncode == 0
-    assert "--output-dir" in shown.stdout
+    assert option in shown.stdout
     loaded = {line.rpartition("|")[2].strip().split(".")[0] for line in shown.stderr.splitlines()}
     assert "tyro" in loaded
     assert not loaded & {"torch", "numba", "nerfstudio", "matplotlib", "numpy"}

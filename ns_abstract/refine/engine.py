@@ -196,6 +196,7 @@ class Refinement:
         whole = (frame.tile_count, *shape)
         self.outer_lower, self.outer_upper = np.zeros(whole, np.float32), np.ones(whole, np.float32)
         self.witness_lower, self.witness_upper = np.full(whole, np.inf, np.float32), np.full(whole, -np.inf, np.float32)
+        self.image = np.zeros(whole, np.float32)
         self.inside = _pixels_inside(frame)
         self.outer_lower[~self.inside] = 0.0
         self.outer_upper[~self.inside] = 0.0
@@ -283,7 +284,7 @@ class Refinement:
         """Refine until the goal is reached; sound whenever it ends."""
         box = self.frame.box
         # the first call compiles kernels; the clock of the trace starts after it
-        image = self._witness(box.middle)
+        self.image = self._witness(box.middle)
         self.start = time.perf_counter()
         if self._cover() and not self._over():
             for values in self._corners():
@@ -291,8 +292,18 @@ class Refinement:
                 if self._over():
                     break
             self._refine()
-        point = self._record(1.0)
-        return self._result(image, point)
+        return self._result(self._record(1.0))
+
+    def proceed(self, goal: Goal) -> FrameResult:
+        """Go on after `run` has covered the set; time between the two does not count."""
+        self.goal = goal
+        self.start = time.perf_counter() - self.trace[-1].seconds
+        self._refine()
+        return self._result(self._record(1.0))
+
+    def snapshot(self) -> FrameResult:
+        """What is known now; sound at any time after the first render."""
+        return self._result(self.point())
 
     def _corners(self) -> np.ndarray:
         """Corners of the set [n, d], some of them where there are many."""
@@ -522,7 +533,7 @@ class Refinement:
             stack(3, offsets),
         )
 
-    def _result(self, image: np.ndarray, point: TracePoint) -> FrameResult:
+    def _result(self, point: TracePoint) -> FrameResult:
         return FrameResult(
             index=self.index,
             box=self.frame.box,
@@ -530,7 +541,7 @@ class Refinement:
             upper=self._whole(self.outer_upper),
             witness_lower=self._whole(self.witness_lower),
             witness_upper=self._whole(self.witness_upper),
-            image=self._whole(image),
+            image=self._whole(self.image),
             seconds=point.seconds,
             cells=self.cells,
             trace=tuple(self.trace),

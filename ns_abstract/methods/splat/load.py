@@ -9,6 +9,7 @@ from __future__ import annotations
 import os
 import re
 import warnings
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, cast
@@ -78,6 +79,51 @@ def load_scene(path: str | os.PathLike[str]) -> SplatScene:
                 fix="give the config.yml of a run, its folder, or a .ply",
             )
     return _load_run(runs.read_config(path))
+
+
+def scene_from_parameters(
+    parameters: Mapping[str, Any],
+    *,
+    source: str,
+    name: str,
+    color_model: Literal["sh", "sigmoid"],
+    sh_degree: int,
+    rasterize_mode: Literal["classic", "antialiased"],
+    background: Float32Array,
+) -> SplatScene:
+    """The scene that a loaded Splatfacto model holds, checked as one that is read from files.
+
+    Args:
+        parameters: means [N, 3], scales [N, 3], quats [N, 4], features_dc [N, 3], features_rest
+            [N, K - 1, 3] and opacities [N, 1], arrays.
+        source: Where they are from, for messages.
+        name, color_model, sh_degree, rasterize_mode, background: As in `SplatScene`.
+
+    Raises:
+        InputError: A value is not finite or cannot be drawn.
+    """
+    found = {key: np.array(parameters[key], np.float32) for key in _PARAMETERS}
+    for key, array in found.items():
+        runs.require_finite(array, Path(source), key)
+    rest = found["features_rest"][:, : (sh_degree + 1) ** 2 - 1]
+    arrays = _Arrays(
+        means=found["means"],
+        log_scales=found["scales"],
+        quats=found["quats"],
+        opacity_logits=found["opacities"].reshape(-1),
+        sh=np.concatenate([found["features_dc"][:, None], rest], axis=1),
+    )
+    arrays, dropped = _drawable(arrays, Path(source), {"scales": "scales", "quats": "quats"})
+    return SplatScene(
+        **vars(arrays),
+        color_model=color_model,
+        sh_degree=sh_degree,
+        rasterize_mode=rasterize_mode,
+        background=background,
+        name=name,
+        source=source,
+        dropped=dropped,
+    )
 
 
 @dataclass(frozen=True)

@@ -294,27 +294,70 @@ class Renderer:
             rotation: [3, 3] world to camera, OpenCV axes.
             position: [3] camera position, world.
         """
-        splats = self.splats
-        view = camera_array(camera)
         across, down = tile_grid(camera, self.side)
         if wanted is None:
             wanted = np.arange(across * down)
+        offsets, entries = self._lists(camera, rotation, position, wanted)
+        return self._blend(camera, wanted, offsets, entries, self._record, self.splats.background)
+
+    def _lists(
+        self, camera: Camera, rotation: np.ndarray, position: np.ndarray, wanted: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Project every Gaussian; the lists of the tiles ``wanted`` (offsets and entries)."""
+        splats = self.splats
         _project(
             splats.means, splats.axes, splats.opacity, splats.sh, splats.degree,
-            np.ascontiguousarray(rotation, np.float64), np.ascontiguousarray(position, np.float64), view, self.rules,
-            splats.antialiased, self.side, self._record, self._box, self._tiles, self._depth, self._visible,
+            np.ascontiguousarray(rotation, np.float64), np.ascontiguousarray(position, np.float64),
+            camera_array(camera), self.rules, splats.antialiased, self.side,
+            self._record, self._box, self._tiles, self._depth, self._visible,
         )  # fmt: skip
+        across, down = tile_grid(camera, self.side)
         order = depth_order(np.flatnonzero(self._visible), self._depth)
         mask = np.zeros(across * down, np.uint8)
         mask[wanted] = 1
-        offsets, entries = tile_lists(order, self._tiles, mask, across)
+        return tile_lists(order, self._tiles, mask, across)
+
+    def _blend(
+        self,
+        camera: Camera,
+        wanted: np.ndarray,
+        offsets: np.ndarray,
+        entries: np.ndarray,
+        record: np.ndarray,
+        background: np.ndarray,
+    ) -> np.ndarray:
         image = np.zeros((len(wanted), self.side, self.side, 3))
         _rasterise(
-            np.asarray(wanted, np.int64), offsets, entries, self._record, self._box, view, self.rules,
-            splats.background, self.side, get_num_threads(), image,
+            np.asarray(wanted, np.int64), offsets, entries, record, self._box, camera_array(camera), self.rules,
+            background, self.side, get_num_threads(), image,
         )  # fmt: skip
         return image
 
     def image(self, camera: Camera, rotation: np.ndarray, position: np.ndarray) -> np.ndarray:
         """The whole image, float64 [H, W, 3] in [0, 1]."""
         return assemble(self.tiles(camera, rotation, position), camera)
+
+    def layers(
+        self, camera: Camera, rotation: np.ndarray, position: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """What Splatfacto outputs in evaluation (splatfacto.py:620-665; gsplat's render mode RGB+ED).
+
+        Returns:
+            Image [H, W, 3] and accumulation [H, W, 1] in [0, 1]; expected depth [H, W, 1], the largest
+            one of the image where nothing is hit.
+        """
+        across, down = tile_grid(camera, self.side)
+        wanted = np.arange(across * down)
+        offsets, entries = self._lists(camera, rotation, position, wanted)
+        image = self._blend(camera, wanted, offsets, entries, self._record, self.splats.background)
+        # the same weights, with depths as colours; the blending clamps to [0, 1]
+        seen = self._visible.astype(bool)
+        farthest = max(float(self._depth[seen].max(initial=0.0)), 1e-300)
+        record = self._record.copy()
+        record[seen, _RED] = 1.0
+        record[seen, _RED + 1] = self._depth[seen] / farthest
+        record[seen, _RED + 2] = 0.0
+        sums = assemble(self._blend(camera, wanted, offsets, entries, record, np.zeros(3)), camera)
+        accumulation = sums[..., :1]
+        depth = farthest * sums[..., 1:2] / np.maximum(accumulation, 1e-10)
+        return assemble(image, camera), accumulation, np.where(accumulation > 0.0, depth, depth.max())

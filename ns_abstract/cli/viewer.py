@@ -1,0 +1,91 @@
+"""``ns-abstract-viewer``: nerfstudio's viewer with abstract images, also without CUDA."""
+
+from __future__ import annotations
+
+import warnings
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Literal
+
+import tyro
+
+from ns_abstract.cli.common import DONE, run
+from ns_abstract.errors import InputError
+
+
+@dataclass
+class Viewer:
+    """nerfstudio's viewer."""
+
+    relative_log_filename: str = "viewer_log_filename.txt"
+    """Filename to use for the log file."""
+    websocket_port: int | None = None
+    """The websocket port to connect to. If None, find an available port."""
+    websocket_port_default: int = 7007
+    """The default websocket port to connect to if websocket_port is not specified."""
+    websocket_host: str = "0.0.0.0"
+    """The host address to bind the websocket server to."""
+    max_num_display_images: int = 512
+    """Maximum number of training images to display in the viewer. If -1, display all."""
+    quit_on_train_completion: bool = False
+    """Whether to kill the training job when it has completed."""
+    image_format: Literal["jpeg", "png"] = "jpeg"
+    """Image format viewer should use; jpeg is lossy compression, while png is lossless."""
+    jpeg_quality: int = 75
+    """Quality tradeoff to use for jpeg compression."""
+    make_share_url: bool = False
+    """Print a shareable URL."""
+    camera_frustum_scale: float = 0.1
+    """Scale for the camera frustums in the viewer."""
+    default_composite_depth: bool = True
+    """The default value for compositing depth."""
+
+
+@dataclass
+class View:
+    """View a trained run with lower and upper bounds of what its camera could show.
+
+    nerfstudio's viewer with the output types abstract_lower, abstract_upper, abstract_gap and
+    abstract_witness and a panel for the set of poses (Control tab, Custom Elements). Open trusted
+    runs only: nerfstudio's reader of config.yml can run code.
+    """
+
+    load_config: Path
+    """config.yml of a Splatfacto or vanilla-nerf run, or a standard 3DGS .ply."""
+    viewer: Viewer = field(default_factory=Viewer)
+    """Viewer configuration"""
+    vis: Literal["viewer", "viewer_legacy"] = "viewer"
+    """Type of viewer"""
+
+
+def view(options: View) -> int:
+    """Run the command until it is interrupted; returns the exit code.
+
+    Raises:
+        InputError: nerfstudio is missing, or the run cannot be opened.
+    """
+    from ns_abstract.nerfstudio.torchvision_operators import autoload
+
+    autoload()
+    warnings.filterwarnings("ignore", category=FutureWarning)
+    try:
+        from ns_abstract.nerfstudio.viewing import view as serve
+    except ModuleNotFoundError as error:
+        raise InputError(
+            f"the package {error.name} is missing", field="nerfstudio", fix="pip install 'ns-abstract[nerfstudio]'"
+        ) from None
+    try:
+        serve(options.load_config, options.vis, vars(options.viewer))
+    except KeyboardInterrupt:
+        # the way to end a viewer
+        pass
+    return DONE
+
+
+def main() -> None:
+    """Entry point of the console script."""
+    run(view, lambda: tyro.cli(tyro.conf.FlagConversionOff[View], prog="ns-abstract-viewer"))
+
+
+if __name__ == "__main__":
+    main()

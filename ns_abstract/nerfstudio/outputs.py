@@ -1,0 +1,181 @@
+"""Abstract images among the outputs of a nerfstudio model."""
+
+from __future__ import annotations
+
+import sys
+import weakref
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+from nerfstudio.utils.rich_utils import CONSOLE
+
+from ns_abstract.arithmetic.selfcheck import check_functions
+from ns_abstract.nerfstudio.loading import lpips_known
+from ns_abstract.nerfstudio.panel import AbstractPanel, camera_of
+from ns_abstract.refine.engine import Goal, Refinement
+from ns_abstract.sets.perturbation import ROTATIONS, TRANSLATIONS
+from ns_abstract.viewer.background import Background
+from ns_abstract.viewer.views import Snapshot, Source, View, perturbation_of
+
+if TYPE_CHECKING:
+    from nerfstudio.models.base_model import Model
+
+    _Base = Model
+else:
+    _Base = object
+
+OUTPUTS = ("abstract_lower", "abstract_upper", "abstract_gap", "abstract_witness")
+
+
+@dataclass
+class AbstractConfig:
+    """Abstract images of a trained model."""
+
+    translation: tuple[float, float, float] = (0.01, 0.0, 0.0)
+    """Radii of the set of poses along the camera's x, y and z, in scene units; sliders in the viewer."""
+    rotation: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """Radii of yaw, pitch and roll in radians; sliders in the viewer."""
+    seconds: float = 2.0
+    """Time for every image of ns-render and ns-eval; 0: no abstract images there."""
+    viewer_seconds: float = 10.0
+    """Time for every view in the viewer."""
+
+    @property
+    def radii(self) -> dict[str, float]:
+        """Radii by parameter."""
+        return dict(zip((*TRANSLATIONS, *ROTATIONS), (*self.translation, *self.rotation), strict=True))
+
+
+def pictures(snapshot: Snapshot | None, height: int, width: int) -> dict[str, torch.Tensor]:
+    """Outputs [height, width, 3] for the bounds, [height, width, 1] for the gaps; repeats pixels of small pictures.
+
+    ``abstract_gap`` is the length over RGB of upper - lower, ``abstract_witness`` the same of the least
+    and largest values that were really rendered. Without a snapshot the bounds are 0 and 1.
+    """
+    if snapshot is None:
+        zero = np.zeros((1, 1, 3), np.float32)
+        lower, upper, least, most = zero, zero + 1.0, zero, zero
+    else:
+        lower, upper = snapshot.lower, snapshot.upper
+        least, most = snapshot.witness_lower, snapshot.witness_upper
+    rows = np.minimum((np.arange(height) + 0.5) * (lower.shape[0] / height), lower.shape[0] - 1).astype(np.int64)
+    columns = np.minimum((np.arange(width) + 0.5) * (lower.shape[1] / width), lower.shape[1] - 1).astype(np.int64)
+    gaps = [np.linalg.norm(high - low, axis=-1, keepdims=True) for low, high in ((lower, upper), (least, most))]
+    found = [np.ascontiguousarray(image[rows[:, None], columns]) for image in (lower, upper, *gaps)]
+    return dict(zip(OUTPUTS, map(torch.from_numpy, found), strict=True))
+
+
+@contextmanager
+def uninterrupted() -> Iterator[None]:
+    """Keep the viewer from interrupting this thread inside the block.
+
+    It interrupts by an exception from a trace function (render_state_machine.py, check_interrupt), which
+    compiled code turns into a SystemError that would end the render thread.
+    """
+    trace = sys.gettrace()
+    sys.settrace(None)
+    try:
+        yield
+    finally:
+        sys.settrace(trace)
+
+
+class AbstractOutputs(_Base):
+    """Comes before a nerfstudio model in a class's bases.
+
+    In a viewer, bounds are worked out in the background and what is known is shown; elsewhere
+    (ns-render, ns-eval) every image waits for its bounds. During training there are none.
+    """
+
+    def populate_modules(self) -> None:
+        """Add the panel."""
+        super().populate_modules()
+        options: AbstractConfig = self.config.abstract  # pyright: ignore[reportAttributeAccessIssue]
+        # the viewer follows attributes of modules: a plain reference from the panel would lead it in circles
+        here = weakref.ref(self)
+
+        self.abstract = AbstractPanel(
+            options.radii,
+            options.viewer_seconds,
+            attached=lambda: (model := here()) and model._attached(),
+            refine=lambda seconds: (model := here()) and model._background.more(seconds),
+        )
+        self._background = Background(lambda: (model := here()) and model._news())
+        self._source: Source | None = None
+        self._evaluating = False
+        self._problems: list[str] | None = None
+
+    def start_evaluation(self) -> None:
+        """Parameters are final from now on: bounds may be worked out."""
+        self._evaluating = True
+
+    def abstract_source(self) -> Source | None:
+        """The scene as it is shown; the same object as long as nothing changes. None: there are no bounds for it."""
+        return None
+
+    @torch.no_grad()
+    def get_outputs_for_camera(self, camera: Any, obb_box: Any = None) -> dict[str, torch.Tensor]:
+        """The model's outputs and the abstract images."""
+        outputs = super().get_outputs_for_camera(camera, obb_box)
+        if not self._evaluating or self.training:
+            return outputs
+        try:
+            with uninterrupted():
+                found = self._abstract(camera)
+        except Exception as error:
+            # the viewer's render thread must not end; nothing is known, and that is what is shown
+            CONSOLE.print(f"[yellow]No abstract image: {type(error).__name__}: {error}")
+            found = pictures(None, int(camera.height.reshape(-1)[0]), int(camera.width.reshape(-1)[0]))
+        return {**outputs, **{name: value.to(self.device) for name, value in found.items()}}
+
+    def _abstract(self, camera: Any) -> dict[str, torch.Tensor]:
+        source = self.abstract_source()
+        options: AbstractConfig = self.config.abstract  # pyright: ignore[reportAttributeAccessIssue]
+        if source is None or not (self.abstract.control.present or options.seconds > 0.0):
+            return {}
+        view = View(camera_of(camera), perturbation_of(self.abstract.radii))
+        if self.abstract.control.present:
+            self._show(source)
+            snapshot = self._background.best(view, self.abstract.seconds)
+            self.abstract.show(view, snapshot, self._background.status)
+        else:
+            snapshot = self._now(source, view, options.seconds)
+        return pictures(snapshot, view.camera.height, view.camera.width)
+
+    def _now(self, source: Source, view: View, seconds: float) -> Snapshot:
+        if self._problems is None:
+            self._problems = check_functions()
+        result = Refinement(source.frame(view.camera, view.perturbation), 0, Goal(seconds=seconds)).run()
+        return Snapshot.of(result, final=True, guarantee="sampled" if self._problems else source.guarantee)
+
+    def _attached(self) -> None:
+        source = self.abstract_source() if self._evaluating else None
+        if source is not None:
+            self._show(source)
+
+    def _show(self, source: Source) -> None:
+        if self._source is not source:
+            self._source = source
+            self._background.show(source)
+
+    def _news(self) -> None:
+        if self._background.status.state != "off":
+            self.abstract.control.draw()
+
+    def get_image_metrics_and_images(
+        self, outputs: dict[str, torch.Tensor], batch: dict[str, torch.Tensor]
+    ) -> tuple[dict[str, float], dict[str, torch.Tensor]]:
+        """The model's metrics and, where there are abstract images, theirs; LPIPS only where it has weights."""
+        metrics, images = super().get_image_metrics_and_images(outputs, batch)
+        if not lpips_known(self.lpips):  # pyright: ignore[reportArgumentType]
+            metrics = {name: value for name, value in metrics.items() if "lpips" not in name}
+        if OUTPUTS[2] in outputs:
+            gap, witness = outputs["abstract_gap"].double(), outputs["abstract_witness"].double()
+            metrics["abstract_mpg"], metrics["abstract_xpg"] = float(gap.mean()), float(gap.max())
+            metrics["abstract_mpg_witness"] = float(witness.mean())
+            images["abstract"] = torch.cat([outputs["abstract_lower"], outputs["abstract_upper"]], dim=1)
+        return metrics, images

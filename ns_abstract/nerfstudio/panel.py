@@ -1,0 +1,246 @@
+"""The viewer's panel for abstract images: sliders, buttons, figures."""
+
+from __future__ import annotations
+
+import json
+import math
+import threading
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from nerfstudio.viewer.render_state_machine import RenderAction
+from nerfstudio.viewer.viewer_elements import (
+    ViewerButton,
+    ViewerControl,
+    ViewerElement,
+    ViewerNumber,
+    ViewerSlider,
+    ViewerText,
+)
+from viser import ViserServer
+
+from ns_abstract.atomic import write_atomic
+from ns_abstract.demo.paths import View as PathView
+from ns_abstract.demo.paths import path_json
+from ns_abstract.report.figures import number
+from ns_abstract.sets.path import Camera
+from ns_abstract.sets.perturbation import ROTATIONS, TRANSLATIONS
+from ns_abstract.viewer.background import Status
+from ns_abstract.viewer.views import Snapshot, View
+
+#: Right ends of the sliders, in thousandths.
+_MOST = 100.0
+_HINTS = {
+    "x": "sideways, thousandths of a scene unit",
+    "y": "up and down, thousandths of a scene unit",
+    "z": "forward and back, thousandths of a scene unit",
+    "yaw": "turn left and right, milliradians",
+    "pitch": "look up and down, milliradians",
+    "roll": "tilt, milliradians",
+}
+
+
+class Figures(ViewerElement[str]):
+    """Text that changes while the viewer runs."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__(name="figures")
+        self.text = text
+
+    def _create_gui_handle(self, viser_server: ViserServer) -> None:
+        self.gui_handle: Any = viser_server.gui.add_markdown(self.text, visible=self.visible)
+
+    def install(self, viser_server: ViserServer) -> None:
+        """Put the text into the panel."""
+        self._create_gui_handle(viser_server)
+
+    def show(self, text: str) -> None:
+        """Replace the text."""
+        self.text = text
+        if self.gui_handle is not None and self.gui_handle.content != text:
+            self.gui_handle.content = text
+
+
+class Attached(ViewerControl):
+    """Tells when a viewer has taken the model up, and lets it draw anew.
+
+    Args:
+        attached: Called once, when the viewer is there.
+    """
+
+    def __init__(self, attached: Callable[[], object]) -> None:
+        self._attached = attached
+        self._present = threading.Event()
+
+    def _setup(self, viewer: Any) -> None:
+        super()._setup(viewer)
+        self._present.set()
+        self._attached()
+
+    @property
+    def present(self) -> bool:
+        """Whether there is a viewer."""
+        return self._present.is_set()
+
+    @property
+    def folder(self) -> Path:
+        """The run's folder."""
+        return self.viewer.log_filename.parent
+
+    def draw(self) -> None:
+        """Ask every client's render thread for a new picture; never waits."""
+        if not (self.present and self.viewer.ready):
+            return
+        for machine in list(self.viewer.render_statemachines.values()):
+            machine.action(RenderAction("step", self.viewer.get_camera_state(machine.client)))
+
+
+class AbstractPanel(torch.nn.Module):
+    """Elements that nerfstudio's viewer finds in a model (viewer/utils.py, parse_object).
+
+    A module only because the viewer looks into nothing else; it has no parameters. More sliders, for
+    variations of the scene, are more entries of ``sliders``.
+
+    Args:
+        radii: Where the sliders start.
+        seconds: Time for a view before "refine" is pressed.
+        attached: Called once a viewer is there.
+        refine: Called with seconds.
+    """
+
+    def __init__(
+        self,
+        radii: dict[str, float],
+        seconds: float,
+        attached: Callable[[], object],
+        refine: Callable[[float], object],
+    ) -> None:
+        super().__init__()
+        self._refine = refine
+        self._last: View | None = None
+        self._figures = Figures("Abstract images: no view yet")
+        self._sliders: dict[str, ViewerSlider] = {}
+        for name in (*TRANSLATIONS, *ROTATIONS):
+            start = 1000.0 * radii.get(name, 0.0)
+            self._sliders[name] = ViewerSlider(
+                f"± {name}", start, 0.0, max(_MOST, start), 0.1, hint=f"Radius of the set: {_HINTS[name]}"
+            )
+        self._seconds = ViewerNumber("seconds", seconds, hint="Time for every view, and for every press of refine")
+        self._file = ViewerText("file", "", hint="Where to write the camera with its set; empty: in the run's folder")
+        self.control = Attached(attached)
+        self.elements: list[ViewerElement] = [
+            self._figures,
+            *self._sliders.values(),
+            self._seconds,
+            ViewerButton("refine", lambda _: self._refine(float(self._seconds.value))),
+            self._file,
+            ViewerButton("send to certify", lambda _: self.send()),
+        ]
+        # the viewer shows attributes in the order of their names
+        for k, element in enumerate(self.elements):
+            setattr(self, f"element_{k:02d}", element)
+
+    def hide(self) -> None:
+        """Show nothing in viewers that are started later."""
+        for element in self.elements:
+            element.visible = False
+
+    @property
+    def radii(self) -> dict[str, float]:
+        """What the sliders say, in scene units and radians."""
+        return {name: float(slider.value) / 1000.0 for name, slider in self._sliders.items()}
+
+    @property
+    def seconds(self) -> float:
+        """Time for a view."""
+        seconds = float(self._seconds.value)
+        return min(max(seconds, 0.1), 86400.0) if math.isfinite(seconds) else 1.0
+
+    def show(self, view: View, snapshot: Snapshot | None, status: Status) -> None:
+        """Say what is known of the view on screen."""
+        self._last = view
+        self._figures.show(describe(view, snapshot, status))
+
+    def send(self) -> None:
+        """Write the camera on screen and its set as a camera path; says where in the panel."""
+        view = self._last
+        if view is None:
+            return
+        folder = self.control.folder if self.control.present else Path()
+        name = str(self._file.value).strip()
+        file = Path(name) if name else _free_name(folder / "abstract")
+        try:
+            file.parent.mkdir(parents=True, exist_ok=True)
+            text = json.dumps(certify_path(view), indent=1) + "\n"
+            write_atomic(file, lambda stream: stream.write(text.encode()))
+        except OSError as error:
+            self._figures.show(f"{self._figures.text}\n\n**{file}** cannot be written ({error.strerror})")
+            return
+        command = f"--load-config {folder / 'config.yml'} --camera-path-filename {file}"
+        self._figures.show(
+            f"{self._figures.text}\n\nWritten: `{file}`\n\n`ns-abstract-certify {command} --model NET.onnx "
+            "--property PROP.json --output-dir OUT`"
+        )
+
+
+def _free_name(folder: Path) -> Path:
+    k = 0
+    while (file := folder / f"view_{k:03d}.json").exists():
+        k += 1
+    return file
+
+
+def certify_path(view: View) -> dict[str, Any]:
+    """A camera path of one entry, with the set under "perturbation", as the other commands read it."""
+    camera, perturbation = view.camera, view.perturbation
+    pose = np.concatenate([camera.camera_to_world, [[0.0, 0.0, 0.0, 1.0]]])
+    fov = math.degrees(2.0 * math.atan(0.5 * camera.height / camera.fy))
+    spec = {
+        "version": 1,
+        "frame": perturbation.frame,
+        "translation": {name: list(ends) for name, ends in perturbation.translation.items()},
+        "rotation": {name: list(ends) for name, ends in perturbation.rotation.items()},
+    }
+    return path_json([PathView(pose, fov, camera.height, camera.width)], seconds=1.0, perturbation=spec)
+
+
+def describe(view: View, snapshot: Snapshot | None, status: Status) -> str:
+    """The figures of a view for people (Markdown)."""
+    states = {"off": "", "starting": "starting", "working": "refining …", "idle": "done", "failed": "stopped"}
+    state = states[status.state] + (f": {status.detail}" if status.detail else "")
+    if snapshot is None:
+        return f"**Abstract images**: no bounds yet, [0, 1] is shown  \n{state}"
+    height, width = snapshot.size
+    size = f"{width} x {height}"
+    if snapshot.size != (view.camera.height, view.camera.width):
+        size += f", preview of {view.camera.width} x {view.camera.height}"
+    figures = snapshot.figures
+    lines = [
+        f"**Abstract images** ({size})",
+        f"MPG {number(figures['mpg'])}, XPG {number(figures['xpg'])}",
+        f"of real renders: MPG {number(figures['mpg_witness'])}, XPG {number(figures['xpg_witness'])}",
+        f"ratio {number(figures['ratio'])}, {snapshot.seconds:.1f} s, {snapshot.cells} cells",
+        f"{snapshot.guarantee}; {state}",
+    ]
+    return "  \n".join(lines)
+
+
+def camera_of(cameras: Any) -> Camera:
+    """The first of nerfstudio's ``Cameras`` as a pinhole camera; lens distortion plays no part, as in Splatfacto."""
+
+    def first(value: Any) -> float:
+        return float(value.reshape(-1)[0])
+
+    pose = cameras.camera_to_worlds.reshape(-1, *cameras.camera_to_worlds.shape[-2:])[0, :3]
+    return Camera(
+        np.ascontiguousarray(pose.detach().cpu().numpy(), np.float64),
+        first(cameras.fx),
+        first(cameras.fy),
+        first(cameras.cx),
+        first(cameras.cy),
+        int(first(cameras.width)),
+        int(first(cameras.height)),
+    )

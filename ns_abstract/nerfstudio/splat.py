@@ -1,0 +1,116 @@
+"""Splatfacto with abstract images, drawn by this package's renderer where there is no CUDA."""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass, field
+from typing import Any, Literal, cast
+
+import numpy as np
+import torch
+from nerfstudio.cameras.cameras import Cameras
+from nerfstudio.models.splatfacto import SplatfactoModel, SplatfactoModelConfig
+
+from ns_abstract.errors import InputError
+from ns_abstract.methods.splat.activate import Splats, activate
+from ns_abstract.methods.splat.constants import GSPLAT_1_4_0
+from ns_abstract.methods.splat.load import scene_from_parameters
+from ns_abstract.methods.splat.render import Renderer
+from ns_abstract.nerfstudio.outputs import AbstractConfig, AbstractOutputs, uninterrupted
+from ns_abstract.nerfstudio.panel import camera_of
+from ns_abstract.viewer.views import SplatSource
+
+_FLIP = np.array([1.0, -1.0, -1.0])
+
+
+@dataclass
+class AbstractSplatfactoModelConfig(SplatfactoModelConfig):
+    """Splatfacto, with abstract images of the trained scene."""
+
+    _target: type = field(default_factory=lambda: AbstractSplatfactoModel)
+    abstract: AbstractConfig = field(default_factory=AbstractConfig)
+    """Abstract images"""
+
+    @classmethod
+    def of(cls, config: SplatfactoModelConfig) -> AbstractSplatfactoModelConfig:
+        """The same configuration with abstract images."""
+        known = {entry.name for entry in dataclasses.fields(cls)} - {"_target"}
+        return cls(**{name: value for name, value in vars(config).items() if name in known})
+
+
+class AbstractSplatfactoModel(AbstractOutputs, SplatfactoModel):
+    """Trains as Splatfacto does; in evaluation it also bounds, and it needs no CUDA."""
+
+    config: AbstractSplatfactoModelConfig
+
+    def populate_modules(self) -> None:
+        """Set up the parameters; without CUDA a checkpoint brings them, so that none are made of points."""
+        self._shown: tuple[Any, SplatSource, Renderer] | None = None
+        self._active: tuple[Any, Splats] | None = None
+        given = self.config
+        if not torch.cuda.is_available():
+            self.seed_points = None
+            self.config = dataclasses.replace(given, random_init=True, num_random=8)
+        super().populate_modules()
+        self.config = given
+
+    def _splats(self) -> Splats:
+        """The activated Gaussians of the current parameters."""
+        state = tuple((id(value), value._version) for value in self.gauss_params.values())
+        if self._active is None or self._active[0] != (state, self.step):
+            plain = self.config.sh_degree == 0
+            degree = min(self.step // self.config.sh_degree_interval, self.config.sh_degree)
+            if degree > 3:
+                raise InputError(f"spherical harmonics of degree {degree}", fix="train with degree 3 or less")
+            scene = scene_from_parameters(
+                {name: value.detach().cpu().numpy() for name, value in self.gauss_params.items()},
+                source="the loaded model",
+                name="model",
+                color_model="sigmoid" if plain else "sh",
+                sh_degree=0 if plain else degree,
+                rasterize_mode=cast(Literal["classic", "antialiased"], self.config.rasterize_mode),
+                background=np.zeros(3, np.float32),
+            )
+            self._active = (state, self.step), activate(scene, GSPLAT_1_4_0)
+        return self._active[1]
+
+    def _scene(self) -> tuple[SplatSource, Renderer]:
+        """What is shown: the Gaussians inside the crop box, before the background."""
+        splats = self._splats()
+        background = self._get_background_color().detach().cpu().numpy().astype(np.float64)
+        box = self.crop_box
+        crop = None if box is None else tuple(np.concatenate([np.ravel(v) for v in (box.R, box.T, box.S)]).tolist())
+        state = (id(splats), background.tobytes(), crop)
+        if self._shown is None or self._shown[0] != state:
+            if box is not None:
+                inside = box.within(torch.from_numpy(splats.means.astype(np.float32))).reshape(-1).numpy()
+                parts = {name: getattr(splats, name)[inside] for name in ("means", "axes", "opacity", "sh")}
+                splats = dataclasses.replace(splats, **parts)
+            splats = dataclasses.replace(splats, background=background)
+            self._shown = state, SplatSource(splats), Renderer(splats, GSPLAT_1_4_0)
+        return self._shown[1:]
+
+    def abstract_source(self) -> SplatSource:
+        """The Gaussians as they are shown."""
+        return self._scene()[0]
+
+    def get_outputs(self, camera: Cameras) -> dict[str, Any]:
+        """Outputs as Splatfacto's; without CUDA from this package's renderer (splatfacto.py:547-665)."""
+        if self.device.type == "cuda" or not isinstance(camera, Cameras):
+            return super().get_outputs(camera)
+        if self.training:
+            raise RuntimeError("gsplat trains on CUDA only; without it, runs can be viewed, rendered and bounded")
+        with uninterrupted():
+            view, renderer = camera_of(camera), self._scene()[1]
+            background = self._get_background_color()
+            if renderer.splats.count == 0:
+                return self.get_empty_outputs(view.width, view.height, background)
+            pose = view.camera_to_world
+            layers = renderer.layers(view, pose[:, :3].T * _FLIP[:, None], pose[:, 3])
+        rgb, accumulation, depth = (torch.from_numpy(layer.astype(np.float32)) for layer in layers)
+        return {
+            "rgb": rgb,
+            "depth": depth,
+            "accumulation": accumulation,
+            "background": background.expand(view.height, view.width, 3),
+        }

@@ -1,0 +1,124 @@
+"""Opens a run in nerfstudio's viewer; imported only when it is asked for."""
+
+from __future__ import annotations
+
+import tempfile
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import yaml
+from nerfstudio.configs.base_config import ViewerConfig
+from nerfstudio.engine.trainer import TrainerConfig
+from nerfstudio.models.splatfacto import SplatfactoModelConfig
+from nerfstudio.models.vanilla_nerf import VanillaModelConfig
+from nerfstudio.pipelines.base_pipeline import Pipeline
+from nerfstudio.scripts.viewer.run_viewer import _start_viewer
+from nerfstudio.utils.eval_utils import eval_setup
+
+from ns_abstract.demo.paths import around
+from ns_abstract.demo.runs import write_splatfacto_run
+from ns_abstract.errors import InputError
+from ns_abstract.methods.runs import find_checkpoint, read_config
+from ns_abstract.methods.splat.load import load_scene
+from ns_abstract.nerfstudio.loading import allow_numpy_scalars
+from ns_abstract.nerfstudio.nerf import AbstractNerfModelConfig
+from ns_abstract.nerfstudio.pipeline import AbstractPipeline
+from ns_abstract.nerfstudio.splat import AbstractSplatfactoModelConfig
+
+_FIX_DATA = "start the command in the folder that ns-train was started in, or put the data set back"
+
+
+def view(load_config: Path, vis: Literal["viewer", "viewer_legacy"], options: dict[str, Any]) -> None:
+    """Open the run and serve the viewer until the process is interrupted.
+
+    Args:
+        load_config: config.yml, or a .ply.
+        vis: Which of nerfstudio's viewers.
+        options: Of its ``ViewerConfig``.
+
+    Raises:
+        InputError: The run cannot be opened.
+    """
+    with tempfile.TemporaryDirectory(prefix="ns-abstract-viewer-") as scratch:
+        config_file = load_config
+        if config_file.suffix.lower() == ".ply":
+            config_file = run_of_ply(config_file, Path(scratch))
+        config, pipeline, step = open_run(config_file)
+        chunk = config.viewer.num_rays_per_chunk
+        config.vis = vis
+        config.viewer = ViewerConfig(**options, num_rays_per_chunk=chunk)
+        _start_viewer(config, pipeline, step)
+
+
+def run_of_ply(file: Path, folder: Path) -> Path:
+    """Write the scene of a ``.ply`` as a run into ``folder``; returns its config.yml."""
+    scene = load_scene(file)
+    middle = np.median(scene.means.astype(np.float64), axis=0)
+    distance = 3.0 * float(np.quantile(np.linalg.norm(scene.means - middle, axis=1), 0.8)) + 1e-3
+    views = [around(middle, 45.0 * k, 20.0, distance) for k in range(8)]
+    return write_splatfacto_run(scene, folder, timestamp="ply", experiment_name="scene", views=views)
+
+
+def open_run(config_file: Path) -> tuple[TrainerConfig, Pipeline, int]:
+    """nerfstudio's ``eval_setup`` with models that bound; the run may have been moved.
+
+    config.yml is read by nerfstudio's own loader, which can run code: open trusted runs only.
+
+    Returns:
+        Configuration, pipeline and training step.
+
+    Raises:
+        InputError: The run cannot be opened.
+    """
+    run = read_config(config_file)
+    find_checkpoint(run)
+    allow_numpy_scalars()
+
+    def prepare(config: TrainerConfig) -> TrainerConfig:
+        return _prepared(config, run.file)
+
+    try:
+        config, pipeline, _, step = eval_setup(run.file, test_mode="test", update_config_callback=prepare)
+    except (yaml.YAMLError, AttributeError, ImportError) as error:
+        raise InputError(
+            f"nerfstudio cannot open it: {error}", file=run.file, fix="give a run of nerfstudio 1.1.5"
+        ) from None
+    return config, pipeline, step
+
+
+def _prepared(config: TrainerConfig, file: Path) -> TrainerConfig:
+    model: Any = config.pipeline.model
+    if type(model) is SplatfactoModelConfig:
+        config.pipeline.model = AbstractSplatfactoModelConfig.of(model)
+    elif type(model) is VanillaModelConfig:
+        config.pipeline.model = AbstractNerfModelConfig.of(model)
+    elif not isinstance(model, (AbstractSplatfactoModelConfig, AbstractNerfModelConfig)):
+        raise InputError(
+            f"the method {config.method_name} is not bounded",
+            file=file,
+            field="pipeline.model",
+            fix="give a run of splatfacto, vanilla-nerf, abstract-splatfacto or abstract-nerf",
+        )
+    config.pipeline._target = AbstractPipeline
+    folder = file.resolve().parent
+    if (folder.name, folder.parent.name) == (config.timestamp, config.method_name):
+        # nerfstudio looks below the working directory
+        config.output_dir, config.experiment_name = folder.parents[2], folder.parents[1].name
+    _find_data(config, file)
+    return config
+
+
+def _find_data(config: TrainerConfig, file: Path) -> None:
+    """Point the data manager to the data set, which config.yml names relative to some folder."""
+    manager: Any = config.pipeline.datamanager
+    named = manager.data if manager.data is not None else manager.dataparser.data
+    for base in (Path(), *file.resolve().parents):
+        # beside the method's folder, where the whole folder was moved
+        for found in (base / named, base / named.name):
+            if found.exists():
+                manager.data = manager.dataparser.data = found
+                if config.data is not None:
+                    config.data = found
+                return
+    raise InputError(f"no data set {named}", file=file, field="pipeline.datamanager.data", fix=_FIX_DATA)

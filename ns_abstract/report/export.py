@@ -1,0 +1,157 @@
+"""Abstract images of a whole path in one archive, as plain pictures, or as a video."""
+
+from __future__ import annotations
+
+import json
+import math
+import zipfile
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import numpy as np
+
+from ns_abstract.atomic import write_atomic
+from ns_abstract.errors import InputError
+from ns_abstract.refine.result import FrameResult, gap
+from ns_abstract.report.files import IMAGES, frame_index, load_frame
+from ns_abstract.report.picture import heat, to_bytes
+
+PICTURES = ("lower", "upper", "gap", "witness", "image")
+_FIX_RESULTS = "give the folder that ns-abstract-render wrote"
+
+
+class Results:
+    """The frames that a command left in a folder.
+
+    Args:
+        folder: The folder.
+
+    Raises:
+        InputError: There are no frames in it, one is damaged, or their sizes differ.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        try:
+            files = {index: file for file in folder.iterdir() if (index := frame_index(file)) is not None}
+        except OSError as error:
+            raise InputError(
+                f"cannot be listed ({error.strerror})", file=folder, field="--input-dir", fix=_FIX_RESULTS
+            ) from None
+        if not files:
+            raise InputError("no frame_*.npz here", file=folder, field="--input-dir", fix=_FIX_RESULTS)
+        self.files = dict(sorted(files.items()))
+        self.size: tuple[int, int] = (0, 0)
+        self.largest = 0.0
+        self.guarantees: set[str] = set()
+        self.unbounded: list[int] = []
+        self.parameters: list[list[dict[str, Any]]] = []
+        for index, file in self.files.items():
+            stored = load_frame(file, leaves=False)
+            result, size = stored.result, stored.result.lower.shape[:2]
+            if self.size not in ((0, 0), size):
+                raise InputError(
+                    f"{size[1]} x {size[0]} pixels, the frames before {self.size[1]} x {self.size[0]}",
+                    file=file,
+                    fix="bound the whole path at one size",
+                )
+            self.size = size
+            self.largest = max(self.largest, float(gap(result.lower, result.upper).max()))
+            self.guarantees.add(str(stored.about.get("guarantee", "unknown")))
+            if not result.bounded:
+                self.unbounded.append(index)
+            box = result.box
+            sides = zip(box.names, box.units, box.lower, box.upper, strict=True)
+            self.parameters.append([dict(zip(("name", "unit", "lower", "upper"), s, strict=True)) for s in sides])
+
+    def __iter__(self) -> Iterable[FrameResult]:
+        """The frames in order, each read when it is its turn."""
+        return (load_frame(file, leaves=False).result for file in self.files.values())
+
+    def picture(self, result: FrameResult, name: str) -> np.ndarray:
+        """[H, W, 3] uint8 of one of `PICTURES`; bounds are rounded outward, gaps share one scale."""
+        if name == "lower":
+            return np.floor(result.lower.astype(np.float64) * 255.0).astype(np.uint8)
+        if name == "upper":
+            return np.ceil(result.upper.astype(np.float64) * 255.0).astype(np.uint8)
+        if name == "gap":
+            return heat(gap(result.lower, result.upper), self.largest)
+        if name == "witness":
+            return heat(gap(result.witness_lower, result.witness_upper), self.largest)
+        return to_bytes(result.image)
+
+
+def write_archive(results: Results, file: Path) -> None:
+    """One npz: ``frames`` [K], the arrays of frame files as [K, H, W, 3] float32, and ``about`` (JSON text).
+
+    Reads with ``np.load(file, allow_pickle=False)``.
+    """
+    shape = (len(results.files), *results.size, 3)
+    about = {
+        "format": "ns-abstract path",
+        "version": 1,
+        "guarantee": sorted(results.guarantees),
+        "parameters": results.parameters,
+        "unbounded": results.unbounded,
+    }
+
+    def write(stream: BinaryIO) -> None:
+        with zipfile.ZipFile(stream, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive:
+            for name, array in (("frames", np.array(list(results.files))), ("about", np.array(json.dumps(about)))):
+                with archive.open(f"{name}.npy", "w") as member:
+                    np.lib.format.write_array(member, array, allow_pickle=False)
+            for name in IMAGES:
+                with archive.open(f"{name}.npy", "w", force_zip64=True) as member:
+                    header = {"descr": "<f4", "fortran_order": False, "shape": shape}
+                    np.lib.format.write_array_header_1_0(member, header)
+                    for result in results:  # pyright: ignore[reportGeneralTypeIssues]
+                        member.write(np.ascontiguousarray(getattr(result, name), "<f4").tobytes())
+
+    write_atomic(file, write)
+
+
+def write_pictures(results: Results, folder: Path, names: Sequence[str]) -> list[Path]:
+    """One PNG for every frame and name, ``lower_00000.png``: whole pixels, no labels."""
+    from PIL import Image
+
+    folder.mkdir(parents=True, exist_ok=True)
+    written = []
+    for result in results:  # pyright: ignore[reportGeneralTypeIssues]
+        for name in names:
+            file = folder / f"{name}_{result.index:05d}.png"
+            image = Image.fromarray(results.picture(result, name))
+            write_atomic(file, lambda stream, image=image: image.save(stream, "png"))
+            written.append(file)
+    return written
+
+
+def write_video(results: Results, file: Path, names: Sequence[str], fps: float) -> None:
+    """An H.264 video (mp4) of the pictures ``names`` side by side, one frame of the path after the other.
+
+    Raises:
+        InputError: PyAV is missing.
+    """
+    try:
+        import av
+    except ImportError:
+        raise InputError("needs the package av", field="mp4", fix="pip install 'ns-abstract[video]'") from None
+    from fractions import Fraction
+
+    height, width = results.size[0], results.size[1] * len(names)
+    # the colour planes have half the size
+    even = height + height % 2, width + width % 2
+
+    def write(stream: BinaryIO) -> None:
+        with av.open(stream, "w", format="mp4") as container:
+            video: Any = container.add_stream("libx264", rate=Fraction(fps).limit_denominator(1001))
+            video.height, video.width = even
+            video.pix_fmt, video.options = "yuv420p", {"crf": "18"}
+            for result in results:  # pyright: ignore[reportGeneralTypeIssues]
+                row = np.concatenate([results.picture(result, name) for name in names], axis=1)
+                padded = np.pad(row, ((0, even[0] - height), (0, even[1] - width), (0, 0)))
+                container.mux(video.encode(av.VideoFrame.from_ndarray(padded, "rgb24")))
+            container.mux(video.encode())
+
+    if not (math.isfinite(fps) and 0.1 <= fps <= 1000.0):
+        raise InputError(f"found {fps}", field="--fps", fix="give a number from 0.1 to 1000")
+    write_atomic(file, write)

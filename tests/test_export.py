@@ -1,0 +1,151 @@
+"""Exports: what is written is what was bounded, and other programs can read it."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from conftest import Inputs, blob_scene
+from PIL import Image
+from test_cli import call, one_line  # noqa: F401
+
+from ns_abstract.cli import export as export_command
+from ns_abstract.cli import render as render_command
+from ns_abstract.errors import InputError
+from ns_abstract.methods.splat.load import load_scene
+from ns_abstract.methods.splat.ply import write_ply
+from ns_abstract.methods.splat.scene import SplatScene
+from ns_abstract.refine.result import FrameResult
+from ns_abstract.report.export import Results
+from ns_abstract.report.files import IMAGES, load_frame, save_frame
+
+Call = Callable[..., tuple[int, str]]
+ARRAYS = ("means", "log_scales", "quats", "opacity_logits", "sh")
+
+
+@pytest.fixture(scope="module")
+def bounded(blobs: Inputs, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Results of ns-abstract-render for the three frames of a small path."""
+    folder = tmp_path_factory.mktemp("bounded") / "out"
+    with pytest.MonkeyPatch.context() as patch, pytest.raises(SystemExit) as leave:
+        options = blobs.options(folder, time_budget=6, target_ratio=1.5)
+        patch.setattr("sys.argv", ["command", *options])
+        render_command.main()
+    assert leave.value.code == 0
+    return folder
+
+
+def run(call: Call, *options: object) -> tuple[int, str]:  # noqa: F811
+    return call([str(option) for option in options], export_command.main)
+
+
+def frames(folder: Path) -> list[FrameResult]:
+    return [load_frame(file).result for file in sorted(folder.glob("frame_*.npz"))]
+
+
+def test_archive_holds_every_frame(call: Call, bounded: Path, tmp_path: Path) -> None:  # noqa: F811
+    file = tmp_path / "new" / "path.npz"
+    code, error = run(call, "npz", "--input-dir", bounded, "--output-filename", file)
+    assert (code, error) == (0, "")
+    with np.load(file, allow_pickle=False) as archive:
+        assert archive["frames"].tolist() == [0, 1, 2]
+        about = json.loads(str(archive["about"]))
+        assert about["guarantee"] == ["float32-sound"] and about["unbounded"] == []
+        assert [p["name"] for p in about["parameters"][0]] == ["x"]
+        for name in IMAGES:
+            np.testing.assert_array_equal(archive[name], np.stack([getattr(f, name) for f in frames(bounded)]))
+
+
+def test_pictures_round_outward(call: Call, bounded: Path, tmp_path: Path) -> None:  # noqa: F811
+    code, _ = run(call, "png", "--input-dir", bounded, "--output-dir", tmp_path, "--pictures", "lower", "upper", "gap")
+    assert code == 0
+    assert len(list(tmp_path.glob("*.png"))) == 9
+    for result in frames(bounded):
+        low, high = (np.asarray(Image.open(tmp_path / f"{n}_{result.index:05d}.png")) for n in ("lower", "upper"))
+        assert (low / 255.0 <= result.lower.astype(np.float64)).all()
+        assert (high / 255.0 >= result.upper.astype(np.float64)).all()
+        assert (result.lower - low / 255.0).max() < 1 / 255.0 and (high / 255.0 - result.upper).max() < 1 / 255.0
+        # the usual conversion, towards zero, would break the upper bound
+        assert ((result.upper * 255.0).astype(np.uint8) / 255.0 < result.upper).any()
+
+
+def test_video_shows_every_frame(call: Call, bounded: Path, tmp_path: Path) -> None:  # noqa: F811
+    av = pytest.importorskip("av", reason="needs the extra video")
+    file = tmp_path / "path.mp4"
+    code, _ = run(
+        call, "mp4", "--input-dir", bounded, "--output-filename", file, "--pictures", "image", "gap", "--fps", 5
+    )
+    assert code == 0
+    with av.open(str(file)) as container:
+        assert container.streams.video[0].average_rate == 5
+        shown = [frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)]
+    expected = frames(bounded)
+    assert len(shown) == len(expected) and shown[0].shape == (32, 64, 3)
+    for picture, result in zip(shown, expected, strict=True):
+        assert np.abs(picture[:, :32] / 255.0 - result.image).mean() < 0.05
+
+
+def test_odd_sizes_and_missing_bounds(bounded: Path, tmp_path: Path, call: Call) -> None:  # noqa: F811
+    pytest.importorskip("av", reason="needs the extra video")
+    result = frames(bounded)[0]
+    cut = {name: np.ascontiguousarray(getattr(result, name)[:31, :29]) for name in IMAGES}
+    cut["lower"], cut["upper"] = np.zeros_like(cut["lower"]), np.ones_like(cut["upper"])
+    save_frame(tmp_path / "frame_00000.npz", dataclasses.replace(result, **cut, bounded=False), status="missing")
+    code, said = run(call, "mp4", "--input-dir", tmp_path, "--output-filename", tmp_path / "a.mp4")
+    assert code == 0 and "no bounds but [0, 1] in frames 0" in said
+
+
+@pytest.mark.parametrize("scene", [blob_scene(40, degree=3), blob_scene(7, degree=0)], ids=["degree 3", "degree 0"])
+def test_ply_comes_back(tmp_path: Path, scene: SplatScene) -> None:
+    file = tmp_path / "scene.ply"
+    lost = write_ply(scene, file)
+    back = load_scene(file)
+    for name in ARRAYS:
+        np.testing.assert_array_equal(getattr(back, name), getattr(scene, name), name)
+    assert (back.sh_degree, back.color_model, back.rasterize_mode) == (scene.sh_degree, "sh", "classic")
+    assert len(lost) == 1 and "background" in lost[0]
+
+
+def test_ply_of_a_run(call: Call, blobs: Inputs, tmp_path: Path) -> None:  # noqa: F811
+    file = tmp_path / "scene.ply"
+    code, said = run(call, "ply", "--load-config", blobs.config, "--output-filename", file)
+    assert code == 0 and "background" in said
+    for name in ARRAYS:
+        np.testing.assert_array_equal(getattr(load_scene(file), name), getattr(load_scene(blobs.config), name), name)
+
+
+def test_ply_says_what_it_loses(tmp_path: Path) -> None:
+    scene = dataclasses.replace(
+        blob_scene(5, degree=0), color_model="sigmoid", rasterize_mode="antialiased", background=np.zeros(3, np.float32)
+    )
+    lost = write_ply(scene, tmp_path / "a.ply")
+    assert ["logits" in lost[0], "antialiased" in lost[1], len(lost)] == [True, True, 2]
+    back = load_scene(tmp_path / "a.ply")
+    shown = 0.2820947917738781 * back.sh.astype(np.float64) + 0.5
+    np.testing.assert_allclose(shown, 1.0 / (1.0 + np.exp(-scene.sh.astype(np.float64))), atol=1e-6)
+
+
+def test_mistakes(call: Call, bounded: Path, tmp_path: Path) -> None:  # noqa: F811
+    one_line(*run(call, "npz", "--input-dir", tmp_path, "--output-filename", tmp_path / "a.npz"), "no frame_*.npz")
+    missing = tmp_path / "none"
+    one_line(*run(call, "npz", "--input-dir", missing, "--output-filename", tmp_path / "a.npz"), "none")
+    one_line(
+        *run(call, "mp4", "--input-dir", bounded, "--output-filename", tmp_path / "a.mp4", "--fps", "nan"), "--fps"
+    )
+    one_line(*run(call, "png", "--input-dir", bounded, "--output-dir", tmp_path, "--pictures", "depth"), "--pictures")
+    (tmp_path / "frame_00000.npz").write_bytes(b"no")
+    with pytest.raises(InputError, match="cannot be read"):
+        Results(tmp_path)
+
+
+def test_sizes_must_agree(bounded: Path, tmp_path: Path) -> None:
+    first, second = frames(bounded)[:2]
+    cut = {name: np.ascontiguousarray(getattr(second, name)[:16]) for name in IMAGES}
+    save_frame(tmp_path / "frame_00000.npz", first)
+    save_frame(tmp_path / "frame_00001.npz", dataclasses.replace(second, **cut))
+    with pytest.raises(InputError, match="one size"):
+        Results(tmp_path)
