@@ -55,7 +55,8 @@ class ChebyshevBasis:
         return len(self.indices)
 
     def _points(self, axis_points: Float64Array) -> Float64Array:
-        return np.array(list(itertools.product(axis_points, repeat=self.dimensions))).reshape(-1, self.dimensions)
+        points = list(itertools.product(axis_points, repeat=self.dimensions))
+        return np.array(points, np.float64).reshape(len(points), self.dimensions)
 
     def values(self, points: Float64Array) -> Float64Array:
         """[n, m] values of the basis at ``points`` [n, d]."""
@@ -73,7 +74,7 @@ class ChebyshevBasis:
 
     @cached_property
     def interpolation(self) -> tuple[Float64Array, Float64Array]:
-        """[m, nodes] and [rest, nodes]: coefficients of the interpolant, those of the basis and those above its degree."""
+        """Coefficients of the interpolant: [m, nodes] those of the basis, [rest, nodes] those above its degree."""
         n = self.degree + 1
         by_axis = chebyshev_values(np.cos(np.pi * (np.arange(n) + 0.5) / n), self.degree).T * (2.0 / n)
         by_axis[0] *= 0.5

@@ -200,7 +200,8 @@ def taylor_cos_sin(angle: TaylorArray) -> tuple[TaylorArray, TaylorArray]:
     cycle = (cosine, -sine, -cosine, sine)
     last = np.full(angle.shape, 1.0 / math.factorial(n + 1) * (1.0 + 8.0 * UNIT64))
     # an absolute error of the centre's function moves every derivative
-    slack = 8.0 * UNIT64 * (np.abs(middle) + 2.0) * np.exp(np.minimum(angle.size - np.abs(middle) + angle.radius, 700.0))
+    reach = np.minimum(angle.size - np.abs(middle) + angle.radius, 700.0)
+    slack = 8.0 * UNIT64 * (np.abs(middle) + 2.0) * np.exp(reach)
     found = []
     for offset in (0, 3):
         derivatives = [cycle[(k + offset) % 4] / math.factorial(k) for k in range(n + 1)]

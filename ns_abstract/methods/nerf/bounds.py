@@ -25,15 +25,16 @@ from ns_abstract.sets.box import ParameterBox
 from ns_abstract.sets.poses import PoseSet
 
 #: (degree, grid) of the polynomials by number of parameters.
-_DEGREES = {0: (1, 2), 1: (16, 96), 2: (5, 16), 3: (3, 8)}
+_DEGREES = {0: (1, 2), 1: (20, 120), 2: (6, 20), 3: (4, 10)}
 #: Degree of the Taylor models of poses.
 _TAYLOR = 6
 #: Cells bounded at once.
 _BATCH = 64
 #: Samples of a ray that are bounded before the light that is left is looked at.
 _BLOCK = 8
-#: Parts by axis that every cell of the starting width is cut into, and levels of halving below it.
-_DEEPER = 4
+#: Halvings below cells of the starting width, by number of parameters (one level may concern any axis).
+_DEEPER = {0: 0, 1: 4}
+_DEEPER_MORE = 6
 #: Most parts of one box.
 _PARTS = 4096
 #: Light (in [0, 1]) that a skipped sample may add, as a share of the tolerance.
@@ -83,7 +84,8 @@ class Division:
     def boxes(self, level: int) -> tuple[np.ndarray, np.ndarray]:
         """[cells, d] lower and upper ends in [-1, 1]."""
         counts = np.array(self.counts(level), np.int64)
-        places = np.array(list(np.ndindex(*counts.tolist())), np.float64).reshape(-1, self.dimensions)
+        found = list(np.ndindex(*counts.tolist()))
+        places = np.array(found, np.float64).reshape(len(found), self.dimensions)
         return 2.0 * places / counts - 1.0, 2.0 * (places + 1.0) / counts - 1.0
 
     def members(self, level: int) -> np.ndarray:
@@ -160,7 +162,8 @@ class Pencil:
         world = world.widened(16.0 * UNIT64 * np.abs(in_camera).sum(axis=1)[:, None])
         length = (world * world).sum(1)
         direction = world * length.rsqrt()[:, None]
-        self.exponents = np.array(rotation.basis.exponents, np.int64).reshape(-1, box.dimensions)
+        exponents = rotation.basis.exponents
+        self.exponents = np.array(exponents, np.int64).reshape(len(exponents), box.dimensions)
         self.origin, self.origin_radius = position.coefficients, position.radius
         self.direction = np.ascontiguousarray(direction.coefficients.transpose(1, 0, 2))  # [n, M, 3]
         self.direction_radius = direction.radius + 16.0 * UNIT64
@@ -237,9 +240,10 @@ class NerfBounds:
             axis = int(np.argmax(widest))
             axes.append(axis)
             widest[axis] *= 0.5
-        if 1 << (len(axes) + _DEEPER * d) > _PARTS:
+        deeper = _DEEPER.get(d, _DEEPER_MORE)
+        if 1 << (len(axes) + deeper) > _PARTS:
             return None
-        for _ in range(_DEEPER * d):
+        for _ in range(deeper):
             axis = int(np.argmax(widest))
             axes.append(axis)
             widest[axis] *= 0.5
@@ -354,7 +358,7 @@ class _Work:
 
     def _bound_batch(self, level: int, items: _Items) -> np.ndarray:
         """Bound some cells of one level; returns [k] which of them are worth halving."""
-        device, field, basis = self.owner.device, self.field, self.basis
+        device, field = self.owner.device, self.field
         monomials, bernstein, members = self._level(level)
         self.cells += len(items)
         t = self.owner.distances[items.sample]
@@ -420,7 +424,8 @@ class _Work:
         """Intersect what is known with new bounds; what is not a number or crosses says nothing."""
         old_low, old_high = lower[rows], upper[rows]
         good = (low <= high) & np.isfinite(low) & np.isfinite(high)
-        low, high = np.where(good, np.maximum(low, old_low), old_low), np.where(good, np.minimum(high, old_high), old_high)
+        low = np.where(good, np.maximum(low, old_low), old_low)
+        high = np.where(good, np.minimum(high, old_high), old_high)
         crossed = ~(low <= high)
         lower[rows] = np.where(crossed, old_low, low)
         upper[rows] = np.where(crossed, old_high, high)
