@@ -20,22 +20,31 @@ from ns_abstract.sets.poses import PoseSet
 UNIFORM = Sampling("uniform", 0.0, 4.0, 24, 0, (0.2, 0.6, 1.0))
 
 
-def tiny_weights(seed: int = 0, *, density: float = 6.0, rough: float = 1.0, color: float = 4.0) -> FieldWeights:
-    """A random field of 3 x 16 with a skip: ``density`` and ``color`` scale the last layers, ``rough`` the encoding."""
+def tiny_weights(seed: int = 0, *, density: float = 8.0, rough: float = 1.0, color: float = 4.0) -> FieldWeights:
+    """A random field of 3 x 16 with a skip, empty in three quarters of the space about the origin.
+
+    ``density`` is the standard deviation of the density before its softplus, ``rough`` scales the waves of the
+    encoding and ``color`` the last layer of the colours.
+    """
     torch.manual_seed(seed)
     found = NerfNetwork(3, 16, 1, 2, 8).weights()
 
-    def scaled(layer: Layer, by: float, columns: slice = slice(None), shift: float = 0.0) -> Layer:
+    def scaled(layer: Layer, by: float, columns: slice = slice(None)) -> Layer:
         weight = layer.weight.copy()
         weight[:, columns] *= by
-        return Layer(weight, (layer.bias + np.float32(shift)).astype(np.float32), layer.skip)
+        return Layer(weight, layer.bias, layer.skip)
 
-    return dataclasses.replace(
+    found = dataclasses.replace(
         found,
         base=tuple(scaled(layer, rough, slice(0, 60)) if i in (0, 1) else layer for i, layer in enumerate(found.base)),
-        density=scaled(found.density, density, shift=1.0),
+        density=dataclasses.replace(found.density, bias=np.zeros(1, np.float32)),
         color=scaled(found.color, color),
     )
+    x = 1.2 * (2.0 * torch.rand(4000, 3, dtype=torch.float64) - 1.0)
+    raw = raw_outputs(found, x, x)[0]
+    by = density / float(raw.std())
+    bias = np.full(1, -by * float(raw.quantile(0.75)), np.float32)
+    return dataclasses.replace(found, density=Layer(scaled(found.density, by).weight, bias))
 
 
 def tiny_scene(seed: int = 0, **changes: float) -> NerfScene:

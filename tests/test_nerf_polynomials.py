@@ -29,7 +29,7 @@ SETS = {
 
 
 def evaluate(model: TaylorArray, scaled: np.ndarray) -> np.ndarray:
-    exponents = np.array(model.basis.exponents, np.int64).reshape(-1, scaled.size)
+    exponents = np.array(model.basis.exponents, np.int64).reshape(model.coefficients.shape[0], scaled.size)
     return np.tensordot(np.prod(scaled**exponents, axis=1), model.coefficients, 1)
 
 

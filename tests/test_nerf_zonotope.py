@@ -85,7 +85,7 @@ def test_several_parameters(dimensions: int, half: float) -> None:
 
 def test_tightness() -> None:
     """No unnoticed loosening: widths over true widths on smooth, medium and rough pieces."""
-    for half, limit in ((1e-4, 1.01), (3e-3, 1.05), (2e-2, 1.5)):
+    for half, limit in ((1e-4, 1.001), (3e-3, 1.02), (6e-3, 2.3)):
         assert 1.0 <= worst(tiny_weights(1), half)[2] < limit
 
 
@@ -135,14 +135,14 @@ def faulty_columns(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(zonotope, "scale_columns", lambda columns, owner, slope: columns.mul_(0.1))
 
 
-def faulty_owner(monkeypatch: pytest.MonkeyPatch) -> None:
+def faulty_sums(monkeypatch: pytest.MonkeyPatch) -> None:
     sums = zonotope.column_sums
-    monkeypatch.setattr(zonotope, "column_sums", lambda columns, owner, n: sums(columns, (owner + 1) % max(n, 1), n))
+    monkeypatch.setattr(zonotope, "column_sums", lambda *arguments: 0.1 * sums(*arguments))
 
 
 @pytest.mark.parametrize(
     ("fault", "half"),
-    [(faulty_fit, 2e-2), (faulty_remainder, 0.1), (faulty_columns, 2e-2), (faulty_owner, 2e-2)],
+    [(faulty_fit, 2e-2), (faulty_remainder, 0.1), (faulty_columns, 2e-2), (faulty_sums, 2e-2)],
 )
 def test_planted_faults_are_found(monkeypatch: pytest.MonkeyPatch, fault, half: float) -> None:
     weights = [tiny_weights(seed, rough=20.0) for seed in range(3)]
@@ -157,7 +157,8 @@ def test_planted_faults_are_found(monkeypatch: pytest.MonkeyPatch, fault, half: 
 def test_opacities_are_monotone_bounds() -> None:
     z = torch.cat([torch.linspace(-800, 800, 4001), torch.tensor([20.0 - 1e-9, 20.0, 20.0 + 1e-9, 1e9, -1e9])]).double()
     for length in (1e-6, 0.1, 100.0):
-        low, high = opacity(z, torch.tensor(length), up=False), opacity(z, torch.tensor(length), up=True)
+        exact = torch.tensor(length, dtype=torch.float64)
+        low, high = opacity(z, exact, up=False), opacity(z, exact, up=True)
         concrete = 1.0 - torch.exp(-length * torch.nn.functional.softplus(z))
         assert (low <= high).all() and (low >= 0.0).all() and (high <= 1.0).all()
         # the renderer's 1 - exp(-x) carries an absolute rounding, which compositing is charged with

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -14,9 +15,12 @@ from ns_abstract.sets.box import ParameterBox
 from ns_abstract.sets.poses import PoseSet
 from ns_abstract.sets.tiles import tile_grid
 
-#: What an open sample may move a pixel by, on boxes a quarter as wide as the set; less on narrower ones.
-_TOLERANCE = 0.03
-_LEAST_TOLERANCE = 2e-4
+#: What an open sample may move a pixel by on boxes a quarter as wide as the set, as a part of the pixels' mean
+#: variation over the set; less on narrower boxes.
+_TOLERANCE = 0.12
+_MOST_TOLERANCE, _LEAST_TOLERANCE = 0.03, 1e-5
+#: Rays and poses rendered to estimate that variation.
+_LOOK_RAYS, _LOOK_POSES = 256, 7
 #: Weights that are multiplied in one call of `NerfFrame.bound`, in units of rays times weights.
 _WORK = 2_500_000
 
@@ -150,4 +154,13 @@ class NerfFrame:
         whole = np.array(self.box.upper) - np.array(self.box.lower)
         width = np.array(box.upper) - np.array(box.lower)
         share = float(np.prod(width / whole)) ** (1.0 / box.dimensions)
-        return max(_LEAST_TOLERANCE, min(1.0, 4.0 * share) * _TOLERANCE)
+        return max(_LEAST_TOLERANCE, min(1.0, 4.0 * share) * min(_MOST_TOLERANCE, _TOLERANCE * self._variation))
+
+    @cached_property
+    def _variation(self) -> float:
+        """Mean over some rays of how far their colours move over the set (an estimate)."""
+        rng = np.random.default_rng(0)
+        tiles = np.sort(rng.permutation(self.tile_count)[:_LOOK_RAYS])
+        values = [*self.box.sample(_LOOK_POSES - 2, rng), np.array(self.box.lower), np.array(self.box.upper)]
+        pictures = np.stack([self.render(v, tiles) for v in values])
+        return float((pictures.max(axis=0) - pictures.min(axis=0)).mean())
