@@ -123,8 +123,11 @@ def main() -> None:
         color[place[:, 0], place[:, 1]] = network.colors(h[seen], along)
         loss = functional.mse_loss((weight[..., None] * color).sum(dim=1), c[which])
         # space outside the hull, which rays of any view may cross, is empty
-        free = x[~valid].reshape(-1, 3)
-        free = free[torch.randint(free.shape[0], (FREE_POINTS,), device=device)]
+        which = which[torch.randint(which.numel(), (FREE_POINTS,), device=device)]
+        free = o[which] + far * torch.rand(FREE_POINTS, 1, device=device) * d[which]
+        voxel = ((free + REACH) / (2.0 * REACH) * HULL).long()
+        a, b, e = voxel.clamp(0, HULL - 1).unbind(-1)
+        free = free[~(occupied[a, b, e] & ((voxel >= 0) & (voxel < HULL)).all(dim=-1))]
         loss = loss + 1e-2 * functional.relu(network.raw_density(free)[0] + 8.0).mean()
         optimizer.zero_grad(set_to_none=True)
         loss.backward()

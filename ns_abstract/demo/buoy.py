@@ -13,8 +13,8 @@ from ns_abstract.methods.nerf.scene import NerfScene
 #: Everything lies inside this distance of the origin.
 REACH = 1.2
 #: Steps of the fit: about a minute of one processor core.
-STEPS = 260
-BATCH = 1024
+STEPS = 500
+BATCH = 1536
 _DENSITY, _EDGE = 40.0, 0.05
 
 

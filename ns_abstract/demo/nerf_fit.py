@@ -20,6 +20,10 @@ POSITION = Encoding(10, 0.0, 8.0)
 DIRECTION = Encoding(4, 0.0, 4.0)
 #: Density before the softplus where training begins: nearly transparent.
 _EMPTY = -3.0
+#: Density before the softplus that counts as empty in `fit_field`.
+_CLEAR = -9.0
+#: Radius of the space that is fitted as empty, relative to that of the object.
+_FAR = 4.0
 
 
 class NerfNetwork(nn.Module):
@@ -96,31 +100,30 @@ def fit_field(
     steps: int,
     *,
     batch: int = 2048,
-    rate: float = 2e-3,
-    bin_length: float = 6.0 / 64.0,
+    rate: float = 8e-4,
     seed: int = 0,
 ) -> None:
-    """Fit a network to an analytic field over the ball of radius ``reach`` about the origin.
+    """Fit a network to an analytic field over the ball of radius ``reach`` about the origin, and more coarsely around it.
 
-    Opacities of a bin of ``bin_length`` are compared, not densities, and colours where something is opaque:
-    that is what a picture shows.
+    Densities are compared before the softplus and squeezed, so that neither empty nor dense space dominates;
+    colours where there is something.
     """
     generator = torch.Generator().manual_seed(seed)
     optimizer = torch.optim.Adam(network.parameters(), lr=rate, eps=1e-8)
     for step in range(steps):
         for group in optimizer.param_groups:
-            group["lr"] = rate * 0.5 * (1.0 + math.cos(math.pi * step / steps)) + 1e-5
+            group["lr"] = rate * min(1.0, (step + 1) / 40) * 0.5 * (1.0 + math.cos(math.pi * step / steps)) + 1e-5
         x = torch.randn(batch, 3, generator=generator)
-        x *= reach * (torch.rand(batch, 1, generator=generator) ** (1.0 / 2.0)) / x.norm(dim=1, keepdim=True)
+        # rays begin far outside of what there is to see
+        around = torch.where(torch.arange(batch)[:, None] % 4 == 0, _FAR * reach, reach)
+        x *= around * torch.rand(batch, 1, generator=generator).sqrt() / x.norm(dim=1, keepdim=True)
         direction = functional.normalize(torch.randn(batch, 3, generator=generator), dim=1)
         density, color = field(x, direction)
         raw, h = network.raw_density(x)
-        alpha = 1.0 - torch.exp(-bin_length * density)
-        found = 1.0 - torch.exp(-bin_length * functional.softplus(raw))
-        loss = functional.mse_loss(found, alpha) * 4.0
-        loss = loss + (alpha[:, None] * (network.colors(h, direction) - color) ** 2).mean() * 4.0
-        # what is empty should be so by a margin
-        loss = loss + 0.02 * (functional.relu(raw + 8.0) * (alpha < 1e-3)).mean()
+        target = torch.where(density > 20.0, density, torch.log(torch.expm1(density.clamp(1e-12, 30.0))))
+        loss = functional.mse_loss(functional.softsign(raw / 4.0), functional.softsign(target.clamp(min=_CLEAR) / 4.0))
+        opaque = (density > 0.5).float()[:, None]
+        loss = loss + (opaque * (network.colors(h, direction) - color) ** 2).mean() / opaque.mean().clamp(min=0.01)
         optimizer.zero_grad(set_to_none=True)
         loss.backward()
         optimizer.step()
