@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import torch
 from torch import Tensor
@@ -48,7 +50,14 @@ def buoy_scene(steps: int = STEPS) -> NerfScene:
     return NerfScene(weights, weights, background=np.array([1.0, 1.0, 1.0], np.float32), name="buoy")
 
 
-def buoy_path(size: int = 64) -> dict:
-    """One view of the buoy and a yaw of 0.002 rad either way."""
+def buoy_views(count: int = 8, size: int = 64) -> list[View]:
+    """Views all around the buoy for the data set beside the run."""
+    angles = 2.0 * np.pi * np.arange(count) / count
+    eyes = [(3.2 * np.cos(a), 3.2 * np.sin(a), 1.2) for a in angles]
+    return [View(look_at(eye, (0.0, 0.0, 0.1)), 40.0, size, size) for eye in eyes]
+
+
+def buoy_path(size: int = 16) -> dict[str, Any]:
+    """One small view of the buoy, and a yaw of 0.002 rad either way."""
     view = View(look_at((2.6, -1.8, 1.2), (0.0, 0.0, 0.1)), 40.0, size, size)
     return path_json([view], seconds=1.0, perturbation={"version": 1, "rotation": {"yaw": 0.002}})
