@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from functools import cached_property, lru_cache
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ns_abstract.arithmetic.forms import Float64Array
 
@@ -44,7 +45,7 @@ class ChebyshevBasis:
         return list(itertools.product(range(self.degree + 1), repeat=self.dimensions))
 
     @cached_property
-    def indices(self) -> Float64Array:
+    def indices(self) -> NDArray[np.int64]:
         """[m, d] degrees by axis of every coefficient, the constant first."""
         kept = sorted((k for k in self._tensor if sum(k) <= self.degree), key=lambda k: (sum(k), k))
         return np.array(kept, np.int64).reshape(len(kept), self.dimensions)

@@ -125,7 +125,7 @@ class TaylorArray:
         shape = np.broadcast_shapes(a.shape, b.shape)
         total = np.zeros((len(self.basis.exponents), *shape))
         dropped = np.zeros(shape)
-        present = [np.flatnonzero([c.any() for c in x.coefficients]) for x in (a, b)]
+        present = [[k for k, c in enumerate(x.coefficients) if c.any()] for x in (a, b)]
         for i, j in itertools.product(*present):
             product = a.coefficients[i] * b.coefficients[j]
             place = self.basis.products[i, j]

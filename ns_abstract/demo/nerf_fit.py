@@ -51,8 +51,8 @@ class NerfNetwork(nn.Module):
         self.color = nn.Linear(head_width, 3)
         with torch.no_grad():
             for layer in (*self.base, *self.head):
-                nn.init.kaiming_uniform_(layer.weight, nonlinearity="relu")
-                nn.init.zeros_(layer.bias)
+                nn.init.kaiming_uniform_(layer.weight, nonlinearity="relu")  # pyright: ignore
+                nn.init.zeros_(layer.bias)  # pyright: ignore
             self.density.bias.fill_(_EMPTY)
             for k, encoding in ((0, POSITION), *(() if skip is None else ((skip, POSITION),))):
                 damp = torch.from_numpy(1.0 / encoding.frequencies).float().repeat(6)
@@ -103,7 +103,7 @@ def fit_field(
     rate: float = 8e-4,
     seed: int = 0,
 ) -> None:
-    """Fit a network to an analytic field over the ball of radius ``reach`` about the origin, and more coarsely around it.
+    """Fit a network to an analytic field over the ball of radius ``reach``, and more coarsely around it.
 
     Densities are compared before the softplus and squeezed, so that neither empty nor dense space dominates;
     colours where there is something.

@@ -111,7 +111,7 @@ class NerfRenderer:
 
     def image(self, camera: Camera, pose: np.ndarray) -> np.ndarray:
         """The image [H, W, 3] float64."""
-        grid = np.stack(np.mgrid[: camera.height, : camera.width], axis=-1).reshape(-1, 2)
+        grid = np.indices((camera.height, camera.width)).reshape(2, -1).T
         return self.pixels(camera, pose, grid).reshape(camera.height, camera.width, 3)
 
     def _distances(self, bins: Tensor) -> Tensor:
