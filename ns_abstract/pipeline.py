@@ -7,26 +7,24 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 
-from ns_abstract.arithmetic.units import arithmetic as arithmetic_named
+from ns_abstract.arithmetic.units import Arithmetic
 from ns_abstract.errors import InputError
+from ns_abstract.methods.load import load_any
+from ns_abstract.methods.nerf.method import NerfMethod
+from ns_abstract.methods.nerf.scene import NerfScene
 from ns_abstract.methods.runs import available_memory
-from ns_abstract.methods.splat.activate import Splats, activate
-from ns_abstract.methods.splat.constants import RASTERISERS, Rasteriser
-from ns_abstract.methods.splat.frame import SplatFrame
-from ns_abstract.methods.splat.load import load_scene
-from ns_abstract.methods.splat.scene import SplatScene
+from ns_abstract.methods.splat.activate import Splats
+from ns_abstract.methods.splat.constants import Rasteriser
+from ns_abstract.methods.splat.method import SplatMethod
 from ns_abstract.refine.engine import Goal, Refinement
 from ns_abstract.refine.result import FrameResult, TracePoint
 from ns_abstract.sets.path import CameraPath, load_camera_path
 from ns_abstract.sets.perturbation import Perturbation, load_perturbation, parse_perturbation
-from ns_abstract.sets.poses import PoseSet, translation_only
-
-#: Bytes that the kernels need by Gaussian, beside the scene itself (record, boxes, colours, buffers).
-_BYTES_BY_GAUSSIAN = 1200
+from ns_abstract.sets.poses import PoseSet
 
 
 @dataclass(frozen=True)
@@ -38,22 +36,73 @@ class Settings:
         camera_path_filename: Camera path JSON.
         perturbation_filename: Perturbation JSON; None: the camera path holds it.
         downscale_factor: Pictures become this many times smaller.
-        renderer: "gsplat" or "paper".
-        arithmetic: "float32" or "real".
+        renderer: "gsplat" or "paper"; None: what the method's own renderer is.
+        arithmetic: "float32" or "real"; None: the strongest that the method has.
         seed: Of the random witnesses.
         memory_limit: GiB.
         resize: Height and width in pixels that pictures are rendered with, in place of the path's.
+        sampling, num_samples, near_plane: Of the rays of a NeRF; None: the method's own.
     """
 
     load_config: Path
     camera_path_filename: Path
     perturbation_filename: Path | None = None
     downscale_factor: float = 1.0
-    renderer: str = "gsplat"
-    arithmetic: str = "float32"
+    renderer: str | None = None
+    arithmetic: str | None = None
     seed: int = 0
     memory_limit: float | None = None
     resize: tuple[int, int] | None = None
+    sampling: str | None = None
+    num_samples: int | None = None
+    near_plane: float | None = None
+
+
+class Method(Protocol):
+    """What the command lines need to know about a way to represent scenes: its scene and the bounded program."""
+
+    scene: Any
+
+    @property
+    def program(self) -> dict[str, Any]:
+        """``name`` and ``version`` of the bounded program, and what else tells it from others."""
+        ...
+
+    @property
+    def guarantee(self) -> str:
+        """What bounds of this program are called: "float32-sound" or "real-sound"."""
+        ...
+
+    @property
+    def content(self) -> str:
+        """The scene in a few words."""
+        ...
+
+    @property
+    def plan(self) -> tuple[str, ...]:
+        """What is left out for this scene, whatever the frame."""
+        ...
+
+    @property
+    def fingerprint(self) -> dict[str, Any]:
+        """Scene and program, for results that are continued."""
+        ...
+
+    def describe(self) -> dict[str, Any]:
+        """The scene for reports; ``name`` is among the keys."""
+        ...
+
+    def memory(self, pixels: int) -> int:
+        """Bytes that bounding pictures of ``pixels`` needs beside the leaves."""
+        ...
+
+    def frame(self, poses: PoseSet) -> Any:
+        """One frame, ready for refinement (`ns_abstract.refine.engine.Frame`), with ``warm_up()``."""
+        ...
+
+    def frame_plan(self, frame: Any, shown: int | None, lower: np.ndarray, upper: np.ndarray) -> list[str]:
+        """What was left out for one frame, given what refinement found."""
+        ...
 
 
 class Job:
@@ -72,18 +121,42 @@ class Job:
         self, settings: Settings, perturbation: Perturbation | None = None, default: Perturbation | None = None
     ) -> None:
         self.settings = settings
-        self.rasteriser: Rasteriser = RASTERISERS[settings.renderer]
-        self.arithmetic = arithmetic_named(settings.arithmetic)
         self.path: CameraPath = load_camera_path(settings.camera_path_filename, settings.downscale_factor)
         if settings.resize is not None:
             self.path = replace(self.path, cameras=tuple(c.resized(*settings.resize) for c in self.path.cameras))
-        self.scene: SplatScene = load_scene(settings.load_config)
+        self.method = open_method(settings)
+        self.scene = self.method.scene
         given = (perturbation,) * self.frame_count if perturbation is not None else None
         self.perturbations: tuple[Perturbation, ...] = given or self._perturbations(default)
         # a set that cannot be made is found before hours of work
         self.pose_sets = tuple(self.pose_set(k, p) for k, p in enumerate(self.perturbations))
-        self.splats: Splats = activate(self.scene, self.rasteriser)
         self._check_memory()
+
+    @property
+    def splat(self) -> SplatMethod:
+        """The method of a splat scene.
+
+        Raises:
+            InputError: The run is of another method.
+        """
+        if not isinstance(self.method, SplatMethod):
+            raise InputError("not a splat scene", file=self.settings.load_config, fix="give a run of splatfacto")
+        return self.method
+
+    @property
+    def splats(self) -> Splats:
+        """The activated scene of a splat."""
+        return self.splat.splats
+
+    @property
+    def rasteriser(self) -> Rasteriser:
+        """The rules that a splat is drawn by."""
+        return self.splat.rasteriser
+
+    @property
+    def arithmetic(self) -> Arithmetic:
+        """What a splat's bounded program computes with."""
+        return self.splat.arithmetic
 
     @property
     def frame_count(self) -> int:
@@ -138,9 +211,7 @@ class Job:
 
     @property
     def _base_bytes(self) -> int:
-        arrays = (self.splats.means, self.splats.axes, self.splats.opacity, self.splats.sh)
-        pixels = max(camera.width * camera.height for camera in self.path.cameras)
-        return 2 * sum(a.nbytes for a in arrays) + self.splats.count * _BYTES_BY_GAUSSIAN + pixels * 400 + (256 << 20)
+        return self.method.memory(max(camera.width * camera.height for camera in self.path.cameras))
 
     def _check_memory(self) -> None:
         limit = self.settings.memory_limit
@@ -148,7 +219,7 @@ class Job:
             raise InputError(f"found {limit}", field="--memory-limit", fix="give a positive number of GiB")
         if self._base_bytes > self.memory:
             raise InputError(
-                f"{self.splats.count:,} Gaussians at this size need {self._base_bytes / 2**30:.1f} GiB, "
+                f"{self.method.content} at this size needs {self._base_bytes / 2**30:.1f} GiB, "
                 f"{self.memory / 2**30:.1f} GiB may be used",
                 field="--memory-limit",
                 fix="raise it, or raise --downscale-factor",
@@ -158,9 +229,9 @@ class Job:
         """The goal with the memory that is left for leaves."""
         return Goal(ratio, seconds, cells, max(64 << 20, (self.memory - self._base_bytes) // 2))
 
-    def frame(self, index: int) -> SplatFrame:
+    def frame(self, index: int) -> Any:
         """Frame ``index``, ready for refinement."""
-        return SplatFrame(self.splats, self.rasteriser, self.arithmetic, self.pose_sets[index])
+        return self.method.frame(self.pose_sets[index])
 
     def warm_up(self, index: int | None) -> None:
         """Compile the kernels that frame ``index`` needs, so that its clock measures bounding alone."""
@@ -183,73 +254,51 @@ class Job:
             frame, index, goal, seed=self.settings.seed, keep_leaves=keep_leaves, stopped=stopped, progress=progress
         )
         result = refinement.run()
-        return replace(result, plan=tuple(self._frame_plan(frame, refinement)))
-
-    def _frame_plan(self, frame: SplatFrame, refinement: Refinement) -> list[str]:
-        total = self.splats.count
-        plan = []
-        shown = refinement.shown
-        if shown is not None and shown < total:
-            plan.append(
-                f"{total - shown:,} of {total:,} Gaussians left out: no pose of the set shows them "
-                "(behind, beside, hidden by others or below the alpha threshold)"
-            )
-        if translation_only(frame.pose_set.enclosure(frame.box, 1)):
-            plan.append("depth-order rules left out but for near-ties: translations never change the order")
-        return plan
+        plan = self.method.frame_plan(frame, refinement.shown, result.lower, result.upper)
+        return replace(result, plan=tuple(plan))
 
     @property
     def plan(self) -> tuple[str, ...]:
         """What is left out for this scene, whatever the frame."""
-        scene, splats, plan = self.scene, self.splats, []
-        for reason, count in scene.dropped.items():
-            plan.append(f"{count:,} stored Gaussians left out: {reason}")
-        if scene.color_model == "sigmoid":
-            plan.append("view dependence left out: the run stores plain colours (sh_degree 0)")
-        elif splats.degree < scene.sh_degree:
-            why = "the paper's renderer has RGB colours" if not self.rasteriser.view_dependent else "all zero"
-            first, last = splats.degree + 1, scene.sh_degree
-            bands = f"band {last}" if first == last else f"bands {first} to {last}"
-            plan.append(f"spherical-harmonics {bands} left out: {why}")
-        if not splats.antialiased:
-            plan.append("opacity compensation left out: rasterize_mode is classic")
-        return tuple(plan)
+        return self.method.plan
 
     @cached_property
     def fingerprint(self) -> dict[str, Any]:
         """What a stored result must agree with to be continued."""
-        digest = hashlib.sha256()
-        for array in (self.scene.means, self.scene.log_scales, self.scene.quats, self.scene.opacity_logits):
-            digest.update(np.ascontiguousarray(array).tobytes())
-        for array in (self.scene.sh, self.scene.background):
-            digest.update(np.ascontiguousarray(array).tobytes())
-        digest.update(repr((self.scene.color_model, self.scene.sh_degree, self.scene.rasterize_mode)).encode())
         sets = hashlib.sha256()
         for poses in self.pose_sets:
             camera = poses.camera
             sets.update(np.ascontiguousarray(camera.camera_to_world).tobytes())
             sets.update(repr((camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height)).encode())
             sets.update(repr((poses.perturbation, poses.box, sorted(poses.fixed.items()))).encode())
-        return {
-            "scene": digest.hexdigest(),
-            "poses": sets.hexdigest(),
-            "renderer": self.settings.renderer,
-            "arithmetic": self.settings.arithmetic,
-        }
+        return {**self.method.fingerprint, "poses": sets.hexdigest()}
 
     def describe(self) -> dict[str, Any]:
         """The scene for reports."""
-        scene = self.scene
-        return {
-            "name": scene.name,
-            "source": str(scene.source),
-            "gaussians": scene.count,
-            "sh_degree": scene.sh_degree,
-            "sh_degree_used": self.splats.degree,
-            "rasterize_mode": scene.rasterize_mode,
-            "background": [float(v) for v in scene.background],
-            "notes": list(scene.notes),
-        }
+        return self.method.describe()
+
+
+def open_method(settings: Settings) -> Method:
+    """The scene of a run with the program that is bounded, by the method that the run's config.yml names.
+
+    Raises:
+        InputError: A file or an option cannot be used.
+    """
+    scene = load_any(settings.load_config)
+    if isinstance(scene, NerfScene):
+        return NerfMethod(
+            scene,
+            settings.renderer,
+            settings.arithmetic,
+            settings.sampling,
+            settings.num_samples,
+            settings.near_plane,
+        )
+    for name in ("sampling", "num_samples", "near_plane"):
+        if getattr(settings, name) is not None:
+            field = "--" + name.replace("_", "-")
+            raise InputError("is for runs of vanilla-nerf, this run is a splat", field=field, fix="leave it out")
+    return SplatMethod(scene, settings.renderer, settings.arithmetic)
 
 
 def check_frames(frames: tuple[int, ...] | None, count: int) -> tuple[int, ...]:

@@ -718,7 +718,7 @@ def test_demo_options_are_checked(call: Callable[..., tuple[int, str]]) -> None:
 def test_demo_writes_what_the_next_command_needs(
     tmp_path: Path, call: Callable[..., tuple[int, str]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    assert call(["--output-dir", str(tmp_path)], demo_command.main)[0] == 0
+    assert call(["--output-dir", str(tmp_path), "--splats-only"], demo_command.main)[0] == 0
     job = Job(Settings(next(tmp_path.rglob("config.yml")), tmp_path / "camera_path.json", tmp_path / "SPEC.json"))
     assert job.frame_count == 5
     assert job.pose_sets[0].box.names == ("x",)

@@ -49,6 +49,9 @@ class Waves:
     Pixels outside the image are NaN everywhere.
     """
 
+    batch: int | None = None
+    witnesses = 1
+
     def __init__(
         self,
         dimensions: int,

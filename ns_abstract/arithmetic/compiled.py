@@ -58,6 +58,16 @@ def prefetch(typingctx, array, row, byte):  # pyright: ignore[reportRedeclaratio
     return types.void(array, types.intp, types.intp), codegen
 
 
+@intrinsic
+def lowest_bit(typingctx, mask):  # pyright: ignore[reportRedeclaration]
+    """Number of the lowest bit that is set in an int64 that is not 0."""
+
+    def codegen(context, builder, signature, args):
+        return builder.cttz(args[0], ir.IntType(1)(1))
+
+    return types.int64(types.int64), codegen
+
+
 if config.DISABLE_JIT:  # pyright: ignore[reportAttributeAccessIssue]
 
     def borrowed(array):
@@ -67,12 +77,7 @@ if config.DISABLE_JIT:  # pyright: ignore[reportAttributeAccessIssue]
     def prefetch(array, row, byte):
         """Nothing: the interpreter has no say in caches."""
 
-
-@intrinsic
-def lowest_bit(typingctx, mask):  # pyright: ignore[reportRedeclaration]
-    """Number of the lowest bit that is set in an int64 that is not 0."""
-
-    def codegen(context, builder, signature, args):
-        return builder.cttz(args[0], ir.IntType(1)(1))
-
-    return types.int64(types.int64), codegen
+    def lowest_bit(mask):
+        """Number of the lowest bit that is set."""
+        mask = int(mask)
+        return (mask & -mask).bit_length() - 1

@@ -1,9 +1,10 @@
-"""``ns-abstract-demo``: a small airfield as a Splatfacto run, with camera paths and a set of poses."""
+"""``ns-abstract-demo``: an airfield as a Splatfacto run and a buoy as a vanilla-nerf run, with sets of poses."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
 
 import tyro
 
@@ -13,13 +14,16 @@ from ns_abstract.errors import InputError
 
 @dataclass
 class Demo:
-    """Write a procedural scene as a real Splatfacto run folder, camera paths and a perturbation.
+    """Write two scenes as real run folders, with camera paths and sets of poses.
 
-    No network, no training, a few seconds.
+    An airfield as a Splatfacto run, and a buoy as a vanilla-nerf run of full size, whose network is fitted to an
+    analytic field: no network connection, a minute or two.
     """
 
     output_dir: Path
-    """Folder for the run; made if missing."""
+    """Folder for the runs; made if missing."""
+    splats_only: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    """Leave out the NeRF, whose fit takes most of the time."""
 
 
 def demo(options: Demo) -> int:
@@ -30,13 +34,17 @@ def demo(options: Demo) -> int:
     """
     from rich.console import Console
 
-    from ns_abstract.demo.writing import write_demo
+    from ns_abstract.demo.writing import write_demo, write_nerf_demo
 
     folder = options.output_dir
     console = Console(stderr=True, highlight=False)
     try:
         with console.status("modelling the airfield, rendering its data set"):
             config, files = write_demo(folder)
+        nerf = None
+        if not options.splats_only:
+            with console.status("fitting the NeRF (about a minute)"):
+                nerf = write_nerf_demo(folder)
     except OSError as error:
         raise InputError(
             f"cannot be written ({error.strerror})", file=folder, field="--output-dir", fix="choose another folder"
@@ -49,6 +57,13 @@ def demo(options: Demo) -> int:
         f"  ns-abstract-render --load-config {config} --camera-path-filename {files['path']} \\\n"
         f"    --perturbation-filename {files['spec']} --output-dir {folder / 'abstract'}"
     )
+    if nerf is not None:
+        config, path = nerf
+        print(
+            f"\nNeRF run     {config}\n"
+            f"  ns-abstract-render --load-config {config} --camera-path-filename {path} \\\n"
+            f"    --output-dir {folder / 'abstract-nerf'}"
+        )
     return DONE
 
 

@@ -24,7 +24,7 @@ class Render:
     """
 
     load_config: Path
-    """config.yml of a Splatfacto run, or a standard 3DGS .ply."""
+    """config.yml of a Splatfacto or vanilla-nerf run, or a standard 3DGS .ply."""
     camera_path_filename: Path
     """Camera path as Nerfstudio's viewer writes it."""
     output_dir: Path
@@ -39,10 +39,18 @@ class Render:
     """Entries of the camera path, counted from 0. Default: all."""
     downscale_factor: float = 1.0
     """Images become this many times smaller."""
-    renderer: Literal["gsplat", "paper"] = "gsplat"
-    """gsplat: what Nerfstudio shows. paper: Algorithm 1 of "Abstract Rendering" (no thresholds, RGB)."""
-    arithmetic: Literal["float32", "real"] = "float32"
-    """float32: enclose every float32 evaluation. real: the real-number renderer and its float64 evaluation."""
+    renderer: Literal["gsplat", "paper"] | None = None
+    """gsplat: what Nerfstudio shows of splats (the default for them). paper: Algorithm 1 (splats: no thresholds,
+    RGB) or 2 (NeRF: black behind the last sample) of "Abstract Rendering"."""
+    arithmetic: Literal["float32", "real"] | None = None
+    """float32: enclose every float32 evaluation (splats, the default for them). real: the real-number renderer and
+    its float64 evaluation."""
+    sampling: Literal["uniform"] | None = None
+    """NeRF: the fine field in the middles of equal bins."""
+    num_samples: int | None = None
+    """NeRF: bins of every ray. Default: 64."""
+    near_plane: float | None = None
+    """NeRF: distance at which rays start. Default: 0, as in Nerfstudio's evaluation."""
     seed: int = 0
     """Seed of the random witnesses."""
     engine: Literal["local", "dask"] = "local"

@@ -32,11 +32,11 @@ def settings_of(options: Render) -> Settings:
 
 def make_run(job: Job, options: Render, frames: tuple[int, ...], problems: list[str]) -> Run:
     """What the report says about the command; ``problems`` of the platform take the guarantee away."""
-    guarantee = "sampled" if problems else f"{options.arithmetic}-sound"
+    guarantee = "sampled" if problems else job.method.guarantee
     limits = [f"The platform's arithmetic failed the self-check, so nothing is guaranteed: {p}" for p in problems]
     return Run(
         guarantee=guarantee,
-        renderer={"name": job.rasteriser.name, "version": job.rasteriser.version},
+        renderer=job.method.program,
         scene=job.describe(),
         frames=frames,
         fingerprint=job.fingerprint,
@@ -108,8 +108,8 @@ def _fill(
 
 def _introduce(console: Console, job: Job, report: Report) -> None:
     scene = job.scene
-    program = f"{job.rasteriser.name} {job.rasteriser.version}"
-    console.print(f"{scene.name}: {scene.count:,} Gaussians, {program}", markup=False)
+    program = job.method.program
+    console.print(f"{scene.name}: {job.method.content}, {program['name']} {program['version']}", markup=False)
     for note in (*scene.notes, *job.plan):
         console.print(f"  {note}", markup=False, soft_wrap=True)
     if report.kept:

@@ -22,6 +22,7 @@ from numpy.typing import ArrayLike, NDArray
 from ns_abstract.atomic import write_atomic
 from ns_abstract.demo.paths import View, dataset_views
 from ns_abstract.errors import InputError
+from ns_abstract.methods.nerf.scene import NerfScene
 from ns_abstract.methods.splat.scene import SplatScene
 
 STEP = 29999  # the last of Splatfacto's 30,000 steps
@@ -79,26 +80,36 @@ def write_splatfacto_run(
         InputError: ``timestamp`` or ``experiment_name`` is not a plain folder name.
     """
     folder = Path(folder)
+    run = run_folder(folder, "splatfacto", timestamp, experiment_name)
+    write_dataset(scene, folder / "data", dataset_views() if views is None else views, render)
+    transform = {"transform": scene.dataparser.matrix.tolist(), "scale": float(scene.dataparser.scale)}
+    write_file(run / "dataparser_transforms.json", json.dumps(transform, indent=4).encode())
+    # Nerfstudio reads the step out of every name in nerfstudio_models: nothing else may stand there.
+    checkpoint = run / "nerfstudio_models" / f"step-{STEP:09d}.ckpt"
+    write_file(checkpoint, _checkpoint_bytes(scene), scratch=run)
+    config = run / "config.yml"
+    write_file(config, _config_text(scene, timestamp, experiment_name).encode())
+    return config
+
+
+def run_folder(folder: Path, method: str, timestamp: str, experiment_name: str) -> Path:
+    """Make the folder of a run.
+
+    Raises:
+        InputError: ``timestamp`` or ``experiment_name`` is not a plain folder name.
+    """
     for field, value in (("timestamp", timestamp), ("experiment_name", experiment_name)):
         if not value or value in {".", ".."} or any(c in value for c in "/\\\0\n"):
             raise InputError(
                 f"{value!r} is not a folder name", fix="use letters, digits, _ and -", field=field
             )
-    run = folder / experiment_name / "splatfacto" / timestamp
+    run = folder / experiment_name / method / timestamp
     run.mkdir(parents=True, exist_ok=True)
-
-    _write_dataset(scene, folder / "data", dataset_views() if views is None else views, render)
-    transform = {"transform": scene.dataparser.matrix.tolist(), "scale": float(scene.dataparser.scale)}
-    _write(run / "dataparser_transforms.json", json.dumps(transform, indent=4).encode())
-    # Nerfstudio reads the step out of every name in nerfstudio_models: nothing else may stand there.
-    checkpoint = run / "nerfstudio_models" / f"step-{STEP:09d}.ckpt"
-    _write(checkpoint, _checkpoint_bytes(scene), scratch=run)
-    config = run / "config.yml"
-    _write(config, _config_text(scene, timestamp, experiment_name).encode())
-    return config
+    return run
 
 
-def _write(file: Path, data: bytes, *, scratch: Path | None = None) -> None:
+def write_file(file: Path, data: bytes, *, scratch: Path | None = None) -> None:
+    """Write a file as a whole, in a folder that is made if missing."""
     file.parent.mkdir(parents=True, exist_ok=True)
     write_atomic(file, lambda stream: stream.write(data), scratch=scratch)
 
@@ -109,19 +120,37 @@ def _config_text(scene: SplatScene, timestamp: str, experiment_name: str) -> str
         experiment=json.dumps(experiment_name),
         timestamp=json.dumps(timestamp),
         count=scene.count,
-        background=_background(scene.background),
+        background=background_name(scene.background),
         mode=scene.rasterize_mode,
         degree=3 if scene.color_model == "sh" else 0,
     )
 
 
-def _background(colour: NDArray[np.float32]) -> str:
+def background_name(colour: NDArray[np.float32]) -> str:
     """Nerfstudio's name of a colour, or a list where it has none ("random" renders as a fixed grey)."""
     names = {"white": (1, 1, 1), "black": (0, 0, 0), "random": (0.1490, 0.1647, 0.2157)}
     for name, value in names.items():
         if np.array_equal(colour, np.asarray(value, np.float32)):
             return name
     return json.dumps([float(c) for c in colour])
+
+
+def lpips_state(prefix: str) -> dict[str, Any]:
+    """Zeros in place of the LPIPS metric's tensors, whose names begin with ``prefix``."""
+    import torch
+
+    def zeros(*shape: int) -> torch.Tensor:
+        # One stored number stands for all.
+        return torch.zeros(1).expand(shape)
+
+    state = {}
+    for name, shape in _LPIPS.items():
+        state[f"{prefix}{name}.weight"] = zeros(*shape)
+        state[f"{prefix}{name}.bias"] = zeros(shape[0])
+    for kind in ("lin", "lins."):
+        for i, channels in enumerate(_LPIPS_HEADS):
+            state[f"{prefix}{kind}{i}.model.1.weight"] = zeros(1, channels, 1, 1)
+    return state
 
 
 def _checkpoint_bytes(scene: SplatScene) -> bytes:
@@ -140,19 +169,10 @@ def _checkpoint_bytes(scene: SplatScene) -> bytes:
         "scales": scene.log_scales,
     }
 
-    def zeros(*shape: int) -> torch.Tensor:
-        # One stored number stands for all.
-        return torch.zeros(1).expand(shape)
-
     pipeline: dict[str, torch.Tensor] = {"_model.device_indicator_param": torch.empty(0)}
     for name, value in gaussians.items():
         pipeline[f"_model.gauss_params.{name}"] = torch.from_numpy(np.array(value, np.float32))
-    for name, shape in _LPIPS.items():
-        pipeline[f"_model.lpips.net.{name}.weight"] = zeros(*shape)
-        pipeline[f"_model.lpips.net.{name}.bias"] = zeros(shape[0])
-    for prefix in ("lin", "lins."):
-        for i, channels in enumerate(_LPIPS_HEADS):
-            pipeline[f"_model.lpips.net.{prefix}{i}.model.1.weight"] = zeros(1, channels, 1, 1)
+    pipeline |= lpips_state("_model.lpips.net.")
 
     state = {
         "step": STEP,
@@ -198,8 +218,8 @@ def _scheduler_state(rate: float) -> dict[str, Any]:
     }
 
 
-def _write_dataset(
-    scene: SplatScene, folder: Path, views: Sequence[View], render: Callable[[View], ArrayLike] | None
+def write_dataset(
+    scene: SplatScene | NerfScene, folder: Path, views: Sequence[View], render: Callable[[View], ArrayLike] | None
 ) -> None:
     """Write transforms.json and one PNG per view; poses are stored in the normalised frame."""
     if len(views) < 2 or any(
@@ -215,7 +235,7 @@ def _write_dataset(
             image = np.broadcast_to(scene.background, (height, width, 3))
         else:
             image = np.asarray(render(view), np.float64)
-        _write(folder / name, _png(image))
+        write_file(folder / name, _png(image))
         frames.append({"file_path": name, "transform_matrix": view.camera_to_world.tolist()})
     meta: dict[str, Any] = {
         "camera_model": "OPENCV",
@@ -236,7 +256,7 @@ def _write_dataset(
         meta["applied_transform"] = scene.dataparser.matrix.tolist()
         meta["applied_scale"] = float(scene.dataparser.scale)
     meta["frames"] = frames
-    _write(folder / "transforms.json", json.dumps(meta, indent=1).encode())
+    write_file(folder / "transforms.json", json.dumps(meta, indent=1).encode())
 
 
 def _png(image: NDArray[Any]) -> bytes:

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import numpy as np
 
 from ns_abstract.demo.airfield import airfield
+from ns_abstract.demo.buoy import buoy_path, buoy_scene, buoy_views
+from ns_abstract.demo.nerf_runs import write_nerf_run
 from ns_abstract.demo.paths import View, write_airfield_paths
-from ns_abstract.demo.runs import write_splatfacto_run
+from ns_abstract.demo.runs import write_file, write_splatfacto_run
 from ns_abstract.methods.splat.activate import activate
 from ns_abstract.methods.splat.constants import GSPLAT_1_4_0
 from ns_abstract.methods.splat.render import Renderer
@@ -16,6 +19,15 @@ from ns_abstract.sets.path import Camera
 
 #: Name of the run's folder: a fixed time, so that the demo is the same every time.
 TIMESTAMP = "2026-01-01_120000"
+
+
+def write_nerf_demo(folder: Path) -> tuple[Path, Path]:
+    """Fit and write the NeRF and its camera path; returns config.yml and the path."""
+    scene = buoy_scene()
+    config = write_nerf_run(scene, folder, timestamp=TIMESTAMP, experiment_name="buoy", views=buoy_views())
+    path = folder / "camera_path_buoy.json"
+    write_file(path, (json.dumps(buoy_path(), indent=1) + "\n").encode())
+    return config, path
 
 
 def write_demo(folder: Path) -> tuple[Path, dict[str, Path]]:

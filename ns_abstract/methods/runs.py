@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 
 from ns_abstract.errors import InputError
 from ns_abstract.jsonio import FIX_ACCESS, file_size, is_number, load_json, read_text, show
-from ns_abstract.methods.splat.scene import DataparserTransform
+from ns_abstract.methods.transform import DataparserTransform
 
 if TYPE_CHECKING:
     import torch

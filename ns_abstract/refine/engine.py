@@ -52,8 +52,16 @@ class Bounds(Protocol):
 
 
 class Frame(Protocol):
-    """What refinement needs to know about a frame; see `ns_abstract.methods.splat.frame.SplatFrame`."""
+    """What refinement needs to know about a frame; see `ns_abstract.methods.splat.frame.SplatFrame`.
 
+    Attributes:
+        batch: Most tiles of one call while cells are split, so that time is looked at in between; the whole set
+            then takes a single call of no cost. None: every call takes all tiles that it concerns.
+        witnesses: Poses rendered in every part of a cell of one parameter that is split.
+    """
+
+    batch: int | None
+    witnesses: int
     box: ParameterBox
     camera: Any
     side: int
@@ -357,6 +365,8 @@ class Refinement:
         boxes, motion = [box], np.nan_to_num(np.array(frame.motion(box), np.float64), nan=0.0)
         history: list[list[ParameterBox]] = [boxes]
         limit = FIRST_MOTION_LINE if box.dimensions == 1 else FIRST_MOTION
+        if frame.batch is not None:
+            limit = np.inf
         while motion.size and motion.max() > limit and 2 * len(boxes) <= _COVER_CELLS:
             axis = int(np.argmax(motion))
             boxes = [half for b in boxes for half in b.split(axis)]
@@ -418,7 +428,11 @@ class Refinement:
             t, k = owner[position]
             cell = self.tiles[t].cells[k]
             by_cell.setdefault(cell.number, (cell, {}))[1][t] = k
-        jobs = [(cell, dict(sorted(rows.items()))) for cell, rows in by_cell.values()]
+        jobs = []
+        for cell, rows in by_cell.values():
+            ordered = sorted(rows.items())
+            step = self.frame.batch or len(ordered)
+            jobs += [(cell, dict(ordered[i : i + step])) for i in range(0, len(ordered), step)]
         # excess falls at least in proportion to the width: far from the goal, levels are skipped
         allowed = (self.goal.ratio - 1.0) * float((self.witness_upper - self.witness_lower)[self.inside].sum())
         far = self.frame.box.dimensions == 1 and running[-1] > _FAR * allowed
@@ -472,8 +486,11 @@ class Refinement:
             if cell.box.dimensions > 1:
                 self._witness(child.box.middle, tiles)
         if cell.box.dimensions == 1:
-            for child in children[:-1]:
-                self._witness(np.array(child.box.upper), tiles)
+            steps = self.frame.witnesses
+            for number in range(1, steps * len(children)):
+                child, step = children[(number - 1) // steps], (number - 1) % steps + 1
+                end = np.array(child.box.upper)
+                self._witness(end if step == steps else child.box.at(np.array([2.0 * step / steps - 1.0])), tiles)
         added = 0
         for k, (t, row) in enumerate(rows.items()):
             tile, change = self.tiles[t], changes.setdefault(t, _Change())

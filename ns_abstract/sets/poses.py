@@ -6,11 +6,14 @@ transform that gsplat receives (OpenCV axes, splatfacto.py:128-143).
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
 from ns_abstract.arithmetic.forms import Basis, Float64Array, FormArray
+from ns_abstract.arithmetic.taylor import TaylorArray, TaylorBasis, taylor_cos_sin
 from ns_abstract.arithmetic.trigonometry import cos_sin
 from ns_abstract.arithmetic.units import UNIT64
 from ns_abstract.errors import InputError
@@ -35,13 +38,6 @@ def rotation_about(axis: Float64Array, angle: float) -> Float64Array:
     """[3, 3] right-handed rotation by ``angle`` (radians) about the unit vector ``axis`` (Rodrigues)."""
     k = _cross_matrix(np.asarray(axis, np.float64))
     return np.eye(3) + np.sin(angle) * k + (1.0 - np.cos(angle)) * (k @ k)
-
-
-def _rotation_form(axis: Float64Array, angle: FormArray) -> FormArray:
-    """[3, 3] form of `rotation_about`."""
-    k = _cross_matrix(np.asarray(axis, np.float64))
-    cosine, sine = cos_sin(angle)
-    return sine * k + (1.0 - cosine) * (k @ k) + np.eye(3)
 
 
 def orthonormal(matrix: Float64Array) -> Float64Array:
@@ -186,26 +182,59 @@ class PoseSet:
 
     def enclosure(self, box: ParameterBox, order: int = 1) -> PoseForms:
         """Forms that enclose the transform of every pose of ``box`` (design.md, P1)."""
-        basis = Basis(self.box.dimensions, order)
+        rotation, position = self._enclosed(box, Basis(self.box.dimensions, order), FormArray, cos_sin)
+        m = rotation.basis.monomials
+        rounding, shift = self._rounding
+        rotation.data[m] += rounding
+        position.data[m] += shift
+        world_to_camera = rotation.transpose() * _FLIP[:, None]
+        origin = position.center.copy()
+        offset = world_to_camera @ (origin - position)
+        return PoseForms(world_to_camera, offset, position, origin)
 
-        def parameter(name: str) -> FormArray:
+    def taylor(self, box: ParameterBox, degree: int) -> tuple[TaylorArray, TaylorArray]:
+        """Taylor models of the camera-to-world rotation [3, 3] and position [3] over ``box`` (P1, N1)."""
+        basis = TaylorBasis(self.box.dimensions, degree)
+        rotation, position = self._enclosed(box, basis, TaylorArray, taylor_cos_sin)
+        rounding, shift = self._rounding
+        return rotation.widened(rounding), position.widened(shift)
+
+    @property
+    def _rounding(self) -> tuple[float, float]:
+        """What the concrete pose's float64 evaluation may add to a rotation's and a position's entry."""
+        start, displacement = self._base()[1], self._base()[4]
+        reach = sum(max(map(abs, limits)) for limits in self.perturbation.translation.values())
+        shift = _POSE_ROUNDING * (1.0 + reach + np.abs(start).max() + np.abs(displacement).max())
+        if self.perturbation.orbit is not None:
+            shift += _POSE_ROUNDING * (1.0 + 2.0 * np.abs(self.perturbation.orbit.target).max())
+        return _POSE_ROUNDING, shift
+
+    def _enclosed(self, box: ParameterBox, basis: Any, kind: Any, trigonometry: Callable[[Any], tuple]) -> tuple:
+        """Camera-to-world rotation and position over ``box`` in the arithmetic ``kind``, without rounding of `pose`."""
+
+        def parameter(name: str) -> Any:
             if name in self.fixed:
-                return FormArray.constant(basis, self.fixed[name])
+                return kind.constant(basis, self.fixed[name])
             index = box.names.index(name)
             low, high = box.lower[index], box.upper[index]
             middle = 0.5 * (low + high)
             half = max(high - middle, middle - low) * (1.0 + 4.0 * UNIT64)
-            return FormArray.parameter(basis, index, middle, half)
+            return kind.parameter(basis, index, middle, half)
+
+        def turned(axis: Float64Array, angle: Any) -> Any:
+            k = _cross_matrix(np.asarray(axis, np.float64))
+            cosine, sine = trigonometry(angle)
+            return sine * k + (1.0 - cosine) * (k @ k) + np.eye(3)
 
         first, start, axis, angle, displacement = self._base()
-        rotation = FormArray.constant(basis, first)
-        position = FormArray.constant(basis, start)
+        rotation = kind.constant(basis, first)
+        position = kind.constant(basis, start)
         if self.target_camera is not None:
-            rotation = rotation @ _rotation_form(axis, parameter("segment") * angle)
+            rotation = rotation @ turned(axis, parameter("segment") * angle)
             position = position + parameter("segment") * displacement
         orbit = self.perturbation.orbit
         if orbit is not None:
-            turn = _rotation_form(np.array(orbit.axis) / np.linalg.norm(orbit.axis), parameter("azimuth"))
+            turn = turned(np.array(orbit.axis) / np.linalg.norm(orbit.axis), parameter("azimuth"))
             target = np.array(orbit.target)
             rotation, position = turn @ rotation, turn @ (position - target) + target
         moving = [name for name in TRANSLATIONS if name in box.names or self.fixed[name] != 0.0]
@@ -218,18 +247,8 @@ class PoseSet:
                 position = position + shift * np.eye(3)[k]
         for name in ROTATIONS:
             if name in box.names or self.fixed[name] != 0.0:
-                rotation = rotation @ _rotation_form(np.array(_CAMERA_AXES[name]), parameter(name))
-        m = basis.monomials
-        # the concrete pose above is evaluated in float64 and must lie inside as well
-        rotation.data[m] += _POSE_ROUNDING
-        reach = sum(max(map(abs, limits)) for limits in self.perturbation.translation.values())
-        position.data[m] += _POSE_ROUNDING * (1.0 + reach + np.abs(start).max() + np.abs(displacement).max())
-        if orbit is not None:
-            position.data[m] += _POSE_ROUNDING * (1.0 + 2.0 * np.abs(orbit.target).max())
-        world_to_camera = rotation.transpose() * _FLIP[:, None]
-        origin = position.center.copy()
-        offset = world_to_camera @ (origin - position)
-        return PoseForms(world_to_camera, offset, position, origin)
+                rotation = rotation @ turned(np.array(_CAMERA_AXES[name]), parameter(name))
+        return rotation, position
 
     def world_to_camera(self, values: Float64Array) -> tuple[Float64Array, Float64Array]:
         """Rotation [3, 3] (OpenCV axes) and camera position [3] at parameter values [d]."""

@@ -9,11 +9,13 @@ from typing import Any
 import numpy as np
 import torch
 
+from ns_abstract.arithmetic.outward import outward
 from ns_abstract.arithmetic.units import arithmetic as arithmetic_of
+from ns_abstract.methods.nerf.render import NerfRenderer, Sampling, camera_rays
+from ns_abstract.methods.nerf.scene import NerfScene
 from ns_abstract.methods.splat.activate import activate
 from ns_abstract.methods.splat.bounds import SplatBounds
 from ns_abstract.methods.splat.constants import GSPLAT_1_4_0, Rasteriser
-from ns_abstract.methods.splat.frame import outward
 from ns_abstract.methods.splat.load import load_scene
 from ns_abstract.methods.splat.reference import Reference
 from ns_abstract.methods.splat.render import Renderer
@@ -62,6 +64,23 @@ def reference_renderer(
 
     def twin(values: torch.Tensor, pixels: torch.Tensor) -> torch.Tensor:
         return reference.pixels(camera, pose(values), pixels)
+
+    return render, probe, twin
+
+
+def nerf_renderer(scene: NerfScene, pose_set: PoseSet, sampling: Sampling) -> tuple[Render, Probe, Twin]:
+    """The renderer of a NeRF at the set's camera, for `falsify`: images, single pixels, and the twin."""
+    renderer = NerfRenderer(scene, sampling)
+    camera, pose = pose_set.camera, pose_twin(pose_set)
+
+    def render(values: Float64Array) -> Float64Array:
+        return renderer.image(camera, pose_set.pose(values))
+
+    def probe(values: Float64Array, pixels: np.ndarray) -> Float64Array:
+        return renderer.pixels(camera, pose_set.pose(values), pixels)
+
+    def twin(values: torch.Tensor, pixels: torch.Tensor) -> torch.Tensor:
+        return renderer.rays(pose(values), torch.from_numpy(camera_rays(camera, pixels.numpy())))
 
     return render, probe, twin
 

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ns_abstract.arithmetic.outward import outward
 from ns_abstract.arithmetic.units import Arithmetic
 from ns_abstract.methods.splat.activate import Splats
 from ns_abstract.methods.splat.bounds import SplatBounds
@@ -57,14 +58,6 @@ class TileBounds:
     trivial: int
 
 
-def outward(lower: np.ndarray, upper: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Float32 neighbours of ``lower`` from below and ``upper`` from above."""
-    low, high = lower.astype(np.float32), upper.astype(np.float32)
-    low = np.where(low > lower, np.nextafter(low, np.float32(-np.inf)), low)
-    high = np.where(high < upper, np.nextafter(high, np.float32(np.inf)), high)
-    return low, high
-
-
 class SplatFrame:
     """Bounds and renders one frame's set of poses.
 
@@ -74,6 +67,11 @@ class SplatFrame:
         pose_set: The poses.
         order: Order of the forms; by default 2 for one parameter and 1 for more.
     """
+
+    #: Every call bounds as many tiles as it is given.
+    batch: int | None = None
+    #: Poses rendered in every part of a cell that is split.
+    witnesses = 1
 
     def __init__(
         self,

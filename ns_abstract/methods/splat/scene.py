@@ -8,20 +8,10 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from ns_abstract.methods.transform import DataparserTransform
+
 Float32Array = NDArray[np.float32]
 Float64Array = NDArray[np.float64]
-
-
-@dataclass(frozen=True)
-class DataparserTransform:
-    """Maps the units of transforms.json to the normalised frame of the run.
-
-    ``x_normalised = scale * (matrix[:, :3] @ x_dataset + matrix[:, 3])``
-    (nerfstudio/data/dataparsers/base_dataparser.py, ``DataparserOutputs``).
-    """
-
-    matrix: Float64Array = field(default_factory=lambda: np.eye(3, 4))  # [3, 4]
-    scale: float = 1.0
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,129 @@
+"""Small NeRF networks to be trained here: on an analytic field, or on pictures (benchmarks/train_lego.py)."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from ns_abstract.methods.nerf.field import encode
+from ns_abstract.methods.nerf.scene import Encoding, FieldWeights, Layer
+
+#: Points [n, 3] and unit directions [n, 3] to densities [n] and colours [n, 3].
+AnalyticField = Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]
+
+POSITION = Encoding(10, 0.0, 8.0)
+DIRECTION = Encoding(4, 0.0, 4.0)
+#: Density before the softplus where training begins: nearly transparent.
+_EMPTY = -3.0
+#: Density before the softplus that counts as empty in `fit_field`.
+_CLEAR = -9.0
+#: Radius of the space that is fitted as empty, relative to that of the object.
+_FAR = 4.0
+
+
+class NerfNetwork(nn.Module):
+    """The architecture of ``NeRFField`` with free sizes.
+
+    The columns of high frequencies start small, in proportion to 1 / frequency: the network then learns coarse
+    shapes first and stays as smooth as the data allow.
+
+    Args:
+        layers, width: Of the base.
+        skip: Layer of the base that sees the encoding again; None: none does.
+        head_layers, head_width: Of the colour head.
+    """
+
+    def __init__(
+        self, layers: int = 8, width: int = 256, skip: int | None = 4, head_layers: int = 2, head_width: int = 128
+    ) -> None:
+        super().__init__()
+        self.skip = skip
+        inputs = [POSITION.size] + [width + (POSITION.size if i == skip else 0) for i in range(1, layers)]
+        self.base = nn.ModuleList(nn.Linear(n, width) for n in inputs)
+        self.density = nn.Linear(width, 1)
+        heads = [width + DIRECTION.size, *[head_width] * (head_layers - 1)]
+        self.head = nn.ModuleList(nn.Linear(n, head_width) for n in heads)
+        self.color = nn.Linear(head_width, 3)
+        with torch.no_grad():
+            for layer in (*self.base, *self.head):
+                nn.init.kaiming_uniform_(layer.weight, nonlinearity="relu")  # pyright: ignore
+                nn.init.zeros_(layer.bias)  # pyright: ignore
+            self.density.bias.fill_(_EMPTY)
+            for k, encoding in ((0, POSITION), *(() if skip is None else ((skip, POSITION),))):
+                damp = torch.from_numpy(1.0 / encoding.frequencies).float().repeat(6)
+                self.base[k].weight[:, : damp.numel()] *= damp  # pyright: ignore
+            damp = torch.from_numpy(1.0 / DIRECTION.frequencies).float().repeat(6)
+            self.head[0].weight[:, : damp.numel()] *= damp  # pyright: ignore
+
+    def raw_density(self, x: Tensor) -> tuple[Tensor, Tensor]:
+        """Densities [...] before the softplus, and the base's output, of points [..., 3]."""
+        encoded = encode(x, POSITION)
+        h = encoded
+        for i, layer in enumerate(self.base):
+            h = functional.relu(layer(torch.cat([encoded, h], dim=-1) if i == self.skip else h))
+        return self.density(h)[..., 0], h
+
+    def colors(self, h: Tensor, direction: Tensor) -> Tensor:
+        """Colours [..., 3] of the base's output seen along ``direction`` [..., 3]."""
+        h = torch.cat([encode(direction, DIRECTION), h], dim=-1)
+        for layer in self.head:
+            h = functional.relu(layer(h))
+        return torch.sigmoid(self.color(h))
+
+    def weights(self) -> FieldWeights:
+        """The parameters as plain arrays."""
+
+        def plain(layer: nn.Module, skip: bool = False) -> Layer:
+            arrays = (getattr(layer, name).detach().cpu().numpy() for name in ("weight", "bias"))
+            weight, bias = (array.astype(np.float32) for array in arrays)
+            return Layer(weight, bias, skip)
+
+        return FieldWeights(
+            tuple(plain(layer, i == self.skip) for i, layer in enumerate(self.base)),
+            plain(self.density),
+            tuple(plain(layer) for layer in self.head),
+            plain(self.color),
+            POSITION,
+            DIRECTION,
+        )
+
+
+def fit_field(
+    network: NerfNetwork,
+    field: AnalyticField,
+    reach: float,
+    steps: int,
+    *,
+    batch: int = 2048,
+    rate: float = 8e-4,
+    seed: int = 0,
+) -> None:
+    """Fit a network to an analytic field over the ball of radius ``reach``, and more coarsely around it.
+
+    Densities are compared before the softplus and squeezed, so that neither empty nor dense space dominates;
+    colours where there is something.
+    """
+    generator = torch.Generator().manual_seed(seed)
+    optimizer = torch.optim.Adam(network.parameters(), lr=rate, eps=1e-8)
+    for step in range(steps):
+        for group in optimizer.param_groups:
+            group["lr"] = rate * min(1.0, (step + 1) / 40) * 0.5 * (1.0 + math.cos(math.pi * step / steps)) + 1e-5
+        x = torch.randn(batch, 3, generator=generator)
+        # rays begin far outside of what there is to see
+        around = torch.where(torch.arange(batch)[:, None] % 4 == 0, _FAR * reach, reach)
+        x *= around * torch.rand(batch, 1, generator=generator).sqrt() / x.norm(dim=1, keepdim=True)
+        direction = functional.normalize(torch.randn(batch, 3, generator=generator), dim=1)
+        density, color = field(x, direction)
+        raw, h = network.raw_density(x)
+        target = torch.where(density > 20.0, density, torch.log(torch.expm1(density.clamp(1e-12, 30.0))))
+        loss = functional.mse_loss(functional.softsign(raw / 4.0), functional.softsign(target.clamp(min=_CLEAR) / 4.0))
+        opaque = (density > 0.5).float()[:, None]
+        loss = loss + (opaque * (network.colors(h, direction) - color) ** 2).mean() / opaque.mean().clamp(min=0.01)
+        optimizer.zero_grad(set_to_none=True)
+        loss.backward()
+        optimizer.step()

@@ -1,0 +1,465 @@
+"""Bounds of rays over a box of poses: cells by sample, densities and colours, compositing (design.md, N6-N8).
+
+Every sample of a ray gets cells of its own width: where the field is rough over the sample's path, the box is cut
+finer. The polynomials that come out of the network are then cut into parts at no cost, and compositing is done
+part by part, where it is exact for independent samples.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ns_abstract.arithmetic.chebyshev import ROUNDING, ChebyshevBasis
+from ns_abstract.arithmetic.taylor import TaylorArray
+from ns_abstract.arithmetic.units import UNIT64
+from ns_abstract.methods.nerf.render import Sampling, camera_rays
+from ns_abstract.methods.nerf.scene import NerfScene
+from ns_abstract.methods.nerf.zonotope import Affine, FieldBounds, Pieces
+from ns_abstract.sets.box import ParameterBox
+from ns_abstract.sets.poses import PoseSet
+
+#: (degree, grid) of the polynomials by number of parameters.
+_DEGREES = {0: (1, 2), 1: (20, 120), 2: (6, 20), 3: (4, 10)}
+#: Degree of the Taylor models of poses.
+_TAYLOR = 6
+#: Cells bounded at once.
+_BATCH = 64
+#: Samples of a ray that are bounded before the light that is left is looked at.
+_BLOCK = 8
+#: Halvings below cells of the starting width, by number of parameters (one level may concern any axis).
+_DEEPER = {0: 0, 1: 4}
+_DEEPER_MORE = 6
+#: Most parts of one box.
+_PARTS = 4096
+#: Light (in [0, 1]) that a skipped sample may add, as a share of the tolerance.
+_QUIET = 0.02
+#: Absolute rounding of activations and compositing, by sample.
+_COMPOSITE = 2.0**-44
+
+
+def basis_of(dimensions: int) -> ChebyshevBasis:
+    """The polynomials that are used for ``dimensions`` parameters."""
+    degree, grid = _DEGREES.get(dimensions, (1, 2))
+    return ChebyshevBasis(dimensions, degree, grid)
+
+
+@dataclass(frozen=True)
+class Division:
+    """Nested equal cells of a box, and the parts that results are kept for.
+
+    Attributes:
+        axes: Axis that is halved from each level to the next.
+        dimensions: Of the box.
+        finer: Halvings of the deepest level's cells into parts, by axis.
+    """
+
+    axes: tuple[int, ...]
+    dimensions: int
+    finer: int = 0
+
+    @property
+    def levels(self) -> int:
+        """The deepest level."""
+        return len(self.axes)
+
+    def counts(self, level: int) -> tuple[int, ...]:
+        """Cells by axis of a level."""
+        return tuple(1 << self.axes[:level].count(j) for j in range(self.dimensions))
+
+    @cached_property
+    def parts(self) -> tuple[int, ...]:
+        """Parts by axis of the whole box."""
+        return tuple(n << self.finer for n in self.counts(self.levels))
+
+    def inner(self, level: int) -> tuple[int, ...]:
+        """Parts by axis of one cell of a level."""
+        return tuple(p // c for p, c in zip(self.parts, self.counts(level), strict=True))
+
+    def boxes(self, level: int) -> tuple[np.ndarray, np.ndarray]:
+        """[cells, d] lower and upper ends in [-1, 1]."""
+        counts = np.array(self.counts(level), np.int64)
+        found = list(np.ndindex(*counts.tolist()))
+        places = np.array(found, np.float64).reshape(len(found), self.dimensions)
+        return 2.0 * places / counts - 1.0, 2.0 * (places + 1.0) / counts - 1.0
+
+    def members(self, level: int) -> np.ndarray:
+        """[cells, parts of a cell] flat numbers of the parts of every cell."""
+        counts, inner = self.counts(level), self.inner(level)
+        whole = np.arange(math.prod(self.parts)).reshape(
+            [n for pair in zip(counts, inner, strict=True) for n in pair]
+        )
+        order = [*range(0, 2 * self.dimensions, 2), *range(1, 2 * self.dimensions, 2)]
+        return whole.transpose(order).reshape(math.prod(counts), math.prod(inner))
+
+    def children(self, level: int, cells: np.ndarray) -> np.ndarray:
+        """[2 n] cells of the next level inside ``cells`` [n]."""
+        counts, axis = self.counts(level), self.axes[level]
+        places = np.array(np.unravel_index(cells, counts)).reshape(self.dimensions, -1)
+        found = []
+        for half in (0, 1):
+            inside = places.copy()
+            inside[axis] = 2 * inside[axis] + half
+            found.append(np.ravel_multi_index(tuple(inside), self.counts(level + 1)))
+        return np.concatenate(found)
+
+
+@dataclass
+class RayBounds:
+    """What is known of n rays over a box.
+
+    Attributes:
+        lower, upper: [n, 3] float64 bounds of the colours.
+        alpha: [n, samples] float32 upper bounds of the opacity of every sample over the box.
+        cells: Cells of the network that were bounded.
+    """
+
+    lower: np.ndarray
+    upper: np.ndarray
+    alpha: np.ndarray
+    cells: int
+
+
+@dataclass
+class _Items:
+    """Cells of samples: ray, sample, cell, [k] each, all of one level."""
+
+    ray: np.ndarray
+    sample: np.ndarray
+    cell: np.ndarray
+
+    def __len__(self) -> int:
+        return self.ray.size
+
+    def take(self, which: np.ndarray | slice) -> _Items:
+        return _Items(self.ray[which], self.sample[which], self.cell[which])
+
+
+def join_items(parts: list[_Items]) -> _Items:
+    """All items of ``parts``."""
+    return _Items(*(np.concatenate([getattr(p, name) for p in parts]) for name in ("ray", "sample", "cell")))
+
+
+class Pencil:
+    """The rays of some pixels over one box of poses, as polynomials of the pose.
+
+    Args:
+        pose_set, box: The poses.
+        pixels: [n, 2] rows and columns.
+        degree: Of the Taylor models.
+    """
+
+    def __init__(self, pose_set: PoseSet, box: ParameterBox, pixels: np.ndarray, degree: int) -> None:
+        rotation, position = pose_set.taylor(box, degree)
+        in_camera = camera_rays(pose_set.camera, pixels)
+        world = (rotation[None, :, :] * TaylorArray.constant(rotation.basis, in_camera)[:, None, :]).sum(2)
+        # pixel rays and their rotation are rounded, and so is the concrete renderer's normalisation
+        world = world.widened(16.0 * UNIT64 * np.abs(in_camera).sum(axis=1)[:, None])
+        length = (world * world).sum(1)
+        direction = world * length.rsqrt()[:, None]
+        exponents = rotation.basis.exponents
+        self.exponents = np.array(exponents, np.int64).reshape(len(exponents), box.dimensions)
+        self.origin, self.origin_radius = position.coefficients, position.radius
+        self.direction = np.ascontiguousarray(direction.coefficients.transpose(1, 0, 2))  # [n, M, 3]
+        self.direction_radius = direction.radius + 16.0 * UNIT64
+
+    def displacement(self, distances: np.ndarray) -> np.ndarray:
+        """[n, samples, d] half of what a sample moves by over each parameter's range, about."""
+        found = np.zeros((self.direction.shape[0], distances.size, self.exponents.shape[1]))
+        for j in range(self.exponents.shape[1]):
+            moving = self.exponents[:, j] > 0
+            steps = self.origin[moving] + distances[:, None, None] * self.direction[:, None, moving]
+            found[..., j] = np.linalg.norm(np.abs(steps).sum(axis=2), axis=-1)
+        return found
+
+
+class NerfBounds:
+    """Bounds of a scene's rays for uniform samples of the fine field.
+
+    Args:
+        scene: The scene.
+        sampling: A uniform one.
+        dimensions: Number of parameters.
+        device: Where the network is bounded.
+    """
+
+    def __init__(
+        self, scene: NerfScene, sampling: Sampling, dimensions: int, device: torch.device | str = "cpu"
+    ) -> None:
+        self.sampling, self.device = sampling, torch.device(device)
+        self.basis = basis_of(dimensions)
+        self.field = FieldBounds(scene.fine, self.basis, device=device)
+        edges = sampling.edges
+        self.distances = 0.5 * (edges[1:] + edges[:-1])
+        self.lengths = edges[1:] - edges[:-1]
+        self.taylor = min(_TAYLOR, max(1, self.basis.degree))
+        #: Half the way of a sample over a cell that the network's bounds bear, learned while working.
+        self.reach = 0.02
+
+    def rays(
+        self,
+        pose_set: PoseSet,
+        box: ParameterBox,
+        pixels: np.ndarray,
+        tolerance: float,
+        known: np.ndarray | None = None,
+    ) -> RayBounds:
+        """Bounds of the colours of ``pixels`` [n, 2] over every pose of ``box``.
+
+        Args:
+            pose_set, box: The poses.
+            pixels: Rows and columns.
+            tolerance: What a sample's open opacity or colour may move a pixel by before its cells are halved.
+            known: [n, samples] upper bounds of opacities over a larger box.
+        """
+        n, samples = len(pixels), self.distances.size
+        pencil = Pencil(pose_set, box, pixels, self.taylor)
+        moves = pencil.displacement(self.distances)
+        division = self._division(moves)
+        if division is None or not (
+            np.isfinite(pencil.direction).all() and np.isfinite(pencil.direction_radius).all()
+        ):
+            return RayBounds(np.zeros((n, 3)), np.ones((n, 3)), np.ones((n, samples), np.float32), 0)
+        return _Work(self, pencil, division, moves, tolerance, known).run()
+
+    def _division(self, moves: np.ndarray) -> Division | None:
+        """Levels for samples that move by ``moves`` [n, samples, d]; None where the box is far too wide."""
+        d = moves.shape[2]
+        if d == 0:
+            return Division((), 0)
+        widest = moves.reshape(-1, d).max(axis=0)
+        if not np.isfinite(widest).all():
+            return None
+        axes: list[int] = []
+        while widest.sum() > self.reach and len(axes) < 40:
+            axis = int(np.argmax(widest))
+            axes.append(axis)
+            widest[axis] *= 0.5
+        deeper = _DEEPER.get(d, _DEEPER_MORE)
+        if 1 << (len(axes) + deeper) > _PARTS:
+            return None
+        for _ in range(deeper):
+            axis = int(np.argmax(widest))
+            axes.append(axis)
+            widest[axis] *= 0.5
+        return Division(tuple(axes), d)
+
+    def learn(self, tried: int, halved: int) -> None:
+        """Widen or narrow the starting cells from how many of those ``tried`` had to be halved."""
+        share = halved / max(1, tried)
+        if share > 0.25:
+            self.reach *= 0.85
+        elif share < 0.08:
+            self.reach *= 1.08
+
+
+class _Work:
+    """The bounds of one pencil of rays; see `NerfBounds.rays`."""
+
+    def __init__(
+        self,
+        owner: NerfBounds,
+        pencil: Pencil,
+        division: Division,
+        moves: np.ndarray,
+        tolerance: float,
+        known: np.ndarray | None,
+    ) -> None:
+        self.owner, self.pencil, self.division, self.tolerance = owner, pencil, division, tolerance
+        self.basis, self.field = owner.basis, owner.field
+        n, samples = moves.shape[:2]
+        parts = math.prod(division.parts)
+        self.alpha_low, self.alpha_high = np.zeros((samples, n, parts)), np.ones((samples, n, parts))
+        self.color_low, self.color_high = np.zeros((samples, n, parts, 3)), np.ones((samples, n, parts, 3))
+        self.light = np.ones((n, parts))
+        self.cells = 0
+        inverse = [1.0 / np.array(division.counts(level), np.float64) for level in range(division.levels + 1)]
+        # the first level whose cells are narrow enough for the sample
+        reach = [moves @ row for row in inverse]
+        self.start = np.zeros((n, samples), np.int64)
+        for level in range(division.levels):
+            self.start[(self.start == level) & (reach[level] > owner.reach)] = level + 1
+        self.quiet = np.zeros((n, samples), bool)
+        if known is not None:
+            self.quiet = known <= _QUIET * tolerance
+            for i, k in np.argwhere(self.quiet):
+                self.alpha_high[k, i] = known[i, k]
+        self._levels: dict[int, tuple[Tensor, Tensor, np.ndarray]] = {}
+
+    def run(self) -> RayBounds:
+        """Bound block after block of samples, nearest first, then composite."""
+        samples = self.owner.distances.size
+        for first in range(0, samples, _BLOCK):
+            block = np.arange(first, min(samples, first + _BLOCK))
+            if not (self.light > self._dark).any():
+                break
+            self._bound_block(block)
+            self.light *= np.prod(1.0 - self.alpha_low[block], axis=0)
+        lower, upper = self._composite()
+        alpha = self.alpha_high.max(axis=2).T.astype(np.float32)
+        return RayBounds(lower, upper, np.nextafter(alpha, np.float32(2.0)), self.cells)
+
+    @property
+    def _dark(self) -> float:
+        """Light that does not matter any more."""
+        return 0.1 * self.tolerance
+
+    def _level(self, level: int) -> tuple[Tensor, Tensor, np.ndarray]:
+        """Monomials at the nodes of every cell [cells, nodes, M], Bernstein matrix [parts, b, m], members."""
+        if level not in self._levels:
+            low, high = self.division.boxes(level)
+            nodes = 0.5 * (low + high)[:, None] + 0.5 * (high - low)[:, None] * self.basis.nodes
+            monomials = np.prod(nodes[:, :, None, :] ** self.pencil.exponents, axis=-1)
+            bernstein = self.basis.bernstein(self.division.inner(level))
+            device = self.owner.device
+            self._levels[level] = (
+                torch.from_numpy(monomials).to(device),
+                torch.from_numpy(bernstein).to(device),
+                self.division.members(level),
+            )
+        return self._levels[level]
+
+    def _bound_block(self, block: np.ndarray) -> None:
+        """Bound the samples ``block`` of all rays."""
+        waiting: dict[int, list[_Items]] = {}
+        for level in range(self.division.levels + 1):
+            ray, place = np.nonzero((self.start[:, block] == level) & ~self.quiet[:, block])
+            if not ray.size:
+                continue
+            members = self._level(level)[2]
+            bright = self.light[:, members].max(axis=2) > self._dark  # [n, cells]
+            item, cell = np.nonzero(bright[ray])
+            waiting[level] = [_Items(ray[item], block[place[item]], cell)]
+        tried = sum(len(items) for parts in waiting.values() for items in parts)
+        halved = 0
+        for level in range(self.division.levels + 1):
+            if level not in waiting:
+                continue
+            items = join_items(waiting.pop(level))
+            again = []
+            for start in range(0, len(items), _BATCH):
+                batch = items.take(slice(start, start + _BATCH))
+                again.append(batch.take(self._bound_batch(level, batch)))
+            coarse = join_items(again)
+            if level == self.division.levels or not len(coarse):
+                continue
+            first = self.start[coarse.ray, coarse.sample] == level
+            halved += int(first.sum())
+            children = self.division.children(level, coarse.cell)
+            finer = _Items(np.tile(coarse.ray, 2), np.tile(coarse.sample, 2), children)
+            waiting.setdefault(level + 1, []).append(finer)
+        if tried >= 32:
+            self.owner.learn(tried, halved)
+
+    def _bound_batch(self, level: int, items: _Items) -> np.ndarray:
+        """Bound some cells of one level; returns [k] which of them are worth halving."""
+        device, field = self.owner.device, self.field
+        monomials, bernstein, members = self._level(level)
+        self.cells += len(items)
+        t = self.owner.distances[items.sample]
+        pencil = self.pencil
+        lines = pencil.origin + t[:, None, None] * pencil.direction[items.ray]
+        radius = pencil.origin_radius + t[:, None] * pencil.direction_radius[items.ray]
+        # rounding of the polynomial's evaluation, and of the concrete renderer's point
+        radius = radius + 96.0 * UNIT64 * (np.abs(pencil.origin).sum(axis=0) + t[:, None] * 2.0)
+        there = monomials[torch.from_numpy(items.cell).to(device)]
+        nodes = there @ torch.from_numpy(lines).to(device)
+        encoded = field.encode(nodes, torch.from_numpy(radius).to(device), field.weights.position)
+        pieces = field.base(*encoded)
+        density = field.density(pieces)
+        low, high, error = _parts(density, bernstein)
+        length = torch.from_numpy(self.owner.lengths[items.sample]).to(device)[:, None]
+        alpha_low, alpha_high = opacity(low[..., 0], length, up=False), opacity(high[..., 0], length, up=True)
+        bad = density.failed[:, None]
+        alpha_low, alpha_high = torch.where(bad, 0.0, alpha_low), torch.where(bad, 1.0, alpha_high)
+        # what the network's own error leaves open, apart from the cell's width
+        middle = 0.5 * (low[..., 0] + high[..., 0])
+        open_ = opacity(middle + error[:, :1], length, up=True) - opacity(middle - error[:, :1], length, up=False)
+        open_ = torch.where(bad, 1.0, open_).cpu().numpy()
+        low_a, high_a = alpha_low.cpu().numpy(), alpha_high.cpu().numpy()
+        rows = items.sample[:, None], items.ray[:, None], members[items.cell]
+        light = self.light[rows[1], rows[2]]
+        self._keep(self.alpha_low, self.alpha_high, rows, low_a, high_a)
+        halve = (open_ * light).max(axis=1) > self.tolerance
+        shines = (high_a * light).max(axis=1) > self.tolerance
+        coloured = np.flatnonzero(shines & ~halve & ~density.failed.cpu().numpy())
+        if coloured.size:
+            vague = self._color(pieces, items.take(coloured), coloured, there, bernstein, rows, high_a * light)
+            halve[coloured] |= vague
+        return halve
+
+    def _color(
+        self,
+        pieces: Pieces,
+        items: _Items,
+        which: np.ndarray,
+        there: Tensor,
+        bernstein: Tensor,
+        rows: tuple[np.ndarray, np.ndarray, np.ndarray],
+        shown: np.ndarray,
+    ) -> np.ndarray:
+        """Bound the colours of the pieces ``which``; returns [k] whether they are too vague."""
+        device, field = self.owner.device, self.field
+        index = torch.from_numpy(which).to(device)
+        direction = there[index] @ torch.from_numpy(self.pencil.direction[items.ray]).to(device)
+        radius = self.pencil.direction_radius[items.ray] + 96.0 * UNIT64
+        encoded = field.encode(direction, torch.from_numpy(radius).to(device), field.weights.direction)
+        color = field.color(pieces.select(index), *encoded)
+        low, high, error = _parts(color, bernstein)
+        bad = color.failed[:, None, None]
+        low = torch.where(bad, 0.0, torch.sigmoid(low) * (1.0 - _COMPOSITE)).cpu().numpy()
+        high = torch.where(bad, 1.0, (torch.sigmoid(high) * (1.0 + _COMPOSITE)).clamp(max=1.0)).cpu().numpy()
+        self._keep(self.color_low, self.color_high, tuple(r[which] for r in rows), low, high)
+        slack = 2.0 * torch.tanh(0.25 * error.amax(dim=1))
+        slack = torch.where(color.failed, 1.0, slack).cpu().numpy()
+        return slack * shown[which].max(axis=1) > self.tolerance
+
+    @staticmethod
+    def _keep(lower: np.ndarray, upper: np.ndarray, rows: tuple, low: np.ndarray, high: np.ndarray) -> None:
+        """Intersect what is known with new bounds; what is not a number or crosses says nothing."""
+        old_low, old_high = lower[rows], upper[rows]
+        good = (low <= high) & np.isfinite(low) & np.isfinite(high)
+        low = np.where(good, np.maximum(low, old_low), old_low)
+        high = np.where(good, np.minimum(high, old_high), old_high)
+        crossed = ~(low <= high)
+        lower[rows] = np.where(crossed, old_low, low)
+        upper[rows] = np.where(crossed, old_high, high)
+
+    def _composite(self) -> tuple[np.ndarray, np.ndarray]:
+        """[n, 3] bounds over all parts (design.md, N8)."""
+        background = np.array(self.owner.sampling.background, np.float64)
+        shape = (*self.light.shape, 3)
+        low, high = np.broadcast_to(background, shape).copy(), np.broadcast_to(background, shape).copy()
+        for k in range(self.alpha_low.shape[0] - 1, -1, -1):
+            least, most = self.alpha_low[k][..., None], self.alpha_high[k][..., None]
+            rise, fall = self.color_high[k] - high, self.color_low[k] - low
+            high += np.where(rise > 0.0, most, least) * rise
+            low += np.where(fall < 0.0, most, least) * fall
+        slack = 4.0 * _COMPOSITE * (self.alpha_low.shape[0] + 4)
+        low, high = low.min(axis=1) - slack, high.max(axis=1) + slack
+        return np.clip(low, 0.0, 1.0), np.clip(high, 0.0, 1.0)
+
+
+def _parts(value: Affine, bernstein: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Bounds [B, parts, n] of an affine batch on every part of its cell, and its radius [B, n]."""
+    error = value.radius
+    controls = torch.einsum("pkm,bmn->bpkn", bernstein, value.poly)
+    slack = (error + ROUNDING * value.poly.abs().sum(dim=1) * 64.0)[:, None]
+    return controls.amin(dim=2) - slack, controls.amax(dim=2) + slack, error
+
+
+def opacity(z: Tensor, length: Tensor, *, up: bool) -> Tensor:
+    """A bound of ``1 - exp(-length softplus(z))``, from above or below (design.md, N7).
+
+    torch returns z itself for the softplus of z > 20, which is less than the function by 2.1e-9.
+    """
+    if up:
+        density = (torch.clamp(z, min=0.0) + torch.log1p(torch.exp(-z.abs()))) * (1.0 + 2.0**-46)
+        return (-torch.expm1(-length * density) * (1.0 + 2.0**-46) + 2.0**-1000).clamp(max=1.0)
+    density = torch.where(z > 19.0, z, torch.clamp(z, min=0.0) + torch.log1p(torch.exp(-z.abs()))) * (1.0 - 2.0**-46)
+    return (-torch.expm1(-length * density) * (1.0 - 2.0**-46)).clamp(min=0.0)

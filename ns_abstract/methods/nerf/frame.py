@@ -1,0 +1,166 @@
+"""One frame of a NeRF, ready for refinement: bounds, renders and motion of its set of poses."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from ns_abstract.arithmetic.outward import outward
+from ns_abstract.methods.nerf.bounds import NerfBounds
+from ns_abstract.methods.nerf.render import NerfRenderer, Sampling
+from ns_abstract.methods.nerf.scene import NerfScene
+from ns_abstract.sets.box import ParameterBox
+from ns_abstract.sets.poses import PoseSet
+from ns_abstract.sets.tiles import tile_grid
+
+#: What an open sample may move a pixel by on boxes a quarter as wide as the set, as a part of the pixels' mean
+#: variation over the set; less on narrower boxes.
+_TOLERANCE = 0.12
+_MOST_TOLERANCE, _LEAST_TOLERANCE = 0.03, 1e-5
+#: Rays and poses rendered to estimate that variation.
+_LOOK_RAYS, _LOOK_POSES = 256, 7
+#: Weights that are multiplied in one call of `NerfFrame.bound`, in units of rays times weights.
+_WORK = 2_500_000
+
+
+@dataclass(frozen=True)
+class RayContext:
+    """What a cell has shown of some rays, for the same rays of the cells inside it.
+
+    Attributes:
+        tiles: [t] numbers of the rays, ascending.
+        alpha: [t, samples] upper bounds of opacities over the cell.
+    """
+
+    tiles: np.ndarray
+    alpha: np.ndarray
+
+
+@dataclass(frozen=True)
+class RayBox:
+    """Bounds of some rays over one cell; see `ns_abstract.refine.engine.Bounds`."""
+
+    lower: np.ndarray
+    upper: np.ndarray
+    slopes: np.ndarray
+    context: RayContext | None
+    linear: tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray] | None
+
+
+class NerfFrame:
+    """Bounds and renders one frame's set of poses. Every ray is a tile of its own.
+
+    The set as a whole is bounded by [0, 1] without work, so that refinement can take ray after ray.
+
+    Args:
+        scene: The fields.
+        sampling: Where they are evaluated.
+        pose_set: The poses.
+        device: Where the network is bounded.
+    """
+
+    #: Poses rendered in every part of a cell that is split.
+    witnesses = 8
+
+    def __init__(self, scene: NerfScene, sampling: Sampling, pose_set: PoseSet, device: str = "cpu") -> None:
+        self.pose_set, self.camera, self.box = pose_set, pose_set.camera, pose_set.box
+        self.side = 1
+        self.across, self.down = tile_grid(self.camera, 1)
+        self.renderer = NerfRenderer(scene, sampling, device=device)
+        self.bounds = NerfBounds(scene, sampling, self.box.dimensions, device)
+        weights = sum(array.size for array in scene.fine.arrays())
+        self.batch = int(np.clip(_WORK // weights, 1, 64))
+
+    @property
+    def tile_count(self) -> int:
+        """Number of rays, row by row."""
+        return self.across * self.down
+
+    def _pixels(self, tiles: np.ndarray) -> np.ndarray:
+        return np.stack([tiles // self.across, tiles % self.across], axis=1)
+
+    def warm_up(self) -> None:
+        """Compile the kernels that this frame needs."""
+        box = self.box
+        for axis in range(box.dimensions):
+            box = box.split(axis, 1024)[0]
+        self.bounds.rays(self.pose_set, box, self._pixels(np.arange(1)), 1.0)
+        self.render(box.middle, np.arange(1))
+
+    def render(self, values: np.ndarray, tiles: np.ndarray | None = None) -> np.ndarray:
+        """Rays [t, 1, 1, 3] float32 of the concrete image at parameter values [d]."""
+        which = np.arange(self.tile_count) if tiles is None else tiles
+        colors = self.renderer.pixels(self.camera, self.pose_set.pose(values), self._pixels(which))
+        return colors.astype(np.float32)[:, None, None, :]
+
+    def motion(self, box: ParameterBox) -> np.ndarray:
+        """[d] pixels that points at a typical distance move by over each parameter's range (an estimate)."""
+        d = box.dimensions
+        low, high = np.array(box.lower), np.array(box.upper)
+        distance = self.bounds.distances[self.bounds.distances.size // 2]
+        found = np.zeros(d)
+        here = self._point(box.middle, distance)
+        for k in range(d):
+            step = np.zeros(d)
+            step[k] = 2.0**-10 * (high[k] - low[k])
+            moved = np.linalg.norm(self._point(box.middle + step, distance) - here) * 2.0**10
+            found[k] = moved / distance * self.camera.fx
+        return found
+
+    def _point(self, values: np.ndarray, distance: float) -> np.ndarray:
+        pose = self.pose_set.pose(values)
+        return pose[:, 3] - distance * pose[:, 2]
+
+    def bound(
+        self, box: ParameterBox, tiles: np.ndarray, within: RayContext | None = None, keep_linear: bool = False
+    ) -> RayBox:
+        """Bounds of the rays ``tiles`` over ``box``; ``within`` is the context of these rays and a box around it."""
+        tiles = np.asarray(tiles)
+        d = box.dimensions
+        whole = d > 0 and box == self.box
+        if whole:
+            lower, upper, context = np.zeros((tiles.size, 3)), np.ones((tiles.size, 3)), None
+        else:
+            known = None
+            if within is not None:
+                known = within.alpha[np.searchsorted(within.tiles, tiles)]
+            parts = [
+                self.bounds.rays(
+                    self.pose_set, box, self._pixels(tiles[i : i + self.batch]), self._tolerance(box),
+                    None if known is None else known[i : i + self.batch],
+                )
+                for i in range(0, tiles.size, self.batch)
+            ]  # fmt: skip
+            lower, upper, alpha = (
+                np.concatenate([getattr(part, name) for part in parts]) for name in ("lower", "upper", "alpha")
+            )
+            order = np.argsort(tiles)
+            context = RayContext(tiles[order], alpha[order])
+        low, high = outward(lower, upper)
+        shape = (tiles.size, 1, 1, 3)
+        low, high = low.reshape(shape), high.reshape(shape)
+        linear = None
+        if keep_linear:
+            flat = np.zeros((*shape, d), np.float32)
+            linear = flat, low, flat, high
+        return RayBox(low, high, np.zeros(d), context, linear)
+
+    def _tolerance(self, box: ParameterBox) -> float:
+        """Narrower boxes are asked for when the bounds of wider ones are not good enough."""
+        if not box.dimensions:
+            return _LEAST_TOLERANCE
+        whole = np.array(self.box.upper) - np.array(self.box.lower)
+        width = np.array(box.upper) - np.array(box.lower)
+        share = float(np.prod(width / whole)) ** (1.0 / box.dimensions)
+        return max(_LEAST_TOLERANCE, min(1.0, 4.0 * share) * min(_MOST_TOLERANCE, _TOLERANCE * self._variation))
+
+    @cached_property
+    def _variation(self) -> float:
+        """Mean over some rays of how far their colours move over the set (an estimate)."""
+        rng = np.random.default_rng(0)
+        tiles = np.sort(rng.permutation(self.tile_count)[:_LOOK_RAYS])
+        values = [*self.box.sample(_LOOK_POSES - 2, rng), np.array(self.box.lower), np.array(self.box.upper)]
+        pictures = np.stack([self.render(v, tiles) for v in values])
+        return float((pictures.max(axis=0) - pictures.min(axis=0)).mean())

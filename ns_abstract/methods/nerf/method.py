@@ -1,0 +1,140 @@
+"""Vanilla-NeRF runs as the command lines see them; see `ns_abstract.pipeline.Method`."""
+
+from __future__ import annotations
+
+import hashlib
+from typing import Any
+
+import numpy as np
+
+from ns_abstract.errors import InputError
+from ns_abstract.methods.nerf.frame import NerfFrame
+from ns_abstract.methods.nerf.render import Sampling
+from ns_abstract.methods.nerf.scene import NerfScene
+from ns_abstract.sets.poses import PoseSet
+
+#: Samples by ray where nothing is said: those of Nerfstudio's coarse pass.
+_SAMPLES = 64
+_SAMPLES_LIMIT = 4096
+
+
+class NerfMethod:
+    """A vanilla NeRF and the program that is bounded: the fine field at N uniform samples.
+
+    Args:
+        scene: The scene.
+        renderer: "paper" (black behind the last sample) or None.
+        arithmetic: "real" or None: float32 evaluations of a network are not enclosed.
+        sampling: "uniform" or None.
+        num_samples: N; None: 64.
+        near_plane: Start of the rays, normalised units; None: 0, as in Nerfstudio's evaluation.
+
+    Raises:
+        InputError: An option does not go with a NeRF.
+    """
+
+    def __init__(
+        self,
+        scene: NerfScene,
+        renderer: str | None = None,
+        arithmetic: str | None = None,
+        sampling: str | None = None,
+        num_samples: int | None = None,
+        near_plane: float | None = None,
+    ) -> None:
+        if renderer not in (None, "paper"):
+            raise InputError(f"{renderer} draws splats, this run is a NeRF", field="--renderer", fix="leave it out")
+        if arithmetic not in (None, "real"):
+            raise InputError(
+                "float32 evaluations of a NeRF's networks cannot be enclosed tightly",
+                field="--arithmetic",
+                fix="use real",
+            )
+        if sampling not in (None, "uniform"):
+            raise InputError("this version bounds uniform samples", field="--sampling", fix="use uniform")
+        samples = _SAMPLES if num_samples is None else num_samples
+        if not 1 <= samples <= _SAMPLES_LIMIT:
+            raise InputError(f"found {samples}", field="--num-samples", fix=f"give 1 to {_SAMPLES_LIMIT}")
+        near = scene.near if near_plane is None else near_plane
+        if not 0.0 <= near < scene.far:
+            raise InputError(f"found {near}", field="--near-plane", fix=f"give 0 or more, below {scene.far:g}")
+        self.scene = scene
+        self.paper = renderer == "paper"
+        background = np.zeros(3) if self.paper else scene.background
+        red, green, blue = (float(v) for v in background)
+        self.sampling = Sampling("uniform", near, scene.far, samples, 0, (red, green, blue))
+
+    @property
+    def program(self) -> dict[str, Any]:
+        """Name and version of the bounded program."""
+        s = self.sampling
+        version = "algorithm-2" if self.paper else "nerfstudio-1.1.5-field"
+        return {
+            "name": "paper-nerf" if self.paper else "nerf-uniform",
+            "version": version,
+            "sampling": s.kind,
+            "samples": s.samples,
+            "near": s.near,
+            "far": s.far,
+        }
+
+    @property
+    def guarantee(self) -> str:
+        """What bounds of this program are called."""
+        return "real-sound"
+
+    @property
+    def content(self) -> str:
+        """The scene in a few words."""
+        return f"vanilla NeRF, {self.scene.fine.text}"
+
+    def frame(self, poses: PoseSet) -> NerfFrame:
+        """One frame, ready for refinement."""
+        return NerfFrame(self.scene, self.sampling, poses)
+
+    def memory(self, pixels: int) -> int:
+        """Bytes that bounding pictures of ``pixels`` needs beside the leaves."""
+        weights = sum(array.nbytes for array in self.scene.fine.arrays())
+        return 8 * weights + pixels * (400 + 4 * self.sampling.samples) + (1 << 30)
+
+    def frame_plan(self, frame: NerfFrame, shown: int | None, lower: np.ndarray, upper: np.ndarray) -> list[str]:
+        """What was left out for one frame, given what refinement found."""
+        untreated = int(((lower == 0.0) & (upper == 1.0)).all(axis=-1).sum())
+        total = lower.shape[0] * lower.shape[1]
+        return [f"{untreated:,} of {total:,} rays left at [0, 1]: the time was over before them"] if untreated else []
+
+    @property
+    def plan(self) -> tuple[str, ...]:
+        """What is left out for this scene, whatever the frame."""
+        s, scene = self.sampling, self.scene
+        shows = scene.coarse_samples + scene.importance_samples + 1
+        return (
+            f"bounded: the fine field at the middles of {s.samples} equal bins from {s.near:g} to {s.far:g} "
+            f"(Algorithm 2 of the paper); Nerfstudio's own picture puts {shows} samples where the coarse field "
+            "has weight and differs from it",
+            "the coarse field left out: uniform samples do not need it",
+        )
+
+    @property
+    def fingerprint(self) -> dict[str, Any]:
+        """Scene and program, for results that are continued."""
+        digest = hashlib.sha256()
+        for array in self.scene.fine.arrays():
+            digest.update(repr(array.shape).encode())
+            digest.update(np.ascontiguousarray(array).tobytes())
+        digest.update(repr((self.scene.fine.position, self.scene.fine.direction, self.sampling)).encode())
+        return {"scene": digest.hexdigest(), "renderer": self.program["name"], "arithmetic": "real"}
+
+    def describe(self) -> dict[str, Any]:
+        """The scene for reports."""
+        scene, s = self.scene, self.sampling
+        return {
+            "name": scene.name,
+            "source": str(scene.source),
+            "field": scene.fine.text,
+            "samples": s.samples,
+            "near": s.near,
+            "far": s.far,
+            "background": list(s.background),
+            "notes": list(scene.notes),
+        }

@@ -1,0 +1,155 @@
+"""Concrete rendering of a vanilla NeRF with Nerfstudio's evaluation semantics, in torch.
+
+``hierarchical`` is what Nerfstudio shows (nerfstudio/models/vanilla_nerf.py, ``get_outputs``);
+``uniform`` evaluates the fine field at the middles of N equal bins, which is Algorithm 2 of
+"Abstract Rendering". Rays: cameras.py:880-900 (pixel centres, OpenGL axes, normalised directions).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ns_abstract.methods.nerf.field import Field
+from ns_abstract.methods.nerf.scene import NerfScene
+from ns_abstract.sets.path import Camera
+
+#: nerfstudio/model_components/ray_samplers.py, ``PDFSampler``.
+HISTOGRAM_PADDING = 0.01
+_SUM_EPS = 1e-5
+#: Points whose fields are evaluated at once.
+_CHUNK = 1 << 15
+
+
+@dataclass(frozen=True)
+class Sampling:
+    """Where a ray is sampled.
+
+    Attributes:
+        kind: "uniform" or "hierarchical".
+        near, far: Ends of the rays, normalised units.
+        samples: Bins of equal length; of the coarse pass where the sampling is hierarchical.
+        importance: Samples that the coarse weights place (hierarchical only).
+        background: RGB behind the last sample.
+    """
+
+    kind: Literal["uniform", "hierarchical"]
+    near: float
+    far: float
+    samples: int
+    importance: int
+    background: tuple[float, float, float]
+
+    @property
+    def edges(self) -> np.ndarray:
+        """[samples + 1] float64 distances of the bins' ends (``UniformSampler`` outside training)."""
+        bins = np.linspace(0.0, 1.0, self.samples + 1)
+        return bins * self.far + (1.0 - bins) * self.near
+
+
+def camera_rays(camera: Camera, pixels: np.ndarray) -> np.ndarray:
+    """[n, 3] float64 ray directions in camera axes, not normalised, of ``pixels`` [n, 2] (row, column)."""
+    rows, columns = np.asarray(pixels).T
+    x = (columns + 0.5 - camera.cx) / camera.fx
+    y = -(rows + 0.5 - camera.cy) / camera.fy
+    return np.stack([x, y, -np.ones_like(x)], axis=1)
+
+
+class NerfRenderer:
+    """Renders rays of a scene.
+
+    Args:
+        scene: The fields.
+        sampling: Where they are evaluated.
+        dtype: Of all arithmetic.
+        device: Where.
+    """
+
+    def __init__(
+        self,
+        scene: NerfScene,
+        sampling: Sampling,
+        dtype: torch.dtype = torch.float64,
+        device: torch.device | str = "cpu",
+    ) -> None:
+        self.sampling, self.dtype, self.device = sampling, dtype, torch.device(device)
+        self.fine = Field(scene.fine, dtype, device)
+        self.coarse = Field(scene.coarse, dtype, device) if sampling.kind == "hierarchical" else self.fine
+        self._background = torch.tensor(sampling.background, dtype=dtype, device=device)
+
+    def rays(self, pose: Tensor, directions: Tensor) -> Tensor:
+        """Colours [n, 3] in [0, 1] along camera-axes ``directions`` [n, 3] from ``pose`` [3, 4]; differentiable."""
+        world = directions @ pose[:, :3].T
+        world = world / torch.linalg.vector_norm(world, dim=-1, keepdim=True)
+        origin = pose[:, 3]
+        s = self.sampling
+        bins = torch.linspace(0.0, 1.0, s.samples + 1, dtype=self.dtype, device=self.device)
+        bins = bins.expand(directions.shape[0], -1)
+        if s.kind == "hierarchical":
+            density, _ = self._densities(self.coarse, origin, world, bins)
+            bins = self._refined(bins, _weights(density, self._lengths(bins)))
+        density, base = self._densities(self.fine, origin, world, bins)
+        weights = _weights(density, self._lengths(bins))
+        color = self.fine.color(base, world[:, None].expand(-1, weights.shape[1], -1))
+        total = (weights[..., None] * color).sum(dim=1)
+        total = total + self._background * (1.0 - weights.sum(dim=1))[:, None]
+        return total.clamp(0.0, 1.0)
+
+    def pixels(self, camera: Camera, pose: np.ndarray, pixels: np.ndarray) -> np.ndarray:
+        """Colours [n, 3] float64 of ``pixels`` [n, 2] (row, column) from camera-to-world ``pose`` [3, 4]."""
+        directions = torch.from_numpy(camera_rays(camera, pixels)).to(self.device, self.dtype)
+        matrix = torch.tensor(np.asarray(pose)).to(self.device, self.dtype)
+        count = self.sampling.samples + (self.sampling.importance if self.sampling.kind == "hierarchical" else 0)
+        step = max(1, _CHUNK // count)
+        with torch.inference_mode():
+            parts = [self.rays(matrix, part) for part in directions.split(step)]
+        return torch.cat(parts).double().cpu().numpy() if parts else np.zeros((0, 3))
+
+    def image(self, camera: Camera, pose: np.ndarray) -> np.ndarray:
+        """The image [H, W, 3] float64."""
+        grid = np.indices((camera.height, camera.width)).reshape(2, -1).T
+        return self.pixels(camera, pose, grid).reshape(camera.height, camera.width, 3)
+
+    def _distances(self, bins: Tensor) -> Tensor:
+        s = self.sampling
+        return bins * s.far + (1.0 - bins) * s.near
+
+    def _lengths(self, bins: Tensor) -> Tensor:
+        distances = self._distances(bins)
+        return distances[:, 1:] - distances[:, :-1]
+
+    def _densities(self, field: Field, origin: Tensor, world: Tensor, bins: Tensor) -> tuple[Tensor, Tensor]:
+        """Densities [n, k] and base outputs [n, k, width] in the middles of the bins [n, k + 1]."""
+        distances = self._distances(bins)
+        middles = (distances[:, :-1] + distances[:, 1:]) / 2.0
+        return field.density(origin + world[:, None] * middles[..., None])
+
+    def _refined(self, bins: Tensor, weights: Tensor) -> Tensor:
+        """``PDFSampler.generate_ray_samples`` outside training: the union of old and new edges, sorted."""
+        weights = weights + HISTOGRAM_PADDING
+        total = weights.sum(dim=-1, keepdim=True)
+        padding = torch.relu(_SUM_EPS - total)
+        pdf = (weights + padding / weights.shape[-1]) / (total + padding)
+        cdf = torch.clamp(torch.cumsum(pdf, dim=-1), max=1.0)
+        cdf = torch.cat([torch.zeros_like(cdf[:, :1]), cdf], dim=-1)
+        count = self.sampling.importance + 1
+        u = torch.linspace(0.0, 1.0 - 1.0 / count, count, dtype=self.dtype, device=self.device) + 0.5 / count
+        u = u.expand(cdf.shape[0], -1).contiguous()
+        places = torch.searchsorted(cdf, u, side="right")
+        below, above = (places - 1).clamp(0, bins.shape[1] - 1), places.clamp(0, bins.shape[1] - 1)
+        low, high = cdf.gather(1, below), cdf.gather(1, above)
+        part = torch.clip(torch.nan_to_num((u - low) / (high - low), 0.0), 0.0, 1.0)
+        start = bins.gather(1, below)
+        new = start + part * (bins.gather(1, above) - start)
+        return torch.sort(torch.cat([bins, new], dim=-1), dim=-1).values.detach()
+
+
+def _weights(density: Tensor, lengths: Tensor) -> Tensor:
+    """Weights [n, k] of densities [n, k] on bins of ``lengths`` [n, k] (``RaySamples.get_weights``)."""
+    depth = lengths * density
+    before = torch.cumsum(depth, dim=1) - depth
+    return torch.nan_to_num((1.0 - torch.exp(-depth)) * torch.exp(-before))

@@ -1,0 +1,107 @@
+"""A trained vanilla NeRF as plain arrays, independent of where it came from."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ns_abstract.methods.transform import DataparserTransform
+
+Float32Array = NDArray[np.float32]
+
+
+@dataclass(frozen=True)
+class Encoding:
+    """Sines and cosines of an input vector x (nerfstudio/field_components/encodings.py, ``NeRFEncoding``).
+
+    ``[sin(2 pi f_j x_i)], [sin(2 pi f_j x_i + pi / 2)], x`` with the coordinate i outside and the
+    frequency j inside; ``f`` grows geometrically from ``2^least`` to ``2^most``.
+    """
+
+    count: int
+    least: float = 0.0
+    most: float = 8.0
+
+    @property
+    def frequencies(self) -> NDArray[np.float64]:
+        """[count] frequencies as Nerfstudio has them: a float32 power of a float32 exponent."""
+        import torch
+
+        return (2.0 ** torch.linspace(self.least, self.most, self.count)).double().numpy()
+
+    @property
+    def size(self) -> int:
+        """Length of the encoded vector of a point."""
+        return 6 * self.count + 3
+
+
+@dataclass(frozen=True)
+class Layer:
+    """A linear layer: ``weight`` [out, in] and ``bias`` [out], float32; ``skip``: the encoding comes first."""
+
+    weight: Float32Array
+    bias: Float32Array
+    skip: bool = False
+
+
+@dataclass(frozen=True)
+class FieldWeights:
+    """One field (nerfstudio/fields/vanilla_nerf_field.py, ``NeRFField``).
+
+    Attributes:
+        base: ReLU after every layer; the first takes the encoded position.
+        density: One output, softplus.
+        head: ReLU after every layer; the first takes the encoded direction, then the base's output.
+        color: Three outputs, sigmoid.
+        position, direction: Encodings.
+    """
+
+    base: tuple[Layer, ...]
+    density: Layer
+    head: tuple[Layer, ...]
+    color: Layer
+    position: Encoding
+    direction: Encoding
+
+    def arrays(self) -> list[Float32Array]:
+        """All weights and biases in a fixed order."""
+        layers = (*self.base, self.density, *self.head, self.color)
+        return [array for layer in layers for array in (layer.weight, layer.bias)]
+
+    @property
+    def text(self) -> str:
+        """The architecture in a few words."""
+        skips = [str(i) for i, layer in enumerate(self.base) if layer.skip]
+        skip = f", skip into layer {', '.join(skips)}" if skips else ""
+        width = self.base[0].weight.shape[0]
+        return f"{len(self.base)} x {width}{skip}; head {len(self.head)} x {self.head[0].weight.shape[0]}"
+
+
+@dataclass(frozen=True)
+class NerfScene:
+    """A vanilla NeRF.
+
+    Attributes:
+        coarse, fine: The two fields.
+        near, far: Distances of the rays' ends in evaluation, units of the normalised frame.
+        coarse_samples, importance_samples: Numbers of the hierarchical sampler.
+        background: [3] float32 RGB behind the last sample.
+        dataparser: Units of the training data against the normalised frame.
+        name: Short name for reports.
+        source: The file the parameters were read from.
+        notes: What was assumed where the source says nothing, one sentence each.
+    """
+
+    coarse: FieldWeights
+    fine: FieldWeights
+    near: float = 0.0
+    far: float = 6.0
+    coarse_samples: int = 64
+    importance_samples: int = 128
+    background: Float32Array = field(default_factory=lambda: np.ones(3, np.float32))
+    dataparser: DataparserTransform = field(default_factory=DataparserTransform)
+    name: str = "scene"
+    source: str = ""
+    notes: tuple[str, ...] = ()

@@ -1,0 +1,20 @@
+"""The frame of a run against that of its data set."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+@dataclass(frozen=True)
+class DataparserTransform:
+    """Maps the units of transforms.json to the normalised frame of the run.
+
+    ``x_normalised = scale * (matrix[:, :3] @ x_dataset + matrix[:, 3])``
+    (nerfstudio/data/dataparsers/base_dataparser.py, ``DataparserOutputs``).
+    """
+
+    matrix: NDArray[np.float64] = field(default_factory=lambda: np.eye(3, 4))  # [3, 4]
+    scale: float = 1.0

@@ -1,0 +1,92 @@
+"""Small NeRFs, sets of poses and dense samples that the tests of NeRF bounds share."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import torch
+from torch.nn import functional
+
+from ns_abstract.demo.nerf_fit import NerfNetwork
+from ns_abstract.demo.paths import look_at
+from ns_abstract.methods.nerf.field import Field, encode
+from ns_abstract.methods.nerf.render import NerfRenderer, Sampling
+from ns_abstract.methods.nerf.scene import FieldWeights, Layer, NerfScene
+from ns_abstract.sets.path import Camera
+from ns_abstract.sets.perturbation import parse_perturbation
+from ns_abstract.sets.poses import PoseSet
+
+UNIFORM = Sampling("uniform", 0.0, 4.0, 24, 0, (0.2, 0.6, 1.0))
+
+
+def tiny_weights(seed: int = 0, *, density: float = 8.0, rough: float = 1.0, color: float = 4.0) -> FieldWeights:
+    """A random field of 3 x 16 with a skip, empty in three quarters of the space about the origin.
+
+    ``density`` is the standard deviation of the density before its softplus, ``rough`` scales the waves of the
+    encoding and ``color`` the last layer of the colours.
+    """
+    torch.manual_seed(seed)
+    found = NerfNetwork(3, 16, 1, 2, 8).weights()
+
+    def scaled(layer: Layer, by: float, columns: slice = slice(None)) -> Layer:
+        weight = layer.weight.copy()
+        weight[:, columns] *= by
+        return Layer(weight, layer.bias, layer.skip)
+
+    found = dataclasses.replace(
+        found,
+        base=tuple(scaled(layer, rough, slice(0, 60)) if i in (0, 1) else layer for i, layer in enumerate(found.base)),
+        density=dataclasses.replace(found.density, bias=np.zeros(1, np.float32)),
+        color=scaled(found.color, color),
+    )
+    x = 1.2 * (2.0 * torch.rand(4000, 3, dtype=torch.float64) - 1.0)
+    raw = raw_outputs(found, x, x)[0]
+    by = density / float(raw.std())
+    bias = np.full(1, -by * float(raw.quantile(0.75)), np.float32)
+    return dataclasses.replace(found, density=Layer(scaled(found.density, by).weight, bias))
+
+
+def tiny_scene(seed: int = 0, **changes: float) -> NerfScene:
+    weights = tiny_weights(seed, **changes)
+    return NerfScene(weights, tiny_weights(seed + 100, **changes), 0.0, 4.0, name="tiny")
+
+
+def view(width: int = 4, height: int = 3) -> Camera:
+    pose = look_at((1.6, 0.4, 0.5), (0.0, 0.0, 0.0))[:3]
+    return Camera(pose, 5.0, 5.0, 0.5 * width, 0.5 * height, width, height)
+
+
+def other_view(width: int = 4, height: int = 3) -> Camera:
+    pose = look_at((1.5, 0.6, 0.3), (0.1, 0.0, 0.0))[:3]
+    return Camera(pose, 5.0, 5.0, 0.5 * width, 0.5 * height, width, height)
+
+
+def poses(spec: dict, camera: Camera | None = None) -> PoseSet:
+    """The set of ``spec`` around `view`, towards `other_view` where the sweep is over segments."""
+    return PoseSet.around(camera or view(), parse_perturbation(spec), other_view())
+
+
+def pixels_of(camera: Camera) -> np.ndarray:
+    return np.stack(np.mgrid[: camera.height, : camera.width], axis=-1).reshape(-1, 2)
+
+
+def images(scene: NerfScene, pose_set: PoseSet, values: np.ndarray, sampling: Sampling = UNIFORM) -> np.ndarray:
+    """[n, pixels, 3] concrete renders at ``values`` [n, d]."""
+    renderer = NerfRenderer(scene, sampling)
+    grid = pixels_of(pose_set.camera)
+    return np.stack([renderer.pixels(pose_set.camera, pose_set.pose(v), grid) for v in values])
+
+
+def raw_outputs(weights: FieldWeights, x: torch.Tensor, direction: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    """Density before the softplus [...] and colours before the sigmoid [..., 3], in float64."""
+    field = Field(weights)
+    encoded = encode(x, weights.position)
+    h = encoded
+    for layer, (weight, bias) in zip(weights.base, field._base, strict=True):
+        h = functional.relu(functional.linear(torch.cat([encoded, h], -1) if layer.skip else h, weight, bias))
+    density = functional.linear(h, *field._density)[..., 0]
+    h = torch.cat([encode(direction, weights.direction), h], -1)
+    for weight, bias in field._head:
+        h = functional.relu(functional.linear(h, weight, bias))
+    return density, functional.linear(h, *field._color)

@@ -1,0 +1,216 @@
+"""Abstract images of a NeRF: attacked at tolerance zero, refined, degenerate sets, skipped work."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+import torch
+from nerfs import UNIFORM, images, pixels_of, poses, tiny_scene
+
+from ns_abstract.methods.nerf import bounds as bounds_module
+from ns_abstract.methods.nerf.bounds import Division, NerfBounds, RayBounds
+from ns_abstract.methods.nerf.frame import NerfFrame
+from ns_abstract.methods.nerf.scene import NerfScene
+from ns_abstract.refine.engine import Goal, Refinement
+from ns_abstract.sets.poses import PoseSet
+from ns_abstract.verify.falsify import falsify
+from ns_abstract.verify.soundness import nerf_renderer
+
+SETS = {
+    "point": {"rotation": {"yaw": [0.1, 0.1]}},
+    "yaw": {"rotation": {"yaw": 0.004}},
+    "roll": {"rotation": {"roll": [0.1, 0.11]}},
+    "shift": {"translation": {"x": 0.004}},
+    "world": {"frame": "world", "translation": {"z": 0.003}, "rotation": {"pitch": [0.02, 0.02]}},
+    "orbit": {"orbit": {"target": [0, 0, 0], "axis": [0, 0.1, 1], "azimuth": [0.3, 0.306]}},
+    "yaw and shift": {"rotation": {"yaw": 0.0005}, "translation": {"x": 0.0005}},
+    "three": {"rotation": {"yaw": 0.0001, "roll": 0.0001}, "translation": {"y": 0.0001}},
+    "six": {
+        "rotation": {"yaw": 2e-7, "roll": 2e-7, "pitch": 2e-7},
+        "translation": {"x": 2e-7, "y": 2e-7, "z": 2e-7},
+    },
+}
+FIELDS = {
+    "plain": {},
+    "spikes": {"density": 1e4},
+    "saturated": {"color": 1e4},
+    "rough": {"rough": 20.0},
+}
+
+
+def attack(scene: NerfScene, pose_set: PoseSet, found: RayBounds, poses_tried: int = 60) -> tuple[int, int]:
+    """Comparisons and violations of random poses, corners, gradient ascent and jumps."""
+    camera = pose_set.camera
+    shape = (camera.height, camera.width, 3)
+    render, probe, twin = nerf_renderer(scene, pose_set, UNIFORM)
+    result = falsify(
+        found.lower.reshape(shape), found.upper.reshape(shape), pose_set.box, render, twin,
+        probe=probe, poses=poses_tried, seed=1,
+    )  # fmt: skip
+    return result.comparisons, result.violations
+
+
+def bounded(scene: NerfScene, pose_set: PoseSet, tolerance: float = 0.02) -> RayBounds:
+    return NerfBounds(scene, UNIFORM, pose_set.box.dimensions).rays(
+        pose_set, pose_set.box, pixels_of(pose_set.camera), tolerance
+    )
+
+
+@pytest.mark.parametrize("name", SETS)
+def test_sets_of_poses_are_enclosed(name: str) -> None:
+    scene, pose_set = tiny_scene(3), poses(SETS[name])
+    found = bounded(scene, pose_set)
+    assert (found.upper - found.lower).mean() < 0.5, "nothing was bounded"
+    compared, violations = attack(scene, pose_set, found)
+    assert compared > 0 and violations == 0
+
+
+@pytest.mark.parametrize("name", FIELDS)
+def test_stiff_fields_are_enclosed(name: str) -> None:
+    for seed in (0, 1):
+        scene = tiny_scene(seed, **FIELDS[name])
+        for spec in ({"rotation": {"yaw": 0.002}}, {"translation": {"x": 2e-4}}):
+            pose_set = poses(spec)
+            assert attack(scene, pose_set, bounded(scene, pose_set, 0.05))[1] == 0
+
+
+def test_a_single_pose_is_one_colour() -> None:
+    scene, pose_set = tiny_scene(0), poses(SETS["point"])
+    found = NerfFrame(scene, UNIFORM, pose_set).bound(pose_set.box, np.arange(12))
+    assert (found.upper - found.lower).max() < 2e-3
+    picture = images(scene, pose_set, np.zeros((1, 0)))[0]
+    assert (found.lower[:, 0, 0] <= picture).all() and (picture <= found.upper[:, 0, 0]).all()
+
+
+def test_far_too_wide_boxes_say_nothing() -> None:
+    scene, pose_set = tiny_scene(0), poses({"rotation": {"yaw": 3.0}, "translation": {"x": 5.0}})
+    found = bounded(scene, pose_set)
+    assert (found.lower == 0.0).all() and (found.upper == 1.0).all() and found.cells == 0
+
+
+@pytest.mark.parametrize("spec", [SETS["yaw"], SETS["yaw and shift"]], ids=["one", "two"])
+def test_refinement_approaches_the_truth(spec: dict) -> None:
+    scene, pose_set = tiny_scene(2, density=30.0), poses(spec)
+    frame = NerfFrame(scene, UNIFORM, pose_set)
+    result = Refinement(frame, 0, Goal(ratio=1.2, seconds=120.0, cells=400)).run()
+    gaps = [point.mpg for point in result.trace]
+    assert gaps == sorted(gaps, reverse=True)
+    assert result.trace[-1].mpg <= 1.25 * result.trace[-1].mpg_witness
+    many = images(scene, pose_set, pose_set.box.sample(200, np.random.default_rng(0)))
+    for picture in many:
+        assert (result.lower.reshape(-1, 3) <= picture).all() and (picture <= result.upper.reshape(-1, 3)).all()
+
+
+def test_the_whole_set_costs_nothing_and_rays_come_in_batches() -> None:
+    scene, pose_set = tiny_scene(0), poses(SETS["yaw"])
+    frame = NerfFrame(scene, UNIFORM, pose_set)
+    whole = frame.bound(pose_set.box, np.arange(12))
+    assert (whole.lower == 0.0).all() and (whole.upper == 1.0).all()
+    sizes = []
+    bound = frame.bound
+    frame.batch = 5
+    frame.bound = lambda box, tiles, *rest: sizes.append(len(tiles)) or bound(box, tiles, *rest)  # type: ignore[method-assign]
+    Refinement(frame, 0, Goal(ratio=1.0, seconds=60.0, cells=9)).run()
+    assert sizes[0] == 12 and max(sizes[1:]) <= 5
+
+
+def test_children_skip_what_is_empty_and_stay_sound() -> None:
+    scene, pose_set = tiny_scene(5, density=20.0), poses(SETS["yaw"])
+    rays = NerfBounds(scene, UNIFORM, 1)
+    pixels = pixels_of(pose_set.camera)
+    parent = rays.rays(pose_set, pose_set.box, pixels, 0.05)
+    child = pose_set.box.split(0, 4)[2]
+    again = rays.rays(pose_set, child, pixels, 0.05)
+    skipping = rays.rays(pose_set, child, pixels, 0.05, parent.alpha)
+    assert (parent.alpha < 1e-4).any() and skipping.cells < again.cells
+    inside = dataclasses.replace(pose_set, box=child)
+    assert attack(scene, inside, skipping)[1] == 0
+
+
+def test_linear_sets_contain_the_bounds() -> None:
+    frame = NerfFrame(tiny_scene(0), UNIFORM, poses(SETS["yaw"]))
+    found = frame.bound(frame.box.split(0, 4)[1], np.arange(3), None, True)
+    assert found.linear is not None
+    for array, shape in zip(found.linear, ((3, 1, 1, 3, 1), (3, 1, 1, 3)) * 2, strict=True):
+        assert array.shape == shape and array.dtype == np.float32
+
+
+@pytest.mark.parametrize("finer", [0, 1])
+@pytest.mark.parametrize("axes", [(), (0,), (0, 0, 0), (1, 0, 1, 2)])
+def test_divisions_are_nested_covers(axes: tuple[int, ...], finer: int) -> None:
+    d = 3 if 2 in axes else max(axes, default=0) + 1
+    division = Division(axes, d, finer)
+    total = int(np.prod(division.parts))
+    for level in range(division.levels + 1):
+        members, (low, high) = division.members(level), division.boxes(level)
+        assert sorted(members.ravel()) == list(range(total))
+        assert np.prod(high - low, axis=1).sum() == pytest.approx(2.0**d)
+        if level == division.levels:
+            continue
+        cells = np.arange(len(low))
+        children, finer_members = division.children(level, cells), division.members(level + 1)
+        for k, cell in enumerate(np.tile(cells, 2)):
+            assert set(finer_members[children[k]]) <= set(members[cell])
+
+
+# ---------------------------------------------------------------- planted faults
+
+
+def composite_without_ends(self) -> tuple[np.ndarray, np.ndarray]:
+    """Takes the lower opacity for both ends."""
+    self.alpha_high = self.alpha_low
+    return original_composite(self)
+
+
+original_composite = bounds_module._Work._composite
+
+
+def stop_too_early(self) -> float:
+    return 0.9
+
+
+def wrong_parts(value, bernstein):
+    low, high, error = original_parts(value, bernstein)
+    return low.flip(1), high.flip(1), error
+
+
+original_parts = bounds_module._parts
+
+
+def narrow_pencil(self, *arguments) -> None:
+    original_pencil(self, *arguments)
+    self.direction = self.direction.copy()
+    self.direction[:, 1:] *= 0.9
+
+
+original_pencil = bounds_module.Pencil.__init__
+
+
+@pytest.mark.parametrize(
+    ("target", "name", "fault"),
+    [
+        (bounds_module._Work, "_composite", composite_without_ends),
+        (bounds_module, "_parts", wrong_parts),
+        (bounds_module.Pencil, "__init__", narrow_pencil),
+    ],
+)
+def test_planted_faults_are_found(monkeypatch: pytest.MonkeyPatch, target, name: str, fault) -> None:
+    scene, pose_set = tiny_scene(3, density=30.0), poses(SETS["yaw"])
+    assert attack(scene, pose_set, bounded(scene, pose_set))[1] == 0
+    monkeypatch.setattr(target, name, fault)
+    assert attack(scene, pose_set, bounded(scene, pose_set))[1] > 0
+
+
+def test_bounds_that_are_no_numbers_are_not_kept(monkeypatch: pytest.MonkeyPatch) -> None:
+    def broken(value, bernstein):
+        low, high, error = original_parts(value, bernstein)
+        return low * float("nan"), high, error * float("nan")
+
+    scene, pose_set = tiny_scene(3), poses(SETS["yaw"])
+    monkeypatch.setattr(bounds_module, "_parts", broken)
+    found = bounded(scene, pose_set)
+    assert np.isfinite(found.lower).all() and np.isfinite(found.upper).all()
+    assert attack(scene, pose_set, found)[1] == 0
+    assert torch.isfinite(torch.from_numpy(found.alpha)).all()
