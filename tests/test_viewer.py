@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import os
+import sys
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -13,8 +14,10 @@ from typing import Any
 import numpy as np
 import pytest
 from browser import until
-from conftest import blob_scene, ring
+from conftest import Inputs, blob_scene, ring
+from test_cli import call, one_line  # noqa: F401
 
+from ns_abstract.cli import viewer as viewer_command
 from ns_abstract.methods.splat.activate import activate
 from ns_abstract.methods.splat.constants import GSPLAT_1_4_0
 from ns_abstract.methods.splat.frame import SplatFrame, TileBounds
@@ -25,6 +28,7 @@ from ns_abstract.viewer.background import Background
 from ns_abstract.viewer.views import Snapshot, SplatSource, View, perturbation_of
 
 PATIENCE = 120.0
+Call = Callable[..., tuple[int, str]]
 
 
 def camera(width: int = 96, height: int = 80, k: int = 0) -> Camera:
@@ -252,3 +256,20 @@ def test_refinement_can_be_looked_at_and_continued() -> None:
     np.testing.assert_array_equal(whole.lower, first.lower)
     for _, snapshot in found:
         assert violations(snapshot, view(x=0.05)) == 0
+
+
+# ---------------------------------------------------------------- the command
+
+
+def test_viewer_needs_nerfstudio(monkeypatch: pytest.MonkeyPatch, blobs: Inputs, call: Call) -> None:  # noqa: F811
+    monkeypatch.delitem(sys.modules, "ns_abstract.nerfstudio.viewing", raising=False)
+    monkeypatch.setitem(sys.modules, "nerfstudio.configs.base_config", None)
+    found = call(["--load-config", str(blobs.config)], viewer_command.main)
+    one_line(*found, "nerfstudio", "pip install")
+
+
+def test_viewer_refuses_what_is_no_run(blobs: Inputs, call: Call) -> None:  # noqa: F811
+    pytest.importorskip("viser", reason="nerfstudio is not installed (extra nerfstudio)")
+    for file in (blobs.config.parent / "none.yml", blobs.path):
+        one_line(*call(["--load-config", str(file)], viewer_command.main), file.name)
+    one_line(*call([], viewer_command.main), "load-config")

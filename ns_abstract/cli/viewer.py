@@ -70,12 +70,12 @@ def view(options: View) -> int:
     warnings.filterwarnings("ignore", category=FutureWarning)
     try:
         from ns_abstract.nerfstudio.viewing import view as serve
+
+        serve(options.load_config, options.vis, vars(options.viewer))
     except ModuleNotFoundError as error:
         raise InputError(
             f"the package {error.name} is missing", field="nerfstudio", fix="pip install 'ns-abstract[nerfstudio]'"
         ) from None
-    try:
-        serve(options.load_config, options.vis, vars(options.viewer))
     except KeyboardInterrupt:
         # the way to end a viewer
         pass
