@@ -1,7 +1,7 @@
 """Polynomials of ``[-1, 1]^d`` in Chebyshev's basis: interpolation, ranges and fits with certified errors.
 
 A polynomial of total degree ``D`` is its coefficients in ``T_k(p) = prod_j T_{k_j}(p_j)``, ``|k| <= D``
-(design.md, N2). The functions here only build matrices; whoever applies them adds `ROUNDING` times the sum of
+(design.md, F2). The functions here only build matrices; whoever applies them adds `ROUNDING` times the sum of
 absolute coefficients.
 """
 

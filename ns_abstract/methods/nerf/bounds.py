@@ -1,4 +1,4 @@
-"""Bounds of rays over a box of poses: cells by sample, densities and colours, compositing (design.md, N6-N8).
+"""Bounds of rays over a box of poses: cells by sample, densities and colours, compositing (design.md, F6-F8).
 
 Every sample of a ray gets cells of its own width: where the field is rough over the sample's path, the box is cut
 finer. The polynomials that come out of the network are then cut into parts at no cost, and compositing is done
@@ -25,7 +25,7 @@ from ns_abstract.sets.box import ParameterBox
 from ns_abstract.sets.poses import PoseSet
 
 #: (degree, grid) of the polynomials by number of parameters.
-_DEGREES = {0: (1, 2), 1: (20, 120), 2: (6, 20), 3: (4, 10)}
+_DEGREES = {0: (1, 2), 1: (28, 112), 2: (6, 20), 3: (4, 10)}
 #: Degree of the Taylor models of poses.
 _TAYLOR = 6
 #: Cells bounded at once.
@@ -39,6 +39,8 @@ _DEEPER_MORE = 6
 _PARTS = 4096
 #: Light (in [0, 1]) that a skipped sample may add, as a share of the tolerance.
 _QUIET = 0.02
+#: A cell on which an opacity is open by this much everywhere was far too wide.
+_LOST = 0.5
 #: Absolute rounding of activations and compositing, by sample.
 _COMPOSITE = 2.0**-44
 
@@ -252,9 +254,9 @@ class NerfBounds:
     def learn(self, tried: int, halved: int) -> None:
         """Widen or narrow the starting cells from how many of those ``tried`` had to be halved."""
         share = halved / max(1, tried)
-        if share > 0.25:
+        if share > 0.2:
             self.reach *= 0.85
-        elif share < 0.08:
+        elif share < 0.1:
             self.reach *= 1.08
 
 
@@ -344,20 +346,20 @@ class _Work:
             again = []
             for start in range(0, len(items), _BATCH):
                 batch = items.take(slice(start, start + _BATCH))
-                again.append(batch.take(self._bound_batch(level, batch)))
+                halve, lost = self._bound_batch(level, batch)
+                again.append(batch.take(halve))
+                halved += int((lost & (self.start[batch.ray, batch.sample] == level)).sum())
             coarse = join_items(again)
             if level == self.division.levels or not len(coarse):
                 continue
-            first = self.start[coarse.ray, coarse.sample] == level
-            halved += int(first.sum())
             children = self.division.children(level, coarse.cell)
             finer = _Items(np.tile(coarse.ray, 2), np.tile(coarse.sample, 2), children)
             waiting.setdefault(level + 1, []).append(finer)
         if tried >= 32:
             self.owner.learn(tried, halved)
 
-    def _bound_batch(self, level: int, items: _Items) -> np.ndarray:
-        """Bound some cells of one level; returns [k] which of them are worth halving."""
+    def _bound_batch(self, level: int, items: _Items) -> tuple[np.ndarray, np.ndarray]:
+        """Bound some cells of one level; returns [k] which are worth halving, and for which of them all was lost."""
         device, field = self.owner.device, self.field
         monomials, bernstein, members = self._level(level)
         self.cells += len(items)
@@ -391,7 +393,7 @@ class _Work:
         if coloured.size:
             vague = self._color(pieces, items.take(coloured), coloured, there, bernstein, rows, high_a * light)
             halve[coloured] |= vague
-        return halve
+        return halve, halve & (open_.min(axis=1) > _LOST)
 
     def _color(
         self,
@@ -431,7 +433,7 @@ class _Work:
         upper[rows] = np.where(crossed, old_high, high)
 
     def _composite(self) -> tuple[np.ndarray, np.ndarray]:
-        """[n, 3] bounds over all parts (design.md, N8)."""
+        """[n, 3] bounds over all parts (design.md, F8)."""
         background = np.array(self.owner.sampling.background, np.float64)
         shape = (*self.light.shape, 3)
         low, high = np.broadcast_to(background, shape).copy(), np.broadcast_to(background, shape).copy()
@@ -454,7 +456,7 @@ def _parts(value: Affine, bernstein: Tensor) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def opacity(z: Tensor, length: Tensor, *, up: bool) -> Tensor:
-    """A bound of ``1 - exp(-length softplus(z))``, from above or below (design.md, N7).
+    """A bound of ``1 - exp(-length softplus(z))``, from above or below (design.md, F7).
 
     torch returns z itself for the softplus of z > 20, which is less than the function by 2.1e-9.
     """

@@ -1,4 +1,4 @@
-"""Bounds of a field over curves of points: Chebyshev zonotopes through its layers (design.md, N3-N6).
+"""Bounds of a field over curves of points: Chebyshev zonotopes through its layers (design.md, F3-F6).
 
 A batch of B pieces, each a curve (or patch) of points over its own cell of poses ``p in [-1, 1]^d``, is kept as
 
@@ -169,7 +169,7 @@ class FieldBounds:
     # --- encodings -----------------------------------------------------------------------------
 
     def encode(self, nodes: Tensor, radius: Tensor, encoding: Encoding) -> tuple[Tensor, Tensor]:
-        """Polynomials and remainders of an encoded vector (design.md, N3).
+        """Polynomials and remainders of an encoded vector (design.md, F3).
 
         Args:
             nodes: [B, nodes, 3] the vector's polynomial at the basis' nodes. Its degree by variable is at most
@@ -211,7 +211,7 @@ class FieldBounds:
     def _linear(
         self, pieces: Pieces, layer: tuple[Tensor, Tensor, Tensor], first: tuple[Tensor, Tensor] | None = None
     ) -> Affine:
-        """A linear layer on ``pieces``, after ``first`` (polynomials, remainders) in the order of its inputs (N4)."""
+        """A linear layer on ``pieces``, after ``first`` (polynomials, remainders) in the order of its inputs (F4)."""
         weight, absolute, bias = layer
         count = 0 if first is None else first[0].shape[-1]
         rounding = _rounding(weight.shape[0])
@@ -247,7 +247,7 @@ class FieldBounds:
         )
 
     def _relu(self, z: Affine) -> Pieces:
-        """max(0, z) (design.md, N5)."""
+        """max(0, z) (design.md, F5)."""
         poly, box = z.poly, z.box
         pieces = poly.shape[0]
         rho = column_sums(z.columns, z.owner, pieces) * _UP
@@ -305,7 +305,7 @@ class FieldBounds:
         return Pieces(poly, columns, owner, which, neuron, error, box * _UP, size * _UP, failed, count)
 
     def _fitted(self, p: Tensor, values: Tensor) -> tuple[Tensor, Tensor]:
-        """Polynomials q [k, m] and errors [k]: ``|max(0, p) - q| <= error`` over the cell (design.md, N5)."""
+        """Polynomials q [k, m] and errors [k]: ``|max(0, p) - q| <= error`` over the cell (design.md, F5)."""
         positive = values.clamp(min=0.0)
         q = positive @ self._fit.T
         fitted = q @ self._evaluation.T
