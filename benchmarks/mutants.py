@@ -257,9 +257,11 @@ MUTANTS = (
     ),
     Mutant(
         "order swap raises but does not lower", PIXELS,
-        "                        t[_PR + q] += 0.5 * (lift + lower) * _UP\n                        t[_PHI + q] += lift\n"
+        "                        t[_PR + q] += 0.5 * (lift + lower) * _UP\n"
+        "                        t[_PHI + q] += lift\n"
         "                        t[_PLO + q] -= lower",
-        "                        t[_PR + q] += 0.5 * (lift + lower) * _UP\n                        t[_PHI + q] += lift",
+        "                        t[_PR + q] += 0.5 * (lift + lower) * _UP\n"
+        "                        t[_PHI + q] += lift",
         "test_bounds.py::test_depth_swap[2]",
     ),
     Mutant(
