@@ -35,6 +35,8 @@ from ns_abstract.verify.search import BLOCK, Findings, Search
 _RULES = 1
 #: Pixels that the picture moves by over a first cell: with one parameter, and with more.
 _MOTION_LINE, _MOTION = 0.08, 0.5
+#: Numbers that a network's layers may have together in a block's cells.
+_BLOCK_NUMBERS = 1 << 18
 #: Frames whose bounds a process keeps at hand.
 _KEPT = 4
 
@@ -261,10 +263,16 @@ class Certification:
         except InputError as error:
             raise error.within(self.settings.property) from None
 
+    @cached_property
+    def block(self) -> int:
+        """Cells examined together: few where each takes long, so that little is lost and progress is seen."""
+        numbers = sum(math.prod(self.network.shape(k)) for k in range(len(self.network.nodes) + 1))
+        return max(1, min(BLOCK, _BLOCK_NUMBERS // numbers))
+
     def first_blocks(self, grid: Grid) -> list[list[Cell]]:
         """What a frame's search begins with."""
         roots = grid.roots()
-        return [roots[i : i + BLOCK] for i in range(0, len(roots), BLOCK)]
+        return [roots[i : i + self.block] for i in range(0, len(roots), self.block)]
 
     def search(self, index: int, grid: Grid) -> Search:
         """The search of a frame; kept at hand."""
@@ -274,7 +282,9 @@ class Certification:
                 self._searches.pop(next(iter(self._searches)))
             pictures = self.pictures(index)
             every_unit = self.property.partitions is not None
-            self._searches[key] = Search(pictures, self.model, self.claim(pictures), grid, every_unit=every_unit)
+            self._searches[key] = Search(
+                pictures, self.model, self.claim(pictures), grid, every_unit=every_unit, block=self.block
+            )
         return self._searches[key]
 
     def partitions(self, grid: Grid) -> int | None:

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 Verdict = Literal["certified", "falsified", "unknown"]
 
-#: Cells examined together.
+#: Most cells examined together.
 BLOCK = 8
 #: Mean width of the linear sets, as a part of the range of a pixel, from which on a cell that can be cut is cut
 #: without asking the network.
@@ -150,10 +150,21 @@ class Search:
         claim: What is to hold.
         grid: The frame's cells.
         every_unit: Whether each unit of the grid needs a verdict of its own where the property fails (PCP-S).
+        block: Most cells examined together.
     """
 
-    def __init__(self, scene: Scene, model: Model, claim: Claim, grid: Grid, *, every_unit: bool = False) -> None:
-        self.scene, self.model, self.claim, self.grid, self.every_unit = scene, model, claim, grid, every_unit
+    def __init__(
+        self,
+        scene: Scene,
+        model: Model,
+        claim: Claim,
+        grid: Grid,
+        *,
+        every_unit: bool = False,
+        block: int = BLOCK,
+    ) -> None:
+        self.scene, self.model, self.claim, self.grid = scene, model, claim, grid
+        self.every_unit, self.block = every_unit, block
 
     def margins(self, poses: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
         """[s] concrete margins and [s, n] outputs at parameter values."""
@@ -185,7 +196,7 @@ class Search:
         self._ascend(failing)
         leaves, children = self._settle(seen, bounded, reasons, slopes)
         seconds = time.perf_counter() - begin
-        blocks = [tuple(children[i : i + BLOCK]) for i in range(0, len(children), BLOCK)]
+        blocks = [tuple(children[i : i + self.block]) for i in range(0, len(children), self.block)]
         share = seconds / len(seen)
         return Findings(
             leaves=tuple(_timed(leaf, share) for leaf in leaves),
