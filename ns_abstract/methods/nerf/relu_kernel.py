@@ -34,28 +34,44 @@ def _on_grid(p, half, even, odd, values):
 
 
 @njit(cache=True, error_model="numpy")
-def _series(values, fit, even, odd, q):
-    """``q[k] = sum_i fit[k, i] values[i]`` from the first half of ``fit`` and its middle (weighted once)."""
-    count = fit.shape[1]
+def _series(values, fit_even, fit_odd, sum_even, sum_odd, q):
+    """``q[k] = sum_i fit[k, i] values[i]`` from the grid's first half and its middle, by even and odd degrees."""
+    count = fit_even.shape[0]
     last = values.shape[0] - 1
+    sum_even[:] = 0.0
+    sum_odd[:] = 0.0
     for i in range(count):
-        even[i] = values[i] + values[last - i]
-        odd[i] = values[i] - values[last - i]
-    even[count - 1] = values[count - 1]
-    odd[count - 1] = 0.0
-    for k in range(q.shape[0]):
-        total = 0.0
-        if k % 2 == 0:
-            for i in range(count):
-                total += fit[k, i] * even[i]
-        else:
-            for i in range(count):
-                total += fit[k, i] * odd[i]
-        q[k] = total
+        # the middle of the grid stands for itself; odd polynomials vanish there
+        even = values[i] + values[last - i] if i < count - 1 else values[i]
+        odd = values[i] - values[last - i]
+        for k in range(sum_even.shape[0]):
+            sum_even[k] += fit_even[i, k] * even
+        for k in range(sum_odd.shape[0]):
+            sum_odd[k] += fit_odd[i, k] * odd
+    q[0::2] = sum_even
+    q[1::2] = sum_odd
 
 
 @njit(cache=True, error_model="numpy")
-def relu(poly, rho, box, failed, half, fit, chord, norming, slope, size, which, neuron, error):
+def _smallest(values, scratch):
+    """The least of ``values`` by folding, which the processor does many at a time; NaN may be passed over."""
+    n = values.shape[0]
+    rest = (n + 1) // 2
+    for i in range(n - rest):
+        scratch[i] = values[i] if values[i] < values[i + rest] else values[i + rest]
+    if n - rest < rest:
+        scratch[rest - 1] = values[rest - 1]
+    n = rest
+    while n > 1:
+        rest = (n + 1) // 2
+        for i in range(n - rest):
+            scratch[i] = scratch[i] if scratch[i] < scratch[i + rest] else scratch[i + rest]
+        n = rest
+    return scratch[0]
+
+
+@njit(cache=True, error_model="numpy")
+def relu(poly, rho, box, failed, half, fit_even, fit_odd, chord, norming, slope, size, which, neuron, error):
     """max(0, z) in place (design.md, N5); returns the number of new error terms.
 
     Args:
@@ -63,7 +79,8 @@ def relu(poly, rho, box, failed, half, fit, chord, norming, slope, size, which, 
         rho: [B, n] sums of absolute columns.
         box: [B, n]; replaced.
         failed: [B].
-        half, fit: [m, (g + 1) / 2] values and fit on the first half of the grid of g points, middle included.
+        half: [m, (g + 1) / 2] values on the first half of the grid of g points, middle included.
+        fit_even, fit_odd: [(g + 1) / 2, .] the fit of even and odd degrees there.
         chord: [m].
         norming: See `ChebyshevBasis.norming`.
         slope, size: [B, n], filled: what columns are multiplied by; sum of absolute coefficients and columns.
@@ -75,6 +92,8 @@ def relu(poly, rho, box, failed, half, fit, chord, norming, slope, size, which, 
     values, fitted, positive = np.empty(points), np.empty(points), np.empty(points)
     even, odd = np.empty(half.shape[1]), np.empty(half.shape[1])
     spread = np.empty(n)
+    scratch, trial = np.empty(points), np.empty(points)
+    sum_even, sum_odd = np.empty(fit_even.shape[1]), np.empty(fit_odd.shape[1])
     found = 0
     for b in range(pieces):
         if failed[b]:
@@ -108,11 +127,10 @@ def relu(poly, rho, box, failed, half, fit, chord, norming, slope, size, which, 
                 p[k] = poly[b, k, j]
                 absolute += abs(p[k])
             _on_grid(p, half, even, odd, values)
-            low = values[0]
-            high = values[0]
-            for i in range(1, points):
-                low = min(low, values[i])
-                high = max(high, values[i])
+            low = _smallest(values, scratch)
+            for i in range(points):
+                trial[i] = -values[i]
+            high = -_smallest(trial, scratch)
             slack = ROUNDING * absolute
             centre = 0.5 * (low + high)
             width = 0.5 * (high - low) * norming + slack
@@ -132,7 +150,7 @@ def relu(poly, rho, box, failed, half, fit, chord, norming, slope, size, which, 
             # written so that what is not a number stays open, and fails below
             for i in range(points):
                 positive[i] = values[i] if values[i] > 0.0 else 0.0
-            _series(positive, fit, even, odd, q)
+            _series(positive, fit_even, fit_odd, sum_even, sum_odd, q)
             _on_grid(q, half, even, odd, fitted)
             below = 0.0
             above = 0.0
@@ -141,15 +159,16 @@ def relu(poly, rho, box, failed, half, fit, chord, norming, slope, size, which, 
                 below += abs(q[k]) * chord[k]
                 above += abs(p[k] - q[k]) * chord[k]
                 sum_q += abs(q[k])
-            most = -np.inf
             for i in range(points):
-                most = max(most, positive[i] - fitted[i])
-            most += max(above, below)
-            least = np.inf
+                trial[i] = fitted[i] - positive[i]
+            most = max(above, below) - _smallest(trial, scratch)
             for i in range(points - 1):
-                first = min(values[i] - fitted[i], values[i + 1] - fitted[i + 1]) - above
-                second = min(-fitted[i], -fitted[i + 1]) - below
-                least = min(least, max(first, second))
+                left = values[i] - fitted[i]
+                right = values[i + 1] - fitted[i + 1]
+                first = (left if left < right else right) - above
+                second = (-fitted[i] if fitted[i] > fitted[i + 1] else -fitted[i + 1]) - below
+                trial[i] = first if first > second else second
+            least = _smallest(trial[: points - 1], scratch)
             new = (0.5 * (most - least) + ROUNDING * (sum_q + absolute) + 0.5 * e + 2.0 * slack) * _UP
             bottom = low - e - r
             top = high + e + r

@@ -156,8 +156,9 @@ class FieldBounds:
         self._chord = torch.from_numpy(basis.chord).to(device)
         self._compiled = self.device.type == "cpu" and basis.dimensions == 1 and basis.grid % 2 == 0
         middle = basis.grid // 2 + 1
-        half, fit = (np.ascontiguousarray(matrix[:, :middle]) for matrix in (basis.evaluation.T, basis.fit))
-        self._halves = half, fit
+        halves = (basis.evaluation.T[:, :middle], basis.fit[0::2, :middle].T, basis.fit[1::2, :middle].T)
+        half, fit_even, fit_odd = map(np.ascontiguousarray, halves)
+        self._halves = half, fit_even, fit_odd
         degrees = torch.from_numpy(basis.indices).to(device, torch.float64)
         ellipses = torch.tensor(_ELLIPSES, dtype=torch.float64, device=device)
         # [ellipses, d, m]: bound of |Im T_k| on the ellipse of one variable, rounded up
@@ -274,9 +275,9 @@ class FieldBounds:
         slope, size = torch.empty(2, pieces, n, dtype=torch.float64)
         places = torch.empty(2, pieces * n, dtype=torch.int64)
         error = torch.empty(pieces * n, dtype=torch.float64)
-        poly, (half, fit) = z.poly.contiguous(), self._halves
+        poly, (half, even, odd) = z.poly.contiguous(), self._halves
         found = relu(
-            poly.numpy(), rho.numpy(), z.box.numpy(), z.failed.numpy(), half, fit, self._chord.numpy(),
+            poly.numpy(), rho.numpy(), z.box.numpy(), z.failed.numpy(), half, even, odd, self._chord.numpy(),
             self.basis.norming, slope.numpy(), size.numpy(), places[0].numpy(), places[1].numpy(), error.numpy(),
         )  # fmt: skip
         return poly, z.box, size, slope, places[0, :found], places[1, :found], error[:found]
