@@ -108,6 +108,23 @@ def test_numbers_that_are_none_fail() -> None:
     assert pieces.failed.tolist() == [False, False, True, False]
 
 
+def test_compiled_and_torch_agree(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The compiled ReLU of one parameter follows the general one up to rounding."""
+    weights, basis = tiny_weights(2, rough=5.0), basis_of(1)
+    nodes, zero = on_curve(curves(16, 6e-3, 1, 0), basis.nodes), torch.zeros(16, 3, dtype=torch.float64)
+    found = []
+    for compiled in (True, False):
+        field = FieldBounds(weights, basis)
+        assert field._compiled
+        field._compiled = compiled
+        found.append(field.base(*field.encode(nodes, zero, weights.position)))
+    assert found[0].new_size.numel() > 0
+    for name in ("owner", "new_owner", "new_neuron", "failed", "count"):
+        assert torch.equal(getattr(found[0], name), getattr(found[1], name)), name
+    for name in ("poly", "columns", "new_size", "box", "size"):
+        torch.testing.assert_close(getattr(found[0], name), getattr(found[1], name), rtol=1e-9, atol=1e-11)
+
+
 # ---------------------------------------------------------------- planted faults
 
 
@@ -147,6 +164,9 @@ def faulty_sums(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_planted_faults_are_found(monkeypatch: pytest.MonkeyPatch, fault, half: float) -> None:
     weights = [tiny_weights(seed, rough=20.0) for seed in range(3)]
     assert max(worst(w, half, seed=s)[0] for s, w in enumerate(weights)) <= 0.0
+    if fault is faulty_fit:
+        # the general rule, which the compiled one agrees with
+        monkeypatch.setattr(zonotope.FieldBounds, "_relu_compiled", zonotope.FieldBounds._relu_torch)
     fault(monkeypatch)
     assert max(worst(w, half, seed=s)[0] for s, w in enumerate(weights)) > 0.0
 

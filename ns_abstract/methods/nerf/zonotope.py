@@ -21,6 +21,7 @@ from torch import Tensor
 
 from ns_abstract.arithmetic.chebyshev import ROUNDING, ChebyshevBasis
 from ns_abstract.arithmetic.units import UNIT64, gamma
+from ns_abstract.methods.nerf.relu_kernel import relu
 from ns_abstract.methods.nerf.scene import Encoding, FieldWeights, Layer
 
 # covers the rounding of sums of non-negative numbers over a layer
@@ -153,6 +154,11 @@ class FieldBounds:
         self._evaluation = torch.from_numpy(basis.evaluation).to(device)
         self._fit = torch.from_numpy(np.ascontiguousarray(basis.fit)).to(device)
         self._chord = torch.from_numpy(basis.chord).to(device)
+        self._compiled = self.device.type == "cpu" and basis.dimensions == 1 and basis.grid % 2 == 0
+        middle = basis.grid // 2 + 1
+        halves = (basis.evaluation.T[:, :middle], basis.fit[0::2, :middle].T, basis.fit[1::2, :middle].T)
+        half, fit_even, fit_odd = map(np.ascontiguousarray, halves)
+        self._halves = half, fit_even, fit_odd
         degrees = torch.from_numpy(basis.indices).to(device, torch.float64)
         ellipses = torch.tensor(_ELLIPSES, dtype=torch.float64, device=device)
         # [ellipses, d, m]: bound of |Im T_k| on the ellipse of one variable, rounded up
@@ -248,9 +254,37 @@ class FieldBounds:
 
     def _relu(self, z: Affine) -> Pieces:
         """max(0, z) (design.md, F5)."""
+        rho = column_sums(z.columns, z.owner, z.poly.shape[0]) * _UP
+        found = self._relu_compiled(z, rho) if self._compiled else self._relu_torch(z, rho)
+        poly, box, size, slope, which, neuron, error = found
+        columns, owner = z.columns, z.owner
+        scale_columns(columns, owner, slope)
+        count = z.count.index_add(0, which, torch.ones_like(which))
+        failed = z.failed | (count > self.limit) | ~torch.isfinite(size).all(dim=1)
+        if bool((failed & ~z.failed).any()):
+            stays = ~failed[owner]
+            columns, owner = columns[stays], owner[stays]
+            stays = ~failed[which]
+            which, neuron, error = which[stays], neuron[stays], error[stays]
+            poly[failed], box[failed], size[failed] = 0.0, 0.0, 0.0
+        return Pieces(poly, columns, owner, which, neuron, error, box, size, failed, count)
+
+    def _relu_compiled(self, z: Affine, rho: Tensor) -> tuple[Tensor, ...]:
+        """See `_relu_torch`; ``z`` is used up."""
+        pieces, _, n = z.poly.shape
+        slope, size = torch.empty(2, pieces, n, dtype=torch.float64)
+        places = torch.empty(2, pieces * n, dtype=torch.int64)
+        error = torch.empty(pieces * n, dtype=torch.float64)
+        poly, (half, even, odd) = z.poly.contiguous(), self._halves
+        found = relu(
+            poly.numpy(), rho.numpy(), z.box.numpy(), z.failed.numpy(), half, even, odd, self._chord.numpy(),
+            self.basis.norming, slope.numpy(), size.numpy(), places[0].numpy(), places[1].numpy(), error.numpy(),
+        )  # fmt: skip
+        return poly, z.box, size, slope, places[0, :found], places[1, :found], error[:found]
+
+    def _relu_torch(self, z: Affine, rho: Tensor) -> tuple[Tensor, ...]:
+        """New polynomials, box and sizes, slopes of the columns, and piece, neuron and size of new error terms."""
         poly, box = z.poly, z.box
-        pieces = poly.shape[0]
-        rho = column_sums(z.columns, z.owner, pieces) * _UP
         spread = poly[:, 1:].abs().sum(dim=1) * _UP
         reach = spread + rho + box
         middle = poly[:, 0]
@@ -292,17 +326,7 @@ class FieldBounds:
         slope[which, neuron] = kept
         size = (middle.abs() + spread + rho) * slope
         size[which, neuron] = q.abs().sum(dim=1) + kept * e + error
-        columns, owner = z.columns, z.owner
-        scale_columns(columns, owner, slope)
-        count = z.count.index_add(0, which, torch.ones_like(which))
-        failed = z.failed | (count > self.limit) | ~torch.isfinite(size).all(dim=1)
-        if bool((failed & ~z.failed).any()):
-            stays = ~failed[owner]
-            columns, owner = columns[stays], owner[stays]
-            stays = ~failed[which]
-            which, neuron, error = which[stays], neuron[stays], error[stays]
-            poly[failed], box[failed], size[failed] = 0.0, 0.0, 0.0
-        return Pieces(poly, columns, owner, which, neuron, error, box * _UP, size * _UP, failed, count)
+        return poly, box * _UP, size * _UP, slope, which, neuron, error
 
     def _fitted(self, p: Tensor, values: Tensor) -> tuple[Tensor, Tensor]:
         """Polynomials q [k, m] and errors [k]: ``|max(0, p) - q| <= error`` over the cell (design.md, F5)."""
