@@ -19,11 +19,13 @@ from ns_abstract.methods.splat.constants import RASTERISERS, Rasteriser
 from ns_abstract.methods.splat.frame import SplatFrame
 from ns_abstract.methods.splat.load import load_scene
 from ns_abstract.methods.splat.scene import SplatScene
+from ns_abstract.methods.splat.variations import VariedSplats, vary
 from ns_abstract.refine.engine import Goal, Refinement
 from ns_abstract.refine.result import FrameResult, TracePoint
 from ns_abstract.sets.path import CameraPath, load_camera_path
 from ns_abstract.sets.perturbation import Perturbation, load_perturbation, parse_perturbation
 from ns_abstract.sets.poses import PoseSet, translation_only
+from ns_abstract.sets.variations import SceneVariation
 
 #: Bytes that the kernels need by Gaussian, beside the scene itself (record, boxes, colours, buffers).
 _BYTES_BY_GAUSSIAN = 1200
@@ -76,6 +78,10 @@ class Job:
         # a set that cannot be made is found before hours of work
         self.pose_sets = tuple(self.pose_set(k, p) for k, p in enumerate(self.perturbations))
         self.splats: Splats = activate(self.scene, self.rasteriser)
+        self._varied: dict[tuple[SceneVariation, ...], VariedSplats] = {}
+        for p in self.perturbations:
+            if p.scene not in self._varied:
+                self._varied[p.scene] = self._vary(p)
         self._check_memory()
 
     @property
@@ -89,7 +95,7 @@ class Job:
         count = len(self.path.cameras)
         if file is not None:
             return (load_perturbation(file, dataset_scale=scale),) * count
-        found = []
+        found, folder = [], Path(self.path.source).parent
         for k in range(count):
             value = self.path.perturbation_of(k)
             if value is None:
@@ -101,10 +107,20 @@ class Job:
                 )
             prefix = "perturbation." if self.path.overrides[k] is None else f"camera_path[{k}].perturbation."
             try:
-                found.append(parse_perturbation(value, dataset_scale=scale, field_prefix=prefix))
+                found.append(parse_perturbation(value, dataset_scale=scale, field_prefix=prefix, folder=folder))
             except InputError as error:
                 raise error.within(self.path.source) from None
         return tuple(found)
+
+    def _vary(self, perturbation: Perturbation) -> VariedSplats:
+        try:
+            return vary(self.scene, self.splats, perturbation.scene)
+        except InputError as error:
+            raise error.within(self.settings.perturbation_filename or self.path.source) from None
+
+    def varied(self, index: int) -> VariedSplats:
+        """The scenes that frame ``index`` shows."""
+        return self._varied[self.perturbations[index].scene]
 
     def pose_set(self, index: int, perturbation: Perturbation) -> PoseSet:
         """The poses of ``perturbation`` around entry ``index`` of the path.
@@ -150,7 +166,9 @@ class Job:
 
     def frame(self, index: int) -> SplatFrame:
         """Frame ``index``, ready for refinement."""
-        return SplatFrame(self.splats, self.rasteriser, self.arithmetic, self.pose_sets[index])
+        return SplatFrame(
+            self.splats, self.rasteriser, self.arithmetic, self.pose_sets[index], varied=self.varied(index)
+        )
 
     def warm_up(self, index: int | None) -> None:
         """Compile the kernels that frame ``index`` needs, so that its clock measures bounding alone."""
@@ -170,8 +188,9 @@ class Job:
         """Refine frame ``index``."""
         frame = self.frame(index)
         refinement = Refinement(
-            frame, index, goal, seed=self.settings.seed, keep_leaves=keep_leaves, stopped=stopped, progress=progress
-        )
+            frame, index, goal, seed=self.settings.seed, keep_leaves=keep_leaves, stopped=stopped, progress=progress,
+            members=frame.members(self.settings.seed),
+        )  # fmt: skip
         result = refinement.run()
         return replace(result, plan=tuple(self._frame_plan(frame, refinement)))
 
@@ -184,7 +203,13 @@ class Job:
                 f"{total - shown:,} of {total:,} Gaussians left out: no pose of the set shows them "
                 "(behind, beside, hidden by others or below the alpha threshold)"
             )
-        if translation_only(frame.pose_set.enclosure(frame.box, 1)):
+        varied = frame.varied
+        for quantity, name in (("mean", "mean"), ("opacity", "opacity"), ("color", "colour")):
+            if count := varied.counts[quantity]:
+                plan.append(f"scene variations: the {name} of {count:,} of {total:,} Gaussians varies")
+            elif varied.varies:
+                plan.append(f"ranges of the {name} left out: none varies")
+        if not varied.counts["mean"] and translation_only(frame.pose_set.enclosure(frame.box, 1)):
             plan.append("depth-order rules left out but for near-ties: translations never change the order")
         return plan
 
