@@ -30,7 +30,8 @@ from ns_abstract.sets.path import Camera
 from ns_abstract.sets.perturbation import load_perturbation, parse_perturbation
 from ns_abstract.sets.poses import PoseSet
 from ns_abstract.sets.tiles import assemble
-from ns_abstract.verify.varied import VariedAttack, attack_varied, show_compiled, show_reference
+from ns_abstract.verify.soundness import check_run
+from ns_abstract.verify.varied import VariedAttack, attack_varied, check_varied, show_compiled, show_reference
 
 NONE = np.empty((0, 3))
 
@@ -427,3 +428,12 @@ def test_fingerprint(make_blobs, tmp_path: Path) -> None:
         write_json(inputs.spec, SHIFT | {"scene": [{"select": {"indices": [index]}, "mean": radius}]})
         found.append(Job(Settings(inputs.config, inputs.path, inputs.spec)).fingerprint["poses"])
     assert found[0] == found[3] and len(set(found)) == 3
+
+
+def test_check(blobs: Inputs) -> None:
+    spec = SHIFT | {"scene": [{"select": {"opacity": [0.5, 1]}, "opacity": 0.1}]}
+    found = check_varied(blobs.config, blobs.path, spec, 0, 2, members=6, targets=2, downscale_factor=2)
+    assert found["violations"] == 0 and found["pictures"] == 2 * 2 * (7 + 2 * 4)
+    assert 0.0 < found["mpg_witness"] < found["mpg"] < found["xpg"]
+    with pytest.raises(InputError, match="scene"):
+        check_run(blobs.config, blobs.path, spec, 0, 1, 4)

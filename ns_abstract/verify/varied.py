@@ -8,21 +8,27 @@ where signed gradients lead that go through the reference renderer from the pixe
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable
+import os
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 import torch
 
-from ns_abstract.methods.splat.activate import Splats
-from ns_abstract.methods.splat.constants import Rasteriser
+from ns_abstract.methods.splat.activate import Splats, activate
+from ns_abstract.methods.splat.constants import GSPLAT_1_4_0, Rasteriser
+from ns_abstract.methods.splat.load import load_scene
 from ns_abstract.methods.splat.reference import Reference
 from ns_abstract.methods.splat.render import Renderer
 from ns_abstract.methods.splat.scene import SplatScene
-from ns_abstract.methods.splat.variations import VariedSplats
+from ns_abstract.methods.splat.variations import VariedSplats, vary
 from ns_abstract.sets.box import Float64Array, ParameterBox
+from ns_abstract.sets.path import load_camera_path
+from ns_abstract.sets.perturbation import parse_perturbation
 from ns_abstract.sets.poses import PoseSet
 from ns_abstract.sets.twin import pose_twin
+from ns_abstract.verify.soundness import bound_cells, equal_cells
 
 #: Parameter values [d] and a member of the set to a picture [H, W, 3].
 Show = Callable[[Float64Array, Splats], np.ndarray]
@@ -192,3 +198,81 @@ def _sign(leaf: torch.Tensor | None) -> Float64Array:
     if leaf is None or leaf.grad is None:
         return np.zeros(1 if leaf is None else tuple(leaf.shape))
     return np.sign(np.nan_to_num(leaf.grad.numpy()))
+
+
+def check_varied(
+    load_config: str | os.PathLike[str],
+    camera_path: str | os.PathLike[str],
+    spec: Mapping[str, Any],
+    frame: int,
+    cells: int = 1,
+    *,
+    members: int = 40,
+    targets: int = 12,
+    reference: bool = True,
+    seed: int = 0,
+    downscale_factor: float = 1,
+    arithmetic: str = "real",
+    rasteriser: Rasteriser = GSPLAT_1_4_0,
+) -> dict[str, Any]:
+    """Bound one frame over a set of poses and scenes, cell by cell, and attack every cell's own bounds.
+
+    Args:
+        load_config: config.yml, run folder or .ply.
+        camera_path: The viewer's JSON.
+        spec: A perturbation object with the key "scene".
+        frame: Number of the entry of the camera path.
+        cells: Equal parts along the first parameter of the poses, if there is any.
+        members, targets: See `attack_varied`; of every cell.
+        reference: Whether the reference renderer's pictures are compared besides the compiled one's.
+        seed: Decides every random choice.
+        downscale_factor: Images become this many times smaller.
+        arithmetic: "real" or "float32".
+        rasteriser: The rules.
+
+    Returns:
+        Counts of Gaussians that vary, mean and largest pixel gap of the bounds (``mpg``, ``xpg``) and of the
+        pictures (``mpg_witness``, ``xpg_witness``), ``pictures``, ``comparisons``, ``violations``, ``amount``.
+
+    Raises:
+        InputError: A file or a field in it cannot be used, or an entry picks no Gaussian.
+    """
+    scene = load_scene(load_config)
+    path = load_camera_path(camera_path, downscale_factor)
+    perturbation = parse_perturbation(dict(spec))
+    poses = PoseSet.around(path.cameras[frame], perturbation, path.following(frame))
+    splats = activate(scene, rasteriser)
+    varied = vary(scene, splats, perturbation.scene)
+    boxes = equal_cells(poses.box, cells) if poses.box.dimensions else [poses.box]
+    order = 2 if poses.box.dimensions <= 1 else 1
+    bounds, _ = bound_cells(
+        scene, poses, boxes, rasteriser=rasteriser, arithmetic=arithmetic, order=order, varied=varied
+    )
+    shows = [show_compiled(Renderer(splats, rasteriser), poses)]
+    if reference:
+        shows.append(show_reference(Reference(scene, rasteriser), poses))
+    attacks = [
+        attack_varied(
+            lower, upper, box, varied, shows, scene, poses, rasteriser,
+            members=members, targets=targets, seed=seed + number,
+        )
+        for number, (box, (lower, upper)) in enumerate(zip(boxes, bounds, strict=True))
+    ]  # fmt: skip
+    outer = np.max([b[1] for b in bounds], axis=0).astype(np.float64) - np.min([b[0] for b in bounds], axis=0)
+    inner = np.max([a.most for a in attacks], axis=0) - np.min([a.least for a in attacks], axis=0)
+    gap, seen = np.linalg.norm(outer, axis=-1), np.linalg.norm(inner, axis=-1)
+    return {
+        "scene": scene.name,
+        "gaussians": scene.count,
+        "varied": varied.counts,
+        "size": [poses.camera.width, poses.camera.height],
+        "parameters": list(poses.box.names),
+        "mpg": float(gap.mean()),
+        "xpg": float(gap.max()),
+        "mpg_witness": float(seen.mean()),
+        "xpg_witness": float(seen.max()),
+        "pictures": sum(sum(a.pictures.values()) for a in attacks),
+        "comparisons": sum(a.comparisons for a in attacks),
+        "violations": sum(a.violations for a in attacks),
+        "amount": max(a.amount for a in attacks),
+    }
