@@ -29,6 +29,8 @@ from ns_abstract.sets.variations import SceneVariation
 
 #: Bytes that the kernels need by Gaussian, beside the scene itself (record, boxes, colours, buffers).
 _BYTES_BY_GAUSSIAN = 1200
+#: The same of the ranges of a varied scene and of the member that is rendered.
+_BYTES_BY_VARIED = 400
 
 
 @dataclass(frozen=True)
@@ -146,7 +148,9 @@ class Job:
     def _base_bytes(self) -> int:
         arrays = (self.splats.means, self.splats.axes, self.splats.opacity, self.splats.sh)
         pixels = max(camera.width * camera.height for camera in self.path.cameras)
-        return 2 * sum(a.nbytes for a in arrays) + self.splats.count * _BYTES_BY_GAUSSIAN + pixels * 400 + (256 << 20)
+        ranges = sum(v.varies for v in self._varied.values()) * _BYTES_BY_VARIED
+        by_gaussian = self.splats.count * (_BYTES_BY_GAUSSIAN + ranges)
+        return 2 * sum(a.nbytes for a in arrays) + by_gaussian + pixels * 400 + (256 << 20)
 
     def _check_memory(self) -> None:
         limit = self.settings.memory_limit
@@ -245,6 +249,8 @@ class Job:
             sets.update(np.ascontiguousarray(camera.camera_to_world).tobytes())
             sets.update(repr((camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height)).encode())
             sets.update(repr((poses.perturbation, poses.box, sorted(poses.fixed.items()))).encode())
+            if poses.perturbation.scene:
+                sets.update(repr(poses.perturbation.scene).encode())
         return {
             "scene": digest.hexdigest(),
             "poses": sets.hexdigest(),

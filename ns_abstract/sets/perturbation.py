@@ -58,7 +58,7 @@ class Perturbation:
     rotation: Mapping[str, Range] = field(default_factory=dict)
     sweep: Literal["keyframes", "segments"] = "keyframes"
     orbit: Orbit | None = None
-    scene: tuple[SceneVariation, ...] = ()
+    scene: tuple[SceneVariation, ...] = field(default=(), repr=False)
 
 
 def load_perturbation(path: str | Path, *, dataset_scale: float = 1.0) -> Perturbation:
