@@ -347,7 +347,8 @@ MUTANTS = (
     ),
     Mutant(
         "colours are not clamped at 0", COLORS,
-        "                clamp_below(form, 0.0, low, high, d, order, m)\n", "",
+        "                clamp_below(form, 0.0, low, high, d, order, m)\n                if color_low",
+        "                if color_low",
         "test_bounds.py::test_view_dependence[3-2]",
     ),
 )

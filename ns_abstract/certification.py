@@ -185,6 +185,13 @@ class Certification:
             resize=size if self.property.preprocess.resize is not None else None,
         )
         self.job = Job(job_settings, default=Perturbation())
+        if any(perturbation.scene for perturbation in self.job.perturbations):
+            raise InputError(
+                "certificates are for sets of poses",
+                file=settings.perturbation_filename or settings.camera_path_filename,
+                field="scene",
+                fix="leave the key out",
+            )
         camera = self.job.path.cameras[0]
         if (camera.height, camera.width) != size:
             raise InputError(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -92,6 +92,14 @@ class Method(Protocol):
         """The scene for reports; ``name`` is among the keys."""
         ...
 
+    def prepare(self, perturbations: Sequence[Perturbation]) -> None:
+        """Find out what the scene itself may do.
+
+        Raises:
+            InputError: Not with this scene.
+        """
+        ...
+
     def memory(self, pixels: int) -> int:
         """Bytes that bounding pictures of ``pixels`` needs beside the leaves."""
         ...
@@ -130,6 +138,10 @@ class Job:
         self.perturbations: tuple[Perturbation, ...] = given or self._perturbations(default)
         # a set that cannot be made is found before hours of work
         self.pose_sets = tuple(self.pose_set(k, p) for k, p in enumerate(self.perturbations))
+        try:
+            self.method.prepare(self.perturbations)
+        except InputError as error:
+            raise error.within(settings.perturbation_filename or self.path.source) from None
         self._check_memory()
 
     @property
@@ -169,7 +181,7 @@ class Job:
         count = len(self.path.cameras)
         if file is not None:
             return (load_perturbation(file, dataset_scale=scale),) * count
-        found = []
+        found, folder = [], Path(self.path.source).parent
         for k in range(count):
             value = self.path.perturbation_of(k)
             if value is None and default is not None:
@@ -184,7 +196,7 @@ class Job:
                 )
             prefix = "perturbation." if self.path.overrides[k] is None else f"camera_path[{k}].perturbation."
             try:
-                found.append(parse_perturbation(value, dataset_scale=scale, field_prefix=prefix))
+                found.append(parse_perturbation(value, dataset_scale=scale, field_prefix=prefix, folder=folder))
             except InputError as error:
                 raise error.within(self.path.source) from None
         return tuple(found)
@@ -251,8 +263,9 @@ class Job:
         """Refine frame ``index``."""
         frame = self.frame(index)
         refinement = Refinement(
-            frame, index, goal, seed=self.settings.seed, keep_leaves=keep_leaves, stopped=stopped, progress=progress
-        )
+            frame, index, goal, seed=self.settings.seed, keep_leaves=keep_leaves, stopped=stopped, progress=progress,
+            members=frame.members(self.settings.seed),
+        )  # fmt: skip
         result = refinement.run()
         plan = self.method.frame_plan(frame, refinement.shown, result.lower, result.upper)
         return replace(result, plan=tuple(plan))
@@ -271,6 +284,8 @@ class Job:
             sets.update(np.ascontiguousarray(camera.camera_to_world).tobytes())
             sets.update(repr((camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height)).encode())
             sets.update(repr((poses.perturbation, poses.box, sorted(poses.fixed.items()))).encode())
+            if poses.perturbation.scene:
+                sets.update(repr(poses.perturbation.scene).encode())
         return {**self.method.fingerprint, "poses": sets.hexdigest()}
 
     def describe(self) -> dict[str, Any]:

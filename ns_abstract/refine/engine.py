@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import itertools
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from typing import Any, Protocol
 
@@ -33,6 +33,8 @@ FIRST_MOTION_LINE = 0.5
 _NARROWEST = 2.0**-40
 #: Most corners of the set that are rendered at the start.
 _CORNERS = 64
+#: Other scenes of the set that are rendered at the middle, and at every other witness.
+_MEMBERS, _MEMBERS_BY_WITNESS = 48, 2
 #: Part of the time that the first cover of the set may take.
 _COVER_SHARE = 0.5
 #: Most cells of the first cover.
@@ -179,6 +181,8 @@ class Refinement:
         stopped: Asked between cells; true ends the work with what is known.
         progress: Called with (trace point, covered part of the set) after every cell of the first
             cover and after every round.
+        members: Where the scene varies too: other scenes of the set, each as a function like the frame's
+            ``render``. They widen the inner bound; only poses are split.
     """
 
     def __init__(
@@ -191,7 +195,9 @@ class Refinement:
         keep_leaves: bool = False,
         stopped: Callable[[], bool] = lambda: False,
         progress: Callable[[TracePoint, float], None] = lambda point, share: None,
+        members: Iterator[Callable[[np.ndarray, np.ndarray | None], np.ndarray]] | None = None,
     ) -> None:
+        self.members = iter(()) if members is None else members
         self.frame, self.index, self.goal = frame, index, goal
         self.keep_leaves, self.stopped, self.progress = keep_leaves, stopped, progress
         self.random = np.random.default_rng([seed, index])
@@ -227,10 +233,15 @@ class Refinement:
     def _witness(self, values: np.ndarray, tiles: np.ndarray | None = None) -> np.ndarray:
         """Render at ``values`` and widen the inner bound."""
         picture = self.frame.render(values, tiles)
+        self._widen(picture, tiles)
+        for render in itertools.islice(self.members, _MEMBERS_BY_WITNESS):
+            self._widen(render(values, tiles), tiles)
+        return picture
+
+    def _widen(self, picture: np.ndarray, tiles: np.ndarray | None) -> None:
         which = slice(None) if tiles is None else tiles
         self.witness_lower[which] = np.minimum(self.witness_lower[which], picture)
         self.witness_upper[which] = np.maximum(self.witness_upper[which], picture)
-        return picture
 
     def _bound(self, cell: _Cell, parent: _Cell | None, tiles: np.ndarray) -> tuple[np.ndarray, np.ndarray, Bounds]:
         """Lower and upper [t, side, side, 3] that can be relied on, and all that the frame returned."""
@@ -295,6 +306,10 @@ class Refinement:
         self.image = self._witness(box.middle)
         self.start = time.perf_counter()
         if self._cover() and not self._over():
+            for render in itertools.islice(self.members, _MEMBERS):
+                self._widen(render(box.middle, None), None)
+                if self._over():
+                    break
             for values in self._corners():
                 self._witness(values)
                 if self._over():

@@ -10,12 +10,12 @@ from typing import Any, Literal
 import numpy as np
 
 from ns_abstract.errors import InputError
-from ns_abstract.jsonio import is_number, load_json, show
+from ns_abstract.jsonio import load_json, show
+from ns_abstract.sets.fields import Fail, Range, interval, known, vector
+from ns_abstract.sets.variations import KEYS, SceneVariation, parse_selection
 
 TRANSLATIONS = ("x", "y", "z")
 ROTATIONS = ("yaw", "pitch", "roll")
-
-Range = tuple[float, float]
 
 _KEYS = {
     "version": "1",
@@ -25,7 +25,7 @@ _KEYS = {
     "rotation": "an object with yaw, pitch, roll",
     "sweep": '"keyframes" or "segments"',
     "orbit": "an object with target, axis, azimuth",
-    "scene": "variations of the scene",
+    "scene": "a list of variations of the scene",
     "hue": "a number",
     "saturation": "a number",
 }
@@ -50,6 +50,7 @@ class Perturbation:
         rotation: Ranges of yaw, pitch, roll, radians.
         sweep: "keyframes", or "segments": the pose also moves from each entry to the next.
         orbit: Optional orbit, applied before translation and rotation.
+        scene: What varies of a Splatfacto scene; entry by entry, Gaussian by Gaussian.
     """
 
     frame: Literal["camera", "world"] = "camera"
@@ -57,6 +58,7 @@ class Perturbation:
     rotation: Mapping[str, Range] = field(default_factory=dict)
     sweep: Literal["keyframes", "segments"] = "keyframes"
     orbit: Orbit | None = None
+    scene: tuple[SceneVariation, ...] = field(default=(), repr=False)
 
 
 def load_perturbation(path: str | Path, *, dataset_scale: float = 1.0) -> Perturbation:
@@ -74,19 +76,29 @@ def load_perturbation(path: str | Path, *, dataset_scale: float = 1.0) -> Pertur
     if isinstance(root, dict) and "camera_path" in root and "perturbation" in root:
         root = root["perturbation"]
     try:
-        return parse_perturbation(root, dataset_scale=dataset_scale, field_prefix="")
+        return parse_perturbation(root, dataset_scale=dataset_scale, field_prefix="", folder=path.parent)
     except InputError as error:
         raise error.within(path) from None
 
 
 def parse_perturbation(
-    value: object, *, dataset_scale: float = 1.0, field_prefix: str = "perturbation."
+    value: object,
+    *,
+    dataset_scale: float = 1.0,
+    field_prefix: str = "perturbation.",
+    folder: Path | None = None,
 ) -> Perturbation:
-    """Check a parsed ``perturbation`` object and convert lengths to the normalised frame.
+    """Check a parsed ``perturbation`` object and convert the camera's translations to the normalised frame.
+
+    Args:
+        value: The object.
+        dataset_scale: See `load_perturbation`.
+        field_prefix: What errors write before a field.
+        folder: Index files are looked for here; None: in the working directory.
 
     Raises:
         InputError: A key is unknown, a value has the wrong type, an interval is reversed, a number
-            is not finite, or the variation is not one of a Splatfacto camera.
+            is not finite, an index file cannot be used, or the variation is one of a NeRF.
     """
 
     def fail(name: str, problem: str, fix: str) -> InputError:
@@ -94,7 +106,7 @@ def parse_perturbation(
 
     if not isinstance(value, dict):
         raise fail("", f"found {show(value)}", "write an object")
-    _known(value, _KEYS, "", fail)
+    known(value, _KEYS, "", fail)
     if value.get("version", 1) != 1 or isinstance(value.get("version"), bool):
         raise fail("version", f"found {show(value['version'])}", "this program reads version 1")
     frame = _choice(value, "frame", ("camera", "world"), fail)
@@ -103,8 +115,6 @@ def parse_perturbation(
     for name in ("hue", "saturation"):
         if name in value:
             raise fail(name, "varies the colours of a NeRF, not of a Splatfacto scene", "remove the key")
-    if "scene" in value:
-        raise fail("scene", "this version bounds sets of camera poses only", "remove the key")
     translation = _ranges(value, "translation", TRANSLATIONS, fail)
     if units == "dataset":
         translation = {name: (dataset_scale * low, dataset_scale * high) for name, (low, high) in translation.items()}
@@ -114,68 +124,64 @@ def parse_perturbation(
         rotation=_ranges(value, "rotation", ROTATIONS, fail),
         sweep=sweep,  # pyright: ignore[reportArgumentType]
         orbit=_orbit(value, fail),
+        scene=_scene(value, fail, field_prefix, folder),
     )
 
 
-def _known(value: Mapping[str, Any], keys, prefix: str, fail) -> None:
-    for key in value:
-        if key not in keys:
-            raise fail(f"{prefix}{show(key).strip(chr(39))}", "unknown key", f"the keys are {', '.join(keys)}")
-
-
-def _choice(value: Mapping[str, Any], name: str, choices: tuple[str, ...], fail) -> str:
+def _choice(value: Mapping[str, Any], name: str, choices: tuple[str, ...], fail: Fail) -> str:
     found = value.get(name, choices[0])
     if found not in choices or not isinstance(found, str):
         raise fail(name, f"found {show(found)}", f"write {' or '.join(choices)}")
     return found
 
 
-def _range(value: object, name: str, fail, *, symmetric: bool = True) -> Range:
-    """An interval [low, high]; a number r >= 0 means [-r, r]."""
-    if symmetric and is_number(value):
-        if value < 0:  # pyright: ignore[reportOperatorIssue]
-            raise fail(name, f"found {show(value)}", "a radius is not negative; write [low, high] for an interval")
-        return -float(value), float(value)  # pyright: ignore[reportArgumentType]
-    kind = "a radius or an interval" if symmetric else "an interval"
-    if not (isinstance(value, list) and len(value) == 2 and all(is_number(v) for v in value)):
-        raise fail(name, f"found {show(value)}", f"write {kind} [low, high] of finite numbers")
-    low, high = float(value[0]), float(value[1])
-    if low > high:
-        raise fail(name, f"the interval [{low:g}, {high:g}] is reversed", "write the smaller end first")
-    return low, high
-
-
-def _ranges(value: Mapping[str, Any], name: str, keys: tuple[str, ...], fail) -> dict[str, Range]:
+def _ranges(value: Mapping[str, Any], name: str, keys: tuple[str, ...], fail: Fail) -> dict[str, Range]:
     inner = value.get(name, {})
     if not isinstance(inner, dict):
         raise fail(name, f"found {show(inner)}", f"write {_KEYS[name]}")
-    _known(inner, keys, f"{name}.", fail)
-    return {key: _range(inner[key], f"{name}.{key}", fail) for key in keys if key in inner}
+    known(inner, keys, f"{name}.", fail)
+    return {key: interval(inner[key], f"{name}.{key}", fail) for key in keys if key in inner}
 
 
-def _vector(value: object, name: str, fail) -> tuple[float, float, float]:
-    if not (isinstance(value, list) and len(value) == 3 and all(is_number(v) for v in value)):
-        raise fail(name, f"found {show(value)}", "write three finite numbers")
-    return float(value[0]), float(value[1]), float(value[2])
+def _scene(value: Mapping[str, Any], fail, prefix: str, folder: Path | None) -> tuple[SceneVariation, ...]:
+    if "scene" not in value:
+        return ()
+    entries = value["scene"]
+    if not isinstance(entries, list) or not entries:
+        raise fail("scene", f"found {show(entries)}", "write a list of objects with select, mean, opacity, color")
+    found = []
+    for k, entry in enumerate(entries):
+        name = f"scene[{k}]"
+        if not isinstance(entry, dict):
+            raise fail(name, f"found {show(entry)}", f"write an object with {', '.join(KEYS)}")
+        known(entry, KEYS, f"{name}.", fail)
+        if "select" not in entry:
+            raise fail(f"{name}.select", "missing", "say which Gaussians vary; {} stands for all")
+        if not any(key in entry for key in KEYS[1:]):
+            raise fail(name, "nothing varies", "write mean, opacity or color")
+        ranges = {key: interval(entry[key], f"{name}.{key}", fail) for key in KEYS[1:] if key in entry}
+        select = parse_selection(entry["select"], f"{name}.select", fail, folder)
+        found.append(SceneVariation(select, **ranges, name=f"{prefix}{name}"))
+    return tuple(found)
 
 
-def _orbit(value: Mapping[str, Any], fail) -> Orbit | None:
+def _orbit(value: Mapping[str, Any], fail: Fail) -> Orbit | None:
     if value.get("orbit") is None:
         return None
     inner = value["orbit"]
     if not isinstance(inner, dict):
         raise fail("orbit", f"found {show(inner)}", f"write {_KEYS['orbit']}")
-    _known(inner, ("target", "axis", "azimuth"), "orbit.", fail)
+    known(inner, ("target", "axis", "azimuth"), "orbit.", fail)
     for name in ("target", "axis", "azimuth"):
         if name not in inner:
             raise fail(f"orbit.{name}", "missing", f"write {_KEYS['orbit']}")
-    axis = _vector(inner["axis"], "orbit.axis", fail)
+    axis = vector(inner["axis"], "orbit.axis", fail)
     with np.errstate(over="ignore"):
         length = float(np.linalg.norm(axis))
     if not 1e-12 < length < np.inf:
         raise fail("orbit.axis", f"has length {length:g}", "write a direction, such as [0, 0, 1]")
     return Orbit(
-        target=_vector(inner["target"], "orbit.target", fail),
+        target=vector(inner["target"], "orbit.target", fail),
         axis=axis,
-        azimuth=_range(inner["azimuth"], "orbit.azimuth", fail),
+        azimuth=interval(inner["azimuth"], "orbit.azimuth", fail),
     )

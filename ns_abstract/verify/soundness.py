@@ -11,6 +11,7 @@ import torch
 
 from ns_abstract.arithmetic.outward import outward
 from ns_abstract.arithmetic.units import arithmetic as arithmetic_of
+from ns_abstract.errors import InputError
 from ns_abstract.methods.nerf.render import NerfRenderer, Sampling, camera_rays
 from ns_abstract.methods.nerf.scene import NerfScene
 from ns_abstract.methods.splat.activate import activate
@@ -20,6 +21,7 @@ from ns_abstract.methods.splat.load import load_scene
 from ns_abstract.methods.splat.reference import Reference
 from ns_abstract.methods.splat.render import Renderer
 from ns_abstract.methods.splat.scene import SplatScene
+from ns_abstract.methods.splat.variations import VariedSplats
 from ns_abstract.sets.box import Float64Array, ParameterBox
 from ns_abstract.sets.path import load_camera_path
 from ns_abstract.sets.perturbation import parse_perturbation
@@ -102,9 +104,13 @@ def bound_cells(
     rasteriser: Rasteriser = GSPLAT_1_4_0,
     arithmetic: str = "real",
     order: int = 1,
+    varied: VariedSplats | None = None,
 ) -> tuple[list[tuple[np.ndarray, np.ndarray]], np.ndarray]:
-    """float32 bounds [H, W, 3] (lower, upper) of every cell, and the summed statistics of the bounds."""
-    bounds = SplatBounds(activate(scene, rasteriser), rasteriser, arithmetic_of(arithmetic))
+    """float32 bounds [H, W, 3] (lower, upper) of every cell, and the summed statistics of the bounds.
+
+    They hold for every scene of ``varied``, if given.
+    """
+    bounds = SplatBounds(activate(scene, rasteriser), rasteriser, arithmetic_of(arithmetic), varied)
     camera = pose_set.camera
     out, statistics = [], np.zeros(5, np.int64)
     for cell in cells:
@@ -176,7 +182,10 @@ def check_run(
     """
     scene = load_scene(load_config)
     path = load_camera_path(camera_path, downscale_factor)
-    pose_set = PoseSet.around(path.cameras[frame], parse_perturbation(dict(spec)), path.following(frame))
+    perturbation = parse_perturbation(dict(spec))
+    if perturbation.scene:
+        raise InputError("found variations of the scene", field="scene", fix="use verify.varied.check_varied")
+    pose_set = PoseSet.around(path.cameras[frame], perturbation, path.following(frame))
     boxes = equal_cells(pose_set.box, cells)
     bounds, statistics = bound_cells(scene, pose_set, boxes, rasteriser=rasteriser, arithmetic=arithmetic, order=order)
     render, probe = compiled_renderer(scene, pose_set, rasteriser)

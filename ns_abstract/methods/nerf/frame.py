@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 
@@ -77,6 +79,10 @@ class NerfFrame:
     def tile_count(self) -> int:
         """Number of rays, row by row."""
         return self.across * self.down
+
+    def members(self, seed: int) -> Iterator[Any]:
+        """Other scenes of the set: none, only poses vary."""
+        return iter(())
 
     def _pixels(self, tiles: np.ndarray) -> np.ndarray:
         return np.stack([tiles // self.across, tiles % self.across], axis=1)

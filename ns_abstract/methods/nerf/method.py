@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -11,6 +12,7 @@ from ns_abstract.errors import InputError
 from ns_abstract.methods.nerf.frame import NerfFrame
 from ns_abstract.methods.nerf.render import Sampling
 from ns_abstract.methods.nerf.scene import NerfScene
+from ns_abstract.sets.perturbation import Perturbation
 from ns_abstract.sets.poses import PoseSet
 
 #: Samples by ray where nothing is said: those of Nerfstudio's coarse pass.
@@ -91,6 +93,15 @@ class NerfMethod:
     def frame(self, poses: PoseSet) -> NerfFrame:
         """One frame, ready for refinement."""
         return NerfFrame(self.scene, self.sampling, poses)
+
+    def prepare(self, perturbations: Sequence[Perturbation]) -> None:
+        """Refuse what needs Gaussians.
+
+        Raises:
+            InputError: A set varies the scene.
+        """
+        if any(perturbation.scene for perturbation in perturbations):
+            raise InputError("a NeRF has no Gaussians", field="scene", fix="leave the key out")
 
     def memory(self, pixels: int) -> int:
         """Bytes that bounding pictures of ``pixels`` needs beside the leaves."""

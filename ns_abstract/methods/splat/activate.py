@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -26,6 +26,9 @@ class Splats:
         degree: Highest SH band that is not zero for some Gaussian and that the rasteriser uses.
         background: [3].
         antialiased: Whether opacity is compensated for the blur.
+        color_shift: [N, 3] added to the activated colours, which are then clamped to [0, ``color_max``];
+            or [0, 3].
+        color_max: Largest colour the activation can give: 1 for a sigmoid, else infinite.
     """
 
     means: Float64Array
@@ -35,6 +38,8 @@ class Splats:
     degree: int
     background: Float64Array
     antialiased: bool
+    color_shift: Float64Array = field(default_factory=lambda: np.empty((0, 3)))
+    color_max: float = np.inf
 
     @property
     def count(self) -> int:
@@ -85,4 +90,5 @@ def activate(scene: SplatScene, rasteriser: Rasteriser) -> Splats:
         degree=degree,
         background=background,
         antialiased=scene.rasterize_mode == "antialiased",
+        color_max=1.0 if scene.color_model == "sigmoid" else np.inf,
     )

@@ -8,7 +8,7 @@ import numpy as np
 from numba import get_num_threads
 
 from ns_abstract.arithmetic.forms import Basis
-from ns_abstract.arithmetic.units import Arithmetic
+from ns_abstract.arithmetic.units import UNIT64, Arithmetic
 from ns_abstract.methods.splat.activate import Splats
 from ns_abstract.methods.splat.colors import BASIS_SIZE, BASIS_SLOPE, fixed_colors, moving_colors
 from ns_abstract.methods.splat.constants import Rasteriser, rules_array
@@ -16,6 +16,7 @@ from ns_abstract.methods.splat.gaussians import FORMS, covariance_noise, gaussia
 from ns_abstract.methods.splat.lists import depth_order, tile_lists
 from ns_abstract.methods.splat.pixels import pixel_stage
 from ns_abstract.methods.splat.render import camera_array
+from ns_abstract.methods.splat.variations import VariedSplats
 from ns_abstract.sets.path import Camera
 from ns_abstract.sets.poses import PoseForms
 from ns_abstract.sets.tiles import tile_grid
@@ -54,10 +55,14 @@ class SplatBounds:
         splats: The activated scene.
         rasteriser: The rules of the bounded program.
         arithmetic: What that program computes with.
+        varied: The set of scenes that is bounded with each pose; None: ``splats`` alone.
     """
 
-    def __init__(self, splats: Splats, rasteriser: Rasteriser, arithmetic: Arithmetic) -> None:
+    def __init__(
+        self, splats: Splats, rasteriser: Rasteriser, arithmetic: Arithmetic, varied: VariedSplats | None = None
+    ) -> None:
         self.splats = splats
+        self.varied = VariedSplats.fixed(splats) if varied is None else varied
         self.rasteriser = rasteriser
         self.arithmetic = arithmetic
         self.rules = rules_array(rasteriser)
@@ -67,6 +72,7 @@ class SplatBounds:
         self._buffers: dict[str, np.ndarray] = {}
         self._noise = covariance_noise(splats.axes, a.unit, a.flush)
         self._color_radius = 8.0 * a.unit * float(np.abs(splats.sh).max(initial=1.0)) if splats.degree == 0 else 0.0
+        self._plain_colors = _shifted_colors(self.varied, a.unit) if splats.degree == 0 else None
 
     def _buffer(self, name: str, shape: tuple[int, ...], dtype: type = np.float64) -> np.ndarray:
         """Uninitialised memory that is kept from call to call."""
@@ -118,7 +124,8 @@ class SplatBounds:
         depth_error = self._buffer("depth_error", (n,))
         state = self._buffer("state", (n,), np.uint8)
         gaussian_stage(
-            candidates, splats.means, splats.axes, self._noise, splats.opacity, splats.opacity, np.empty((0, 3)),
+            candidates, self.varied.mean_middle, splats.axes, self._noise,
+            self.varied.opacity_low, self.varied.opacity_high, self.varied.mean_radius,
             rotation, offset, forms.origin, camera_reach, rotation_reach, view, self.rules, self._errors,
             d, order, m, splats.antialiased, record, box, tiles, depth, delta, depth_error, state,
         )  # fmt: skip
@@ -151,9 +158,11 @@ class SplatBounds:
 
     def _colors(self, forms: PoseForms, candidates: np.ndarray, alive: np.ndarray, n: int) -> np.ndarray:
         """Colours of the visible Gaussians: [n, 3], [n, 6] (centre, radius) or forms."""
-        splats = self.splats
+        splats, varied = self.splats, self.varied
         basis = forms.position.basis
         if splats.degree == 0:
+            if self._plain_colors is not None:
+                return self._plain_colors if n == splats.count else self._plain_colors[candidates]
             if n == splats.count:
                 return np.ascontiguousarray(splats.sh[:, 0])
             return splats.sh[candidates, 0]
@@ -166,14 +175,30 @@ class SplatBounds:
             colors = self._buffer("colors", (n, 6))
             position_error += 2.0 * float(forms.position.radius.max())
             fixed_colors(
-                indices, splats.means, splats.sh, splats.degree, forms.position.center, position_error, unit,
+                indices, varied.mean_middle, varied.mean_radius, varied.color_low, varied.color_high,
+                splats.sh, splats.degree, forms.position.center, position_error, unit,
                 BASIS_SIZE, BASIS_SLOPE, colors,
             )  # fmt: skip
             return colors
         colors = self._buffer("colors", (n, 3 * (basis.monomials + 1)))
         moving_colors(
-            indices, splats.means, splats.sh, splats.degree, forms.position.data, forms.origin, position_error, unit,
+            indices, varied.mean_middle, varied.mean_radius, varied.color_low, varied.color_high,
+            splats.sh, splats.degree, forms.position.data, forms.origin, position_error, unit,
             BASIS_SIZE, BASIS_SLOPE, basis.dimensions, basis.order, basis.monomials, colors,
         )  # fmt: skip
         return colors
 
+
+
+def _shifted_colors(varied: VariedSplats, unit: float) -> np.ndarray | None:
+    """[N, 6] centre and radius by channel of view-independent colours (design.md, S4); None where none varies."""
+    if not varied.color_low.size:
+        return None
+    color, top = varied.stored.sh[:, 0], varied.stored.color_max
+    low, high = (np.clip(color + end, 0.0, top) for end in (varied.color_low, varied.color_high))
+    moved = (varied.color_low != 0.0) | (varied.color_high != 0.0)
+    size = color + np.maximum(np.abs(varied.color_low), np.abs(varied.color_high))
+    # one addition and the ends' own rounding
+    radius = 0.5 * (high - low) + (4.0 * unit + 8.0 * UNIT64) * size
+    found = np.stack([np.where(moved, 0.5 * (low + high), color), np.where(moved, radius, 0.0)], axis=-1)
+    return np.ascontiguousarray(found.reshape(-1, 6))

@@ -91,17 +91,36 @@ def _color_error(sh, i, channel, count, unit, direction_error, sizes, slopes):
 
 
 @njit(cache=True, error_model="numpy")
-def _direction_error(distance, position_error, mean_size, unit):
-    return (position_error + 2.0 * unit * mean_size) / distance + 16.0 * unit
+def _direction_error(length, position_error, means, mean_radius, i, unit):
+    """Angle between the directions to a Gaussian at distance ``length`` and any that the program may use, at most 2."""
+    size = abs(means[i, 0]) + abs(means[i, 1]) + abs(means[i, 2])
+    reach = 0.0
+    if mean_radius.shape[0] > 0:
+        r0, r1, r2 = mean_radius[i, 0], mean_radius[i, 1], mean_radius[i, 2]
+        reach = math.sqrt(r0 * r0 + r1 * r1 + r2 * r2) * _UP
+        size += r0 + r1 + r2
+    distance = length - position_error - reach
+    if not distance > 0.0:
+        return 2.0
+    error = (position_error + reach + 2.0 * unit * size) / distance + 16.0 * unit
+    if reach > 0.0:
+        # from a chord to the arc, along which the basis functions' slopes hold (design.md, S4)
+        error = 2.0 * math.asin(min(1.0, 0.5 * error)) * (1.0 + 2.0**-40)
+    return min(error, 2.0)
 
 
 @njit(cache=True, parallel=True, error_model="numpy")
-def fixed_colors(indices, means, sh, degree, position, position_error, unit, sizes, slopes, colors):
-    """Colours seen from one camera position: centre and radius by Gaussian (design.md, C1, C3).
+def fixed_colors(
+    indices, means, mean_radius, color_low, color_high, sh, degree, position, position_error, unit, sizes, slopes,
+    colors,
+):  # fmt: skip
+    """Colours seen from one camera position: centre and radius by Gaussian (design.md, C1, C3, S4).
 
     Args:
         indices: [n] rows to fill, with ``colors`` [., 6] = (centre, radius) by channel, and the
             Gaussian's number in the scene in the second column: [n, 2].
+        mean_radius: [N, 3] or [0, 3]; see `gaussians.gaussian_stage`.
+        color_low, color_high: [N, 3] ranges of what is added to the colours, or [0, 3].
         position: [3]; ``position_error`` bounds what float evaluation and the set add to it.
     """
     count = (degree + 1) * (degree + 1)
@@ -114,13 +133,19 @@ def fixed_colors(indices, means, sh, degree, position, position_error, unit, siz
             i = indices[row, 1]
             for k in range(3):
                 direction[k] = means[i, k] - position[k]
-            distance = math.sqrt(direction[0] ** 2 + direction[1] ** 2 + direction[2] ** 2) - position_error
+            length = math.sqrt(direction[0] ** 2 + direction[1] ** 2 + direction[2] ** 2)
             sh_color(sh[i], direction, degree, basis, color)
-            mean_size = abs(means[i, 0]) + abs(means[i, 1]) + abs(means[i, 2])
-            error = _direction_error(distance, position_error, mean_size, unit) if distance > 0.0 else 2.0
+            error = _direction_error(length, position_error, means, mean_radius, i, unit)
             for c in range(3):
+                radius = _color_error(sh, i, c, count, unit, error, sizes, slopes)
+                if color_low.shape[0] > 0 and (color_low[i, c] != 0.0 or color_high[i, c] != 0.0):
+                    rounding = 4.0 * unit * (color[c] + radius + max(abs(color_low[i, c]), abs(color_high[i, c])))
+                    low = max(0.0, max(0.0, color[c] - radius) + color_low[i, c] - rounding)
+                    high = max(0.0, color[c] + radius + color_high[i, c] + rounding)
+                    color[c] = 0.5 * (low + high)
+                    radius = 0.5 * (high - low) * _UP + _COEFFICIENT * high
                 colors[target, 2 * c] = color[c]
-                colors[target, 2 * c + 1] = _color_error(sh, i, c, count, unit, min(error, 2.0), sizes, slopes)
+                colors[target, 2 * c + 1] = radius
 
 
 @njit(cache=True, error_model="numpy")
@@ -138,12 +163,14 @@ def _accumulate(target, form, weights, m):
 
 @njit(cache=True, parallel=True, error_model="numpy")
 def moving_colors(
-    indices, means, sh, degree, position, origin, position_error, unit, sizes, slopes, d, order, m, colors
-):
-    """Colours over a cell in which the camera moves, as forms (design.md, C2, C3).
+    indices, means, mean_radius, color_low, color_high, sh, degree, position, origin, position_error, unit,
+    sizes, slopes, d, order, m, colors,
+):  # fmt: skip
+    """Colours over a cell in which the camera moves, as forms (design.md, C2, C3, S4).
 
     Args:
         indices: [n, 2] row of ``colors`` and number of the Gaussian in the scene.
+        mean_radius, color_low, color_high: See `fixed_colors`.
         position: [rows, 3] forms of the camera position, centred at ``origin`` [3].
         position_error: Bound of the float error of the camera position.
         colors: [., 3 (m + 1)] output: coefficients and radius by channel.
@@ -179,7 +206,7 @@ def moving_colors(
                 scale_add(work[3], 1.0, work[4], 1.0, 0.0, work[3], d, order, m)
             bounds(work[3], low, high, d, order, m)
             for q in range(LANES):
-                distance[q] = math.sqrt(low[q]) * (1.0 - _COEFFICIENT) - position_error if low[q] > 0.0 else 0.0
+                distance[q] = math.sqrt(low[q]) * (1.0 - _COEFFICIENT) if low[q] > 0.0 else 0.0
             reciprocal_square_root(work[3], scratch, work[5], d, order, m)
             for axis in range(3):
                 multiply(work[axis], work[5], work[6 + axis], d, order, m)
@@ -217,14 +244,11 @@ def moving_colors(
                 settle(form, d, order, m)
                 for q in range(LANES):
                     i = indices[first + min(q, lanes - 1), 1]
-                    mean_size = abs(means[i, 0]) + abs(means[i, 1]) + abs(means[i, 2])
-                    error = (
-                        _direction_error(distance[q], position_error, mean_size, unit) if distance[q] > 0.0 else 2.0
-                    )
+                    error = _direction_error(distance[q], position_error, means, mean_radius, i, unit)
                     size = 0.0
                     for k in range(count):
                         size += abs(sh[i, k, channel]) * sizes[k]
-                    form[m, q] += _color_error(sh, i, channel, count, unit, min(error, 2.0), sizes, slopes)
+                    form[m, q] += _color_error(sh, i, channel, count, unit, error, sizes, slopes)
                     # a camera that may stand in the Gaussian's centre: any direction
                     if not form[m, q] + form[m + 1, q] + form[m + 2, q] <= 2.0 * size + 1.0:
                         for r in range(1, m + 3):
@@ -233,6 +257,19 @@ def moving_colors(
                         form[m, q] = size * 1.01 + _color_error(sh, i, channel, count, unit, 2.0, sizes, slopes)
                 bounds(form, low, high, d, order, m)
                 clamp_below(form, 0.0, low, high, d, order, m)
+                if color_low.shape[0] > 0:
+                    for q in range(LANES):
+                        i = indices[first + min(q, lanes - 1), 1]
+                        least, most = color_low[i, channel], color_high[i, channel]
+                        if least != 0.0 or most != 0.0:
+                            middle = 0.5 * (least + most)
+                            size = abs(form[0, q]) + form[m + 1, q] + form[m + 2, q] + form[m, q]
+                            form[0, q] += middle
+                            form[m, q] += max(most - middle, middle - least) * _UP + (4.0 * unit + _COEFFICIENT) * (
+                                size + max(abs(least), abs(most))
+                            )
+                    bounds(form, low, high, d, order, m)
+                    clamp_below(form, 0.0, low, high, d, order, m)
                 for q in range(lanes):
                     row = indices[first + q, 0]
                     for k in range(m + 1):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,9 +13,13 @@ from ns_abstract.methods.splat.activate import Splats
 from ns_abstract.methods.splat.bounds import SplatBounds
 from ns_abstract.methods.splat.constants import Rasteriser
 from ns_abstract.methods.splat.render import Renderer
+from ns_abstract.methods.splat.variations import VariedSplats
 from ns_abstract.sets.box import ParameterBox
 from ns_abstract.sets.poses import PoseSet
 from ns_abstract.sets.tiles import tile_grid
+
+#: Parameter values [d] and tile numbers to the tiles of a picture; see `SplatFrame.render`.
+Render = Callable[[np.ndarray, np.ndarray | None], np.ndarray]
 
 #: Gaussians and poses looked at to estimate how far the picture moves.
 _MOTION_GAUSSIANS = 2000
@@ -66,6 +71,7 @@ class SplatFrame:
         rasteriser, arithmetic: What is bounded.
         pose_set: The poses.
         order: Order of the forms; by default 2 for one parameter and 1 for more.
+        varied: The scenes of the set; None: ``splats`` alone.
     """
 
     #: Every call bounds as many tiles as it is given.
@@ -80,13 +86,15 @@ class SplatFrame:
         arithmetic: Arithmetic,
         pose_set: PoseSet,
         order: int | None = None,
+        varied: VariedSplats | None = None,
     ) -> None:
         self.pose_set = pose_set
         self.camera = pose_set.camera
         self.box = pose_set.box
         self.order = order or (2 if self.box.dimensions <= 1 else 1)
-        self.renderer = Renderer(splats, rasteriser)
-        self.bounds = SplatBounds(splats, rasteriser, arithmetic)
+        self.bounds = SplatBounds(splats, rasteriser, arithmetic, varied)
+        self.varied = self.bounds.varied
+        self.renderer = Renderer(self.varied.nearest, rasteriser)
         self.side = rasteriser.work_tile
         self.across, self.down = tile_grid(self.camera, self.side)
 
@@ -106,6 +114,18 @@ class SplatFrame:
     def render(self, values: np.ndarray, tiles: np.ndarray | None = None) -> np.ndarray:
         """Tiles [t, side, side, 3] float32 of the concrete image at parameter values [d]."""
         return self.renderer.tiles(self.camera, *self.pose_set.world_to_camera(values), tiles).astype(np.float32)
+
+    def members(self, seed: int) -> Iterator[Render]:
+        """Other scenes of the set, without end, each as a function like `render`; none where nothing varies."""
+        if not self.varied.varies:
+            return
+        for member in self.varied.members(np.random.default_rng(seed)):
+
+            def render(values: np.ndarray, tiles: np.ndarray | None = None, member: Splats = member) -> np.ndarray:
+                view = self.pose_set.world_to_camera(values)
+                return self.renderer.tiles(self.camera, *view, tiles, member).astype(np.float32)
+
+            yield render
 
     def bound(
         self, box: ParameterBox, tiles: np.ndarray, within: Context | None = None, keep_linear: bool = False

@@ -234,9 +234,9 @@ def gaussian_stage(
 
     Args:
         candidates: [n] int32.
-        means, axes: [N, 3], [N, 3, 3] of the scene.
+        means, axes: [N, 3], [N, 3, 3] of the scene; means in the middle of their ranges.
         noise: [N, 12] see `covariance_noise`.
-        opacity_low, opacity_high: [N].
+        opacity_low, opacity_high: [N] ends of the opacities' ranges.
         mean_radius: [N, 3] half-widths of independent mean ranges, world axes, or [0, 3].
         rotation, offset: [rows, 9], [rows, 3] pose forms; see `PoseForms`.
         origin: [3].
@@ -259,16 +259,20 @@ def gaussian_stage(
 
 
 @njit(cache=True, error_model="numpy")
-def _coordinate_error(rotation_reach, camera_reach, means, i, row, unit):
-    """Float error of one camera coordinate (design.md, G2): ten units of the sum of absolute products."""
+def _coordinate_error(rotation_reach, camera_reach, means, mean_radius, i, row, unit):
+    """Float error of one camera coordinate (design.md, G2, S2): ten units of the sum of absolute products."""
     total = 0.0
     for k in range(3):
-        total += rotation_reach[3 * row + k] * (abs(means[i, k]) + camera_reach[k])
+        size = abs(means[i, k])
+        if mean_radius.shape[0] > 0:
+            size += mean_radius[i, k]
+        total += rotation_reach[3 * row + k] * (size + camera_reach[k])
     return 10.0 * unit * total * _UP
 
 
 @njit(cache=True, error_model="numpy")
 def _mean_spread(rotation_reach, mean_radius, i, row):
+    """How far a Gaussian's own range moves one camera coordinate (design.md, S2); 0 without ranges."""
     total = 0.0
     if mean_radius.shape[0] > 0:
         for k in range(3):
@@ -306,7 +310,7 @@ def _cull_block(
         index = first + q
         i = candidates[index]
         state[index] = 0
-        error_z = _coordinate_error(rotation_reach, camera_reach, means, i, 2, unit)
+        error_z = _coordinate_error(rotation_reach, camera_reach, means, mean_radius, i, 2, unit)
         spread_z = _mean_spread(rotation_reach, mean_radius, i, 2) + error_z
         if not (scalars[_ZHI, q] + spread_z >= near and scalars[_ZLO, q] - spread_z <= far):
             # a bound that is not a number keeps the Gaussian
@@ -330,7 +334,7 @@ def _cull_block(
                 # inside the image at the middle pose
                 continue
             error = focal * (
-                _coordinate_error(rotation_reach, camera_reach, means, i, axis, unit)
+                _coordinate_error(rotation_reach, camera_reach, means, mean_radius, i, axis, unit)
                 + _mean_spread(rotation_reach, mean_radius, i, axis)
             ) + (max(extent, abs(center), abs(extent - center)) + blur) * spread_z
             # focal x + (center + blur) z + reach < 0: left of the image at every pose with z > 0
@@ -418,7 +422,11 @@ def _project_block(
         # G10: rounding of the depth against that of another Gaussian; what both share is in the slope
         products = 0.0
         for k in range(3):
-            products += rotation_reach[6 + k] * abs(means[i, k])
+            size = abs(means[i, k])
+            if mean_radius.shape[0] > 0:
+                # twice: the slope's own rounding is charged for the means in the middle of their ranges (S3)
+                size += 2.0 * mean_radius[i, k]
+            products += rotation_reach[6 + k] * size
         depth_error[index] = unit * (4.2 * products + 1.1 * max(abs(scalars[_ZLO, q]), abs(scalars[_ZHI, q]))) + (
             _mean_spread(rotation_reach, mean_radius, i, 2)
         )
@@ -494,7 +502,7 @@ def _project_block(
         index = block[q]
         i = candidates[index]
         _finish(
-            index, i, q, means, noise, opacity_low, opacity_high, camera_reach, rotation_reach,
+            index, i, q, means, noise, opacity_low, opacity_high, mean_radius, camera_reach, rotation_reach,
             rules, camera, errors, m, antialiased, work, scalars, record, box, tiles, depth_error, state,
         )  # fmt: skip
     # P = P' z, Q = Q' z, S = S' z, W1 = P' X^ - Q' Y^, W2 = S' Y^
@@ -575,7 +583,7 @@ def _cross_square(work, out, d, order, m):
 
 @njit(cache=True, error_model="numpy")
 def _finish(
-    index, i, q, means, noise, opacity_low, opacity_high, camera_reach, rotation_reach,
+    index, i, q, means, noise, opacity_low, opacity_high, mean_radius, camera_reach, rotation_reach,
     rules, camera, errors, m, antialiased, work, scalars, record, box, tiles, depth_error, state,
 ):  # fmt: skip
     """Float errors, pixel region and tile ranges of one Gaussian (design.md, G5-G9)."""
@@ -608,9 +616,9 @@ def _finish(
     tiles[index, 3] = tiles_y
     for k in range(4, 8):
         tiles[index, k] = 0
-    error_x = _coordinate_error(rotation_reach, camera_reach, means, i, 0, unit)
-    error_y = _coordinate_error(rotation_reach, camera_reach, means, i, 1, unit)
-    error_z = _coordinate_error(rotation_reach, camera_reach, means, i, 2, unit)
+    error_x = _coordinate_error(rotation_reach, camera_reach, means, mean_radius, i, 0, unit)
+    error_y = _coordinate_error(rotation_reach, camera_reach, means, mean_radius, i, 1, unit)
+    error_z = _coordinate_error(rotation_reach, camera_reach, means, mean_radius, i, 2, unit)
     z_low = scalars[_ZLO, q] - error_z
     z_high = scalars[_ZHI, q] + error_z
     if not (z_low >= near * (1.0 + 4.0 * unit) and z_high < np.inf):

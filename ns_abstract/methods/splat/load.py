@@ -170,7 +170,7 @@ def _load_run(run: runs.RunConfig) -> SplatScene:
         dataparser=transform,
         name=run.experiment_name,
         source=str(checkpoint),
-        dropped=dropped,
+        **dropped,
         notes=(*notes, *_assumptions(run)),
     )
 
@@ -257,8 +257,12 @@ def _row_count(means: Any, file: Path) -> int:
     return shape[0]
 
 
-def _drawable(arrays: _Arrays, file: Path, fields: dict[str, str]) -> tuple[_Arrays, dict[str, int]]:
-    """Check scales and quaternions; leave out the rows that gsplat can never draw."""
+def _drawable(arrays: _Arrays, file: Path, fields: dict[str, str]) -> tuple[_Arrays, dict[str, Any]]:
+    """Check scales and quaternions; leave out the rows that gsplat can never draw.
+
+    Returns:
+        The arrays, and what a `SplatScene` says about the rows left out.
+    """
     limits = np.finfo(np.float32)
     # Strictly inside the normal range, so that any float32 exp stays inside it.
     with np.errstate(over="ignore", under="ignore"):
@@ -281,7 +285,7 @@ def _drawable(arrays: _Arrays, file: Path, fields: dict[str, str]) -> tuple[_Arr
     if not zero.any():
         return arrays, {}
     kept = {name: np.ascontiguousarray(value[~zero]) for name, value in vars(arrays).items()}
-    return _Arrays(**kept), {"zero quaternion": int(zero.sum())}
+    return _Arrays(**kept), {"dropped": {"zero quaternion": int(zero.sum())}, "stored": np.flatnonzero(~zero)}
 
 
 def _require_rows(good: Any, file: Path, field: str, problem: str) -> None:
@@ -332,7 +336,7 @@ def _load_ply(path: Path) -> SplatScene:
         dataparser=DataparserTransform(),
         name=path.stem,
         source=str(path),
-        dropped=dropped,
+        **dropped,
     )
 
 

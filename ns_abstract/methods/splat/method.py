@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -13,10 +14,15 @@ from ns_abstract.methods.splat.activate import Splats, activate
 from ns_abstract.methods.splat.constants import RASTERISERS, Rasteriser
 from ns_abstract.methods.splat.frame import SplatFrame
 from ns_abstract.methods.splat.scene import SplatScene
+from ns_abstract.methods.splat.variations import VariedSplats, vary
+from ns_abstract.sets.perturbation import Perturbation
 from ns_abstract.sets.poses import PoseSet, translation_only
+from ns_abstract.sets.variations import SceneVariation
 
 #: Bytes that the kernels need by Gaussian, beside the scene itself (record, boxes, colours, buffers).
 _BYTES_BY_GAUSSIAN = 1200
+#: The same of the ranges of a varied scene and of the member that is rendered.
+_BYTES_BY_VARIED = 400
 
 
 class SplatMethod:
@@ -33,6 +39,7 @@ class SplatMethod:
         self.rasteriser: Rasteriser = RASTERISERS[renderer or "gsplat"]
         self.arithmetic: Arithmetic = arithmetic_named(arithmetic or "float32")
         self.splats: Splats = activate(scene, self.rasteriser)
+        self._varied: dict[tuple[SceneVariation, ...], VariedSplats] = {}
 
     @property
     def program(self) -> dict[str, Any]:
@@ -51,12 +58,30 @@ class SplatMethod:
 
     def frame(self, poses: PoseSet) -> SplatFrame:
         """One frame, ready for refinement."""
-        return SplatFrame(self.splats, self.rasteriser, self.arithmetic, poses)
+        varied = self.varied(poses.perturbation.scene)
+        return SplatFrame(self.splats, self.rasteriser, self.arithmetic, poses, varied=varied)
+
+    def prepare(self, perturbations: Sequence[Perturbation]) -> None:
+        """Find the Gaussians that vary.
+
+        Raises:
+            InputError: A selection is empty, or its file cannot be used.
+        """
+        for perturbation in perturbations:
+            self.varied(perturbation.scene)
+
+    def varied(self, variations: tuple[SceneVariation, ...]) -> VariedSplats:
+        """The scenes of a set."""
+        if variations not in self._varied:
+            self._varied[variations] = vary(self.scene, self.splats, variations)
+        return self._varied[variations]
 
     def memory(self, pixels: int) -> int:
         """Bytes that bounding pictures of ``pixels`` needs beside the leaves."""
         arrays = (self.splats.means, self.splats.axes, self.splats.opacity, self.splats.sh)
-        return 2 * sum(a.nbytes for a in arrays) + self.splats.count * _BYTES_BY_GAUSSIAN + pixels * 400 + (256 << 20)
+        ranges = sum(v.varies for v in self._varied.values()) * _BYTES_BY_VARIED
+        by_gaussian = self.splats.count * (_BYTES_BY_GAUSSIAN + ranges)
+        return 2 * sum(a.nbytes for a in arrays) + by_gaussian + pixels * 400 + (256 << 20)
 
     def frame_plan(self, frame: SplatFrame, shown: int | None, lower: np.ndarray, upper: np.ndarray) -> list[str]:
         """What was left out for one frame, given what refinement found."""
@@ -67,7 +92,13 @@ class SplatMethod:
                 f"{total - shown:,} of {total:,} Gaussians left out: no pose of the set shows them "
                 "(behind, beside, hidden by others or below the alpha threshold)"
             )
-        if translation_only(frame.pose_set.enclosure(frame.box, 1)):
+        varied = frame.varied
+        for quantity, name in (("mean", "mean"), ("opacity", "opacity"), ("color", "colour")):
+            if count := varied.counts[quantity]:
+                plan.append(f"scene variations: the {name} of {count:,} of {total:,} Gaussians varies")
+            elif varied.varies:
+                plan.append(f"ranges of the {name} left out: none varies")
+        if not varied.counts["mean"] and translation_only(frame.pose_set.enclosure(frame.box, 1)):
             plan.append("depth-order rules left out but for near-ties: translations never change the order")
         return plan
 

@@ -11,6 +11,7 @@ rasterize_to_pixels_fwd.cu).
 
 from __future__ import annotations
 
+import copy
 from dataclasses import dataclass
 
 import torch
@@ -125,9 +126,20 @@ class Reference:
         self._covariances = spread @ spread.transpose(1, 2)
         self._opacities = torch.sigmoid(torch.from_numpy(scene.opacity_logits.copy()).to(dtype))
         self._sh = torch.from_numpy(scene.sh.copy()).to(dtype)
+        self._shift: Tensor | None = None
         self._background = torch.from_numpy(scene.background.copy()).to(dtype)
         if not rasteriser.background:
             self._background = torch.zeros(3, dtype=dtype)
+
+    def member(self, means: Tensor, opacities: Tensor, color_shift: Tensor | None) -> Reference:
+        """The same scene with other means [N, 3], activated opacities [N] and shifts of activated colours [N, 3].
+
+        Gradients of `pixels` flow back to them.
+        """
+        other = copy.copy(self)
+        other._means, other._opacities = means.to(self.dtype), opacities.to(self.dtype)
+        other._shift = None if color_shift is None else color_shift.to(self.dtype)
+        return other
 
     def project(self, camera: Camera, camera_to_world: Tensor, subset: Tensor | None = None) -> Projection:
         """Project the scene (fully_fused_projection_fwd.cu, isect_tiles.cu).
@@ -230,9 +242,11 @@ class Reference:
         """[n, 3] colours seen from ``position`` [3], world."""
         sh = self._sh[indices]
         if self.scene.color_model == "sigmoid":
-            return torch.sigmoid(sh[:, 0])
+            colors = torch.sigmoid(sh[:, 0])
+            return colors if self._shift is None else (colors + self._shift[indices]).clamp(0.0, 1.0)
         degree = self.scene.sh_degree if self.rules.view_dependent else 0
-        return sh_colors(degree, self._means[indices] - position, sh)
+        colors = sh_colors(degree, self._means[indices] - position, sh)
+        return colors if self._shift is None else (colors + self._shift[indices]).clamp(min=0.0)
 
     def _layers(self, p: Projection, order: Tensor, axis: int, low: float, high: float) -> Tensor:
         """Rows ``order`` of ``p`` that reach pixel centres in [low, high] along one axis (0: x) of one tile."""
@@ -307,7 +321,8 @@ class Reference:
             center = torch.tensor([column + 0.5, row + 0.5], dtype=self.dtype)
             layers = self._layers(p, self._layers(p, order, 1, row + 0.5, row + 0.5), 0, column + 0.5, column + 0.5)
             reached, kept = p, layers
-            if torch.is_grad_enabled() and camera_to_world.requires_grad:
+            leaves = (camera_to_world, self._means, self._opacities, self._shift)
+            if torch.is_grad_enabled() and any(leaf is not None and leaf.requires_grad for leaf in leaves):
                 # the decisions of the first pass stand, the second one only adds derivatives
                 reached = self.project(camera, camera_to_world, p.indices[layers])
                 kept = torch.arange(len(layers))

@@ -31,7 +31,7 @@ _COLUMNS = 9
 
 @njit(cache=True, error_model="numpy")
 def _project_chunk(
-    chunk, means, axes, opacity, sh, degree, rotation, position, camera, rules, antialiased, tile,
+    chunk, means, axes, opacity, sh, degree, shift, color_max, rotation, position, camera, rules, antialiased, tile,
     record, box, tiles, depth, visible,
 ):  # fmt: skip
     """Project one chunk of Gaussians; see `ns_abstract.methods.splat.constants` for the rules' sources."""
@@ -143,20 +143,23 @@ def _project_chunk(
         else:
             direction[0], direction[1], direction[2] = d0, d1, d2
             sh_color(sh[i], direction, degree, basis, record[i, _RED:])
+        if shift.shape[0] > 0:
+            for channel in range(3):
+                record[i, _RED + channel] = min(color_max, max(0.0, record[i, _RED + channel] + shift[i, channel]))
         depth[i] = z
         visible[i] = 1
 
 
 @njit(cache=True, parallel=True, error_model="numpy")
 def _project(
-    means, axes, opacity, sh, degree, rotation, position, camera, rules, antialiased, tile,
+    means, axes, opacity, sh, degree, shift, color_max, rotation, position, camera, rules, antialiased, tile,
     record, box, tiles, depth, visible,
 ):  # fmt: skip
     """Project every Gaussian."""
     for chunk in prange((means.shape[0] + _CHUNK - 1) // _CHUNK):
         _project_chunk(
-            chunk, means, axes, opacity, sh, degree, rotation, position, camera, rules, antialiased, tile,
-            record, box, tiles, depth, visible,
+            chunk, means, axes, opacity, sh, degree, shift, color_max, rotation, position, camera, rules,
+            antialiased, tile, record, box, tiles, depth, visible,
         )  # fmt: skip
 
 
@@ -285,7 +288,12 @@ class Renderer:
         self._visible = np.empty(n, np.uint8)
 
     def tiles(
-        self, camera: Camera, rotation: np.ndarray, position: np.ndarray, wanted: np.ndarray | None = None
+        self,
+        camera: Camera,
+        rotation: np.ndarray,
+        position: np.ndarray,
+        wanted: np.ndarray | None = None,
+        member: Splats | None = None,
     ) -> np.ndarray:
         """The tiles ``wanted`` (numbers, row-major; all if None) as float64 [t, side, side, 3].
 
@@ -293,23 +301,24 @@ class Renderer:
             camera: Intrinsics and size; its own pose is not used.
             rotation: [3, 3] world to camera, OpenCV axes.
             position: [3] camera position, world.
+            member: What to show in place of the scene: as many Gaussians, of the same degree.
         """
+        splats = self.splats if member is None else member
         across, down = tile_grid(camera, self.side)
         if wanted is None:
             wanted = np.arange(across * down)
-        offsets, entries = self._lists(camera, rotation, position, wanted)
-        return self._blend(camera, wanted, offsets, entries, self._record, self.splats.background)
+        offsets, entries = self._lists(splats, camera, rotation, position, wanted)
+        return self._blend(camera, wanted, offsets, entries, self._record, splats.background)
 
     def _lists(
-        self, camera: Camera, rotation: np.ndarray, position: np.ndarray, wanted: np.ndarray
+        self, splats: Splats, camera: Camera, rotation: np.ndarray, position: np.ndarray, wanted: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
         """Project every Gaussian; the lists of the tiles ``wanted`` (offsets and entries)."""
-        splats = self.splats
         _project(
-            splats.means, splats.axes, splats.opacity, splats.sh, splats.degree,
-            np.ascontiguousarray(rotation, np.float64), np.ascontiguousarray(position, np.float64),
-            camera_array(camera), self.rules, splats.antialiased, self.side,
-            self._record, self._box, self._tiles, self._depth, self._visible,
+            splats.means, splats.axes, splats.opacity, splats.sh, splats.degree, splats.color_shift,
+            splats.color_max, np.ascontiguousarray(rotation, np.float64), np.ascontiguousarray(position, np.float64),
+            camera_array(camera), self.rules, splats.antialiased, self.side, self._record, self._box, self._tiles,
+            self._depth, self._visible,
         )  # fmt: skip
         across, down = tile_grid(camera, self.side)
         order = depth_order(np.flatnonzero(self._visible), self._depth)
@@ -333,9 +342,11 @@ class Renderer:
         )  # fmt: skip
         return image
 
-    def image(self, camera: Camera, rotation: np.ndarray, position: np.ndarray) -> np.ndarray:
-        """The whole image, float64 [H, W, 3] in [0, 1]."""
-        return assemble(self.tiles(camera, rotation, position), camera)
+    def image(
+        self, camera: Camera, rotation: np.ndarray, position: np.ndarray, member: Splats | None = None
+    ) -> np.ndarray:
+        """The whole image, float64 [H, W, 3] in [0, 1]; see `tiles`."""
+        return assemble(self.tiles(camera, rotation, position, member=member), camera)
 
     def layers(
         self, camera: Camera, rotation: np.ndarray, position: np.ndarray
@@ -348,7 +359,7 @@ class Renderer:
         """
         across, down = tile_grid(camera, self.side)
         wanted = np.arange(across * down)
-        offsets, entries = self._lists(camera, rotation, position, wanted)
+        offsets, entries = self._lists(self.splats, camera, rotation, position, wanted)
         image = self._blend(camera, wanted, offsets, entries, self._record, self.splats.background)
         # the same weights, with depths as colours; the blending clamps to [0, 1]
         seen = self._visible.astype(bool)

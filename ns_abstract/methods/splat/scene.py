@@ -37,6 +37,7 @@ class SplatScene:
         name: Short name for reports.
         source: The file the parameters were read from.
         dropped: Count of stored Gaussians that gsplat can never draw, by reason.
+        stored: [N] numbers of the Gaussians in the source, ascending, where some were dropped; else None.
         notes: What was assumed where the source says nothing, one sentence each.
     """
 
@@ -53,6 +54,7 @@ class SplatScene:
     name: str = "scene"
     source: str = ""
     dropped: dict[str, int] = field(default_factory=dict)
+    stored: NDArray[np.int64] | None = None
     notes: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:

@@ -1,0 +1,278 @@
+"""An attack on the abstract image of a set of poses and of scenes whose Gaussians vary.
+
+Tolerance is zero, as in `ns_abstract.verify.falsify`; what differs is the number of parameters, seven by
+Gaussian. Members of the set are rendered at corners (of all Gaussians alike and of random signs), inside, and
+where signed gradients lead that go through the reference renderer from the pixels that came closest to a bound.
+"""
+
+from __future__ import annotations
+
+import itertools
+import os
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import torch
+
+from ns_abstract.methods.splat.activate import Splats, activate
+from ns_abstract.methods.splat.constants import GSPLAT_1_4_0, Rasteriser
+from ns_abstract.methods.splat.load import load_scene
+from ns_abstract.methods.splat.reference import Reference
+from ns_abstract.methods.splat.render import Renderer
+from ns_abstract.methods.splat.scene import SplatScene
+from ns_abstract.methods.splat.variations import VariedSplats, vary
+from ns_abstract.sets.box import Float64Array, ParameterBox
+from ns_abstract.sets.path import load_camera_path
+from ns_abstract.sets.perturbation import parse_perturbation
+from ns_abstract.sets.poses import PoseSet
+from ns_abstract.sets.twin import pose_twin
+from ns_abstract.verify.soundness import bound_cells, equal_cells
+
+#: Parameter values [d] and a member of the set to a picture [H, W, 3].
+Show = Callable[[Float64Array, Splats], np.ndarray]
+
+_STEPS = 4
+
+
+@dataclass
+class VariedAttack:
+    """What an attack did and found.
+
+    Attributes:
+        pictures: Rendered in full, by strategy.
+        comparisons: Pixel channels compared with their bounds.
+        violations: Comparisons that failed; a value or bound that is no number fails.
+        amount: How far the worst value lies outside.
+        least, most: [H, W, 3] extremes of what was rendered.
+    """
+
+    least: Float64Array = field(repr=False)
+    most: Float64Array = field(repr=False)
+    pictures: dict[str, int] = field(default_factory=dict)
+    comparisons: int = 0
+    violations: int = 0
+    amount: float = 0.0
+
+
+def show_compiled(renderer: Renderer, poses: PoseSet) -> Show:
+    """Pictures of the compiled renderer."""
+    return lambda values, member: renderer.image(poses.camera, *poses.world_to_camera(values), member)
+
+
+def show_reference(reference: Reference, poses: PoseSet) -> Show:
+    """Pictures of the reference renderer, in its own precision: a member's values are rounded to it."""
+
+    def show(values: Float64Array, member: Splats) -> np.ndarray:
+        with torch.no_grad():
+            other = reference.member(*_tensors(member))
+            return other.image(poses.camera, torch.from_numpy(poses.pose(values))).numpy()
+
+    return show
+
+
+def _tensors(member: Splats) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor | None]:
+    shift = torch.from_numpy(member.color_shift) if member.color_shift.size else None
+    return torch.from_numpy(member.means), torch.from_numpy(member.opacity), shift
+
+
+def attack_varied(
+    lower: np.ndarray,
+    upper: np.ndarray,
+    box: ParameterBox,
+    varied: VariedSplats,
+    shows: list[Show],
+    scene: SplatScene,
+    poses: PoseSet,
+    rasteriser: Rasteriser,
+    *,
+    members: int = 40,
+    targets: int = 12,
+    seed: int = 0,
+) -> VariedAttack:
+    """Attack the abstract image [lower, upper] of the poses of ``box`` and the scenes of ``varied``.
+
+    Args:
+        lower, upper: [H, W, 3]; compared as they are.
+        box: Parameters of the poses; d = 0 is one pose.
+        varied: The scenes.
+        shows: Renderers; every picture of every one must lie inside.
+        scene, poses, rasteriser: What the reference renderer differentiates.
+        members: Scenes rendered without gradients, each at a pose.
+        targets: Pixel channels that gradients push, each along ``4`` signed steps.
+        seed: Decides every random choice.
+    """
+    lower, upper = np.asarray(lower, np.float64), np.asarray(upper, np.float64)
+    generator = np.random.default_rng(seed)
+    record = VariedAttack(np.full(lower.shape, np.inf), np.full(lower.shape, -np.inf))
+    seen: list[tuple[Float64Array, Splats]] = []
+    least_at, most_at = np.zeros(lower.shape, np.int64), np.zeros(lower.shape, np.int64)
+
+    def compare(values: Float64Array, member: Splats, strategy: str) -> None:
+        number = len(seen)
+        seen.append((values, member))
+        for show in shows:
+            picture = np.asarray(show(values, member), np.float64)
+            outside = ~((lower <= picture) & (picture <= upper))
+            record.pictures[strategy] = record.pictures.get(strategy, 0) + 1
+            record.comparisons += picture.size
+            if outside.any():
+                record.violations += int(outside.sum())
+                distance = np.maximum(lower - picture, picture - upper)[outside]
+                record.amount = max(record.amount, float(np.nan_to_num(distance, nan=np.inf, posinf=np.inf).max()))
+            least_at[picture < record.least], most_at[picture > record.most] = number, number
+            record.least, record.most = np.fmin(record.least, picture), np.fmax(record.most, picture)
+
+    corners = box.corners() if box.dimensions else np.empty((0, 0))
+    for k, member in enumerate(itertools.islice(varied.members(generator), members)):
+        at_corner = k % 3 == 1 and len(corners)
+        values = corners[generator.integers(len(corners))] if at_corner else box.sample(1, generator)[0]
+        compare(box.middle if k % 3 == 0 else values, member, "members")
+    compare(box.middle, varied.nearest, "nearest")
+    slopes = _Slopes(scene, poses, rasteriser, varied, box)
+    for number in range(targets):
+        row, column, channel, sign = _target(record, lower, upper, number, generator)
+        values, member = seen[(most_at if sign > 0.0 else least_at)[row, column, channel]]
+        for step in range(_STEPS):
+            # a full step to the ends first, then steps of half the rest
+            values, member = slopes.push(values, member, (row, column, channel), sign, 2.0 if step == 0 else 0.5)
+            compare(values, member, "gradient")
+    return record
+
+
+def _target(
+    record: VariedAttack, lower: Float64Array, upper: Float64Array, number: int, generator: np.random.Generator
+) -> tuple[int, int, int, float]:
+    """A pixel channel and a direction: in turn, what is closest to its bound relative to the gap, and any."""
+    sign = 1.0 if number % 2 == 0 else -1.0
+    gap = upper - lower
+    with np.errstate(divide="ignore", invalid="ignore"):
+        score = ((record.most - lower) if sign > 0.0 else (upper - record.least)) / gap
+    score[~np.isfinite(score) | (record.most <= record.least)] = -np.inf
+    order = np.argsort(-score, axis=None, kind="stable")
+    usable = max(1, int(np.isfinite(score).sum()))
+    flat = order[number // 4 % usable] if number % 4 < 2 else order[generator.integers(usable)]
+    row, column, channel = (int(v) for v in np.unravel_index(flat, lower.shape))
+    return row, column, channel, sign
+
+
+class _Slopes:
+    """Signed steps of poses and scenes along the gradient of one pixel channel."""
+
+    def __init__(
+        self, scene: SplatScene, poses: PoseSet, rasteriser: Rasteriser, varied: VariedSplats, box: ParameterBox
+    ) -> None:
+        self.reference, self.poses = Reference(scene, rasteriser), poses
+        self.varied, self.box, self.pose = varied, box, pose_twin(poses)
+
+    def push(
+        self, values: Float64Array, member: Splats, place: tuple[int, int, int], sign: float, size: float
+    ) -> tuple[Float64Array, Splats]:
+        """The pose and member after a step of ``size`` half-widths in every range, clipped into the set."""
+        varied, box = self.varied, self.box
+        leaves = [torch.from_numpy(values.copy()), *(None if t is None else t.clone() for t in _tensors(member))]
+        for leaf in leaves:
+            if leaf is not None:
+                leaf.requires_grad_(True)
+        reference = self.reference.member(leaves[1], leaves[2], leaves[3])  # pyright: ignore[reportArgumentType]
+        color = reference.pixels(self.poses.camera, self.pose(leaves[0]), torch.tensor([place[:2]]))
+        value = sign * color[0, place[2]]
+        if value.requires_grad:
+            value.backward()
+        low, high = np.array(box.lower), np.array(box.upper)
+        steps = [_sign(leaf) * size for leaf in leaves]
+        values = np.clip(values + 0.5 * steps[0] * (high - low), low, high) if values.size else values
+        means = member.means
+        if varied.mean_low.size:
+            means = means + 0.5 * steps[1] * (varied.mean_high - varied.mean_low)
+        opacity = member.opacity + 0.5 * steps[2] * (varied.opacity_high - varied.opacity_low)
+        shift = member.color_shift
+        if varied.color_low.size:
+            shift = shift + 0.5 * steps[3] * (varied.color_high - varied.color_low)
+        return values, varied.at(means, opacity, shift)
+
+
+def _sign(leaf: torch.Tensor | None) -> Float64Array:
+    """The gradient's signs; 0 where there is none."""
+    if leaf is None or leaf.grad is None:
+        return np.zeros(1 if leaf is None else tuple(leaf.shape))
+    return np.sign(np.nan_to_num(leaf.grad.numpy()))
+
+
+def check_varied(
+    load_config: str | os.PathLike[str],
+    camera_path: str | os.PathLike[str],
+    spec: Mapping[str, Any],
+    frame: int,
+    cells: int = 1,
+    *,
+    members: int = 40,
+    targets: int = 12,
+    reference: bool = True,
+    seed: int = 0,
+    downscale_factor: float = 1,
+    arithmetic: str = "real",
+    rasteriser: Rasteriser = GSPLAT_1_4_0,
+) -> dict[str, Any]:
+    """Bound one frame over a set of poses and scenes, cell by cell, and attack every cell's own bounds.
+
+    Args:
+        load_config: config.yml, run folder or .ply.
+        camera_path: The viewer's JSON.
+        spec: A perturbation object with the key "scene".
+        frame: Number of the entry of the camera path.
+        cells: Equal parts along the first parameter of the poses, if there is any.
+        members, targets: See `attack_varied`; of every cell.
+        reference: Whether the reference renderer's pictures are compared besides the compiled one's.
+        seed: Decides every random choice.
+        downscale_factor: Images become this many times smaller.
+        arithmetic: "real" or "float32".
+        rasteriser: The rules.
+
+    Returns:
+        Counts of Gaussians that vary, mean and largest pixel gap of the bounds (``mpg``, ``xpg``) and of the
+        pictures (``mpg_witness``, ``xpg_witness``), ``pictures``, ``comparisons``, ``violations``, ``amount``.
+
+    Raises:
+        InputError: A file or a field in it cannot be used, or an entry picks no Gaussian.
+    """
+    scene = load_scene(load_config)
+    path = load_camera_path(camera_path, downscale_factor)
+    perturbation = parse_perturbation(dict(spec))
+    poses = PoseSet.around(path.cameras[frame], perturbation, path.following(frame))
+    splats = activate(scene, rasteriser)
+    varied = vary(scene, splats, perturbation.scene)
+    boxes = equal_cells(poses.box, cells) if poses.box.dimensions else [poses.box]
+    order = 2 if poses.box.dimensions <= 1 else 1
+    bounds, _ = bound_cells(
+        scene, poses, boxes, rasteriser=rasteriser, arithmetic=arithmetic, order=order, varied=varied
+    )
+    shows = [show_compiled(Renderer(splats, rasteriser), poses)]
+    if reference:
+        shows.append(show_reference(Reference(scene, rasteriser), poses))
+    attacks = [
+        attack_varied(
+            lower, upper, box, varied, shows, scene, poses, rasteriser,
+            members=members, targets=targets, seed=seed + number,
+        )
+        for number, (box, (lower, upper)) in enumerate(zip(boxes, bounds, strict=True))
+    ]  # fmt: skip
+    outer = np.max([b[1] for b in bounds], axis=0).astype(np.float64) - np.min([b[0] for b in bounds], axis=0)
+    inner = np.max([a.most for a in attacks], axis=0) - np.min([a.least for a in attacks], axis=0)
+    gap, seen = np.linalg.norm(outer, axis=-1), np.linalg.norm(inner, axis=-1)
+    return {
+        "scene": scene.name,
+        "gaussians": scene.count,
+        "varied": varied.counts,
+        "size": [poses.camera.width, poses.camera.height],
+        "parameters": list(poses.box.names),
+        "mpg": float(gap.mean()),
+        "xpg": float(gap.max()),
+        "mpg_witness": float(seen.mean()),
+        "xpg_witness": float(seen.max()),
+        "pictures": sum(sum(a.pictures.values()) for a in attacks),
+        "comparisons": sum(a.comparisons for a in attacks),
+        "violations": sum(a.violations for a in attacks),
+        "amount": max(a.amount for a in attacks),
+    }
