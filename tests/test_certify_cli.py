@@ -34,7 +34,7 @@ from ns_abstract.verify.network import OutputBounds
 
 MODULE = "ns_abstract.cli.certify"
 SIZE = 16
-RUNS = Path(os.environ.get("NS_ABSTRACT_SHARED", "../shared")) / "runs"
+
 PRE = {"resize": [SIZE, SIZE], "mean": [0.4, 0.45, 0.5], "std": [0.25, 0.25, 0.3]}
 SWEEP = {"version": 1, "translation": {"x": 0.15}}
 
