@@ -251,12 +251,12 @@ class NerfBounds:
             widest[axis] *= 0.5
         return Division(tuple(axes), d)
 
-    def learn(self, tried: int, halved: int) -> None:
-        """Widen or narrow the starting cells from how many of those ``tried`` had to be halved."""
-        share = halved / max(1, tried)
+    def learn(self, tried: int, lost: int, widen: bool) -> None:
+        """Narrow the starting cells if many of those ``tried`` were lost, or ``widen`` them if few were."""
+        share = lost / max(1, tried)
         if share > 0.2:
             self.reach *= 0.85
-        elif share < 0.1:
+        elif widen and share < 0.1:
             self.reach *= 1.08
 
 
@@ -336,8 +336,12 @@ class _Work:
             members = self._level(level)[2]
             bright = self.light[:, members].max(axis=2) > self._dark  # [n, cells]
             item, cell = np.nonzero(bright[ray])
+            if not item.size:
+                continue
             waiting[level] = [_Items(ray[item], block[place[item]], cell)]
         tried = sum(len(items) for parts in waiting.values() for items in parts)
+        # cells that the box itself makes narrow do not show what wider ones would bear
+        wide = any(level > 0 for level in waiting)
         halved = 0
         for level in range(self.division.levels + 1):
             if level not in waiting:
@@ -356,7 +360,7 @@ class _Work:
             finer = _Items(np.tile(coarse.ray, 2), np.tile(coarse.sample, 2), children)
             waiting.setdefault(level + 1, []).append(finer)
         if tried >= 32:
-            self.owner.learn(tried, halved)
+            self.owner.learn(tried, halved, wide)
 
     def _bound_batch(self, level: int, items: _Items) -> tuple[np.ndarray, np.ndarray]:
         """Bound some cells of one level; returns [k] which are worth halving, and for which of them all was lost."""
@@ -389,7 +393,9 @@ class _Work:
         self._keep(self.alpha_low, self.alpha_high, rows, low_a, high_a)
         halve = (open_ * light).max(axis=1) > self.tolerance
         shines = (high_a * light).max(axis=1) > self.tolerance
-        coloured = np.flatnonzero(shines & ~halve & ~density.failed.cpu().numpy())
+        # what is halved gets its colours from the halves, if there are any
+        final = ~halve | (level == self.division.levels)
+        coloured = np.flatnonzero(shines & final & ~density.failed.cpu().numpy())
         if coloured.size:
             vague = self._color(pieces, items.take(coloured), coloured, there, bernstein, rows, high_a * light)
             halve[coloured] |= vague
