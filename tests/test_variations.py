@@ -402,7 +402,8 @@ def test_command(poses: dict, make_blobs, tmp_path: Path, monkeypatch: pytest.Mo
         assert (lower <= result["witness_lower"]).all() and (result["witness_upper"] <= upper).all()
         assert (result["witness_upper"] - result["witness_lower"]).max() > 0.1
     job = Job(Settings(inputs.config, inputs.path, inputs.spec))
-    varied, pose_set = job.varied(0), job.pose_sets[0]
+    pose_set = job.pose_sets[0]
+    varied = job.splat.varied(pose_set.perturbation.scene)
     text = f"the opacity of {varied.counts['opacity']} of 50 Gaussians varies"
     report = json.loads((tmp_path / "out" / "report.json").read_text())
     assert 0 < varied.counts["opacity"] < 40 and text in " ".join(report["frames"][0]["plan"])

@@ -35,6 +35,8 @@ _BLOCK = 8
 #: Halvings below cells of the starting width, by number of parameters (one level may concern any axis).
 _DEEPER = {0: 0, 1: 4}
 _DEEPER_MORE = 6
+#: Halvings of the deepest cells into parts, by axis.
+_FINER = {1: 2, 2: 1}
 #: Most parts of one box.
 _PARTS = 4096
 #: Light (in [0, 1]) that a skipped sample may add, as a share of the tolerance.
@@ -243,13 +245,14 @@ class NerfBounds:
             axes.append(axis)
             widest[axis] *= 0.5
         deeper = _DEEPER.get(d, _DEEPER_MORE)
-        if 1 << (len(axes) + deeper) > _PARTS:
+        finer = _FINER.get(d, 0)
+        if 1 << (len(axes) + deeper + d * finer) > _PARTS:
             return None
         for _ in range(deeper):
             axis = int(np.argmax(widest))
             axes.append(axis)
             widest[axis] *= 0.5
-        return Division(tuple(axes), d)
+        return Division(tuple(axes), d, finer)
 
     def learn(self, tried: int, lost: int, widen: bool) -> None:
         """Narrow the starting cells if many of those ``tried`` were lost, or ``widen`` them if few were."""
@@ -372,7 +375,8 @@ class _Work:
         lines = pencil.origin + t[:, None, None] * pencil.direction[items.ray]
         radius = pencil.origin_radius + t[:, None] * pencil.direction_radius[items.ray]
         # rounding of the polynomial's evaluation, and of the concrete renderer's point
-        radius = radius + 96.0 * UNIT64 * (np.abs(pencil.origin).sum(axis=0) + t[:, None] * 2.0)
+        size = np.abs(pencil.origin).sum(axis=0) + t[:, None] * np.abs(pencil.direction[items.ray]).sum(axis=1)
+        radius = radius + 40.0 * UNIT64 * size
         there = monomials[torch.from_numpy(items.cell).to(device)]
         nodes = there @ torch.from_numpy(lines).to(device)
         encoded = field.encode(nodes, torch.from_numpy(radius).to(device), field.weights.position)
@@ -457,8 +461,13 @@ def _parts(value: Affine, bernstein: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Bounds [B, parts, n] of an affine batch on every part of its cell, and its radius [B, n]."""
     error = value.radius
     controls = torch.einsum("pkm,bmn->bpkn", bernstein, value.poly)
-    slack = (error + ROUNDING * value.poly.abs().sum(dim=1) * 64.0)[:, None]
-    return controls.amin(dim=2) - slack, controls.amax(dim=2) + slack, error
+    # on parts that are nearly the whole cell, Bernstein coefficients of high degrees are far from the values
+    spread = value.poly[:, 1:].abs().sum(dim=1)[:, None]
+    middle = value.poly[:, :1]
+    low = torch.maximum(controls.amin(dim=2), middle - spread)
+    high = torch.minimum(controls.amax(dim=2), middle + spread)
+    slack = (error + ROUNDING * (value.poly.abs().sum(dim=1) * bernstein.abs().amax()))[:, None]
+    return low - slack, high + slack, error
 
 
 def opacity(z: Tensor, length: Tensor, *, up: bool) -> Tensor:

@@ -20,7 +20,7 @@ from ns_abstract.sets.tiles import tile_grid
 #: What an open sample may move a pixel by on boxes a quarter as wide as the set, as a part of the pixels' mean
 #: variation over the set; less on narrower boxes.
 _TOLERANCE = 0.12
-_MOST_TOLERANCE, _LEAST_TOLERANCE = 0.03, 1e-5
+_MOST_TOLERANCE, _LEAST_TOLERANCE = 0.03, 5e-4
 #: Rays and poses rendered to estimate that variation.
 _LOOK_RAYS, _LOOK_POSES = 256, 7
 #: Weights that are multiplied in one call of `NerfFrame.bound`, in units of rays times weights.
