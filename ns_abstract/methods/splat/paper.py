@@ -129,6 +129,7 @@ def bound(
     inverse: Inverse = "matrixinv",
     blend: Blend = "vr-ind",
     order: int = 2,
+    linear: bool = True,
 ) -> Enclosure:
     """Bounds of Algorithm 1 over all poses of ``forms``, by the paper's rules.
 
@@ -141,6 +142,7 @@ def bound(
         blend: "vr-ind" (Algorithm 4), "sort" (Algorithm 1, lines 13-18, one by one), or "sumcumprod"
             (Algorithm 5), which needs one depth order for all poses.
         order: Taylor order of MATRIXINV.
+        linear: Whether opacities keep their linear part; without it they are intervals.
 
     Returns:
         Enclosures [P, 3] of the real-number picture.
@@ -159,7 +161,8 @@ def bound(
         if mean.range.upper[2] < PAPER.near or mean.range.lower[2] > PAPER.far:
             continue
         opacity = float(splats.opacity[i])
-        alphas.append(_alpha(splats.axes[i], mean, opacity, rotation, camera, u, inverse, order))
+        alpha = _alpha(splats.axes[i], mean, opacity, rotation, camera, u, inverse, order)
+        alphas.append(alpha if linear else Enclosure.of(alpha.basis, alpha.range))
         means.append(mean)
         colors.append(splats.sh[i, 0])
     if not alphas:

@@ -1,0 +1,161 @@
+"""Our bounds against those of the paper's rules, on the same Gaussians, pixels and cells.
+
+The cost of the paper's depth-order rule grows with the square of the number of Gaussians, so each pixel gets
+a scene of its own: the Gaussians that give it most of its light.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+
+from ns_abstract.arithmetic.forms import Float64Array
+from ns_abstract.arithmetic.rules import Enclosure
+from ns_abstract.arithmetic.units import REAL
+from ns_abstract.bench.sets import pose_set
+from ns_abstract.methods.splat import paper
+from ns_abstract.methods.splat.activate import Splats, activate
+from ns_abstract.methods.splat.bounds import SplatBounds
+from ns_abstract.methods.splat.constants import PAPER
+from ns_abstract.pipeline import Job
+from ns_abstract.sets.box import ParameterBox
+from ns_abstract.sets.path import Camera
+from ns_abstract.sets.poses import PoseSet
+
+#: Poses rendered for the range that the bounds are compared with.
+_SAMPLES = 33
+#: Gaussians fainter than this at a pixel are no part of its scene.
+_FAINT = 1e-3
+
+#: The paper's rules, and what they are without one of their parts.
+PAPER_RULES: dict[str, dict[str, object]] = {
+    "MATRIXINV, VR-IND": {},
+    "adjugate, VR-IND": {"inverse": "adjugate"},
+    "MATRIXINV, sorting": {"blend": "sort"},
+    "MATRIXINV, VR-IND, interval alpha": {"linear": False},
+}
+
+
+def weights_at(splats: Splats, camera: Camera, rotation: Float64Array, position: Float64Array, u: Float64Array):
+    """[N] share of the light at the point ``u`` [2] that each Gaussian takes, by Algorithm 1."""
+    x, y, z = ((splats.means - position) @ rotation.T).T
+    seen = np.flatnonzero((z >= PAPER.near) & (z <= PAPER.far))
+    x, y, z = x[seen], y[seen], z[seen]
+    axes = np.einsum("ij,njk->nik", rotation, splats.axes[seen])
+    rows = [
+        focal / z[:, None] * (axes[:, k] - (side / z)[:, None] * axes[:, 2])
+        for k, (focal, side) in enumerate(((camera.fx, x), (camera.fy, y)))
+    ]
+    a, b, c = ((p * q).sum(axis=1) for p, q in ((rows[0], rows[0]), (rows[0], rows[1]), (rows[1], rows[1])))
+    dx, dy = u[0] - camera.fx * x / z - camera.cx, u[1] - camera.fy * y / z - camera.cy
+    with np.errstate(all="ignore"):
+        q = (c * dx * dx - 2.0 * b * dx * dy + a * dy * dy) / (a * c - b * b)
+        alpha = np.nan_to_num(splats.opacity[seen] * np.exp(-0.5 * q))
+    order = np.argsort(z, kind="stable")
+    light = np.concatenate([[1.0], np.cumprod(1.0 - alpha[order])[:-1]])
+    weights = np.zeros(splats.count)
+    weights[seen[order]] = light * alpha[order]
+    return weights
+
+
+def _pixel_camera(camera: Camera, column: int, row: int) -> Camera:
+    """A camera of one pixel, whose centre is that of ``camera``'s pixel (column, row)."""
+    return replace(camera, cx=camera.cx - column, cy=camera.cy - row, width=1, height=1)
+
+
+def _own(splats: Splats, camera: Camera, poses: PoseSet, cell: ParameterBox) -> tuple[Float64Array, Float64Array]:
+    """[3] lower and upper ends of the only pixel, by the compiled stages."""
+    bounds = SplatBounds(splats, PAPER, REAL)
+    found = bounds.cell(camera, poses.enclosure(cell, 2 if cell.dimensions == 1 else 1))
+    return found.lower[0, 0, 0], found.upper[0, 0, 0]
+
+
+def compare(
+    job: Job, name: str, frame: int, parts: int, pixels: int, most: int, seed: int = 0
+) -> list[dict[str, object]]:
+    """Mean gaps of all rules over sampled pixels, for the middle one of ``parts`` equal cells of a set.
+
+    Args:
+        job: The scene.
+        name: Set of poses.
+        frame: Entry of the camera path.
+        parts: Cells by axis that the set is cut into.
+        pixels: Pixels drawn from those where Gaussians take at least half of the light.
+        most: Gaussians of a pixel's scene: those with the largest weights at the cell's middle.
+        seed: Of the draw.
+
+    Returns:
+        One row for each rule: gap (length over RGB) relative to that of renders within the cell, its
+        largest value over the pixels, and milliseconds by pixel.
+    """
+    splats = activate(job.scene, PAPER)
+    poses = pose_set(job, name, frame)
+    cell = poses.box
+    for axis in range(cell.dimensions):
+        cell = cell.split(axis, parts)[parts // 2]
+    camera, random = poses.camera, np.random.default_rng(seed)
+    places = random.permutation(camera.width * camera.height)
+    rules: dict[str, Callable[[Splats, Camera], tuple[Float64Array, Float64Array]]] = {
+        "ours": lambda scene, view: _own(scene, view, poses, cell)
+    }
+    forms = poses.enclosure(cell, 1)
+    for rule, options in PAPER_RULES.items():
+
+        def by_rule(scene: Splats, view: Camera, options: dict = options) -> tuple[Float64Array, Float64Array]:
+            found: Enclosure = paper.bound(scene, view, forms, **options)
+            low, high = found.bounds()
+            return np.clip(low[0], 0.0, 1.0), np.clip(high[0], 0.0, 1.0)
+
+        rules[rule] = by_rule
+    gaps: dict[str, list[float]] = {rule: [] for rule in ("renders", *rules)}
+    seconds = dict.fromkeys(rules, 0.0)
+    outside = dict.fromkeys(rules, 0)
+    counts: list[int] = []
+    for place in places.tolist():
+        row, column = divmod(place, camera.width)
+        view = _pixel_camera(camera, column, row)
+        weights = weights_at(splats, view, *poses.world_to_camera(cell.middle), np.array([0.5, 0.5]))
+        chosen = np.sort(np.argsort(-weights, kind="stable")[:most])
+        chosen = chosen[weights[chosen] >= _FAINT]
+        if weights[chosen].sum() < 0.5:
+            continue
+        scene = replace(
+            splats, means=splats.means[chosen], axes=splats.axes[chosen], opacity=splats.opacity[chosen],
+            sh=splats.sh[chosen],
+        )  # fmt: skip
+        draws = [*cell.corners(), *cell.sample(_SAMPLES, random)]
+        shown = np.stack([paper.render(scene, view, *poses.world_to_camera(values))[0] for values in draws])
+        shown = np.clip(shown, 0.0, 1.0)
+        least, greatest = shown.min(axis=0), shown.max(axis=0)
+        gaps["renders"].append(float(np.linalg.norm(greatest - least)))
+        counts.append(chosen.size)
+        for rule, bounded in rules.items():
+            started = time.process_time()
+            low, high = bounded(scene, view)
+            seconds[rule] += time.process_time() - started
+            gaps[rule].append(float(np.linalg.norm(high - low)))
+            # renders are rounded, bounds are of real numbers
+            outside[rule] += int((least < low - 1e-12).any() or (greatest > high + 1e-12).any())
+        if len(counts) == pixels:
+            break
+    inner = float(np.mean(gaps["renders"]))
+    return [
+        {
+            "scene": job.scene.name,
+            "size": f"{camera.width}x{camera.height}",
+            "set": name,
+            "cell": f"1/{parts}",
+            "Gaussians": float(np.mean(counts)),
+            "rules": rule,
+            "renders' gap": inner,
+            "gap": float(np.mean(gaps[rule])),
+            "gap / renders'": float(np.mean(gaps[rule])) / inner,
+            "largest gap": max(gaps[rule]),
+            "ms by pixel": 1e3 * seconds[rule] / len(counts),
+            "violations": outside[rule],
+        }
+        for rule in rules
+    ]
