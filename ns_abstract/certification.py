@@ -26,7 +26,7 @@ from ns_abstract.sets.perturbation import Perturbation
 from ns_abstract.sets.tiles import assemble
 from ns_abstract.sets.twin import pose_twin
 from ns_abstract.verify.cells import Cell, Grid, coarse_parts
-from ns_abstract.verify.network import ImageSets, Network, OutputBounds, bound_outputs, load_network
+from ns_abstract.verify.network import ImageSets, Network, OutputBounds, Substitution, bound_outputs, load_network
 from ns_abstract.verify.preprocess import Preprocess
 from ns_abstract.verify.properties import Claim, Property, Query, load_property
 from ns_abstract.verify.search import BLOCK, Findings, Search
@@ -151,13 +151,15 @@ class NetworkModel:
     def input_sets(self, linear: tuple[np.ndarray, ...], lower: np.ndarray, upper: np.ndarray) -> ImageSets:
         return self.preprocess.sets((linear[0], linear[1], linear[2], linear[3]), lower, upper)
 
-    def bound(self, images: ImageSets, query: Query) -> OutputBounds:
+    def bound(self, images: ImageSets, query: Query, substitution: Substitution = "everywhere") -> OutputBounds:
         d = images.dimensions
         if not d:
             # a single pose is a set whose one parameter moves nothing
             still = np.zeros((*images.b_lower.shape, 1))
             images = dataclasses.replace(images, a_lower=still, a_upper=still)
-        found = bound_outputs(self.network, images, query.rows, query.offset, memory=self.memory)
+        found = bound_outputs(
+            self.network, images, query.rows, query.offset, substitution=substitution, memory=self.memory
+        )
         return found if d else dataclasses.replace(found, a=found.a[..., :0])
 
 
