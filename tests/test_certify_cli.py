@@ -21,12 +21,14 @@ import pytest
 import torch
 from certifying import classifier, linear
 from conftest import Inputs, write_json
+from nerfs import tiny_scene
 
 from ns_abstract import certification
 from ns_abstract.certification import Certification, CertifySettings, examine_block
 from ns_abstract.cli import certify as certify_command
 from ns_abstract.cli import certifying
 from ns_abstract.cli.certify import Certify, certify
+from ns_abstract.demo.nerf_runs import write_nerf_run
 from ns_abstract.demo.writing import write_demo
 from ns_abstract.engines import Here, Processes
 from ns_abstract.errors import InputError
@@ -545,8 +547,11 @@ def test_report(planted: Case, finished: Path) -> None:
     assert document["trace"][-1]["certified"] == pytest.approx(document["coverage"]["certified"])
 
 
-def test_substitutions_are_compared(blobs: Inputs, net: Path, tmp_path: Path) -> None:
+def test_substitutions_are_compared(
+    blobs: Inputs, net: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Half-widths that any way certifies hold under attack, and the way of the verdicts gives no smaller ones."""
+    monkeypatch.setattr(certifying, "_COMPARE_LEAST", 120.0)
     spec = {"version": 1, "translation": {"x": 0.02}}
     case = Case(tmp_path / "case", blobs, net, {"type": "classification", "label": 0, "preprocess": PRE}, spec)
     pictures = case.job.pictures(0)
@@ -688,6 +693,27 @@ def test_partition_that_does_not_fit(
     prop = {"type": "classification", "label": 0, "preprocess": PRE, "partitions": [3, 4]}
     code, said = call(Case(tmp_path / "case", blobs, net, prop).options(tmp_path / "out"))
     assert code == 2 and "prop.json: partitions" in said
+
+
+def test_nerf_is_refused(
+    blobs: Inputs, net: Path, call: Callable[..., tuple[int, str]], tmp_path: Path
+) -> None:
+    config = write_nerf_run(tiny_scene(0), tmp_path / "runs", timestamp="2026-01-01_000000", experiment_name="tiny")
+    prop = {"type": "classification", "label": 0, "preprocess": PRE}
+    case = Case(tmp_path / "case", Inputs(config, blobs.path, tmp_path / "unused"), net, prop)
+    code, said = call(case.options(tmp_path / "out"))
+    assert code == 2 and said.count("\n") == 1
+    for fragment in ("config.yml", "certificates are for splats", "vanilla NeRF", "give a run of splatfacto"):
+        assert fragment in said
+
+
+def test_scene_variations_are_refused(
+    blobs: Inputs, net: Path, call: Callable[..., tuple[int, str]], tmp_path: Path
+) -> None:
+    spec = SWEEP | {"scene": [{"select": {"box": [[-1, -1, -1], [1, 1, 1]]}, "color": 0.1}]}
+    case = Case(tmp_path / "case", blobs, net, {"type": "classification", "label": 0, "preprocess": PRE}, spec)
+    code, said = call(case.options(tmp_path / "out"))
+    assert code == 2 and "spec.json: scene" in said and "sets of poses" in said
 
 
 def test_help_is_quick_and_light() -> None:

@@ -68,7 +68,7 @@ class _Run:
     def _about(self) -> CertifiedRun:
         job, prop = self.job, self.job.property
         return CertifiedRun(
-            guarantee=f"{self.options.arithmetic}-sound",
+            guarantee=job.job.method.guarantee,
             network_guarantee=tuple(job.network.guarantee),
             renderer={"name": job.job.rasteriser.name, "version": job.job.rasteriser.version},
             scene=job.job.describe(),
