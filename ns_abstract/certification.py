@@ -18,6 +18,7 @@ from ns_abstract.arithmetic.selfcheck import check_functions
 from ns_abstract.errors import InputError
 from ns_abstract.jsonio import load_json
 from ns_abstract.methods.splat.frame import SplatFrame
+from ns_abstract.methods.splat.method import SplatMethod
 from ns_abstract.methods.splat.reference import Reference
 from ns_abstract.pipeline import Job, Settings
 from ns_abstract.report.record import file_stamp
@@ -26,7 +27,7 @@ from ns_abstract.sets.perturbation import Perturbation
 from ns_abstract.sets.tiles import assemble
 from ns_abstract.sets.twin import pose_twin
 from ns_abstract.verify.cells import Cell, Grid, coarse_parts
-from ns_abstract.verify.network import ImageSets, Network, OutputBounds, bound_outputs, load_network
+from ns_abstract.verify.network import ImageSets, Network, OutputBounds, Substitution, bound_outputs, load_network
 from ns_abstract.verify.preprocess import Preprocess
 from ns_abstract.verify.properties import Claim, Property, Query, load_property
 from ns_abstract.verify.search import BLOCK, Findings, Search
@@ -51,8 +52,8 @@ class CertifySettings:
         model: Network, .onnx or .pt2.
         property: PROP.json.
         perturbation_filename: Perturbation JSON; None: the camera path holds it.
-        renderer: "gsplat" or "paper".
-        arithmetic: "float32" or "real".
+        renderer: "gsplat" or "paper"; None: gsplat.
+        arithmetic: "float32" or "real"; None: float32.
         memory: Bytes for the bounds of one process.
     """
 
@@ -61,8 +62,8 @@ class CertifySettings:
     model: Path
     property: Path
     perturbation_filename: Path | None = None
-    renderer: str = "gsplat"
-    arithmetic: str = "float32"
+    renderer: str | None = None
+    arithmetic: str | None = None
     memory: int = 1 << 30
 
     def absolute(self) -> CertifySettings:
@@ -151,13 +152,15 @@ class NetworkModel:
     def input_sets(self, linear: tuple[np.ndarray, ...], lower: np.ndarray, upper: np.ndarray) -> ImageSets:
         return self.preprocess.sets((linear[0], linear[1], linear[2], linear[3]), lower, upper)
 
-    def bound(self, images: ImageSets, query: Query) -> OutputBounds:
+    def bound(self, images: ImageSets, query: Query, substitution: Substitution = "everywhere") -> OutputBounds:
         d = images.dimensions
         if not d:
             # a single pose is a set whose one parameter moves nothing
             still = np.zeros((*images.b_lower.shape, 1))
             images = dataclasses.replace(images, a_lower=still, a_upper=still)
-        found = bound_outputs(self.network, images, query.rows, query.offset, memory=self.memory)
+        found = bound_outputs(
+            self.network, images, query.rows, query.offset, substitution=substitution, memory=self.memory
+        )
         return found if d else dataclasses.replace(found, a=found.a[..., :0])
 
 
@@ -185,6 +188,12 @@ class Certification:
             resize=size if self.property.preprocess.resize is not None else None,
         )
         self.job = Job(job_settings, default=Perturbation())
+        if not isinstance(self.job.method, SplatMethod):
+            raise InputError(
+                f"certificates are for splats, this run is a {self.job.method.content}",
+                file=settings.load_config,
+                fix="give a run of splatfacto or a .ply; ns-abstract-render bounds the pictures of a NeRF",
+            )
         if any(perturbation.scene for perturbation in self.job.perturbations):
             raise InputError(
                 "certificates are for sets of poses",

@@ -10,7 +10,7 @@ import multiprocessing
 import os
 import secrets
 import signal
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from multiprocessing.connection import Connection, wait
 from typing import Any, NamedTuple, Protocol
@@ -266,24 +266,3 @@ def connected(address: str | None, workers: int = 1) -> Iterator[Any]:
         ) from None
     with client:
         yield client
-
-
-def spread(
-    engine: Engine, tasks: Sequence[tuple[int, Task]], seconds: float, stop: Callable[[], bool]
-) -> Iterator[tuple[int, Any]]:
-    """Results of independent tasks as they come, until all are there or ``stop`` says so.
-
-    Args:
-        engine: Where.
-        tasks: Numbers and tasks.
-        seconds: Between looks at ``stop``.
-        stop: True gives up what is not finished.
-    """
-    for key, (function, arguments) in tasks:
-        engine.submit(key, function, *arguments)
-    left = len(tasks)
-    while left and not stop():
-        for key, value in engine.collect(seconds):
-            left -= 1
-            yield key, value
-    engine.close()

@@ -21,10 +21,15 @@ from ns_abstract.methods.splat.activate import Splats
 from ns_abstract.methods.splat.constants import Rasteriser
 from ns_abstract.methods.splat.method import SplatMethod
 from ns_abstract.refine.engine import Goal, Refinement
-from ns_abstract.refine.result import FrameResult, TracePoint
+from ns_abstract.refine.result import FrameResult, PartResult, TracePoint, joined
 from ns_abstract.sets.path import CameraPath, load_camera_path
 from ns_abstract.sets.perturbation import Perturbation, load_perturbation, parse_perturbation
 from ns_abstract.sets.poses import PoseSet
+
+#: Shortest time that a frame is given once it is begun.
+LEAST_SECONDS = 0.01
+#: Bytes for leaves below which nothing can be done.
+_LEAST_LEAF_BYTES = 64 << 20
 
 
 @dataclass(frozen=True)
@@ -222,16 +227,17 @@ class Job:
         return int(0.8 * free) if free is not None else 8 << 30
 
     @property
-    def _base_bytes(self) -> int:
+    def base_memory(self) -> int:
+        """Bytes that a process needs beside the leaves."""
         return self.method.memory(max(camera.width * camera.height for camera in self.path.cameras))
 
     def _check_memory(self) -> None:
         limit = self.settings.memory_limit
         if limit is not None and not 0.0 < limit < float("inf"):
             raise InputError(f"found {limit}", field="--memory-limit", fix="give a positive number of GiB")
-        if self._base_bytes > self.memory:
+        if self.base_memory > self.memory:
             raise InputError(
-                f"{self.method.content} at this size needs {self._base_bytes / 2**30:.1f} GiB, "
+                f"{self.method.content} at this size needs {self.base_memory / 2**30:.1f} GiB, "
                 f"{self.memory / 2**30:.1f} GiB may be used",
                 field="--memory-limit",
                 fix="raise it, or raise --downscale-factor",
@@ -239,7 +245,11 @@ class Job:
 
     def goal(self, ratio: float, seconds: float, cells: int | None = None) -> Goal:
         """The goal with the memory that is left for leaves."""
-        return Goal(ratio, seconds, cells, max(64 << 20, (self.memory - self._base_bytes) // 2))
+        return Goal(ratio, seconds, cells, self.leaf_bytes(1))
+
+    def leaf_bytes(self, processes: int) -> int:
+        """Bytes for the leaves that ``processes`` on one machine may have together."""
+        return max(processes * _LEAST_LEAF_BYTES, (self.memory - processes * self.base_memory) // 2)
 
     def frame(self, index: int) -> Any:
         """Frame ``index``, ready for refinement."""
@@ -261,13 +271,43 @@ class Job:
         progress: Callable[[TracePoint, float], None] = lambda point, share: None,
     ) -> FrameResult:
         """Refine frame ``index``."""
+        return self.joined([self.bound_part(index, goal, keep_leaves=keep_leaves, stopped=stopped, progress=progress)])
+
+    def bound_part(
+        self,
+        index: int,
+        goal: Goal,
+        tiles: np.ndarray | None = None,
+        *,
+        keep_leaves: bool = False,
+        stopped: Callable[[], bool] = lambda: False,
+        progress: Callable[[TracePoint, float], None] = lambda point, share: None,
+    ) -> PartResult:
+        """Refine some tiles of frame ``index``, or all of them."""
         frame = self.frame(index)
         refinement = Refinement(
             frame, index, goal, seed=self.settings.seed, keep_leaves=keep_leaves, stopped=stopped, progress=progress,
-            members=frame.members(self.settings.seed),
+            members=frame.members(self.settings.seed), tiles=tiles,
         )  # fmt: skip
-        result = refinement.run()
-        plan = self.method.frame_plan(frame, refinement.shown, result.lower, result.upper)
+        return refinement.run_part()
+
+    def joined(self, parts: Sequence[PartResult]) -> FrameResult:
+        """The frame that parts make up, with what was left out for it.
+
+        Raises:
+            ValueError: Tiles are missing or there twice.
+        """
+        frame = self.frame(parts[0].index)
+        result = joined(parts, frame.camera)
+        shown = [part.shown for part in parts]
+        known = [numbers for numbers in shown if numbers is not None]
+        count = int(np.unique(np.concatenate(known)).size) if len(known) == len(shown) else None
+        plan = self.method.frame_plan(frame, count, result.lower, result.upper)
+        if len(parts) > 1:
+            plan.append(
+                f"bounded in {len(parts)} groups of tiles side by side: cells are the sum of theirs, seconds those of "
+                "the slowest"
+            )
         return replace(result, plan=tuple(plan))
 
     @property

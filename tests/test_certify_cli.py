@@ -21,11 +21,14 @@ import pytest
 import torch
 from certifying import classifier, linear
 from conftest import Inputs, write_json
+from nerfs import tiny_scene
 
 from ns_abstract import certification
 from ns_abstract.certification import Certification, CertifySettings, examine_block
 from ns_abstract.cli import certify as certify_command
+from ns_abstract.cli import certifying
 from ns_abstract.cli.certify import Certify, certify
+from ns_abstract.demo.nerf_runs import write_nerf_run
 from ns_abstract.demo.writing import write_demo
 from ns_abstract.engines import Here, Processes
 from ns_abstract.errors import InputError
@@ -544,6 +547,51 @@ def test_report(planted: Case, finished: Path) -> None:
     assert document["trace"][-1]["certified"] == pytest.approx(document["coverage"]["certified"])
 
 
+def test_substitutions_are_compared(
+    blobs: Inputs, net: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Half-widths that any way certifies hold under attack, and the way of the verdicts gives no smaller ones."""
+    monkeypatch.setattr(certifying, "_COMPARE_LEAST", 120.0)
+    spec = {"version": 1, "translation": {"x": 0.02}}
+    case = Case(tmp_path / "case", blobs, net, {"type": "classification", "label": 0, "preprocess": PRE}, spec)
+    pictures = case.job.pictures(0)
+    label = int(case.job.model.outputs(pictures.image(pictures.box.middle)[None])[0].argmax())
+    case = Case(tmp_path / "case", blobs, net, {"type": "classification", "label": label, "preprocess": PRE}, spec)
+    document = case.run(tmp_path / "out", frames=None)
+    found = document["substitution"]
+    assert found["skipped"] is None and 1 <= len(found["cells"]) <= 5 and found["seconds"] > 0.0
+    assert set(found["modes"]) == {"everywhere", "end", "box"}
+    rng = np.random.default_rng(3)
+    for cell in found["cells"]:
+        pictures = case.job.pictures(cell["frame"])
+        claim, margin, half = case.job.claim(pictures), cell["margin"], cell["half_width"]
+        assert margin["everywhere"] > 0.0 and margin["everywhere"] >= margin["box"] - 1e-6
+        middle = 0.5 * (cell["lower"][0] + cell["upper"][0])
+        assert half["everywhere"][0] >= 0.5 * (cell["upper"][0] - cell["lower"][0]) * (1 - 1e-9)
+        for width in half.values():
+            if width is None:
+                continue
+            assert width[0] <= half["everywhere"][0]
+            poses = np.clip(middle + width[0] * np.append(rng.uniform(-1, 1, 5), [-1, 1]), -0.02, 0.02)[:, None]
+            outputs = case.job.model.outputs(np.stack([pictures.image(v) for v in poses]))
+            assert (claim.margin(torch.from_numpy(outputs).double(), torch.from_numpy(poses)) > 0.0).all()
+    page = (tmp_path / "out" / "report.html").read_text()
+    assert "What the shared parameters are worth" in page and "margin, everywhere" in page
+
+
+def test_substitutions_are_not_compared(
+    blobs: Inputs, bright: tuple[Path, float, float], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    prop = {"type": "classification", "label": 0, "preprocess": PRE}
+    document = Case(tmp_path / "pose", blobs, bright[0], prop, None).run(tmp_path / "one")
+    assert "more than one pose" in document["substitution"]["skipped"] and not document["substitution"]["cells"]
+    assert "Not compared: no cell of more" in (tmp_path / "one" / "report.html").read_text()
+    monkeypatch.setattr(certifying, "_COMPARE_LEAST", 1e-9)
+    monkeypatch.setattr(certifying, "_COMPARE_SHARE", 1e-9)
+    document = Case(tmp_path / "set", blobs, bright[0], prop).run(tmp_path / "two")
+    assert "bounding one cell in 3 ways takes about" in document["substitution"]["skipped"]
+
+
 def test_page(finished: Path) -> None:
     page = (finished / "report.html").read_text()
     assert page.index("Falsified; certified on") < page.index("<h2>")
@@ -645,6 +693,27 @@ def test_partition_that_does_not_fit(
     prop = {"type": "classification", "label": 0, "preprocess": PRE, "partitions": [3, 4]}
     code, said = call(Case(tmp_path / "case", blobs, net, prop).options(tmp_path / "out"))
     assert code == 2 and "prop.json: partitions" in said
+
+
+def test_nerf_is_refused(
+    blobs: Inputs, net: Path, call: Callable[..., tuple[int, str]], tmp_path: Path
+) -> None:
+    config = write_nerf_run(tiny_scene(0), tmp_path / "runs", timestamp="2026-01-01_000000", experiment_name="tiny")
+    prop = {"type": "classification", "label": 0, "preprocess": PRE}
+    case = Case(tmp_path / "case", Inputs(config, blobs.path, tmp_path / "unused"), net, prop)
+    code, said = call(case.options(tmp_path / "out"))
+    assert code == 2 and said.count("\n") == 1
+    for fragment in ("config.yml", "certificates are for splats", "vanilla NeRF", "give a run of splatfacto"):
+        assert fragment in said
+
+
+def test_scene_variations_are_refused(
+    blobs: Inputs, net: Path, call: Callable[..., tuple[int, str]], tmp_path: Path
+) -> None:
+    spec = SWEEP | {"scene": [{"select": {"box": [[-1, -1, -1], [1, 1, 1]]}, "color": 0.1}]}
+    case = Case(tmp_path / "case", blobs, net, {"type": "classification", "label": 0, "preprocess": PRE}, spec)
+    code, said = call(case.options(tmp_path / "out"))
+    assert code == 2 and "spec.json: scene" in said and "sets of poses" in said
 
 
 def test_help_is_quick_and_light() -> None:

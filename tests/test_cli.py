@@ -682,14 +682,14 @@ def test_cluster_on_this_machine_gives_the_same(blobs: Inputs, finished: Path, t
 
 @needs_dask
 def test_worker_with_other_files_is_refused(blobs: Inputs, tmp_path: Path) -> None:
-    from ns_abstract.cli.cluster import bound_frame
+    from ns_abstract.cli.cluster import Part, bound_part
     from ns_abstract.errors import InputError
 
     job = Job(Settings(blobs.config, blobs.path, blobs.spec))
     goal = job.goal(1.5, 1.0, 2)
-    assert bound_frame(job.settings, job.fingerprint, 0, goal, False).index == 0
+    assert bound_part(job.settings, job.fingerprint, Part(0, None), goal, False).index == 0
     with pytest.raises(InputError, match="other content"):
-        bound_frame(job.settings, job.fingerprint | {"scene": "another"}, 0, goal, False)
+        bound_part(job.settings, job.fingerprint | {"scene": "another"}, Part(0, None), goal, False)
 
 
 @needs_dask

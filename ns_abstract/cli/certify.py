@@ -40,10 +40,11 @@ class Certify:
     """Seconds for all frames together. Default: 1800."""
     frames: tuple[int, ...] | None = None
     """Entries of the camera path, counted from 0. Default: all."""
-    renderer: Literal["gsplat", "paper"] = "gsplat"
-    """gsplat: what Nerfstudio shows. paper: Algorithm 1 of "Abstract Rendering" (no thresholds, RGB)."""
-    arithmetic: Literal["float32", "real"] = "float32"
-    """float32: images of every float32 evaluation. real: the real-number renderer and its float64 evaluation."""
+    renderer: Literal["gsplat", "paper"] | None = None
+    """gsplat: what Nerfstudio shows (the default). paper: Algorithm 1 of "Abstract Rendering" (no thresholds, RGB)."""
+    arithmetic: Literal["float32", "real"] | None = None
+    """float32: images of every float32 evaluation (the default). real: the real-number renderer and its float64
+    evaluation."""
     engine: Literal["local", "dask"] = "local"
     """dask: spread the cells over a Dask cluster (needs the extra "cluster")."""
     scheduler_address: str | None = None

@@ -8,7 +8,7 @@ import os
 import shutil
 import sys
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -27,9 +27,11 @@ from ns_abstract.report.certificate import CertifiedRun, certificate_document, c
 from ns_abstract.report.certificate_page import certificate_page, percent
 from ns_abstract.report.picture import preview, to_bytes
 from ns_abstract.report.record import file_stamp
+from ns_abstract.sets.box import ParameterBox
 from ns_abstract.verify.cells import Grid
 from ns_abstract.verify.search import Findings
 from ns_abstract.verify.store import Block, Store, fractions
+from ns_abstract.verify.substitution import MODES, STEP, Comparison, compare, gains, spread_by_volume
 
 if TYPE_CHECKING:
     from ns_abstract.cli.certify import Certify
@@ -39,6 +41,8 @@ _PATIENCE, _TRACE, _REPORT = 0.5, 1.0, 30.0
 #: Counterexamples in report.json by frame, and images of each kind on the page.
 _EXAMPLES, _IMAGES = 5, 6
 _PIXELS = 256
+#: Cells that are bounded in weaker ways besides, part of the time for it, and seconds that it may always take.
+_COMPARED, _COMPARE_SHARE, _COMPARE_LEAST = 5, 0.03, 1.0
 #: Most bytes for the bounds of one process.
 _BOUND_BYTES = 1 << 30
 
@@ -64,7 +68,7 @@ class _Run:
     def _about(self) -> CertifiedRun:
         job, prop = self.job, self.job.property
         return CertifiedRun(
-            guarantee=f"{self.options.arithmetic}-sound",
+            guarantee=job.job.method.guarantee,
             network_guarantee=tuple(job.network.guarantee),
             renderer={"name": job.job.rasteriser.name, "version": job.job.rasteriser.version},
             scene=job.job.describe(),
@@ -187,9 +191,46 @@ class _Run:
             file = folder / f"frame_{block.frame:05d}_{place}.npz"
             write_atomic(file, lambda stream, data=data: stream.write(data))
 
+    # ---------------------------------------------------------------- weaker bounds
+
+    def compare(self, store: Store) -> dict[str, Any]:
+        """Bound a few certified cells in weaker ways as well, in a small part of the search's time."""
+        allowed = max(_COMPARE_LEAST, _COMPARE_SHARE * store.seconds)
+        cells = [
+            (tally.frame, box)
+            for tally in store.tallies()
+            for row in store.leaves(tally.frame, "certified")
+            if (box := self._box(tally.frame, row)).dimensions
+        ]
+        if not cells:
+            return substitution_entry([], "no cell of more than one pose is certified")
+        effort = store.effort
+        each = effort["worker_seconds"] / max(1, effort["cells_bounded"]) * len(MODES)
+        if each > allowed:
+            reason = f"bounding one cell in {len(MODES)} ways takes about {each:.0f} s, {allowed:.0f} s may be used"
+            return substitution_entry([], reason)
+        found: list[tuple[int, Comparison]] = []
+        begin = time.perf_counter()
+        for number in spread_by_volume([_volume(self.grids[frame].box, box) for frame, box in cells], _COMPARED):
+            frame, box = cells[number]
+            result = compare(self.job.search(frame, self.grids[frame]), box, begin + allowed)
+            if result is None:
+                break
+            found.append((frame, result))
+        reason = None if found else f"the time for it, {allowed:.0f} s, was over before one cell was done"
+        return substitution_entry(found, reason, time.perf_counter() - begin)
+
+    def _box(self, frame: int, row: Mapping[str, Any]) -> ParameterBox:
+        """A cell that was read back."""
+        names, box = [name for name, _ in self.job.parameters], self.grids[frame].box
+        for axis, name in enumerate(box.names):
+            column = names.index(name)
+            box = box.replace(axis, row["lower"][column], row["upper"][column])
+        return box
+
     # ---------------------------------------------------------------- report
 
-    def report(self, store: Store, state: str) -> dict[str, Any]:
+    def report(self, store: Store, state: str, substitution: Mapping[str, Any] | None = None) -> dict[str, Any]:
         """Write report.json and report.html; returns the former's content."""
         rows = {tally.frame: store.leaves(tally.frame) for tally in store.tallies()}
         entries = [self._entry(tally, rows[tally.frame]) for tally in store.tallies()]
@@ -201,6 +242,7 @@ class _Run:
             seconds=store.seconds,
             effort=store.effort,
             reasons=store.reasons,
+            substitution=substitution or substitution_entry([], "made when the search ends without being interrupted"),
         )
         write_certificate(
             self.options.output_dir, document, certificate_page(document, rows, self._pictures(rows))
@@ -285,6 +327,48 @@ class _Run:
         return found
 
 
+def _volume(whole: ParameterBox, part: ParameterBox) -> float:
+    """The part of a set that a cell is."""
+    sides = zip(part.lower, part.upper, whole.lower, whole.upper, strict=True)
+    return float(np.prod([(high - low) / (most - least) for low, high, least, most in sides]))
+
+
+def substitution_entry(
+    compared: Sequence[tuple[int, Comparison]], skipped: str | None, seconds: float = 0.0
+) -> dict[str, Any]:
+    """The key ``substitution`` of report.json.
+
+    Args:
+        compared: Frames and cells.
+        skipped: Why there are none, or None.
+        seconds: Spent on them.
+    """
+
+    def entry(frame: int, found: Comparison) -> dict[str, Any]:
+        box = found.box
+        half = [0.5 * (high - low) for low, high in zip(box.lower, box.upper, strict=True)]
+        return {
+            "frame": frame,
+            "parameters": list(box.names),
+            "lower": list(box.lower),
+            "upper": list(box.upper),
+            "margin": {mode: value if np.isfinite(value) else None for mode, value in found.margins.items()},
+            "half_width": {
+                mode: None if factor is None else [factor * h for h in half] for mode, factor in found.factors.items()
+            },
+            "at_least": list(found.open_ended),
+        }
+
+    return {
+        "modes": dict(MODES),
+        "cells": [entry(frame, found) for frame, found in compared],
+        "wider_than": gains([found for _, found in compared]),
+        "step": STEP,
+        "skipped": skipped,
+        "seconds": seconds,
+    }
+
+
 def _depth(row: Mapping[str, Any]) -> float:
     """The margin of a counterexample; what is no number is worse than all."""
     return -np.inf if row["margin"] is None else row["margin"]
@@ -314,14 +398,18 @@ def certify_path(options: Certify, stop: Callable[[], bool], budget: float) -> b
         if store.resumed:
             console.print(f"  {store.count} cells kept from before, {store.open_blocks} blocks open", markup=False)
         run.report(store, "running")
+        substitution = None
         try:
+            deadline = time.perf_counter() + (1.0 - _COMPARE_SHARE) * budget
             with ExitStack() as engines:
-                run.search(store, run.engine(engines), time.perf_counter() + budget, stop)
+                run.search(store, run.engine(engines), deadline, stop)
+            if not stop():
+                substitution = run.compare(store)
         finally:
             # also after a failure: what is finished is written
             store.finish(run.grids)
             state = "interrupted" if stop() else "budget" if store.open_blocks else "done"
-            document = run.report(store, state)
+            document = run.report(store, state, substitution)
         complete = all(entry["sampled"]["poses"] for entry in document["frames"])
     covered = coverage(document["frames"])
     parts = ", ".join(f"{kind} {percent(covered[kind])}" for kind in ("certified", "falsified", "unknown"))

@@ -54,7 +54,7 @@ class Render:
     seed: int = 0
     """Seed of the random witnesses."""
     engine: Literal["local", "dask"] = "local"
-    """dask: spread the frames over a Dask cluster (needs the extra "cluster")."""
+    """dask: spread the frames, and tiles where frames are few, over a Dask cluster (needs the extra "cluster")."""
     scheduler_address: str | None = None
     """HOST:PORT of a running Dask scheduler. Default: a cluster on this machine."""
     resume: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False

@@ -13,15 +13,12 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
 from ns_abstract.arithmetic.selfcheck import check_functions
-from ns_abstract.pipeline import Job, Settings, check_frames
+from ns_abstract.pipeline import LEAST_SECONDS, Job, Settings, check_frames
 from ns_abstract.refine.result import FrameResult, TracePoint
 from ns_abstract.report.record import Report, Run
 
 if TYPE_CHECKING:
     from ns_abstract.cli.render import Render
-
-#: Shortest time that a frame is given once it is begun.
-_LEAST_SECONDS = 0.01
 
 
 def settings_of(options: Render) -> Settings:
@@ -60,9 +57,10 @@ def render_path(options: Render, stop: Callable[[], bool], seconds_by_frame: flo
     with ExitStack() as stack:
         client = None
         if options.engine == "dask":
+            from ns_abstract.cli.cluster import local_workers
             from ns_abstract.engines import connected
 
-            client = stack.enter_context(connected(options.scheduler_address))
+            client = stack.enter_context(connected(options.scheduler_address, local_workers(job)))
         run = make_run(job, options, frames, problems)
         report = (Report.resume if options.resume else Report)(options.output_dir, run)
         for problem in problems:
@@ -151,7 +149,7 @@ def _bound_here(
             # one frame is always tried, so that resuming with any budget gets on
             if stop() or (done and time.perf_counter() >= deadline):
                 return
-            share = max(_LEAST_SECONDS, (deadline - time.perf_counter()) / (len(pending) - done))
+            share = max(LEAST_SECONDS, (deadline - time.perf_counter()) / (len(pending) - done))
             meter = _Meter(progress, whole, done, index, share, options.target_ratio)
             yield job.bound(
                 index,

@@ -12,14 +12,13 @@ from __future__ import annotations
 import itertools
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Protocol
 
 import numpy as np
 
-from ns_abstract.refine.result import FrameResult, Leaves, TracePoint, gap
+from ns_abstract.refine.result import FrameResult, Leaves, PartResult, TracePoint, gap, joined
 from ns_abstract.sets.box import ParameterBox
-from ns_abstract.sets.tiles import assemble
 
 #: Part of the whole excess that one round of splitting takes on.
 _ROUND_SHARE = 0.8
@@ -39,6 +38,8 @@ _MEMBERS, _MEMBERS_BY_WITNESS = 48, 2
 _COVER_SHARE = 0.5
 #: Most cells of the first cover.
 _COVER_CELLS = 4096
+#: Part of the gap beyond the witnesses that a goal allows which parts of a frame share by their pixels.
+_SLACK_SHARE = 0.1
 #: Cells that may still be bounded where their number is not limited.
 _PLENTY = 1 << 60
 
@@ -97,12 +98,18 @@ class Goal:
         seconds: Time budget of the frame.
         cells: Largest number of cells, or None (for reproducible runs).
         leaf_bytes: Memory that open leaves, or the linear sets that are kept of all leaves, may take.
+        slack: MPG beyond ``ratio`` times the witness MPG that is good enough, too.
     """
 
     ratio: float = 1.05
     seconds: float = 60.0
     cells: int | None = None
     leaf_bytes: int = 4 << 30
+    slack: float = 0.0
+
+    def met(self, point: TracePoint) -> bool:
+        """Whether the bounds are good enough."""
+        return point.mpg <= self.ratio * point.mpg_witness + self.slack
 
 
 class _Cell:
@@ -183,6 +190,8 @@ class Refinement:
             cover and after every round.
         members: Where the scene varies too: other scenes of the set, each as a function like the frame's
             ``render``. They widen the inner bound; only poses are split.
+        tiles: Numbers of the tiles that are looked at, ascending; None: all. Everything here counts tiles by
+            their place in this list, and measures are those of its pixels (R6).
     """
 
     def __init__(
@@ -196,8 +205,10 @@ class Refinement:
         stopped: Callable[[], bool] = lambda: False,
         progress: Callable[[TracePoint, float], None] = lambda point, share: None,
         members: Iterator[Callable[[np.ndarray, np.ndarray | None], np.ndarray]] | None = None,
+        tiles: np.ndarray | None = None,
     ) -> None:
         self.members = iter(()) if members is None else members
+        self.part = None if tiles is None else np.asarray(tiles, np.int64)
         self.frame, self.index, self.goal = frame, index, goal
         self.keep_leaves, self.stopped, self.progress = keep_leaves, stopped, progress
         self.random = np.random.default_rng([seed, index])
@@ -205,13 +216,13 @@ class Refinement:
         shape = (side, side, 3)
         self.tiles = [
             _Tile(np.full(shape, np.inf, np.float32), np.full(shape, -np.inf, np.float32))
-            for _ in range(frame.tile_count)
+            for _ in range(self._count)
         ]
-        whole = (frame.tile_count, *shape)
+        whole = (self._count, *shape)
         self.outer_lower, self.outer_upper = np.zeros(whole, np.float32), np.ones(whole, np.float32)
         self.witness_lower, self.witness_upper = np.full(whole, np.inf, np.float32), np.full(whole, -np.inf, np.float32)
         self.image = np.zeros(whole, np.float32)
-        self.inside = _pixels_inside(frame)
+        self.inside = _pixels_inside(frame)[self._numbers_of(None)]
         self.outer_lower[~self.inside] = 0.0
         self.outer_upper[~self.inside] = 0.0
         self.cells = 0
@@ -219,11 +230,27 @@ class Refinement:
         self.start = time.perf_counter()
         self.covered = False
         #: scene elements that some cell of the cover shows, if the frame tells
-        self.shown: int | None = None
+        self.shown: np.ndarray | None = None
         self.leaf_sets: dict[tuple[int, int], tuple[ParameterBox, tuple[np.ndarray, ...]]] = {}
         self._kept_bytes = 0
         self._held_bytes = 0
         self._numbers = itertools.count()
+
+    # --- tiles ---------------------------------------------------------------------------------
+
+    @property
+    def _count(self) -> int:
+        return self.frame.tile_count if self.part is None else self.part.size
+
+    def _numbers_of(self, places: np.ndarray | None) -> np.ndarray:
+        """The frame's numbers of tiles; of all that are looked at if None."""
+        if self.part is None:
+            return np.arange(self.frame.tile_count) if places is None else places
+        return self.part if places is None else self.part[places]
+
+    def _render(self, render: Callable[..., np.ndarray], values: np.ndarray, places: np.ndarray | None) -> np.ndarray:
+        whole = self.part is None and places is None
+        return render(values, None if whole else self._numbers_of(places))
 
     # --- the two sides -------------------------------------------------------------------------
 
@@ -232,10 +259,10 @@ class Refinement:
 
     def _witness(self, values: np.ndarray, tiles: np.ndarray | None = None) -> np.ndarray:
         """Render at ``values`` and widen the inner bound."""
-        picture = self.frame.render(values, tiles)
+        picture = self._render(self.frame.render, values, tiles)
         self._widen(picture, tiles)
         for render in itertools.islice(self.members, _MEMBERS_BY_WITNESS):
-            self._widen(render(values, tiles), tiles)
+            self._widen(self._render(render, values, tiles), tiles)
         return picture
 
     def _widen(self, picture: np.ndarray, tiles: np.ndarray | None) -> None:
@@ -245,7 +272,8 @@ class Refinement:
 
     def _bound(self, cell: _Cell, parent: _Cell | None, tiles: np.ndarray) -> tuple[np.ndarray, np.ndarray, Bounds]:
         """Lower and upper [t, side, side, 3] that can be relied on, and all that the frame returned."""
-        bounds = self.frame.bound(cell.box, tiles, None if parent is None else parent.context, self.keep_leaves)
+        within = None if parent is None else parent.context
+        bounds = self.frame.bound(cell.box, self._numbers_of(tiles), within, self.keep_leaves)
         return self._take(cell, bounds)
 
     def _take(self, cell: _Cell, bounds: Bounds) -> tuple[np.ndarray, np.ndarray, Bounds]:
@@ -301,13 +329,20 @@ class Refinement:
 
     def run(self) -> FrameResult:
         """Refine until the goal is reached; sound whenever it ends."""
+        return self._result(self._work())
+
+    def run_part(self) -> PartResult:
+        """`run` for tiles that are to be put beside others."""
+        return self._part_result(self._work())
+
+    def _work(self) -> TracePoint:
         box = self.frame.box
         # the first call compiles kernels; the clock of the trace starts after it
         self.image = self._witness(box.middle)
         self.start = time.perf_counter()
         if self._cover() and not self._over():
             for render in itertools.islice(self.members, _MEMBERS):
-                self._widen(render(box.middle, None), None)
+                self._widen(self._render(render, box.middle, None), None)
                 if self._over():
                     break
             for values in self._corners():
@@ -315,7 +350,7 @@ class Refinement:
                 if self._over():
                     break
             self._refine()
-        return self._result(self._record(1.0))
+        return self._record(1.0)
 
     def proceed(self, goal: Goal) -> FrameResult:
         """Go on after `run` has covered the set; time between the two does not count."""
@@ -329,18 +364,11 @@ class Refinement:
         return self._result(self.point())
 
     def _corners(self) -> np.ndarray:
-        """Corners of the set [n, d], some of them where there are many."""
-        box = self.frame.box
-        if not box.dimensions:
-            return np.empty((0, 0))
-        corners = box.corners()
-        if corners.shape[0] > _CORNERS:
-            corners = corners[np.sort(self.random.choice(corners.shape[0], _CORNERS, replace=False))]
-        return corners
+        return _first_corners(self.frame.box, self.random)
 
     def _cover(self) -> bool:
         """Bound a first cover of the set; False if the work was stopped first."""
-        box, everything = self.frame.box, np.arange(self.frame.tile_count)
+        box, everything = self.frame.box, np.arange(self._count)
         boxes, first, probe = self._first_boxes(everything)
         leaves: list[tuple[_Cell, np.ndarray, np.ndarray]] = []
         for number, part in enumerate(boxes):
@@ -369,7 +397,7 @@ class Refinement:
         visible = [getattr(cell.context, "visible", None) for cell, _, _ in leaves]
         known = [v for v in visible if v is not None]
         if len(known) == len(visible):
-            self.shown = int(np.unique(np.concatenate(known)).size)
+            self.shown = np.unique(np.concatenate(known))
         self._settle(everything)
         self._record(1.0)
         return True
@@ -390,7 +418,7 @@ class Refinement:
         # the time and memory of one cell tell how many can be afforded
         started = time.perf_counter()
         first = boxes[len(boxes) // 2]
-        probe = frame.bound(first, everything, None, self.keep_leaves)
+        probe = frame.bound(first, self._numbers_of(everything), None, self.keep_leaves)
         seconds = time.perf_counter() - started
         allowed = _COVER_SHARE * self.goal.seconds / max(seconds, 1e-4)
         if self.goal.cells is not None:
@@ -406,7 +434,7 @@ class Refinement:
     def _refine(self) -> None:
         while True:
             point = self._record(1.0)
-            if self._over() or point.mpg <= self.goal.ratio * point.mpg_witness:
+            if self._over() or self.goal.met(point):
                 return
             # what is kept for the result cannot be given up for room
             if self._kept_bytes >= self.goal.leaf_bytes:
@@ -547,6 +575,7 @@ class Refinement:
         entries = sorted(self.leaf_sets.items(), key=lambda item: (item[1][0].lower, item[1][0].upper, item[0][1]))
         side = self.frame.side
         n = len(entries)
+        tiles = self._numbers_of(np.array([e[0][1] for e in entries], np.int64))
 
         def stack(part: int, shape: tuple[int, ...]) -> np.ndarray:
             rows = [entry[1][1][part] for entry in entries]
@@ -556,9 +585,7 @@ class Refinement:
         return Leaves(
             np.array([e[1][0].lower for e in entries], np.float64).reshape(n, d),
             np.array([e[1][0].upper for e in entries], np.float64).reshape(n, d),
-            np.array(
-                [(e[0][1] // self.frame.across * side, e[0][1] % self.frame.across * side) for e in entries], np.int32
-            ).reshape(n, 2),
+            np.stack([tiles // self.frame.across * side, tiles % self.frame.across * side], axis=1).astype(np.int32),
             stack(0, slopes),
             stack(1, offsets),
             stack(2, slopes),
@@ -566,23 +593,68 @@ class Refinement:
         )
 
     def _result(self, point: TracePoint) -> FrameResult:
-        return FrameResult(
+        if self.part is not None:
+            raise ValueError("some tiles are no frame: use run_part")
+        return joined([self._part_result(point)], self.frame.camera)
+
+    def _part_result(self, point: TracePoint) -> PartResult:
+        return PartResult(
             index=self.index,
             box=self.frame.box,
-            lower=self._whole(self.outer_lower),
-            upper=self._whole(self.outer_upper),
-            witness_lower=self._whole(self.witness_lower),
-            witness_upper=self._whole(self.witness_upper),
-            image=self._whole(self.image),
+            tiles=self._numbers_of(None),
+            lower=self.outer_lower,
+            upper=self.outer_upper,
+            witness_lower=self.witness_lower,
+            witness_upper=self.witness_upper,
+            image=self.image,
+            pixels=int(self.inside.sum()),
             seconds=point.seconds,
             cells=self.cells,
             trace=tuple(self.trace),
             bounded=self.covered,
+            shown=self.shown,
             leaves=self._leaves() if self.covered else None,
         )
 
-    def _whole(self, tiles: np.ndarray) -> np.ndarray:
-        return assemble(tiles, self.frame.camera)
+
+def groups(frame: Frame, count: int) -> list[np.ndarray]:
+    """The frame's tiles in ``count`` parts of equal number, fewer where there are fewer tiles.
+
+    Runs of tiles, which show few scene elements each; where every ray is a tile of its own, every ``count``-th one,
+    so that the parts are alike.
+    """
+    count = max(1, min(count, frame.tile_count))
+    everything = np.arange(frame.tile_count)
+    if frame.batch is not None:
+        return [everything[k::count] for k in range(count)]
+    return np.array_split(everything, count)
+
+
+def shared_goal(frame: Frame, index: int, goal: Goal, seed: int) -> Goal:
+    """A goal for each of several parts of a frame: where all reach theirs, the whole frame reaches ``goal`` (R6).
+
+    Parts that hardly move would never come near a ratio; they may miss it by what the others stay below it.
+    """
+    if frame.batch is not None or not frame.box.dimensions:
+        return goal
+    corners = _first_corners(frame.box, np.random.default_rng([seed, index]))
+    pictures = [frame.render(values) for values in (frame.box.middle, corners[0], corners[-1])]
+    least, most = np.minimum.reduce(pictures), np.maximum.reduce(pictures)
+    spread = float(gap(least, most)[_pixels_inside(frame)].mean())
+    excess = goal.ratio - 1.0
+    # rounding of means must not turn the sum around
+    slack = _SLACK_SHARE * excess * spread * (1.0 - 2.0**-20)
+    return replace(goal, ratio=1.0 + (1.0 - _SLACK_SHARE) * excess, slack=slack)
+
+
+def _first_corners(box: ParameterBox, random: np.random.Generator) -> np.ndarray:
+    """Corners of the set [n, d] that are rendered at first, some of them where there are many."""
+    if not box.dimensions:
+        return np.empty((0, 0))
+    corners = box.corners()
+    if corners.shape[0] > _CORNERS:
+        corners = corners[np.sort(random.choice(corners.shape[0], _CORNERS, replace=False))]
+    return corners
 
 
 def _usable(lower: np.ndarray, upper: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

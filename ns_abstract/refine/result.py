@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+import bisect
+import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ns_abstract.sets.box import ParameterBox
+from ns_abstract.sets.tiles import assemble, tile_grid
 
 Float32Array = NDArray[np.float32]
 Float64Array = NDArray[np.float64]
@@ -77,6 +82,109 @@ class FrameResult:
     plan: tuple[str, ...] = ()
     bounded: bool = True
     leaves: Leaves | None = field(default=None, repr=False)
+
+
+@dataclass(frozen=True)
+class PartResult:
+    """Some tiles of a frame's abstract image; fields as in `FrameResult` where nothing is said.
+
+    Attributes:
+        tiles: [t] numbers of the tiles.
+        lower, upper, witness_lower, witness_upper, image: [t, side, side, 3].
+        pixels: Number of the tiles' pixels that belong to the image.
+        trace: Measures are those of these pixels.
+        shown: Scene elements that some cell shows in these tiles, or None.
+    """
+
+    index: int
+    box: ParameterBox
+    tiles: NDArray[np.int64]
+    lower: Float32Array
+    upper: Float32Array
+    witness_lower: Float32Array
+    witness_upper: Float32Array
+    image: Float32Array
+    pixels: int
+    seconds: float
+    cells: int
+    trace: tuple[TracePoint, ...]
+    bounded: bool
+    shown: NDArray[np.int64] | None
+    leaves: Leaves | None = field(default=None, repr=False)
+
+
+def joined(parts: Sequence[PartResult], camera: Any) -> FrameResult:
+    """The frame whose tiles stand in ``parts``, each tile in one of them.
+
+    Its cells are those of all parts, its time is the longest of a part.
+
+    Raises:
+        ValueError: Parts of different frames, or a tile that is missing or there twice.
+    """
+    first = parts[0]
+    side = first.lower.shape[1]
+    across, down = tile_grid(camera, side)
+    tiles = np.concatenate([part.tiles for part in parts])
+    if not np.array_equal(np.sort(tiles), np.arange(across * down)):
+        raise ValueError(f"frame {first.index}: tiles are missing or there twice")
+    if any((part.index, part.box) != (first.index, first.box) for part in parts):
+        raise ValueError(f"parts of frame {first.index} and of another set")
+    order = np.argsort(tiles)
+
+    def whole(name: str) -> np.ndarray:
+        return assemble(np.concatenate([getattr(part, name) for part in parts])[order], camera)
+
+    bounded = all(part.bounded for part in parts)
+    return FrameResult(
+        index=first.index,
+        box=first.box,
+        lower=whole("lower"),
+        upper=whole("upper"),
+        witness_lower=whole("witness_lower"),
+        witness_upper=whole("witness_upper"),
+        image=whole("image"),
+        seconds=max(part.seconds for part in parts),
+        cells=sum(part.cells for part in parts),
+        trace=_joined_trace(parts),
+        bounded=bounded,
+        leaves=_joined_leaves([part.leaves for part in parts]) if bounded else None,
+    )
+
+
+def _joined_trace(parts: Sequence[PartResult]) -> tuple[TracePoint, ...]:
+    """Sums of cells and means by pixels, from when every part has a first point, whenever one has a new point."""
+    if len(parts) == 1:
+        return parts[0].trace
+    times = [[point.seconds for point in part.trace] for part in parts]
+    if not all(times):
+        return ()
+    begin = max(t[0] for t in times)
+    points = []
+    for now in sorted({second for t in times for second in t if second >= begin}):
+        latest = [part.trace[bisect.bisect_right(t, now) - 1] for part, t in zip(parts, times, strict=True)]
+        weights = [part.pixels / sum(p.pixels for p in parts) for part in parts]
+        points.append(
+            TracePoint(
+                now,
+                sum(point.cells for point in latest),
+                math.fsum(w * point.mpg for w, point in zip(weights, latest, strict=True)),
+                math.fsum(w * point.mpg_witness for w, point in zip(weights, latest, strict=True)),
+            )
+        )
+    return tuple(points)
+
+
+def _joined_leaves(parts: Sequence[Leaves | None]) -> Leaves | None:
+    """All leaves, ordered by box and tile."""
+    known = [part for part in parts if part is not None]
+    if len(known) < len(parts):
+        return None
+    if len(known) == 1:
+        return known[0]
+    arrays = {name: np.concatenate([getattr(part, name) for part in known]) for name in Leaves.__dataclass_fields__}
+    keys = np.concatenate([arrays["box_lower"], arrays["box_upper"], arrays["tile"].astype(np.float64)], axis=1)
+    order = np.lexsort(keys.T[::-1])
+    return Leaves(**{name: array[order] for name, array in arrays.items()})
 
 
 def gap(lower: NDArray[np.floating], upper: NDArray[np.floating]) -> Float64Array:

@@ -22,6 +22,9 @@ METRICS = {
     "not_examined": "part of unknown whose cells were still to be examined",
     "sampled_right": "part of evenly spread poses at whose images the property holds; says nothing about others",
     "margin": "how far the property is from failing; proved from below in certified cells",
+    "substitution": "certified cells bounded in weaker ways, too: margin on the cell, and the largest half-widths "
+    "about its middle that each way certifies, on a ladder of steps by the given factor; says how much the shared "
+    "parameters are worth, and is no part of the certificate",
     "PCP-S": "parts of the fixed partition where no sample breaks the property (certified ones cannot be broken)",
     "PCP-V": "parts of the fixed partition that are certified as a whole",
 }
@@ -90,6 +93,7 @@ def certificate_document(
     seconds: float,
     effort: Mapping[str, float],
     reasons: Mapping[str, int],
+    substitution: Mapping[str, Any],
 ) -> dict[str, Any]:
     """Content of report.json.
 
@@ -102,6 +106,7 @@ def certificate_document(
         seconds: Wall time, earlier runs included.
         effort: Figures of the work done.
         reasons: Why cells are unknown, and how many.
+        substitution: A few certified cells bounded in weaker ways, too.
     """
     covered = coverage(frames)
     poses = sum(entry["sampled"]["poses"] for entry in frames)
@@ -135,6 +140,7 @@ def certificate_document(
             "seconds": seconds,
             "effort": effort,
             "unknown_because": reasons,
+            "substitution": substitution,
             "plan": run.plan,
             "limits": run.limits,
             "state": state,

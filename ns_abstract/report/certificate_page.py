@@ -61,6 +61,7 @@ def certificate_page(
         _pictures(pictures),
         _counterexamples(document),
         _time(document),
+        _substitution(document),
         _frames(document),
         _guarantee(document),
         _files(),
@@ -288,6 +289,50 @@ def _time(document: Mapping[str, Any]) -> str:
     )
     return text + draw_plot(
         x, y, ("seconds", "part of the set"), marks, size=(640, 256), title="Certified, falsified and unknown over time"
+    )
+
+
+def _substitution(document: Mapping[str, Any]) -> str:
+    """What the correlation of the pixels is worth: margins and certified half-widths by way of bounding."""
+    entry = document["substitution"]
+    title = "<h2>What the shared parameters are worth</h2>"
+    if entry["skipped"]:
+        return f"{title}<p>Not compared: {escape(entry['skipped'])}.</p>"
+    modes = list(entry["modes"])
+
+    def widths(cell: Mapping[str, Any], mode: str) -> str:
+        half = cell["half_width"][mode]
+        if half is None:
+            return "none found"
+        text = " · ".join(number(value, 3) for value in half)
+        return f"≥ {text}" if mode in cell["at_least"] else text
+
+    rows = "".join(
+        f'<tr><td>{cell["frame"]}</td><td class="left">'
+        + escape(
+            ", ".join(
+                f"{name} = {number(0.5 * (low + high), 5)} ± {number(0.5 * (high - low), 3)}"
+                for name, low, high in zip(cell["parameters"], cell["lower"], cell["upper"], strict=True)
+            )
+        )
+        + "</td>"
+        + "".join(f"<td>{number(cell['margin'][mode])}</td>" for mode in modes)
+        + "".join(f"<td>{widths(cell, mode)}</td>" for mode in modes)
+        + "</tr>"
+        for cell in entry["cells"]
+    )
+    head = "".join(f"<th>{kind}, {escape(mode)}</th>" for kind in ("margin", "half-width") for mode in modes)
+    terms = "".join(f"<dt>{escape(mode)}</dt><dd>{escape(text)}</dd>" for mode, text in entry["modes"].items())
+    wider = ", ".join(
+        f"{number(gain, 3)} times those of {escape(mode)}" for mode, gain in entry["wider_than"].items() if gain
+    )
+    return (
+        f"{title}<p>Certified cells about evenly spread poses, bounded in weaker ways, too "
+        f"(in {number(entry['seconds'], 2)} s): the proven margin on the cell, and the largest half-width about its "
+        f"middle that is certified, in steps of {number(entry['step'], 3)}."
+        + (f" Half-widths are {wider} (geometric mean)." if wider else "")
+        + f'</p><div class="wide"><table><thead><tr><th>frame</th><th class="left">cell</th>{head}</tr></thead>'
+        f"<tbody>{rows}</tbody></table></div><dl>{terms}</dl>"
     )
 
 

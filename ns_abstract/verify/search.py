@@ -21,7 +21,7 @@ from ns_abstract.verify.cells import Cell, Grid
 from ns_abstract.verify.properties import Claim, Query
 
 if TYPE_CHECKING:
-    from ns_abstract.verify.network import ImageSets, OutputBounds
+    from ns_abstract.verify.network import ImageSets, OutputBounds, Substitution
 
 Verdict = Literal["certified", "falsified", "unknown"]
 
@@ -72,7 +72,7 @@ class Model(Protocol):
         """Sets of the network's input; see `ns_abstract.verify.preprocess.Preprocess.sets`."""
         ...
 
-    def bound(self, images: ImageSets, query: Query) -> OutputBounds:
+    def bound(self, images: ImageSets, query: Query, substitution: Substitution = "everywhere") -> OutputBounds:
         """Bounds of the query's rows over the sets."""
         ...
 
@@ -308,7 +308,7 @@ class Search:
                 linear, lower, upper, slope = self.scene.sets(cell.box)
             except InputError:
                 raise
-            except _FAILURES as error:
+            except FAILURES as error:
                 reasons[number] = _told(error)
                 continue
             slopes[number] = slope
@@ -329,7 +329,7 @@ class Search:
             found = self.claim.proved(query, self.model.bound(sets, query), boxes)
         except InputError:
             raise
-        except _FAILURES as error:
+        except FAILURES as error:
             reasons.update(dict.fromkeys(kept, _told(error)))
             return
         for number, margin in zip(kept, np.asarray(found, np.float64).tolist(), strict=True):
@@ -399,7 +399,7 @@ class ContradictionError(RuntimeError):
 
 
 #: What may go wrong in one cell without ending the run; lack of memory and a user's mistake do end it.
-_FAILURES = (ArithmeticError, ValueError, IndexError, KeyError, TypeError, RuntimeError, AssertionError)
+FAILURES = (ArithmeticError, ValueError, IndexError, KeyError, TypeError, RuntimeError, AssertionError)
 
 
 def _told(error: Exception) -> str:
