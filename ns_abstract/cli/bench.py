@@ -5,15 +5,26 @@ from __future__ import annotations
 import faulthandler
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import tyro
 
 from ns_abstract.cli.common import DONE, run
 from ns_abstract.errors import InputError
 
+if TYPE_CHECKING:
+    from ns_abstract.pipeline import Job
+
 #: Seconds after which a case that does not end ends the process, with a trace of where it stands.
 _STUCK = 900.0
+#: Headings of the tables by benchmark.
+_TITLES = {
+    "cell": "Cost of a cell",
+    "tightness": "Error against run time",
+    "soundness": "Soundness",
+    "plan": "What is left out, taken back",
+    "rules": "Our bounds and the paper's rules",
+}
 
 
 @dataclass
@@ -70,6 +81,34 @@ class Soundness(Scenes):
     """Images by the independent reference."""
     scale: float = 1.0
     """Multiplies the ranges of translations and rotations."""
+    seed: int = 0
+    """Decides every random choice."""
+
+
+@dataclass
+class Plan(Scenes):
+    """Take back, one by one, what a scene's plan leaves out: what it costs, and how bounds differ."""
+
+    sets: tuple[str, ...] = ("x", "yaw")
+    """Sets of poses: x, yaw, roll, six, segments, orbit, point."""
+    cells: int = 24
+    """Cells that every scene and set is bounded with."""
+    scale: float = 1.0
+    """Multiplies the ranges of translations and rotations."""
+
+
+@dataclass
+class Rules(Scenes):
+    """Our bounds against the paper's rules, on the same Gaussians, pixels and cells."""
+
+    sets: tuple[str, ...] = ("x", "yaw")
+    """Sets of poses: x, yaw, roll, six, segments, orbit, point."""
+    parts: tuple[int, ...] = (8, 64)
+    """Cells by axis that a set is cut into; the middle one is bounded."""
+    pixels: int = 8
+    """Pixels for every scene, set and cell."""
+    gaussians: int = 30
+    """Most Gaussians by pixel."""
     seed: int = 0
     """Decides every random choice."""
 
@@ -143,8 +182,27 @@ def stiff(options: Stiff) -> int:
     return 1 if failed else DONE
 
 
-def bench(options: Cell | Tightness | Soundness | Stiff) -> int:
-    """Run one benchmark; the exit code of a soundness benchmark with violations is 1."""
+def rows_of(options: Cell | Plan | Rules, job: Job, name: str) -> list[dict[str, Any]]:
+    """What a benchmark without curves finds for one scene and set of poses."""
+    if isinstance(options, Cell):
+        from ns_abstract.bench.cell import cell_cost
+
+        return [cell_cost(job, name, options.frame, options.repeats)]
+    if isinstance(options, Plan):
+        from ns_abstract.bench.plan import without
+
+        return without(job, name, options.frame, options.cells, options.scale)
+    from ns_abstract.bench.rules import compare
+
+    return [
+        row
+        for parts in options.parts
+        for row in compare(job, name, options.frame, parts, options.pixels, options.gaussians, options.seed)
+    ]
+
+
+def bench(options: Cell | Tightness | Soundness | Plan | Rules | Stiff) -> int:
+    """Run one benchmark; the exit code is 1 if a bound was violated."""
     if isinstance(options, Stiff):
         return stiff(options)
     from ns_abstract.bench.sets import open_jobs, pose_set
@@ -155,10 +213,9 @@ def bench(options: Cell | Tightness | Soundness | Stiff) -> int:
     results = {}
     for job in jobs:
         for name in options.sets:
-            if isinstance(options, Cell):
-                from ns_abstract.bench.cell import cell_cost
-
-                rows.append(cell_cost(job, name, options.frame, options.repeats))
+            told = len(rows)
+            if isinstance(options, Cell | Plan | Rules):
+                rows += rows_of(options, job, name)
             elif isinstance(options, Tightness):
                 from ns_abstract.bench.tightness import refine, summary
 
@@ -181,13 +238,14 @@ def bench(options: Cell | Tightness | Soundness | Stiff) -> int:
                         options.scale,
                     )
                 )
-            print(markdown(rows[-1:]) if len(rows) == 1 else markdown(rows[-1:]).splitlines()[2], flush=True)
+            lines = markdown(rows).splitlines()
+            print("\n".join(lines[0 if not told else 2 + told :]), flush=True)
     kind = type(options).__name__.lower()
     write(
         rows,
         options.output_dir,
         kind,
-        {"cell": "Cost of a cell", "tightness": "Error against run time"}.get(kind, "Soundness"),
+        _TITLES[kind],
     )
     if results:
         from ns_abstract.bench.plots import save_curves
@@ -203,7 +261,14 @@ def bench(options: Cell | Tightness | Soundness | Stiff) -> int:
 def main() -> None:
     """Entry point of the console script."""
     kinds = tyro.extras.subcommand_type_from_defaults(
-        {"cell": Cell(), "tightness": Tightness(), "soundness": Soundness(), "stiff": Stiff()}
+        {
+            "cell": Cell(),
+            "tightness": Tightness(),
+            "soundness": Soundness(),
+            "plan": Plan(),
+            "rules": Rules(),
+            "stiff": Stiff(),
+        }
     )
     run(bench, lambda: tyro.cli(kinds, prog="ns-abstract-bench"))
 

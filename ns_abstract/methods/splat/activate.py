@@ -68,12 +68,20 @@ def used_degree(scene: SplatScene, rasteriser: Rasteriser) -> int:
     return 0
 
 
-def activate(scene: SplatScene, rasteriser: Rasteriser) -> Splats:
-    """Apply Splatfacto's activations (splatfacto.py:590-606) in float64."""
+def activate(scene: SplatScene, rasteriser: Rasteriser, every_band: bool = False) -> Splats:
+    """Apply Splatfacto's activations (splatfacto.py:590-606) in float64.
+
+    Args:
+        scene: The stored parameters.
+        rasteriser: The rules.
+        every_band: Keep the harmonics that are zero for every Gaussian, too.
+    """
     axes = rotation_matrices(scene.quats.astype(np.float64)) * np.exp(scene.log_scales.astype(np.float64))[:, None]
     logits = scene.opacity_logits.astype(np.float64)
     opacity = np.where(logits >= 0, 1.0, np.exp(np.minimum(logits, 0))) / (1.0 + np.exp(-np.abs(logits)))
     degree = used_degree(scene, rasteriser)
+    if every_band and scene.color_model != "sigmoid" and rasteriser.view_dependent:
+        degree = scene.sh_degree
     sh = scene.sh.astype(np.float64)
     if scene.color_model == "sigmoid":
         colors = 1.0 / (1.0 + np.exp(-sh[:, :1]))
