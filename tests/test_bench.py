@@ -27,9 +27,9 @@ def job(blobs) -> Job:
 def test_ours_are_tighter_than_the_papers(job: Job) -> None:
     rows = rules.compare(job, "yaw", 0, 8, pixels=3, most=12)
     assert [row["rules"] for row in rows] == ["ours", *rules.PAPER_RULES]
-    assert all(row["violations"] == 0 and row["gap / renders'"] >= 1.0 for row in rows)
-    ours, others = float(str(rows[0]["gap"])), [float(str(row["gap"])) for row in rows[1:]]
-    assert ours < min(others)
+    assert all(row["violations"] == 0 for row in rows)
+    ours, *others = (float(str(row["gap"])) for row in rows)
+    assert float(str(rows[0]["renders' gap"])) <= ours < min(others)
     # without its linear part the paper's alpha is worth less
     assert others[0] < others[-1]
 
