@@ -110,7 +110,7 @@ class AbstractNerfModel(AbstractOutputs, NeRFModel):
             raise InputError("the whole field is bounded, a part of it is shown", fix="switch the crop box off")
         fields = (self.field_coarse, self.field_fine)
         state = tuple((id(p), p._version) for one in fields if one is not None for p in one.parameters())
-        background = self._background()
+        background = self._color_behind()
         key = state, background.tobytes()
         if self._shown is None or self._shown[0] != key:
             self._shown = key, NerfSource(self._scene(background))
@@ -137,7 +137,7 @@ class AbstractNerfModel(AbstractOutputs, NeRFModel):
             source="the loaded model",
         )
 
-    def _background(self) -> np.ndarray:
+    def _color_behind(self) -> np.ndarray:
         """[3] colour behind the last sample; black where it is random (renderers.py:144-146)."""
         color = self.renderer_rgb.background_color
         if isinstance(color, str):
