@@ -607,6 +607,8 @@ def test_a_nerf_in_the_viewer(nerfstudio: SimpleNamespace, folder: Path, monkeyp
         for _ in range(8):
             found = model.get_outputs_for_camera(camera)
             assert found["rgb_fine"].shape == (96, 128, 3) and list(found)[-4:] == OUTPUTS
+            # the viewer's render thread looks for it
+            assert found["depth"].shape == (96, 128, 1)
             sizes.append(model._drawn[1]["rgb_fine"].shape[0])
         assert sizes == sorted(sizes) and sizes[0] < sizes[-1] and draws
         text = until(

@@ -148,7 +148,7 @@ class AbstractNerfModel(AbstractOutputs, NeRFModel):
         """The model's own outputs; in a viewer without CUDA, small pictures first, so that the camera can move."""
         self._cropped = obb_box is not None
         if not self.abstract.control.present or self.device.type == "cuda" or self.training:
-            return super()._concrete(camera, obb_box)
+            return with_depth(super()._concrete(camera, obb_box))
         shown = camera_of(camera)
         box = None if obb_box is None else tuple(torch.cat([obb_box.R.flatten(), obb_box.T, obb_box.S]).tolist())
         key = shown.camera_to_world.tobytes(), round(shown.fy / shown.height, 6), box
@@ -160,7 +160,7 @@ class AbstractNerfModel(AbstractOutputs, NeRFModel):
             pose = camera.camera_to_worlds.reshape(-1, 3, 4)[:1]
             at = Cameras(pose, small.fx, small.fy, small.cx, small.cy, small.width, small.height).to(self.device)
             start = time.perf_counter()
-            best = super()._concrete(at, obb_box)
+            best = with_depth(super()._concrete(at, obb_box))
             self._speed = small.width * small.height / (time.perf_counter() - start)
             self._drawn = key, best, _GROWTH * seconds if factor > 1.0 else math.inf
             self.abstract.control.draw()
@@ -174,6 +174,11 @@ class AbstractNerfModel(AbstractOutputs, NeRFModel):
             steepness = torch.stack([log_lipschitz(f) for f in fields]).mean()
             losses["smoothness"] = self.config.smoothness_penalty * steepness
         return losses
+
+
+def with_depth(outputs: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:
+    """The outputs and ``depth``, without which the viewer's render thread ends (render_state_machine.py:198)."""
+    return {**outputs, "depth": outputs["depth_fine"]}
 
 
 def log_lipschitz(module: torch.nn.Module) -> torch.Tensor:
