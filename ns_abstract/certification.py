@@ -9,7 +9,7 @@ import math
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -29,8 +29,11 @@ from ns_abstract.sets.twin import pose_twin
 from ns_abstract.verify.cells import Cell, Grid, coarse_parts
 from ns_abstract.verify.network import ImageSets, Network, OutputBounds, Substitution, bound_outputs, load_network
 from ns_abstract.verify.preprocess import Preprocess
-from ns_abstract.verify.properties import Claim, Property, Query, load_property
+from ns_abstract.verify.properties import Claim, LinearClaim, Property, Query, load_property
 from ns_abstract.verify.search import BLOCK, Findings, Search
+
+if TYPE_CHECKING:
+    from ns_abstract.verify.interop import Form
 
 #: Of the search's rules: results of different ones are not mixed.
 _RULES = 1
@@ -154,14 +157,18 @@ class NetworkModel:
 
     def bound(self, images: ImageSets, query: Query, substitution: Substitution = "everywhere") -> OutputBounds:
         d = images.dimensions
-        if not d:
-            # a single pose is a set whose one parameter moves nothing
-            still = np.zeros((*images.b_lower.shape, 1))
-            images = dataclasses.replace(images, a_lower=still, a_upper=still)
         found = bound_outputs(
-            self.network, images, query.rows, query.offset, substitution=substitution, memory=self.memory
+            self.network, parametric(images), query.rows, query.offset, substitution=substitution, memory=self.memory
         )
         return found if d else dataclasses.replace(found, a=found.a[..., :0])
+
+
+def parametric(images: ImageSets) -> ImageSets:
+    """The same sets with at least one parameter: that of a single pose moves nothing."""
+    if images.dimensions:
+        return images
+    still = np.zeros((*images.b_lower.shape, 1))
+    return dataclasses.replace(images, a_lower=still, a_upper=still)
 
 
 class Certification:
@@ -302,6 +309,36 @@ class Certification:
                 pictures, self.model, self.claim(pictures), grid, every_unit=every_unit, block=self.block
             )
         return self._searches[key]
+
+    def write_vnnlib(self, index: int, box: ParameterBox, target: Path, form: Form) -> tuple[Path, Path]:
+        """Write the abstract image of a cell, the network and the property for other verifiers.
+
+        Args:
+            index: Entry of the camera path.
+            box: The cell.
+            target: Path without ending.
+            form: As in `ns_abstract.verify.interop.write_vnnlib`.
+
+        Returns:
+            The .onnx and the .vnnlib file.
+
+        Raises:
+            InputError: The property is not linear in the outputs, or the network cannot be extended.
+        """
+        from ns_abstract.verify.interop import write_vnnlib
+
+        pictures = self.pictures(index)
+        claim = self.claim(pictures)
+        if not isinstance(claim, LinearClaim):
+            raise InputError(
+                "is not linear in the network's outputs",
+                file=self.settings.property,
+                field="type",
+                fix="give a property of type classification or vnnlib",
+            )
+        linear, lower, upper, _ = pictures.sets(box)
+        images = parametric(self.model.input_sets(tuple(part[None] for part in linear), lower[None], upper[None]))
+        return write_vnnlib(self.settings.model, images, claim.rows, claim.offset, target, form, claim.groups)
 
     def partitions(self, grid: Grid) -> int | None:
         """Number of parts of the fixed partition, if there is one."""

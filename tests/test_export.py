@@ -5,14 +5,21 @@ from __future__ import annotations
 import dataclasses
 import json
 from collections.abc import Callable
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
+import onnx
+import onnxruntime
 import pytest
-from conftest import Inputs, blob_scene
+import torch
+from certifying import classifier
+from conftest import Inputs, blob_scene, write_json
+from onnx import numpy_helper
 from PIL import Image
 from test_cli import call, one_line  # noqa: F401
 
+from ns_abstract.certification import Certification, CertifySettings
 from ns_abstract.cli import export as export_command
 from ns_abstract.cli import render as render_command
 from ns_abstract.errors import InputError
@@ -22,6 +29,8 @@ from ns_abstract.methods.splat.scene import SplatScene
 from ns_abstract.refine.result import FrameResult
 from ns_abstract.report.export import Results
 from ns_abstract.report.files import IMAGES, load_frame, save_frame
+from ns_abstract.verify.properties import LinearClaim
+from ns_abstract.verify.vnnlib import load_vnnlib
 
 Call = Callable[..., tuple[int, str]]
 ARRAYS = ("means", "log_scales", "quats", "opacity_logits", "sh")
@@ -149,3 +158,116 @@ def test_sizes_must_agree(bounded: Path, tmp_path: Path) -> None:
     save_frame(tmp_path / "frame_00001.npz", dataclasses.replace(second, **cut))
     with pytest.raises(InputError, match="one size"):
         Results(tmp_path)
+
+
+# ---------------------------------------------------------------- VNN-LIB
+
+PREPROCESS = {"resize": [16, 16], "mean": [0.4, 0.45, 0.5], "std": [0.25, 0.25, 0.3]}
+UNSAFE = """
+(declare-const Y_0 Real) (declare-const Y_1 Real) (declare-const Y_2 Real)
+(assert (or (and (<= Y_0 Y_1) (<= Y_0 Y_2)) (and (>= Y_2 1.5))))
+"""
+
+
+@pytest.fixture(scope="module")
+def instances(blobs: Inputs, tmp_path_factory: pytest.TempPathFactory) -> Callable[..., tuple[Path, Certification]]:
+    """Exports frame 0 with a random network and a property; returns the folder and the same certification."""
+    folder = tmp_path_factory.mktemp("vnnlib")
+    net = classifier(folder / "net.onnx")
+    (folder / "unsafe.vnnlib").write_text(UNSAFE)
+
+    def make(prop: dict, name: str, *more: object, spec: Path | None = blobs.spec) -> tuple[Path, Certification]:
+        file = write_json(folder / f"{name}.json", prop | {"preprocess": PREPROCESS})
+        settings = CertifySettings(blobs.config, blobs.path, net, file, spec)
+        options: list[object] = ["vnnlib", "--frames", 0, "--output-dir", folder / name, "--model", net]
+        options += ["--load-config", blobs.config, "--camera-path-filename", blobs.path, "--property", file]
+        options += [] if spec is None else ["--perturbation-filename", spec]
+        with pytest.MonkeyPatch.context() as patch, pytest.raises(SystemExit) as leave:
+            patch.setattr("sys.argv", ["command", *map(str, options), *map(str, more)])
+            export_command.main()
+        assert leave.value.code == 0
+        return folder / name, Certification(settings)
+
+    return make
+
+
+def exported_margins(
+    network: Path, job: Certification, values: np.ndarray, box: list[dict]
+) -> tuple[np.ndarray, float]:
+    """The written network's outputs for the picture at ``values``, and the largest slack |e| that it takes."""
+    stored = {t.name: numpy_helper.to_array(t).astype(np.float64) for t in onnx.load(str(network)).graph.initializer}
+    middle, half = (np.array([0.5 * (b["upper"] + s * b["lower"]) for b in box]) for s in (1.0, -1.0))
+    picture = torch.from_numpy(job.pictures(0).image(values)[None])
+    x = job.property.preprocess.apply(picture).numpy().astype(np.float64).reshape(-1)
+    p = (values - middle) / half if len(box) else np.zeros(1)
+    slack = (x - stored["renderer"] @ p - stored["center"]) / stored["radius"][0]
+    run = onnxruntime.InferenceSession(str(network), providers=["CPUExecutionProvider"])
+    given = np.concatenate([p, slack])[None].astype(np.float32)
+    return run.run(None, {run.get_inputs()[0].name: given})[0][0], float(np.abs(slack).max())
+
+
+def test_vnnlib_holds_the_abstract_image_and_the_property(instances) -> None:
+    folder, job = instances({"type": "classification", "label": 1}, "classes", "--parts", 3)
+    lines = [line.split(",") for line in (folder / "instances.csv").read_text().splitlines()]
+    boxes = json.loads((folder / "boxes.json").read_text())
+    assert [line[2] for line in lines] == ["300"] * 3 and len(boxes) == 3
+    ends = [(b[0]["lower"], b[0]["upper"]) for b in boxes.values()]
+    assert ends[0][0] == -0.03 and ends[-1][1] == 0.03 and all(a[1] == b[0] for a, b in pairwise(ends))
+    rng, outside = np.random.default_rng(2), 0.0
+    rows = np.array([[-1.0, 1.0, 0.0], [0.0, 1.0, -1.0]])
+    for (network, prop, _), (name, box) in zip(lines, boxes.items(), strict=True):
+        assert (network, prop) == (f"{name}.onnx", f"{name}.vnnlib")
+        low, high = box[0]["lower"], box[0]["upper"]
+        for value in (low, high, *rng.uniform(low, high, 8)):
+            values = np.array([value])
+            found, slack = exported_margins(folder / network, job, values, box)
+            # every picture of the box is the image of an input in the box
+            assert slack <= 1.0
+            y = job.model.outputs(job.pictures(0).image(values)[None])[0]
+            np.testing.assert_allclose(found, rows @ y, atol=1e-4)
+        outside = max(outside, exported_margins(folder / network, job, np.array([low - 0.03]), box)[1])
+        unsafe = load_vnnlib(folder / prop, 2)
+        assert unsafe.groups == ((0,), (1,)) and unsafe.inputs > 0
+        np.testing.assert_array_equal(unsafe.rows, np.eye(2))
+    # the check can fail: pictures of other poses are not in the sets
+    assert outside > 1.0
+
+
+def test_vnnlib_keeps_groups_of_rows(instances) -> None:
+    folder, job = instances({"type": "vnnlib", "file": "unsafe.vnnlib"}, "groups", "--form", "gemm", spec=None)
+    unsafe = load_vnnlib(folder / "frame_00000_box_00000.vnnlib", 3)
+    assert unsafe.groups == ((0, 1), (2,))
+    # a single pose has a parameter that moves nothing
+    assert json.loads((folder / "boxes.json").read_text()) == {"frame_00000_box_00000": []}
+    run = onnxruntime.InferenceSession(str(folder / "frame_00000_box_00000.onnx"), providers=["CPUExecutionProvider"])
+    count = run.get_inputs()[0].shape[1]
+    claim = job.claim(job.pictures(0))
+    y = job.model.outputs(job.pictures(0).image(np.zeros(0))[None])
+    found = run.run(None, {run.get_inputs()[0].name: np.zeros((1, count), np.float32)})[0]
+    margins = [
+        LinearClaim(unsafe.rows, unsafe.offset, unsafe.groups).margin(torch.from_numpy(found), torch.zeros(1, 0)),
+        claim.margin(torch.from_numpy(y), torch.zeros(1, 0)),
+    ]
+    # the middle of the slack is the picture up to the rounding that the bounds allow for
+    np.testing.assert_allclose(*margins, atol=1e-2)
+
+
+def test_vnnlib_mistakes(call: Call, blobs: Inputs, tmp_path: Path) -> None:  # noqa: F811
+    net = classifier(tmp_path / "net.onnx")
+    prop = write_json(tmp_path / "p.json", {"type": "classification", "label": 1, "preprocess": PREPROCESS})
+    other = write_json(
+        tmp_path / "q.json",
+        {"type": "regression", "target": [0, 0, 0], "tolerance": {"absolute": 1}, "preprocess": PREPROCESS},
+    )
+
+    def options(prop: Path, *more: object) -> tuple[int, str]:
+        return run(
+            call, "vnnlib", "--load-config", blobs.config, "--camera-path-filename", blobs.path, "--model", net,
+            "--property", prop, "--perturbation-filename", blobs.spec, "--output-dir", tmp_path / "out", *more,
+        )  # fmt: skip
+
+    one_line(*options(other), "q.json", "linear")
+    for flag, value in (("--parts", 0), ("--timeout", 0), ("--frames", 9)):
+        one_line(*options(prop, flag, value), flag)
+    one_line(*options(prop, "--parts", 2, 2), "--parts")
+    assert not list((tmp_path / "out").glob("*.onnx"))

@@ -26,6 +26,9 @@ from ns_abstract.cli.viewer import Viewer
 from ns_abstract.demo.paths import path_json
 from ns_abstract.demo.runs import write_splatfacto_run
 from ns_abstract.errors import InputError
+from ns_abstract.methods.load import load_any
+from ns_abstract.methods.nerf.render import NerfRenderer, Sampling
+from ns_abstract.methods.nerf.scene import Encoding, NerfScene
 from ns_abstract.methods.splat.activate import activate
 from ns_abstract.methods.splat.constants import GSPLAT_1_4_0
 from ns_abstract.methods.splat.load import load_scene
@@ -335,8 +338,9 @@ def test_viewer_finds_the_panel_and_works_in_the_background(
     paths = [path for path, _ in viewer.viewer_elements]
     assert all(path.startswith("Custom Elements/model/abstract/") for path in paths)
     names = [element.name for _, element in viewer.viewer_elements]
-    expected = ["figures", "± x", "± y", "± z", "± yaw", "± pitch", "± roll", "seconds", "refine", "file"]
-    assert names == [*expected, "send to certify"]
+    sliders = [f"± {name}" for name in ("x", "y", "z", "yaw", "pitch", "roll", "mean", "opacity", "color")]
+    selection = ["select", "select what is in the middle"]
+    assert names == ["figures", *sliders, *selection, "seconds", "refine", "file", "send to certify"]
     assert model.abstract.control.present
     machine = Machine()
     viewer.render_statemachines[77] = machine
@@ -381,6 +385,31 @@ def test_viewer_finds_the_panel_and_works_in_the_background(
     np.testing.assert_allclose([sent.fx, sent.fy], [shown.fx, shown.fy], rtol=1e-12)
     assert (sent.width, sent.height) == (100, 80)
     assert "ns-abstract-certify" in model.abstract._figures.text
+    # a variation of the scene: around what is in the middle of the picture, and sent as it is
+    whole = float(found["abstract_gap"].mean())
+    model.abstract.select_middle()
+    box = json.loads(model.abstract._select.value)["box"]
+    forward = -camera.camera_to_worlds[0, :, 2].numpy()
+    middle = camera.camera_to_worlds[0, :, 3].numpy() + float(found["depth"][40, 50, 0]) * forward
+    assert (np.array(box[0]) < middle).all() and (middle < np.array(box[1])).all()
+    model.abstract._select.value = '{"box": [[-9, -9, -9], [9, 9, 9]]}'
+    model.abstract._sliders["color"].value = 50.0
+    assert (draw()["abstract_upper"] == 1).all()
+    until(lambda: draw() and model._background.status.state == "idle", 120, "bounds of the variation")
+    varied = draw()
+    assert float(varied["abstract_gap"].mean()) > whole
+    assert (varied["abstract_lower"] <= varied["rgb"]).all() and (varied["rgb"] <= varied["abstract_upper"]).all()
+    model.abstract._file.value = str(tmp_path / "varied.json")
+    model.abstract.send()
+    expected = perturbation_of({"x": 0.01, "color": 0.05}, model.abstract._select.value)
+    assert load_perturbation(tmp_path / "varied.json") == expected and expected.scene
+    assert "ns-abstract-render" in model.abstract._figures.text
+    # what cannot be read is said, and nothing is claimed
+    model.abstract._select.value = '{"box": '
+    assert (draw()["abstract_upper"] == 1).all() and "not valid JSON" in model.abstract._figures.text
+    model.abstract._select.value = "{}"
+    model.abstract._sliders["color"].value = 0.0
+    assert float(draw()["abstract_gap"].mean()) == whole
     model.abstract._file.value = "/proc/none/view.json"
     model.abstract.send()
     assert "cannot be written" in model.abstract._figures.text
@@ -512,6 +541,109 @@ def test_train_and_open(nerfstudio: SimpleNamespace, folder: Path, method: str) 
     assert width == (16 if method == "abstract-nerf" else 256)
     found = pipeline.model.get_outputs_for_camera(cameras(nerfstudio, height=6, width=6))
     assert found["rgb_fine"].shape == (6, 6, 3)
+
+
+@pytest.mark.parametrize("option", ["num_frequencies", "max_frequency_exponent", "num_direction_frequencies", None])
+def test_the_loader_reads_what_was_trained(nerfstudio: SimpleNamespace, folder: Path, option: str | None) -> None:
+    """Every option of abstract-nerf changes the picture, and both renderers change alike; vanilla-nerf has none."""
+    import torch
+
+    chosen = {"width": 24, "depth": 3, "num_frequencies": 5, "max_frequency_exponent": 3.5}
+    chosen |= {"num_direction_frequencies": 3} | ({} if option is None else {option: 4})
+    name = f"options-{option}"
+    flags = [part for key, v in chosen.items() for part in (f"--pipeline.model.{key.replace('_', '-')}", v)]
+    training = [name if part == "e" else part for part in _TRAIN]
+    command("ns-train", "abstract-nerf", *training, *flags, "nerfstudio-data", folder=folder, where=folder)
+    file = folder / "outputs" / name / "abstract-nerf" / "t0" / "config.yml"
+    _config, pipeline, _ = nerfstudio.viewing.open_run(file)
+    loaded = load_any(file)
+    assert isinstance(loaded, NerfScene)
+    directions = chosen["num_direction_frequencies"]
+    encodings = Encoding(int(chosen["num_frequencies"]), 0.0, chosen["max_frequency_exponent"]), Encoding(
+        int(directions), 0.0, directions - 1.0
+    )
+    assert (loaded.fine.position, loaded.fine.direction) == encodings
+    assert [layer.weight.shape[0] for layer in loaded.fine.base] == [24] * 3
+    model, camera = pipeline.model, cameras(nerfstudio, height=6, width=8)
+    with torch.no_grad():
+        # what three steps leave is nearly transparent
+        for field in (model.field_coarse, model.field_fine):
+            field.field_output_density.net.bias += 2.0
+            field.field_heads[0].net.weight *= 8.0
+    scene = model.abstract_source().scene
+    assert scene.fine.position == loaded.fine.position and scene.far == loaded.far
+    for ours, theirs in zip(loaded.fine.arrays()[:2], scene.fine.arrays()[:2], strict=True):
+        np.testing.assert_array_equal(ours, theirs)
+    shown = nerfstudio.panel.camera_of(camera)
+    background = tuple(float(v) for v in scene.background)
+    sampling = Sampling("hierarchical", scene.near, scene.far, 64, 128, background)  # type: ignore[arg-type]
+    expected = model.get_outputs_for_camera(camera)["rgb_fine"].numpy()
+    found = NerfRenderer(scene, sampling, torch.float32).image(shown, shown.camera_to_world)
+    assert expected.std() > 0.005 and np.abs(found - expected).max() <= 1e-5
+    # the exponents of the encodings matter: with nerfstudio's own the picture is another
+    stock = dataclasses.replace(
+        scene, fine=dataclasses.replace(scene.fine, position=Encoding(scene.fine.position.count, 0.0, 8.0))
+    )
+    other = NerfRenderer(stock, sampling, torch.float32).image(shown, shown.camera_to_world)
+    assert np.abs(other - expected).max() > 1e-3
+
+
+def test_a_nerf_in_the_viewer(nerfstudio: SimpleNamespace, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Concrete pictures grow while the view stays, bounds come ray by ray, and the panel says of what they are."""
+    file = folder / "outputs" / "options-None" / "abstract-nerf" / "t0" / "config.yml"
+    if not file.exists():
+        pytest.skip("the run that test_the_loader_reads_what_was_trained leaves is missing")
+    _config, pipeline, _ = nerfstudio.viewing.open_run(file)
+    model, camera = pipeline.model, cameras(nerfstudio, height=96, width=128)
+    draws: list[int] = []
+    monkeypatch.setattr(model.abstract.control, "draw", lambda: draws.append(1))
+    model.abstract.control._present.set()
+    model._speed = 1000.0
+    model.abstract._sliders["x"].value = 1.0
+    model.abstract._seconds.value = 20.0
+    assert "± mean" not in {element.name for element in model.abstract.elements}
+    try:
+        sizes = []
+        for _ in range(8):
+            found = model.get_outputs_for_camera(camera)
+            assert found["rgb_fine"].shape == (96, 128, 3) and list(found)[-4:] == OUTPUTS
+            # the viewer's render thread looks for it
+            assert found["depth"].shape == (96, 128, 1)
+            sizes.append(model._drawn[1]["rgb_fine"].shape[0])
+        assert sizes == sorted(sizes) and sizes[0] < sizes[-1] and draws
+        text = until(
+            lambda: (
+                model.get_outputs_for_camera(camera)
+                and "pixels" in (said := model.abstract._figures.text)
+                and model._background.status.state == "idle"
+                and said
+            ),
+            300,
+            "bounds of rays",
+        )
+        assert "uniform samples" in text and "real-sound" in text
+        source = model.abstract_source()
+        assert model.abstract_source() is source
+        small = View(nerfstudio.panel.camera_of(camera), model.abstract.perturbation).at_most(source.most)
+        snapshot = model._background.best(small, 20.0)
+        assert snapshot.untreated < snapshot.size[0] * snapshot.size[1]
+        frame = source.frame(
+            small.camera.rescaled(small.camera.height / snapshot.size[0]), small.perturbation
+        )
+        for values in [*frame.box.corners(), *frame.box.sample(10, np.random.default_rng(0))]:
+            picture = frame.renderer.image(frame.camera, frame.pose_set.pose(values))
+            assert ((picture >= snapshot.lower) & (picture <= snapshot.upper)).all()
+        # a moved camera begins with a small picture again
+        model.get_outputs_for_camera(cameras(nerfstudio, 1, 96, 128))
+        assert model._drawn[1]["rgb_fine"].shape[0] < sizes[-1]
+        # what is cropped is not what is bounded
+        from nerfstudio.data.scene_box import OrientedBox
+
+        part = OrientedBox.from_params((0.0, 0.0, 0.0), (0.0, 0.0, 0.0), (0.4, 0.4, 0.4))
+        found = model.get_outputs_for_camera(camera, part)
+        assert (found["abstract_upper"] == 1).all() and "crop box" in model.abstract._figures.text
+    finally:
+        model._background.close()
 
 
 def test_stock_viewer_starts(nerfstudio: SimpleNamespace, folder: Path, config_file: Path) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import os
 import sys
 import time
@@ -15,17 +16,20 @@ import numpy as np
 import pytest
 from browser import until
 from conftest import Inputs, blob_scene, ring
+from nerfs import tiny_scene
+from nerfs import view as nerf_camera
 from test_cli import call, one_line  # noqa: F401
 
 from ns_abstract.cli import viewer as viewer_command
+from ns_abstract.errors import InputError
 from ns_abstract.methods.splat.activate import activate
 from ns_abstract.methods.splat.constants import GSPLAT_1_4_0
 from ns_abstract.methods.splat.frame import SplatFrame, TileBounds
 from ns_abstract.refine.engine import Goal, Refinement
 from ns_abstract.sets.path import Camera
-from ns_abstract.sets.perturbation import Perturbation
+from ns_abstract.sets.perturbation import Perturbation, parse_perturbation, perturbation_object
 from ns_abstract.viewer.background import Background
-from ns_abstract.viewer.views import Snapshot, SplatSource, View, perturbation_of
+from ns_abstract.viewer.views import NerfSource, Snapshot, Source, SplatSource, View, perturbation_of
 
 PATIENCE = 120.0
 Call = Callable[..., tuple[int, str]]
@@ -72,8 +76,9 @@ class Unsound(SplatFrame):
 
 
 def source(odd: str = "") -> SplatSource:
-    splats = activate(blob_scene(), GSPLAT_1_4_0)
-    return Odd(splats, odd=odd) if odd else SplatSource(splats)
+    scene = blob_scene()
+    splats = activate(scene, GSPLAT_1_4_0)
+    return Odd(splats, scene, odd=odd) if odd else SplatSource(splats, scene)
 
 
 @pytest.fixture
@@ -83,10 +88,10 @@ def background(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[..., Backgr
     monkeypatch.setenv("NUMBA_NUM_THREADS", "1")
     made: list[Background] = []
 
-    def make(odd: str = "", **options: Any) -> Background:
+    def make(odd: str = "", scene: Source | None = None, **options: Any) -> Background:
         found = Background(**options)
         made.append(found)
-        found.show(source(odd))
+        found.show(source(odd) if scene is None else scene)
         return found
 
     yield make
@@ -256,6 +261,144 @@ def test_refinement_can_be_looked_at_and_continued() -> None:
     np.testing.assert_array_equal(whole.lower, first.lower)
     for _, snapshot in found:
         assert violations(snapshot, view(x=0.05)) == 0
+
+
+# ---------------------------------------------------------------- variations of the scene
+
+#: About a third of the Gaussians of `blob_scene`.
+SELECT = '{"box": [[-9, -9, -9], [0, 9, 9]], "opacity": [0.2, 1]}'
+
+
+def varied_view(select: str = SELECT, **radii: float) -> View:
+    return View(camera(), perturbation_of(radii, select))
+
+
+def outside(snapshot: Snapshot, view: View, count: int = 24) -> int:
+    """Values of pictures of members of ``view``'s set outside the bounds."""
+    at = view.camera.rescaled(view.side / max(snapshot.size))
+    frame = source().frame(at, view.perturbation)
+    rng, found = np.random.default_rng(5), 0
+    for member in itertools.islice(frame.varied.members(rng), count):
+        values = frame.box.middle if frame.box.dimensions == 0 else frame.box.sample(1, rng)[0]
+        picture = frame.renderer.image(at, *frame.pose_set.world_to_camera(values), member)
+        found += int(((picture < snapshot.lower) | (picture > snapshot.upper)).sum())
+    return found
+
+
+@pytest.mark.parametrize("quantity", ["mean", "opacity", "color"])
+def test_a_variation_slider_widens_the_abstract_image(background: Callable[..., Background], quantity: str) -> None:
+    one = background()
+    narrow, wide = (varied_view(**{quantity: radius}) for radius in (0.01, 0.04))
+    still = answer(one, View(camera(), perturbation_of({})))
+    first, second = answer(one, narrow), answer(one, wide)
+    assert outside(first, narrow) == outside(second, wide) == 0
+    # what is asked for is what is bounded: the wider set leaves the narrower one's bounds, and the smaller gap's
+    assert outside(first, wide) > 0 and outside(still, narrow) > 0
+    gaps = [float((s.upper - s.lower).mean()) for s in (still, first, second)]
+    assert gaps[0] < gaps[1] < gaps[2]
+    assert all(s.figures["mpg_witness"] > 0.0 for s in (first, second))  # type: ignore[operator]
+    # and the other way: the slider back at 0 is the picture of before
+    assert one.best(View(camera(), perturbation_of({quantity: 0.0})), 1.0) is still
+
+
+def test_variations_and_poses_together(background: Callable[..., Background]) -> None:
+    asked = varied_view(x=0.005, color=0.02, mean=0.002)
+    found = answer(background(), asked, 2.0)
+    assert outside(found, asked) == 0
+    assert outside(found, varied_view(x=0.005, color=0.1)) > 0
+
+
+def test_sets_of_the_sliders_are_read_back() -> None:
+    every = perturbation_of(dict.fromkeys(("x", "yaw", "mean", "opacity", "color"), 0.25), SELECT)
+    assert parse_perturbation(perturbation_object(every)) == every
+    assert every.scene[0].mean == (-0.25, 0.25) and every.scene[0].select.opacity == (0.2, 1.0)
+    rules = {
+        "select": {"color": {"max": [0.5, 1.0, 1.0]}, "indices": [3, 1]},
+        "opacity": [-0.1, 0.3],
+    }
+    spec = {
+        "version": 1, "frame": "world", "sweep": "segments", "translation": {"y": [0, 0.5]},
+        "orbit": {"target": [0, 0, 1], "axis": [0, 1, 0], "azimuth": [0, 1]},
+        "scene": [rules, {"select": {}, "mean": 1}],
+    }  # fmt: skip
+    given = parse_perturbation(spec)
+    assert parse_perturbation(perturbation_object(given)) == given
+    # the views of different sets of scenes are different views
+    keys = {varied_view(**r).key for r in ({"mean": 0.1}, {"opacity": 0.1}, {"mean": 0.2})}
+    assert len(keys | {varied_view("{}", mean=0.1).key}) == 4
+
+
+@pytest.mark.parametrize("text", ["{", "[]", '{"sphere": 1}', '{"box": [[0, 0, 0]]}', '{"opacity": [NaN, 1]}'])
+def test_selections_that_cannot_be_read(text: str) -> None:
+    with pytest.raises(InputError, match="select"):
+        perturbation_of({"mean": 0.1}, text)
+    # nobody looks at them where nothing varies
+    assert perturbation_of({"x": 0.1, "mean": 0.0}, text) == perturbation_of({"x": 0.1})
+
+
+def test_an_empty_selection_is_told(background: Callable[..., Background]) -> None:
+    one = background()
+    nothing = varied_view('{"box": [[8, 8, 8], [9, 9, 9]]}', mean=0.1)
+    until(lambda: one.best(nothing, 1.0) or one.status.state == "failed", PATIENCE, "the failure")
+    assert "picks none of 50 Gaussians" in one.status.detail
+    assert answer(one, view()).final
+
+
+# ---------------------------------------------------------------- NeRFs
+
+
+def test_bounds_of_a_nerf_ray_by_ray(background: Callable[..., Background]) -> None:
+    scene = NerfSource(tiny_scene(3))
+    asked = View(nerf_camera(6, 5), perturbation_of({"x": 0.002}))
+    one = background(scene=scene)
+    seen: list[Snapshot] = []
+
+    def look() -> bool:
+        found = one.best(asked, 20.0)
+        if found is not None and (not seen or found is not seen[-1]):
+            seen.append(found)
+        assert one.status.state != "failed", one.status.detail
+        return one.status.state == "idle"
+
+    until(look, PATIENCE, "the end of the work")
+    assert seen[-1].final and seen[-1].guarantee == "real-sound" and seen[-1].size == (5, 6)
+    # rays that were not reached are [0, 1], and fewer and fewer
+    assert [s.untreated for s in seen] == sorted((s.untreated for s in seen), reverse=True)
+    assert seen[-1].untreated < 15
+    frame = scene.frame(asked.camera, asked.perturbation)
+    pictures = [
+        frame.renderer.image(frame.camera, frame.pose_set.pose(v))
+        for v in [*frame.box.corners(), *frame.box.sample(20, np.random.default_rng(0))]
+    ]
+    for found in seen:
+        assert all(((p >= found.lower) & (p <= found.upper)).all() for p in pictures)
+    tight = dataclasses.replace(seen[-1], upper=seen[-1].upper - np.float32(0.05))
+    assert not all((p <= tight.upper).all() for p in pictures)
+
+
+def test_nerfs_are_bounded_in_small_pictures() -> None:
+    scene = NerfSource(tiny_scene(3))
+    shown = View(camera(512, 384), perturbation_of({"x": 0.01}))
+    small = shown.at_most(scene.most)
+    assert (small.camera.width, small.camera.height) == (32, 24)
+    assert small.key == shown.key and small.at_most(64) is small and shown.at_most(None) is shown
+    assert [c.width for c, _ in small.stages(9.0, 0, scene.ladder)] == [8, 16, 32]
+    with pytest.raises(InputError, match="no Gaussians"):
+        scene.frame(shown.camera, perturbation_of({"mean": 0.1}))
+
+
+def test_a_larger_picture_of_which_less_is_known_waits() -> None:
+    def snapshot(size: int, untreated: int, *, final: bool) -> Snapshot:
+        lower = np.full((size, size, 3), 0.5, np.float32)
+        upper = lower.copy()
+        lower.reshape(-1, 3)[:untreated], upper.reshape(-1, 3)[:untreated] = 0.0, 1.0
+        return Snapshot(lower, upper, lower, upper, {}, 0.0, 1, final, "real-sound")
+
+    one, asked = Background(), View(camera(64, 64), perturbation_of({"x": 0.01}))
+    steps = ((8, 16, True, 8), (16, 200, False, 8), (16, 50, False, 16), (32, 900, True, 32))
+    for size, untreated, final, shown in steps:
+        one._store(asked.key, asked, snapshot(size, untreated, final=final))
+        assert one._cache[asked.key].size == (shown, shown)
 
 
 # ---------------------------------------------------------------- the command

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import json
 import sys
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -61,25 +62,64 @@ class Ply:
     """The .ply file; replaced if it exists."""
 
 
+@dataclass
+class VnnLib:
+    """Abstract images, a network and a property as ONNX and VNN-LIB, for other verifiers.
+
+    Cuts the set of poses of a frame into boxes and writes for each NAME.onnx, whose input is the box's parameters in
+    [-1, 1] and the slack of every number of the image, and NAME.vnnlib ("unsat": the property holds on every image
+    of the box). Beside them instances.csv, as verifiers of VNN-COMP read it, and boxes.json, the boxes.
+    """
+
+    load_config: Path
+    """config.yml of a Splatfacto run, or a standard 3DGS .ply."""
+    camera_path_filename: Path
+    """Camera path as Nerfstudio's viewer writes it."""
+    model: Path
+    """Network: .onnx."""
+    property: Path
+    """What is to hold (JSON): classification or vnnlib, with the preprocessing."""
+    output_dir: Path
+    """Folder for the files; made if missing."""
+    perturbation_filename: Path | None = None
+    """Set of poses (JSON). Default: the key "perturbation" of the camera path, or its poses alone."""
+    frames: tuple[int, ...] | None = None
+    """Entries of the camera path, counted from 0. Default: all."""
+    parts: tuple[int, ...] = ()
+    """Boxes along each parameter of the set. Default: 1."""
+    renderer: Literal["gsplat", "paper"] = "gsplat"
+    """gsplat: what Nerfstudio shows. paper: Algorithm 1 of "Abstract Rendering" (no thresholds, RGB)."""
+    arithmetic: Literal["float32", "real"] = "float32"
+    """float32: images of every float32 evaluation. real: the real-number renderer and its float64 evaluation."""
+    form: Literal["slice", "gemm"] = "slice"
+    """slice: small files. gemm: no operators in front but Gemm and Reshape, for verifiers that know little."""
+    timeout: int = 300
+    """Seconds by box in instances.csv."""
+
+
 Command = (
     Annotated[Npz, tyro.conf.subcommand("npz")]
     | Annotated[Png, tyro.conf.subcommand("png")]
     | Annotated[Mp4, tyro.conf.subcommand("mp4")]
     | Annotated[Ply, tyro.conf.subcommand("ply")]
+    | Annotated[VnnLib, tyro.conf.subcommand("vnnlib")]
 )
 
 
-def export(options: Npz | Png | Mp4 | Ply) -> int:
+def export(options: Npz | Png | Mp4 | Ply | VnnLib) -> int:
     """Run the command; returns the exit code.
 
     Raises:
         InputError: A file or an option cannot be used.
     """
-    target = options.output_dir if isinstance(options, Png) else options.output_filename
+    into = isinstance(options, (Png, VnnLib))
+    target = options.output_dir if into else options.output_filename
     try:
-        if not isinstance(options, Png):
+        if not into:
             target.parent.mkdir(parents=True, exist_ok=True)
-        if isinstance(options, Ply):
+        if isinstance(options, VnnLib):
+            notes = _vnnlib(options)
+        elif isinstance(options, Ply):
             from ns_abstract.methods.splat.load import load_scene
             from ns_abstract.methods.splat.ply import write_ply
 
@@ -92,6 +132,40 @@ def export(options: Npz | Png | Mp4 | Ply) -> int:
         print(note, file=sys.stderr)
     print(target)
     return DONE
+
+
+def _vnnlib(options: VnnLib) -> list[str]:
+    from ns_abstract.atomic import write_atomic
+    from ns_abstract.certification import Certification, CertifySettings
+    from ns_abstract.pipeline import check_frames
+    from ns_abstract.verify.cells import Grid
+
+    if options.timeout < 1:
+        raise InputError(f"found {options.timeout}", field="--timeout", fix="give a number of at least 1")
+    if any(n < 1 for n in options.parts):
+        raise InputError(f"found {min(options.parts)}", field="--parts", fix="give numbers of at least 1")
+    names = {entry.name for entry in fields(CertifySettings)} & {entry.name for entry in fields(VnnLib)}
+    job = Certification(CertifySettings(**{name: getattr(options, name) for name in names}))
+    options.output_dir.mkdir(parents=True, exist_ok=True)
+    lines, boxes = [], {}
+    for frame in check_frames(options.frames, job.job.frame_count):
+        box = job.job.pose_sets[frame].box
+        parts = options.parts or (1,) * box.dimensions
+        try:
+            grid = Grid.fixed(box, parts, parts)
+        except InputError as error:
+            raise InputError(error.problem, field="--parts", fix=error.fix) from None
+        for k, cell in enumerate(grid.roots()):
+            one = grid.box_of(cell)
+            name = f"frame_{frame:05d}_box_{k:05d}"
+            written = job.write_vnnlib(frame, one, options.output_dir / name, options.form)
+            lines.append(",".join([*(file.name for file in written), str(options.timeout)]))
+            sides = zip(one.names, one.units, one.lower, one.upper, strict=True)
+            boxes[name] = [dict(zip(("name", "unit", "lower", "upper"), side, strict=True)) for side in sides]
+    for file, text in (("instances.csv", "\n".join(lines)), ("boxes.json", json.dumps(boxes, indent=1))):
+        content = f"{text}\n".encode()
+        write_atomic(options.output_dir / file, lambda stream, content=content: stream.write(content))
+    return list(job.property.notes)
 
 
 def _path(options: Npz | Png | Mp4) -> list[str]:

@@ -334,7 +334,7 @@ def tensor_to_float32(value: Any, file: Path, field: str) -> NDArray[np.float32]
     if kind:
         raise InputError(f"{kind} tensor", file=file, field=field, fix="save it as a dense float32 tensor")
     # Strides of 0 let a small file claim any size.
-    if value.numel() * value.element_size() > file_size(file, "checkpoint"):
+    if value.numel() * value.element_size() > value.untyped_storage().nbytes():
         raise InputError("claims more values than the file holds", file=file, field=field, fix=_RECOPY)
     try:
         array = np.array(value.detach().resolve_neg().to(torch.float32).numpy(), np.float32, order="C")

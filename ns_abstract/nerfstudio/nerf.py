@@ -3,15 +3,32 @@
 from __future__ import annotations
 
 import dataclasses
+import math
+import time
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
+from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.field_components.encodings import NeRFEncoding
 from nerfstudio.fields.vanilla_nerf_field import NeRFField
 from nerfstudio.models.vanilla_nerf import NeRFModel, VanillaModelConfig
+from nerfstudio.utils.colors import COLORS_DICT
 
-from ns_abstract.nerfstudio.outputs import AbstractConfig, AbstractOutputs
+from ns_abstract.errors import InputError
+from ns_abstract.methods.nerf.load import field_weights
+from ns_abstract.methods.nerf.scene import NerfScene
+from ns_abstract.nerfstudio.outputs import AbstractConfig, AbstractOutputs, resampled
+from ns_abstract.nerfstudio.panel import camera_of
+from ns_abstract.viewer.views import NerfSource
+
+#: Seconds that a picture may take while the camera moves, and in the end; each picture of a view that stays has so
+#: many times the pixels of the one before.
+_FIRST, _LAST, _GROWTH = 0.2, 3.2, 4.0
+#: Rays by second that are assumed before any was drawn, and fewest rows of a picture.
+_RAYS, _ROWS = 200.0, 6
 
 
 @dataclass
@@ -31,8 +48,8 @@ class AbstractNerfModelConfig(VanillaModelConfig):
     """Frequencies of the encoded direction, from 1 to 2^(their number - 1)"""
     smoothness_penalty: float = 0.0
     """Weight of the logarithm of a Lipschitz bound of the networks in the loss; 1e-4 is a start"""
-    abstract: AbstractConfig = field(default_factory=AbstractConfig)
-    """Abstract images"""
+    abstract: AbstractConfig = field(default_factory=lambda: AbstractConfig(seconds=0.0, viewer_seconds=120.0))
+    """Abstract images; rays are bounded one after the other, so they are for small pictures"""
 
     @classmethod
     def of(cls, config: VanillaModelConfig) -> AbstractNerfModelConfig:
@@ -57,6 +74,11 @@ class AbstractNerfModel(AbstractOutputs, NeRFModel):
     def populate_modules(self) -> None:
         """Set up the fields."""
         super().populate_modules()
+        self._shown: tuple[Any, NerfSource] | None = None
+        #: what was drawn last: of which view, the outputs, and seconds for the next picture of it
+        self._drawn: tuple[Any, dict[str, torch.Tensor], float] | None = None
+        self._speed = _RAYS
+        self._cropped = False
         c = self.config
         if c.num_direction_frequencies == 0:
             # nerfstudio's own fields
@@ -75,6 +97,75 @@ class AbstractNerfModel(AbstractOutputs, NeRFModel):
             for _ in range(2)
         )
 
+    def abstract_source(self) -> NerfSource | None:
+        """The fields as they are shown; None where they are not what can be bounded.
+
+        Raises:
+            InputError: Only a part is shown.
+        """
+        c = self.config
+        if c.enable_temporal_distortion or not c.enable_collider or c.background_color == "last_sample":
+            return None
+        if self._cropped:
+            raise InputError("the whole field is bounded, a part of it is shown", fix="switch the crop box off")
+        fields = (self.field_coarse, self.field_fine)
+        state = tuple((id(p), p._version) for one in fields if one is not None for p in one.parameters())
+        background = self._color_behind()
+        key = state, background.tobytes()
+        if self._shown is None or self._shown[0] != key:
+            self._shown = key, NerfSource(self._scene(background))
+        return self._shown[1]
+
+    def _scene(self, background: np.ndarray) -> NerfScene:
+        c = self.config
+        exponents = (8.0, 4.0)
+        if c.num_direction_frequencies:
+            exponents = c.max_frequency_exponent, c.num_direction_frequencies - 1.0
+        state = {name: value.detach().cpu() for name, value in self.state_dict().items()}
+        coarse, fine = (
+            field_weights(state, name, Path("the loaded model"), exponents) for name in ("field_coarse", "field_fine")
+        )
+        return NerfScene(
+            coarse=coarse,
+            fine=fine,
+            near=0.0,
+            far=float(c.collider_params["far_plane"]),  # pyright: ignore[reportOptionalSubscript]
+            coarse_samples=c.num_coarse_samples,
+            importance_samples=c.num_importance_samples,
+            background=background,
+            name="model",
+            source="the loaded model",
+        )
+
+    def _color_behind(self) -> np.ndarray:
+        """[3] colour behind the last sample; black where it is random (renderers.py:144-146)."""
+        color = self.renderer_rgb.background_color
+        if isinstance(color, str):
+            color = COLORS_DICT.get(color, torch.zeros(3))
+        return color.detach().cpu().numpy().astype(np.float32).reshape(3)
+
+    def _concrete(self, camera: Any, obb_box: Any) -> dict[str, torch.Tensor]:
+        """The model's own outputs; in a viewer without CUDA, small pictures first, so that the camera can move."""
+        self._cropped = obb_box is not None
+        if not self.abstract.control.present or self.device.type == "cuda" or self.training:
+            return with_depth(super()._concrete(camera, obb_box))
+        shown = camera_of(camera)
+        box = None if obb_box is None else tuple(torch.cat([obb_box.R.flatten(), obb_box.T, obb_box.S]).tolist())
+        key = shown.camera_to_world.tobytes(), round(shown.fy / shown.height, 6), box
+        best, seconds = (self._drawn[1:] if self._drawn is not None and self._drawn[0] == key else ({}, _FIRST))
+        if seconds <= _LAST:
+            rays = self._speed * seconds
+            factor = max(1.0, min(math.sqrt(shown.width * shown.height / rays), shown.height / _ROWS))
+            small = shown.rescaled(factor)
+            pose = camera.camera_to_worlds.reshape(-1, 3, 4)[:1]
+            at = Cameras(pose, small.fx, small.fy, small.cx, small.cy, small.width, small.height).to(self.device)
+            start = time.perf_counter()
+            best = with_depth(super()._concrete(at, obb_box))
+            self._speed = small.width * small.height / (time.perf_counter() - start)
+            self._drawn = key, best, _GROWTH * seconds if factor > 1.0 else math.inf
+            self.abstract.control.draw()
+        return {name: resampled(value, shown.height, shown.width) for name, value in best.items()}
+
     def get_loss_dict(self, outputs: Any, batch: Any, metrics_dict: Any = None) -> dict[str, torch.Tensor]:
         """The losses of vanilla-nerf and the penalty."""
         losses = super().get_loss_dict(outputs, batch, metrics_dict)
@@ -83,6 +174,11 @@ class AbstractNerfModel(AbstractOutputs, NeRFModel):
             steepness = torch.stack([log_lipschitz(f) for f in fields]).mean()
             losses["smoothness"] = self.config.smoothness_penalty * steepness
         return losses
+
+
+def with_depth(outputs: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:
+    """The outputs and ``depth``, without which the viewer's render thread ends (render_state_machine.py:198)."""
+    return {**outputs, "depth": outputs["depth_fine"]}
 
 
 def log_lipschitz(module: torch.nn.Module) -> torch.Tensor:

@@ -14,12 +14,14 @@ import torch
 from nerfstudio.utils.rich_utils import CONSOLE
 
 from ns_abstract.arithmetic.selfcheck import check_functions
+from ns_abstract.errors import InputError
 from ns_abstract.nerfstudio.loading import lpips_known
 from ns_abstract.nerfstudio.panel import AbstractPanel, camera_of
 from ns_abstract.refine.engine import Goal, Refinement
 from ns_abstract.sets.perturbation import ROTATIONS, TRANSLATIONS
+from ns_abstract.sets.variations import VARIATIONS
 from ns_abstract.viewer.background import Background
-from ns_abstract.viewer.views import Snapshot, Source, View, perturbation_of
+from ns_abstract.viewer.views import Snapshot, Source, View
 
 if TYPE_CHECKING:
     from nerfstudio.models.base_model import Model
@@ -39,6 +41,14 @@ class AbstractConfig:
     """Radii of the set of poses along the camera's x, y and z, in scene units; sliders in the viewer."""
     rotation: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """Radii of yaw, pitch and roll in radians; sliders in the viewer."""
+    mean: float = 0.0
+    """Radius of the mean of every selected Gaussian, in scene units; a slider in the viewer."""
+    opacity: float = 0.0
+    """Radius of the opacity of every selected Gaussian; a slider in the viewer."""
+    color: float = 0.0
+    """Radius of the colour of every selected Gaussian; a slider in the viewer."""
+    select: str = "{}"
+    """Which Gaussians vary: "select" of the perturbation file; {} stands for all."""
     seconds: float = 2.0
     """Time for every image of ns-render and ns-eval; 0: no abstract images there."""
     viewer_seconds: float = 10.0
@@ -47,7 +57,8 @@ class AbstractConfig:
     @property
     def radii(self) -> dict[str, float]:
         """Radii by parameter."""
-        return dict(zip((*TRANSLATIONS, *ROTATIONS), (*self.translation, *self.rotation), strict=True))
+        poses = dict(zip((*TRANSLATIONS, *ROTATIONS), (*self.translation, *self.rotation), strict=True))
+        return {**poses, **{name: getattr(self, name) for name in VARIATIONS}}
 
 
 def pictures(snapshot: Snapshot | None, height: int, width: int) -> dict[str, torch.Tensor]:
@@ -62,11 +73,19 @@ def pictures(snapshot: Snapshot | None, height: int, width: int) -> dict[str, to
     else:
         lower, upper = snapshot.lower, snapshot.upper
         least, most = snapshot.witness_lower, snapshot.witness_upper
-    rows = np.minimum((np.arange(height) + 0.5) * (lower.shape[0] / height), lower.shape[0] - 1).astype(np.int64)
-    columns = np.minimum((np.arange(width) + 0.5) * (lower.shape[1] / width), lower.shape[1] - 1).astype(np.int64)
     gaps = [np.linalg.norm(high - low, axis=-1, keepdims=True) for low, high in ((lower, upper), (least, most))]
-    found = [np.ascontiguousarray(image[rows[:, None], columns]) for image in (lower, upper, *gaps)]
-    return dict(zip(OUTPUTS, map(torch.from_numpy, found), strict=True))
+    found = [resampled(torch.from_numpy(image), height, width) for image in (lower, upper, *gaps)]
+    return dict(zip(OUTPUTS, found, strict=True))
+
+
+def resampled(image: torch.Tensor, height: int, width: int) -> torch.Tensor:
+    """[height, width, c] of an image [h, w, c]: at every place the pixel of the image that covers its middle."""
+
+    def places(wanted: int, there: int) -> torch.Tensor:
+        return ((torch.arange(wanted, dtype=torch.float64) + 0.5) * (there / wanted)).clamp(max=there - 1).long()
+
+    rows, columns = places(height, image.shape[0]), places(width, image.shape[1])
+    return image[rows[:, None], columns].contiguous()
 
 
 @contextmanager
@@ -91,6 +110,9 @@ class AbstractOutputs(_Base):
     (ns-render, ns-eval) every image waits for its bounds. During training there are none.
     """
 
+    #: Whether the scene consists of Gaussians, which may vary.
+    gaussians = False
+
     def populate_modules(self) -> None:
         """Add the panel."""
         super().populate_modules()
@@ -100,6 +122,7 @@ class AbstractOutputs(_Base):
 
         self.abstract = AbstractPanel(
             options.radii,
+            options.select if self.gaussians else None,
             options.viewer_seconds,
             attached=lambda: (model := here()) and model._attached(),
             refine=lambda seconds: (model := here()) and model._background.more(seconds),
@@ -120,9 +143,12 @@ class AbstractOutputs(_Base):
     @torch.no_grad()
     def get_outputs_for_camera(self, camera: Any, obb_box: Any = None) -> dict[str, torch.Tensor]:
         """The model's outputs and the abstract images."""
-        outputs = super().get_outputs_for_camera(camera, obb_box)
+        outputs = self._concrete(camera, obb_box)
         if not self._evaluating or self.training:
             return outputs
+        if "depth" in outputs:
+            depth = outputs["depth"]
+            self.abstract.depth = float(depth[depth.shape[0] // 2, depth.shape[1] // 2, 0])
         try:
             with uninterrupted():
                 found = self._abstract(camera)
@@ -132,16 +158,27 @@ class AbstractOutputs(_Base):
             found = pictures(None, int(camera.height.reshape(-1)[0]), int(camera.width.reshape(-1)[0]))
         return {**outputs, **{name: value.to(self.device) for name, value in found.items()}}
 
+    def _concrete(self, camera: Any, obb_box: Any) -> dict[str, torch.Tensor]:
+        """The model's own outputs."""
+        return super().get_outputs_for_camera(camera, obb_box)
+
     def _abstract(self, camera: Any) -> dict[str, torch.Tensor]:
-        source = self.abstract_source()
         options: AbstractConfig = self.config.abstract  # pyright: ignore[reportAttributeAccessIssue]
-        if source is None or not (self.abstract.control.present or options.seconds > 0.0):
+        if not (self.abstract.control.present or options.seconds > 0.0):
             return {}
-        view = View(camera_of(camera), perturbation_of(self.abstract.radii))
+        shown = camera_of(camera)
+        try:
+            source = self.abstract_source()
+            if source is None:
+                return {}
+            view = View(shown, self.abstract.perturbation)
+        except InputError as error:
+            self.abstract.refuse(error)
+            return pictures(None, shown.height, shown.width)
         if self.abstract.control.present:
             self._show(source)
-            snapshot = self._background.best(view, self.abstract.seconds)
-            self.abstract.show(view, snapshot, self._background.status)
+            snapshot = self._background.best(view.at_most(source.most), self.abstract.seconds)
+            self.abstract.show(view, snapshot, self._background.status, source.about)
         else:
             snapshot = self._now(source, view, options.seconds)
         return pictures(snapshot, view.camera.height, view.camera.width)
@@ -149,7 +186,8 @@ class AbstractOutputs(_Base):
     def _now(self, source: Source, view: View, seconds: float) -> Snapshot:
         if self._problems is None:
             self._problems = check_functions()
-        result = Refinement(source.frame(view.camera, view.perturbation), 0, Goal(seconds=seconds)).run()
+        frame = source.frame(view.camera, view.perturbation)
+        result = Refinement(frame, 0, Goal(seconds=seconds), members=frame.members(0)).run()
         return Snapshot.of(result, final=True, guarantee="sampled" if self._problems else source.guarantee)
 
     def _attached(self) -> None:

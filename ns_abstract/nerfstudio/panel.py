@@ -25,14 +25,19 @@ from viser import ViserServer
 from ns_abstract.atomic import write_atomic
 from ns_abstract.demo.paths import View as PathView
 from ns_abstract.demo.paths import path_json
+from ns_abstract.errors import InputError
 from ns_abstract.report.figures import number
 from ns_abstract.sets.path import Camera
-from ns_abstract.sets.perturbation import ROTATIONS, TRANSLATIONS
+from ns_abstract.sets.perturbation import ROTATIONS, TRANSLATIONS, Perturbation, perturbation_object
+from ns_abstract.sets.variations import VARIATIONS
 from ns_abstract.viewer.background import Status
-from ns_abstract.viewer.views import Snapshot, View
+from ns_abstract.viewer.views import Snapshot, View, perturbation_of
 
 #: Right ends of the sliders, in thousandths.
 _MOST = 100.0
+_MOST_VARIATION = 500.0
+#: Side of the box around what is in the middle of the picture, as a part of its distance.
+_BOX = 0.25
 _HINTS = {
     "x": "sideways, thousandths of a scene unit",
     "y": "up and down, thousandths of a scene unit",
@@ -40,6 +45,9 @@ _HINTS = {
     "yaw": "turn left and right, milliradians",
     "pitch": "look up and down, milliradians",
     "roll": "tilt, milliradians",
+    "mean": "where each selected Gaussian stands, thousandths of a scene unit",
+    "opacity": "opacity of each selected Gaussian, thousandths",
+    "color": "colour channels of each selected Gaussian, thousandths",
 }
 
 
@@ -101,11 +109,11 @@ class Attached(ViewerControl):
 class AbstractPanel(torch.nn.Module):
     """Elements that nerfstudio's viewer finds in a model (viewer/utils.py, parse_object).
 
-    A module only because the viewer looks into nothing else; it has no parameters. More sliders, for
-    variations of the scene, are more entries of ``sliders``.
+    A module only because the viewer looks into nothing else; it has no parameters.
 
     Args:
         radii: Where the sliders start.
+        select: Which Gaussians vary, as the perturbation file says it; None: no scene of Gaussians.
         seconds: Time for a view before "refine" is pressed.
         attached: Called once a viewer is there.
         refine: Called with seconds.
@@ -114,6 +122,7 @@ class AbstractPanel(torch.nn.Module):
     def __init__(
         self,
         radii: dict[str, float],
+        select: str | None,
         seconds: float,
         attached: Callable[[], object],
         refine: Callable[[float], object],
@@ -121,19 +130,33 @@ class AbstractPanel(torch.nn.Module):
         super().__init__()
         self._refine = refine
         self._last: View | None = None
+        self._certified = select is not None
         self._figures = Figures("Abstract images: no view yet")
         self._sliders: dict[str, ViewerSlider] = {}
-        for name in (*TRANSLATIONS, *ROTATIONS):
-            start = 1000.0 * radii.get(name, 0.0)
+        #: depth of the middle of the picture on screen
+        self.depth: float | None = None
+        varied = () if select is None else VARIATIONS
+        for name in (*TRANSLATIONS, *ROTATIONS, *varied):
+            start, most = 1000.0 * radii.get(name, 0.0), _MOST_VARIATION if name in ("opacity", "color") else _MOST
             self._sliders[name] = ViewerSlider(
-                f"± {name}", start, 0.0, max(_MOST, start), 0.1, hint=f"Radius of the set: {_HINTS[name]}"
+                f"± {name}", start, 0.0, max(most, start), 0.1, hint=f"Radius of the set: {_HINTS[name]}"
             )
+        self._select = ViewerText(
+            "select",
+            select or "",
+            hint='Which Gaussians vary: {"box": [[x, y, z], [x, y, z]], "opacity": [low, high], '
+            '"color": {"min": [r, g, b], "max": [r, g, b]}}; {} stands for all',
+        )
+        selection: list[ViewerElement] = [] if select is None else [
+            self._select, ViewerButton("select what is in the middle", lambda _: self.select_middle())
+        ]  # fmt: skip
         self._seconds = ViewerNumber("seconds", seconds, hint="Time for every view, and for every press of refine")
         self._file = ViewerText("file", "", hint="Where to write the camera with its set; empty: in the run's folder")
         self.control = Attached(attached)
         self.elements: list[ViewerElement] = [
             self._figures,
             *self._sliders.values(),
+            *selection,
             self._seconds,
             ViewerButton("refine", lambda _: self._refine(float(self._seconds.value))),
             self._file,
@@ -154,15 +177,38 @@ class AbstractPanel(torch.nn.Module):
         return {name: float(slider.value) / 1000.0 for name, slider in self._sliders.items()}
 
     @property
+    def perturbation(self) -> Perturbation:
+        """The set that the panel describes.
+
+        Raises:
+            InputError: The selection cannot be read.
+        """
+        return perturbation_of(self.radii, str(self._select.value))
+
+    def select_middle(self) -> None:
+        """Select the Gaussians in a box around the surface in the middle of the picture."""
+        if self._last is None or self.depth is None:
+            return
+        pose = self._last.camera.camera_to_world
+        middle, side = pose[:, 3] - self.depth * pose[:, 2], 0.5 * _BOX * self.depth
+        self._select.value = json.dumps({"box": [np.round(middle + s, 4).tolist() for s in (-side, side)]})
+        self.control.draw()
+
+    @property
     def seconds(self) -> float:
         """Time for a view."""
         seconds = float(self._seconds.value)
         return min(max(seconds, 0.1), 86400.0) if math.isfinite(seconds) else 1.0
 
-    def show(self, view: View, snapshot: Snapshot | None, status: Status) -> None:
-        """Say what is known of the view on screen."""
+    def show(self, view: View, snapshot: Snapshot | None, status: Status, about: str = "") -> None:
+        """Say what is known of the view on screen; ``about`` as `ns_abstract.viewer.views.Source.about`."""
         self._last = view
-        self._figures.show(describe(view, snapshot, status))
+        self._figures.show(describe(view, snapshot, status, about))
+
+    def refuse(self, error: InputError) -> None:
+        """Say why there is no set."""
+        self._last = None
+        self._figures.show(f"**Abstract images**: no bounds, [0, 1] is shown  \n{error}")
 
     def send(self) -> None:
         """Write the camera on screen and its set as a camera path; says where in the panel."""
@@ -179,11 +225,12 @@ class AbstractPanel(torch.nn.Module):
         except OSError as error:
             self._figures.show(f"{self._figures.text}\n\n**{file}** cannot be written ({error.strerror})")
             return
-        command = f"--load-config {folder / 'config.yml'} --camera-path-filename {file}"
-        self._figures.show(
-            f"{self._figures.text}\n\nWritten: `{file}`\n\n`ns-abstract-certify {command} --model NET.onnx "
-            "--property PROP.json --output-dir OUT`"
-        )
+        files = f"--load-config {folder / 'config.yml'} --camera-path-filename {file}"
+        # certificates are for poses of splats
+        command = f"ns-abstract-certify {files} --model NET.onnx --property PROP.json"
+        if view.perturbation.scene or not self._certified:
+            command = f"ns-abstract-render {files}"
+        self._figures.show(f"{self._figures.text}\n\nWritten: `{file}`\n\n`{command} --output-dir OUT`")
 
 
 def _free_name(folder: Path) -> Path:
@@ -198,16 +245,11 @@ def certify_path(view: View) -> dict[str, Any]:
     camera, perturbation = view.camera, view.perturbation
     pose = np.concatenate([camera.camera_to_world, [[0.0, 0.0, 0.0, 1.0]]])
     fov = math.degrees(2.0 * math.atan(0.5 * camera.height / camera.fy))
-    spec = {
-        "version": 1,
-        "frame": perturbation.frame,
-        "translation": {name: list(ends) for name, ends in perturbation.translation.items()},
-        "rotation": {name: list(ends) for name, ends in perturbation.rotation.items()},
-    }
+    spec = perturbation_object(perturbation)
     return path_json([PathView(pose, fov, camera.height, camera.width)], seconds=1.0, perturbation=spec)
 
 
-def describe(view: View, snapshot: Snapshot | None, status: Status) -> str:
+def describe(view: View, snapshot: Snapshot | None, status: Status, about: str = "") -> str:
     """The figures of a view for people (Markdown)."""
     states = {"off": "", "starting": "starting", "working": "refining …", "idle": "done", "failed": "stopped"}
     state = states[status.state] + (f": {status.detail}" if status.detail else "")
@@ -225,6 +267,8 @@ def describe(view: View, snapshot: Snapshot | None, status: Status) -> str:
         f"ratio {number(figures['ratio'])}, {snapshot.seconds:.1f} s, {snapshot.cells} cells",
         f"{snapshot.guarantee}; {state}",
     ]
+    if about:
+        lines.append(f"Bounds {about}; nothing is known yet of {snapshot.untreated:,} of {height * width:,} pixels")
     return "  \n".join(lines)
 
 

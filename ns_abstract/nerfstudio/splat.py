@@ -16,6 +16,7 @@ from ns_abstract.methods.splat.activate import Splats, activate
 from ns_abstract.methods.splat.constants import GSPLAT_1_4_0
 from ns_abstract.methods.splat.load import scene_from_parameters
 from ns_abstract.methods.splat.render import Renderer
+from ns_abstract.methods.splat.scene import SplatScene
 from ns_abstract.nerfstudio.outputs import AbstractConfig, AbstractOutputs, uninterrupted
 from ns_abstract.nerfstudio.panel import camera_of
 from ns_abstract.viewer.views import SplatSource
@@ -42,11 +43,12 @@ class AbstractSplatfactoModel(AbstractOutputs, SplatfactoModel):
     """Trains as Splatfacto does; in evaluation it also bounds, and it needs no CUDA."""
 
     config: AbstractSplatfactoModelConfig
+    gaussians = True
 
     def populate_modules(self) -> None:
         """Set up the parameters; without CUDA a checkpoint brings them, so that none are made of points."""
         self._shown: tuple[Any, SplatSource, Renderer] | None = None
-        self._active: tuple[Any, Splats] | None = None
+        self._active: tuple[Any, SplatScene, Splats] | None = None
         given = self.config
         if not torch.cuda.is_available():
             self.seed_points = None
@@ -54,8 +56,8 @@ class AbstractSplatfactoModel(AbstractOutputs, SplatfactoModel):
         super().populate_modules()
         self.config = given
 
-    def _splats(self) -> Splats:
-        """The activated Gaussians of the current parameters."""
+    def _splats(self) -> tuple[SplatScene, Splats]:
+        """The Gaussians of the current parameters, as stored and activated."""
         state = tuple((id(value), value._version) for value in self.gauss_params.values())
         if self._active is None or self._active[0] != (state, self.step):
             plain = self.config.sh_degree == 0
@@ -71,12 +73,12 @@ class AbstractSplatfactoModel(AbstractOutputs, SplatfactoModel):
                 rasterize_mode=cast(Literal["classic", "antialiased"], self.config.rasterize_mode),
                 background=np.zeros(3, np.float32),
             )
-            self._active = (state, self.step), activate(scene, GSPLAT_1_4_0)
-        return self._active[1]
+            self._active = (state, self.step), scene, activate(scene, GSPLAT_1_4_0)
+        return self._active[1:]
 
     def _scene(self) -> tuple[SplatSource, Renderer]:
         """What is shown: the Gaussians inside the crop box, before the background."""
-        splats = self._splats()
+        scene, splats = self._splats()
         background = self._get_background_color().detach().cpu().numpy().astype(np.float64)
         box = self.crop_box
         crop = None if box is None else tuple(np.concatenate([np.ravel(v) for v in (box.R, box.T, box.S)]).tolist())
@@ -86,8 +88,9 @@ class AbstractSplatfactoModel(AbstractOutputs, SplatfactoModel):
                 inside = box.within(torch.from_numpy(splats.means.astype(np.float32))).reshape(-1).numpy()
                 parts = {name: getattr(splats, name)[inside] for name in ("means", "axes", "opacity", "sh")}
                 splats = dataclasses.replace(splats, **parts)
+                scene = cropped(scene, inside)
             splats = dataclasses.replace(splats, background=background)
-            self._shown = state, SplatSource(splats), Renderer(splats, GSPLAT_1_4_0)
+            self._shown = state, SplatSource(splats, scene), Renderer(splats, GSPLAT_1_4_0)
         return self._shown[1:]
 
     def abstract_source(self) -> SplatSource:
@@ -114,3 +117,11 @@ class AbstractSplatfactoModel(AbstractOutputs, SplatfactoModel):
             "accumulation": accumulation,
             "background": background.expand(view.height, view.width, 3),
         }
+
+
+def cropped(scene: SplatScene, inside: np.ndarray) -> SplatScene:
+    """The Gaussians of ``scene`` where ``inside`` [N] is true; they keep their numbers in the source."""
+    parts = {name: getattr(scene, name)[inside] for name in ("means", "log_scales", "quats", "opacity_logits", "sh")}
+    stored = np.arange(scene.count) if scene.stored is None else scene.stored
+    left_out = scene.dropped | {"outside the crop box": int((~inside).sum())}
+    return dataclasses.replace(scene, **parts, stored=stored[inside], dropped=left_out)

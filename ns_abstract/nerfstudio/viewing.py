@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
+import torch
 import yaml
 from nerfstudio.configs.base_config import ViewerConfig
 from nerfstudio.engine.trainer import TrainerConfig
@@ -26,6 +27,8 @@ from ns_abstract.nerfstudio.nerf import AbstractNerfModelConfig
 from ns_abstract.nerfstudio.pipeline import AbstractPipeline
 from ns_abstract.nerfstudio.splat import AbstractSplatfactoModelConfig
 
+#: Rays of a NeRF that are drawn at once on a CPU.
+_CHUNK = 256
 _FIX_DATA = "start the command in the folder that ns-train was started in, or put the data set back"
 
 
@@ -101,6 +104,9 @@ def _prepared(config: TrainerConfig, file: Path) -> TrainerConfig:
             fix="give a run of splatfacto, vanilla-nerf, abstract-splatfacto or abstract-nerf",
         )
     config.pipeline._target = AbstractPipeline
+    if isinstance(config.pipeline.model, AbstractNerfModelConfig) and not torch.cuda.is_available():
+        # pictures are interrupted between chunks when the camera moves
+        config.pipeline.model.eval_num_rays_per_chunk = min(_CHUNK, config.pipeline.model.eval_num_rays_per_chunk)
     folder = file.resolve().parent
     if (folder.name, folder.parent.name) == (config.timestamp, config.method_name):
         # nerfstudio looks below the working directory

@@ -12,7 +12,7 @@ import numpy as np
 from ns_abstract.errors import InputError
 from ns_abstract.jsonio import load_json, show
 from ns_abstract.sets.fields import Fail, Range, interval, known, vector
-from ns_abstract.sets.variations import KEYS, SceneVariation, parse_selection
+from ns_abstract.sets.variations import KEYS, VARIATIONS, SceneVariation, parse_selection, selection_object
 
 TRANSLATIONS = ("x", "y", "z")
 ROTATIONS = ("yaw", "pitch", "roll")
@@ -128,6 +128,30 @@ def parse_perturbation(
     )
 
 
+def perturbation_object(perturbation: Perturbation) -> dict[str, Any]:
+    """What a perturbation file holds for a set: `parse_perturbation` reads it back as the same set."""
+
+    def ranges(limits: Mapping[str, Range]) -> dict[str, list[float]]:
+        return {name: list(ends) for name, ends in limits.items()}
+
+    found: dict[str, Any] = {
+        "version": 1,
+        "frame": perturbation.frame,
+        "translation": ranges(perturbation.translation),
+        "rotation": ranges(perturbation.rotation),
+        "sweep": perturbation.sweep,
+    }
+    if (orbit := perturbation.orbit) is not None:
+        found["orbit"] = {"target": list(orbit.target), "axis": list(orbit.axis), "azimuth": list(orbit.azimuth)}
+    if perturbation.scene:
+        found["scene"] = [
+            {"select": selection_object(entry.select)}
+            | ranges({key: limits for key in VARIATIONS if (limits := getattr(entry, key)) is not None})
+            for entry in perturbation.scene
+        ]
+    return found
+
+
 def _choice(value: Mapping[str, Any], name: str, choices: tuple[str, ...], fail: Fail) -> str:
     found = value.get(name, choices[0])
     if found not in choices or not isinstance(found, str):
@@ -157,9 +181,9 @@ def _scene(value: Mapping[str, Any], fail, prefix: str, folder: Path | None) -> 
         known(entry, KEYS, f"{name}.", fail)
         if "select" not in entry:
             raise fail(f"{name}.select", "missing", "say which Gaussians vary; {} stands for all")
-        if not any(key in entry for key in KEYS[1:]):
+        if not any(key in entry for key in VARIATIONS):
             raise fail(name, "nothing varies", "write mean, opacity or color")
-        ranges = {key: interval(entry[key], f"{name}.{key}", fail) for key in KEYS[1:] if key in entry}
+        ranges = {key: interval(entry[key], f"{name}.{key}", fail) for key in VARIATIONS if key in entry}
         select = parse_selection(entry["select"], f"{name}.select", fail, folder)
         found.append(SceneVariation(select, **ranges, name=f"{prefix}{name}"))
     return tuple(found)

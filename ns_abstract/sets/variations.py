@@ -14,7 +14,8 @@ from ns_abstract.jsonio import load_json, read_bytes, read_text, show
 from ns_abstract.sets.fields import Fail, Range, Vector, interval, known, vector
 
 #: What an entry of the list may hold.
-KEYS = ("select", "mean", "opacity", "color")
+VARIATIONS = ("mean", "opacity", "color")
+KEYS = ("select", *VARIATIONS)
 SELECT_KEYS = ("box", "indices", "opacity", "color")
 
 _INDEX_BYTES = 256 << 20
@@ -92,6 +93,21 @@ def parse_selection(value: object, name: str, fail: Fail, folder: Path | None) -
         color_min=low_color,
         color_max=high_color,
     )
+
+
+def selection_object(select: Selection) -> dict[str, Any]:
+    """What a file holds for a selection: `parse_selection` reads it back as the same one."""
+    found: dict[str, Any] = {}
+    if select.box is not None:
+        found["box"] = [list(corner) for corner in select.box]
+    if select.indices is not None:
+        found["indices"] = list(select.indices)
+    if select.opacity is not None:
+        found["opacity"] = list(select.opacity)
+    colors = {"min": select.color_min, "max": select.color_max}
+    if any(color is not None for color in colors.values()):
+        found["color"] = {name: list(color) for name, color in colors.items() if color is not None}
+    return found
 
 
 def _ordered(low: Vector, high: Vector, name: str, fail: Fail) -> None:

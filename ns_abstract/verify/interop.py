@@ -2,12 +2,13 @@
 
 The written network takes ``X = (p, e)``, the cell's parameters p in [-1, 1]^d and one e in [-1, 1] for every
 number of the image, and computes ``A p + c + r e`` (the abstract image), the network, and the rows of the
-property. The VNN-LIB file (version 1) asks for an X in that box with a row that is not positive: "unsat"
-means that the property holds for every image of the set.
+property. The VNN-LIB file (version 1) asks for an X in that box with a group of rows none of which is positive:
+"unsat" means that the property holds for every image of the set.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Literal
 
@@ -27,7 +28,13 @@ _UNIT = 2.0**-24
 
 
 def write_vnnlib(
-    model: Path, images: ImageSets, rows: Any, offset: np.ndarray, target: Path, form: Form = "slice"
+    model: Path,
+    images: ImageSets,
+    rows: Any,
+    offset: np.ndarray,
+    target: Path,
+    form: Form = "slice",
+    groups: Sequence[Sequence[int]] | None = None,
 ) -> tuple[Path, Path]:
     """Write one abstract image, a network and a property as ``target.onnx`` and ``target.vnnlib``.
 
@@ -37,11 +44,12 @@ def write_vnnlib(
     Args:
         model: The network's .onnx file, with its weights inside.
         images: One cell.
-        rows, offset: [k, output_size] and [k]; the property is ``rows @ y + offset > 0``, with both rounded to
-            float32.
+        rows, offset: [k, output_size] and [k], both rounded to float32; the property is that in every group
+            some row of ``rows @ y + offset`` is above 0.
         target: Path without ending.
         form: "slice" needs n (d + 2) numbers for an image of n; "gemm" n (n + d), and no operator but Gemm
             and Reshape, for verifiers that know little.
+        groups: Row numbers of each group; None: every row is one.
 
     Raises:
         InputError: The network cannot be extended.
@@ -62,7 +70,7 @@ def write_vnnlib(
     _extend(proto, _parallel(images), network.input_shape, matrix, np.asarray(offset, np.float64), form)
     d, n = images.dimensions, network.input_size
     network_file, property_file = target.with_name(target.name + ".onnx"), target.with_name(target.name + ".vnnlib")
-    text = _vnnlib(d, n, len(matrix)).encode("ascii")
+    text = _vnnlib(d, n, [(k,) for k in range(len(matrix))] if groups is None else groups, len(matrix)).encode("ascii")
     write_atomic(network_file, lambda stream: stream.write(proto.SerializeToString()))
     write_atomic(property_file, lambda stream: stream.write(text))
     return network_file, property_file
@@ -147,14 +155,14 @@ def _extend(
     graph.output.append(helper.make_tensor_value_info(result, TensorProto.FLOAT, [1, len(rows)]))
 
 
-def _vnnlib(d: int, n: int, k: int) -> str:
-    """The box of (p, e) and the negated property, in VNN-LIB 1."""
+def _vnnlib(d: int, n: int, groups: Sequence[Sequence[int]], k: int) -> str:
+    """The box of (p, e) and the negated property of ``k`` rows, in VNN-LIB 1."""
     lines = [f"; X_0 to X_{d - 1}: parameters of the cell; the rest: slack of the image's {n} numbers"]
     lines += [f"(declare-const X_{i} Real)" for i in range(d + n)]
     lines += [f"(declare-const Y_{i} Real)" for i in range(k)]
     for i in range(d + n):
         lines += [f"(assert (>= X_{i} -1.0))", f"(assert (<= X_{i} 1.0))"]
     lines.append("(assert (or")
-    lines += [f"    (and (<= Y_{i} 0.0))" for i in range(k)]
+    lines += ["    (and " + " ".join(f"(<= Y_{i} 0.0)" for i in group) + ")" for group in groups]
     lines.append("))")
     return "\n".join(lines) + "\n"

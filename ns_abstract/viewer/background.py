@@ -24,8 +24,6 @@ from typing import Any
 
 from ns_abstract.viewer.views import Snapshot, Source, View
 
-#: Seconds that a worker may go on with an outdated request.
-_PATIENCE = 0.4
 #: Memory for pictures that were seen before.
 _CACHE_BYTES = 256 << 20
 #: A worker that ends sooner than this after its start is not replaced at once.
@@ -207,7 +205,8 @@ class Background:
         self._staff()
         if self._workers:
             self._workers[0].post(("work", number, view, seconds, known))
-        timer = threading.Timer(_PATIENCE, self._relieve)
+        assert self._source is not None
+        timer = threading.Timer(self._source[1].patience, self._relieve)
         timer.daemon = True
         timer.start()
 
@@ -226,7 +225,7 @@ class Background:
             if self._closed or self._wanted is None or self._source is None or len(self._workers) < 2:
                 return
             first, second = self._workers
-            late = time.monotonic() - self._asked >= _PATIENCE
+            late = time.monotonic() - self._asked >= self._source[1].patience
             if self._answered or not late or first.busy in (None, self._wanted[0]) or second.scene != self._source[0]:
                 return
             self._workers.pop(0)
@@ -287,7 +286,7 @@ class Background:
 
     def _store(self, key: _Key, view: View, snapshot: Snapshot) -> None:
         old = self._known(key, view)
-        if old is not None and old.size > snapshot.size:
+        if old is not None and (old.size > snapshot.size or (snapshot.says_less(old) and not snapshot.final)):
             return
         self._cache[key] = snapshot
         self._cache.move_to_end(key)

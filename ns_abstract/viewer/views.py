@@ -2,39 +2,63 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Protocol
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import Any, ClassVar, Protocol
 
 import numpy as np
 
 from ns_abstract.arithmetic.units import arithmetic as arithmetic_named
+from ns_abstract.jsonio import parse_json
+from ns_abstract.methods.nerf.frame import NerfFrame
+from ns_abstract.methods.nerf.method import NerfMethod
+from ns_abstract.methods.nerf.scene import NerfScene
 from ns_abstract.methods.splat.activate import Splats
 from ns_abstract.methods.splat.constants import RASTERISERS
 from ns_abstract.methods.splat.frame import SplatFrame
+from ns_abstract.methods.splat.scene import SplatScene
+from ns_abstract.methods.splat.variations import VariedSplats, vary
 from ns_abstract.refine.engine import Frame
 from ns_abstract.refine.result import FrameResult
 from ns_abstract.report.figures import metrics
 from ns_abstract.report.files import check_frame
 from ns_abstract.sets.path import Camera
-from ns_abstract.sets.perturbation import ROTATIONS, TRANSLATIONS, Perturbation
+from ns_abstract.sets.perturbation import ROTATIONS, TRANSLATIONS, Perturbation, parse_perturbation
 from ns_abstract.sets.poses import PoseSet
+from ns_abstract.sets.variations import VARIATIONS, SceneVariation
 
-#: Longest sides of the pictures that come before the one asked for, and the seconds that each may take.
-LADDER = {64: 0.25, 128: 0.6, 256: 1.5}
+#: Longest sides of the pictures that come before the one asked for, and the seconds that each may take: of splats,
+#: and of NeRFs, whose rays are bounded one after the other.
+SPLAT_LADDER = {64: 0.25, 128: 0.6, 256: 1.5}
+NERF_LADDER = {8: 30.0, 16: 60.0}
+#: Longest sides of a NeRF's pictures by the number of its weights, the last for all larger ones.
+_NERF_MOST = ((200_000, 32), (2_000_000, 16), (None, 8))
 
 
-def perturbation_of(radii: dict[str, float]) -> Perturbation:
-    """The set of poses within ``radii`` (x, y, z in normalised units; yaw, pitch, roll in radians) of a camera."""
+def perturbation_of(radii: Mapping[str, float], select: str = "{}") -> Perturbation:
+    """The set of poses within ``radii`` of a camera, and of scenes within ``radii`` of the stored one.
 
-    def ranges(names: tuple[str, ...]) -> dict[str, tuple[float, float]]:
-        return {name: (-radii[name], radii[name]) for name in names if radii.get(name, 0.0) > 0.0}
+    Args:
+        radii: x, y, z (normalised units), yaw, pitch, roll (radians); mean (normalised units), opacity, color.
+        select: Which Gaussians vary: a ``select`` object of the perturbation file, as text.
 
-    return Perturbation(translation=ranges(TRANSLATIONS), rotation=ranges(ROTATIONS))
+    Raises:
+        InputError: Gaussians are to vary and ``select`` cannot be read.
+    """
+
+    def given(names: Sequence[str]) -> dict[str, Any]:
+        return {name: radii[name] for name in names if radii.get(name, 0.0) > 0.0}
+
+    value: dict[str, Any] = {"translation": given(TRANSLATIONS), "rotation": given(ROTATIONS)}
+    if ranges := given(VARIATIONS):
+        value["scene"] = [{"select": parse_json(select.strip() or "{}", "select"), **ranges}]
+    return parse_perturbation(value, field_prefix="")
 
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """A camera with the size it is shown at, and the set of poses around it."""
+    """A camera with the size it is shown at, and the set of poses and scenes around it."""
 
     camera: Camera
     perturbation: Perturbation
@@ -43,7 +67,14 @@ class View:
     def key(self) -> tuple[bytes, float, str]:
         """Equal for views that differ in the size of the picture only."""
         camera = self.camera
-        return camera.camera_to_world.tobytes(), round(camera.fy / camera.height, 6), repr(self.perturbation)
+        around = f"{self.perturbation!r} {self.perturbation.scene!r}"
+        return camera.camera_to_world.tobytes(), round(camera.fy / camera.height, 6), around
+
+    def at_most(self, side: int | None) -> View:
+        """This view with a picture of no more than ``side`` pixels along its longest side."""
+        if side is None or self.side <= side:
+            return self
+        return replace(self, camera=self.camera.rescaled(self.side / side))
 
     @property
     def side(self) -> int:
@@ -56,9 +87,11 @@ class View:
         slack = 2.0 / min(height, width, camera.height, camera.width)
         return abs(width * camera.height / (height * camera.width) - 1.0) <= slack
 
-    def stages(self, seconds: float, known: int = 0) -> list[tuple[Camera, float]]:
+    def stages(
+        self, seconds: float, known: int = 0, ladder: Mapping[int, float] = SPLAT_LADDER
+    ) -> list[tuple[Camera, float]]:
         """Cameras of growing size above the longest side ``known`` and their times; the last is this view's own."""
-        smaller = [(self.camera.rescaled(self.side / s), t) for s, t in LADDER.items() if known < s < self.side]
+        smaller = [(self.camera.rescaled(self.side / s), t) for s, t in ladder.items() if known < s < self.side]
         return [*smaller, (self.camera, seconds)]
 
 
@@ -107,6 +140,15 @@ class Snapshot:
         )
 
     @property
+    def untreated(self) -> int:
+        """Pixels of which nothing is known: [0, 1] in every channel."""
+        return int(((self.lower == 0.0) & (self.upper == 1.0)).all(axis=-1).sum())
+
+    def says_less(self, other: Snapshot) -> bool:
+        """Whether nothing is known of a larger part of this picture than of ``other``."""
+        return self.untreated * other.size[0] * other.size[1] > other.untreated * self.size[0] * self.size[1]
+
+    @property
     def size(self) -> tuple[int, int]:
         """Height and width."""
         return self.lower.shape[0], self.lower.shape[1]
@@ -117,16 +159,47 @@ class Snapshot:
         return 4 * self.lower.nbytes
 
 
+class SceneFrame(Frame, Protocol):
+    """A frame whose scene may vary."""
+
+    def members(self, seed: int) -> Iterator[Any]:
+        """Other scenes of the set, each as a function like ``render``."""
+        ...
+
+
 class Source(Protocol):
-    """A scene that frames can be made of; crosses to the worker process."""
+    """A scene that frames can be made of; crosses to the worker process.
+
+    Attributes:
+        ladder: Longest sides of previews and the seconds that each may take.
+        most: Longest side that is worth bounding, or None.
+        patience: Seconds that a worker may go on with an outdated request before another takes over.
+        about: What is bounded where that is not the picture on screen, for people; or "".
+    """
+
+    @property
+    def ladder(self) -> Mapping[int, float]: ...
+
+    @property
+    def most(self) -> int | None: ...
+
+    @property
+    def patience(self) -> float: ...
+
+    @property
+    def about(self) -> str: ...
 
     @property
     def guarantee(self) -> str:
         """What the bounds are worth on a platform that passes its self-check."""
         ...
 
-    def frame(self, camera: Camera, perturbation: Perturbation) -> Frame:
-        """The frame of ``camera`` and a set of poses around it."""
+    def frame(self, camera: Camera, perturbation: Perturbation) -> SceneFrame:
+        """The frame of ``camera`` and a set of poses around it.
+
+        Raises:
+            InputError: The scene does not vary as asked.
+        """
         ...
 
     def warm_up(self) -> None:
@@ -140,13 +213,21 @@ class SplatSource:
 
     Attributes:
         splats: The activated Gaussians, with the background that is shown.
+        scene: The same Gaussians as stored, which selections look at.
         renderer: Name in `RASTERISERS`.
         arithmetic: "float32" or "real".
     """
 
     splats: Splats
+    scene: SplatScene
     renderer: str = "gsplat"
     arithmetic: str = "float32"
+    _kept: dict[tuple[SceneVariation, ...], VariedSplats] = field(default_factory=dict, init=False, repr=False)
+
+    ladder: ClassVar[Mapping[int, float]] = SPLAT_LADDER
+    most: ClassVar[int | None] = None
+    patience: ClassVar[float] = 0.4
+    about: ClassVar[str] = ""
 
     @property
     def guarantee(self) -> str:
@@ -154,13 +235,26 @@ class SplatSource:
         return f"{self.arithmetic}-sound"
 
     def frame(self, camera: Camera, perturbation: Perturbation) -> SplatFrame:
-        """The frame of ``camera`` and a set of poses around it."""
+        """The frame of ``camera`` and a set of poses and scenes around it.
+
+        Raises:
+            InputError: A selection is empty.
+        """
         return SplatFrame(
             self.splats,
             RASTERISERS[self.renderer],
             arithmetic_named(self.arithmetic),
             PoseSet.around(camera, perturbation),
+            varied=self._varied(perturbation),
         )
+
+    def _varied(self, perturbation: Perturbation) -> VariedSplats:
+        """The scenes of a set; those of the last set are kept, as pictures of several sizes ask for them."""
+        if perturbation.scene not in self._kept:
+            found = vary(self.scene, self.splats, perturbation.scene)
+            self._kept.clear()
+            self._kept[perturbation.scene] = found
+        return self._kept[perturbation.scene]
 
     def warm_up(self) -> None:
         """Compile the kernels for one and for several parameters."""
@@ -171,5 +265,56 @@ class SplatSource:
         pose[:, 3] = middle
         pose[2, 3] += distance
         camera = Camera(pose, 32.0, 32.0, 16.0, 16.0, 32, 32)
+        for radii in ({"x": 1e-4}, {"x": 1e-4, "yaw": 1e-4}):
+            self.frame(camera, perturbation_of(radii)).warm_up()
+
+
+@dataclass(frozen=True, eq=False)
+class NerfSource:
+    """A vanilla NeRF as it is bounded: its fine field at uniform samples, in small pictures.
+
+    Attributes:
+        scene: The fields.
+    """
+
+    scene: NerfScene
+
+    ladder: ClassVar[Mapping[int, float]] = NERF_LADDER
+    #: a few rays are bounded at once, and a new worker has to compile
+    patience: ClassVar[float] = 5.0
+
+    @property
+    def most(self) -> int:
+        """Longest side: so that all rays can be bounded within minutes."""
+        weights = sum(array.size for array in self.scene.fine.arrays())
+        return next(side for limit, side in _NERF_MOST if limit is None or weights <= limit)
+
+    @cached_property
+    def _method(self) -> NerfMethod:
+        return NerfMethod(self.scene)
+
+    @property
+    def guarantee(self) -> str:
+        """What the bounds are worth on a platform that passes its self-check."""
+        return self._method.guarantee
+
+    @property
+    def about(self) -> str:
+        """What is bounded, as that is not the picture on screen."""
+        s = self._method.sampling
+        return f"of the fine field at {s.samples} uniform samples by ray, not of the picture with importance samples"
+
+    def frame(self, camera: Camera, perturbation: Perturbation) -> NerfFrame:
+        """The frame of ``camera`` and a set of poses around it.
+
+        Raises:
+            InputError: Gaussians are to vary.
+        """
+        self._method.prepare([perturbation])
+        return self._method.frame(PoseSet.around(camera, perturbation))
+
+    def warm_up(self) -> None:
+        """Compile the kernels for one and for several parameters."""
+        camera = Camera(np.eye(3, 4), 2.0, 2.0, 1.0, 1.0, 2, 2)
         for radii in ({"x": 1e-4}, {"x": 1e-4, "yaw": 1e-4}):
             self.frame(camera, perturbation_of(radii)).warm_up()

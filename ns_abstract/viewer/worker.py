@@ -58,7 +58,10 @@ class Worker:
             self.connection.send(("begin", number))
             try:
                 self._work(*content)
-            except (InputError, ArithmeticError, ValueError, IndexError, AssertionError, MemoryError) as error:
+            except InputError as error:
+                self.refinement = None
+                self.connection.send(("error", number, str(error)))
+            except (ArithmeticError, ValueError, IndexError, AssertionError, MemoryError) as error:
                 self.refinement = None
                 self.connection.send(("error", number, f"{type(error).__name__}: {error}"))
 
@@ -83,7 +86,7 @@ class Worker:
             refinement.proceed(self._goal(refinement.trace[-1].seconds + seconds))
             self.tell(number, refinement, final=not self._stopped())
         else:
-            for camera, share in view.stages(seconds, known):
+            for camera, share in view.stages(seconds, known, self.source.ladder):
                 if not self._bound(number, camera, perturbation, share, key if camera is view.camera else ()):
                     return
         if not self._stopped():
@@ -92,7 +95,8 @@ class Worker:
     def _bound(self, number: int, camera: Camera, perturbation: Any, seconds: float, about: tuple[Any, ...]) -> bool:
         """Refine one size; False if a newer message waits."""
         assert self.source is not None
-        refinement = Refinement(self.source.frame(camera, perturbation), 0, self._goal(seconds), stopped=self._stopped)
+        frame = self.source.frame(camera, perturbation)
+        refinement = Refinement(frame, 0, self._goal(seconds), stopped=self._stopped, members=frame.members(0))
         refinement.progress = _Teller(self, number, refinement)
         self.refinement, self.about = refinement, about
         refinement.run()

@@ -1,11 +1,13 @@
 """Load a vanilla NeRF from an ``ns-train vanilla-nerf`` run folder.
 
 Nothing from Nerfstudio is imported and no code in the files is run. Numbers and widths of layers are
-those of the checkpoint; the encodings' exponents are Nerfstudio's own unless config.yml names others.
+those of the checkpoint; the encodings' exponents are Nerfstudio's own, and for runs of abstract-nerf what
+config.yml says.
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -14,20 +16,29 @@ from ns_abstract.jsonio import is_number, show
 from ns_abstract.methods import runs
 from ns_abstract.methods.nerf.scene import Encoding, FieldWeights, Layer, NerfScene
 
-_FIX = "give a run of vanilla-nerf"
+_FIX = "give a run of vanilla-nerf or abstract-nerf"
 _LAYERS_LIMIT = 64
 _SAMPLES_LIMIT = 4096
-#: nerfstudio/models/vanilla_nerf.py: exponents of the encodings, which its config cannot change.
-_POSITION_EXPONENTS, _DIRECTION_EXPONENTS = (0.0, 8.0), (0.0, 4.0)
+#: nerfstudio/models/vanilla_nerf.py: exponents of the encodings of positions and directions, which its config
+#: cannot change.
+_EXPONENTS = (8.0, 4.0)
+#: nerfstudio/nerf.py: defaults of abstract-nerf.
+_FREQUENCIES = {"num_frequencies": 6, "num_direction_frequencies": 2}
+_MAX_EXPONENT, _MAX_EXPONENT_LIMIT = 5.0, 60.0
+_FREQUENCIES_LIMIT = 64
+_STOCK, _OURS = ":nerfstudio.models.vanilla_nerf.NeRFModel", ":ns_abstract.nerfstudio.nerf.AbstractNerfModel"
 #: nerfstudio/models/base_model.py: default of ``collider_params``.
 _PLANES = {"near_plane": 2.0, "far_plane": 6.0}
 
 
 def holds_nerf(run: runs.RunConfig) -> bool:
     """Whether config.yml names vanilla NeRF: by its method or by its model class."""
+    return run.method_name in ("vanilla-nerf", "abstract-nerf") or _target(run).endswith((_STOCK, _OURS))
+
+
+def _target(run: runs.RunConfig) -> str:
     target = run.model.get("_target")
-    name = target.tag if isinstance(target, runs.Tagged) else ""
-    return run.method_name == "vanilla-nerf" or name.endswith(":nerfstudio.models.vanilla_nerf.NeRFModel")
+    return target.tag if isinstance(target, runs.Tagged) else ""
 
 
 def load_nerf(run: runs.RunConfig) -> NerfScene:
@@ -61,9 +72,10 @@ def load_nerf(run: runs.RunConfig) -> NerfScene:
             field="pipeline._model.field_fine",
             fix=_FIX,
         )
+    exponents, counts = _encodings(run)
     return NerfScene(
-        coarse=_field(state, "field_coarse", checkpoint),
-        fine=_field(state, "field_fine", checkpoint),
+        coarse=field_weights(state, "field_coarse", checkpoint, exponents, counts),
+        fine=field_weights(state, "field_fine", checkpoint, exponents, counts),
         # nerfstudio/model_components/scene_colliders.py: reset_near_plane, outside training
         near=0.0,
         far=_far_plane(run),
@@ -75,6 +87,25 @@ def load_nerf(run: runs.RunConfig) -> NerfScene:
         source=str(checkpoint),
         notes=notes,
     )
+
+
+def _encodings(run: runs.RunConfig) -> tuple[tuple[float, float], tuple[int | None, int | None]]:
+    """Highest exponents and, where config.yml says them, numbers of the frequencies of positions and directions."""
+    ours = run.method_name == "abstract-nerf" or _target(run).endswith(_OURS)
+    if not ours:
+        return _EXPONENTS, (None, None)
+    position, direction = (run.integer(name, n, 0, _FREQUENCIES_LIMIT) for name, n in _FREQUENCIES.items())
+    if direction == 0:
+        return _EXPONENTS, (None, None)
+    highest = run.model.get("max_frequency_exponent", _MAX_EXPONENT)
+    if not is_number(highest) or not 0.0 <= highest <= _MAX_EXPONENT_LIMIT:
+        raise InputError(
+            f"found {show(highest)}",
+            file=run.file,
+            field="pipeline.model.max_frequency_exponent",
+            fix=f"write a number from 0 to {_MAX_EXPONENT_LIMIT:g}",
+        )
+    return (float(highest), direction - 1.0), (position, direction)
 
 
 def _far_plane(run: runs.RunConfig) -> float:
@@ -90,7 +121,26 @@ def _far_plane(run: runs.RunConfig) -> float:
     return float(value)  # pyright: ignore[reportArgumentType]
 
 
-def _field(state: dict[str, Any], name: str, file: Path) -> FieldWeights:
+def field_weights(
+    state: Mapping[str, Any],
+    name: str,
+    file: Path,
+    exponents: tuple[float, float] = _EXPONENTS,
+    counts: tuple[int | None, int | None] = (None, None),
+) -> FieldWeights:
+    """One field of a model's state.
+
+    Args:
+        state: Tensors by name.
+        name: "field_coarse" or "field_fine".
+        file: Where the state is from, for messages.
+        exponents: Highest exponents of the frequencies of positions and directions; the lowest are 0.
+        counts: Numbers of these frequencies; None: what the layers' widths say.
+
+    Raises:
+        InputError: The layers do not fit each other or the encodings.
+    """
+
     def layer(key: str, skip: bool = False) -> Layer:
         where = f"pipeline._model.{name}.{key}"
         for part in ("weight", "bias"):
@@ -120,7 +170,9 @@ def _field(state: dict[str, Any], name: str, file: Path) -> FieldWeights:
             )
 
     base = layers("mlp_base")
-    position = _encoding(base[0].weight.shape[1], _POSITION_EXPONENTS, file, f"pipeline._model.{name}.mlp_base")
+    position = _encoding(
+        base[0].weight.shape[1], exponents[0], counts[0], file, f"pipeline._model.{name}.mlp_base"
+    )
     for i in range(1, len(base)):
         width, inputs = base[i - 1].weight.shape[0], base[i].weight.shape[1]
         fits(f"mlp_base.layers.{i}", inputs, (width, width + position.size))
@@ -129,7 +181,7 @@ def _field(state: dict[str, Any], name: str, file: Path) -> FieldWeights:
     density, head, color = layer("field_output_density.net"), layers("mlp_head"), layer("field_heads.0.net")
     fits("field_output_density.net", density.weight.shape[1], (width,))
     direction = _encoding(
-        head[0].weight.shape[1] - width, _DIRECTION_EXPONENTS, file, f"pipeline._model.{name}.mlp_head"
+        head[0].weight.shape[1] - width, exponents[1], counts[1], file, f"pipeline._model.{name}.mlp_head"
     )
     for i in range(1, len(head)):
         fits(f"mlp_head.layers.{i}", head[i].weight.shape[1], (head[i - 1].weight.shape[0],))
@@ -141,7 +193,7 @@ def _field(state: dict[str, Any], name: str, file: Path) -> FieldWeights:
     return FieldWeights(tuple(base), density, tuple(head), color, position, direction)
 
 
-def _encoding(size: int, exponents: tuple[float, float], file: Path, field: str) -> Encoding:
+def _encoding(size: int, highest: float, count: int | None, file: Path, field: str) -> Encoding:
     if size < 9 or (size - 3) % 6:
         raise InputError(
             f"{size} encoded values are not 3 coordinates with sines and cosines",
@@ -149,4 +201,12 @@ def _encoding(size: int, exponents: tuple[float, float], file: Path, field: str)
             field=f"{field}.layers.0.weight",
             fix=_FIX,
         )
-    return Encoding((size - 3) // 6, *exponents)
+    found = (size - 3) // 6
+    if count not in (None, found):
+        raise InputError(
+            f"takes {found} frequencies, config.yml says {count}",
+            file=file,
+            field=f"{field}.layers.0.weight",
+            fix="give the checkpoint that belongs to config.yml",
+        )
+    return Encoding(found, 0.0, highest)

@@ -122,7 +122,7 @@ def scene_from_parameters(
         background=background,
         name=name,
         source=source,
-        dropped=dropped,
+        **dropped,
     )
 
 
