@@ -43,6 +43,14 @@ _PARTS = 4096
 _QUIET = 0.02
 #: A cell on which an opacity is open by this much everywhere was far too wide.
 _LOST = 0.5
+#: Light that a sample may leave open before compositing has shown where it matters.
+_COARSE = 0.1
+#: A sample is worth halving if it can take away this share of what a part has too much.
+_SHARE = 0.125
+#: Rounds of halving where the colours' bounds are too wide.
+_ROUNDS = 32
+#: Numbers (rays, samples, parts) that are worked on together.
+_NUMBERS = 1 << 21
 #: Absolute rounding of activations and compositing, by sample.
 _COMPOSITE = 2.0**-44
 
@@ -212,6 +220,7 @@ class NerfBounds:
         pixels: np.ndarray,
         tolerance: float,
         known: np.ndarray | None = None,
+        aim: tuple[np.ndarray, np.ndarray] | None = None,
     ) -> RayBounds:
         """Bounds of the colours of ``pixels`` [n, 2] over every pose of ``box``.
 
@@ -220,6 +229,7 @@ class NerfBounds:
             pixels: Rows and columns.
             tolerance: What a sample's open opacity or colour may move a pixel by before its cells are halved.
             known: [n, samples] upper bounds of opacities over a larger box.
+            aim: [n, 3] lower and upper colours; bounds between them are good enough.
         """
         n, samples = len(pixels), self.distances.size
         pencil = Pencil(pose_set, box, pixels, self.taylor)
@@ -229,7 +239,17 @@ class NerfBounds:
             np.isfinite(pencil.direction).all() and np.isfinite(pencil.direction_radius).all()
         ):
             return RayBounds(np.zeros((n, 3)), np.ones((n, 3)), np.ones((n, samples), np.float32), 0)
-        return _Work(self, pencil, division, moves, tolerance, known).run()
+        if n > 1 and n * samples * math.prod(division.parts) > _NUMBERS:
+            halves = []
+            for which in (slice(0, n // 2), slice(n // 2, n)):
+                part = None if aim is None else (aim[0][which], aim[1][which])
+                given = None if known is None else known[which]
+                halves.append(self.rays(pose_set, box, pixels[which], tolerance, given, part))
+            lower, upper, alpha = (
+                np.concatenate([getattr(half, name) for half in halves]) for name in ("lower", "upper", "alpha")
+            )
+            return RayBounds(lower, upper, alpha, halves[0].cells + halves[1].cells)
+        return _Work(self, pencil, division, moves, tolerance, known, aim).run()
 
     def _division(self, moves: np.ndarray) -> Division | None:
         """Levels for samples that move by ``moves`` [n, samples, d]; None where the box is far too wide."""
@@ -274,14 +294,19 @@ class _Work:
         moves: np.ndarray,
         tolerance: float,
         known: np.ndarray | None,
+        aim: tuple[np.ndarray, np.ndarray] | None,
     ) -> None:
-        self.owner, self.pencil, self.division, self.tolerance = owner, pencil, division, tolerance
+        self.owner, self.pencil, self.division, self.tolerance, self.aim = owner, pencil, division, tolerance, aim
         self.basis, self.field = owner.basis, owner.field
         n, samples = moves.shape[:2]
         parts = math.prod(division.parts)
         self.alpha_low, self.alpha_high = np.zeros((samples, n, parts)), np.ones((samples, n, parts))
         self.color_low, self.color_high = np.zeros((samples, n, parts, 3)), np.ones((samples, n, parts, 3))
-        self.light = np.ones((n, parts))
+        # what the network itself leaves open of opacities and colours, and the level of the cells that showed it
+        self.open, self.vague = (np.ones((samples, n, parts), np.float32) for _ in range(2))
+        self.level = np.full((samples, n, parts), -1, np.int8)
+        # light that reaches a sample, and what all samples so far let through
+        self.before, self.light = np.ones((samples, n, parts), np.float32), np.ones((n, parts))
         self.cells = 0
         inverse = [1.0 / np.array(division.counts(level), np.float64) for level in range(division.levels + 1)]
         # the first level whose cells are narrow enough for the sample
@@ -297,14 +322,16 @@ class _Work:
         self._levels: dict[int, tuple[Tensor, Tensor, np.ndarray]] = {}
 
     def run(self) -> RayBounds:
-        """Bound block after block of samples, nearest first, then composite."""
+        """Bound block after block of samples, nearest first, then halve cells where colours are too wide."""
         samples = self.owner.distances.size
         for first in range(0, samples, _BLOCK):
             block = np.arange(first, min(samples, first + _BLOCK))
             if not (self.light > self._dark).any():
                 break
+            self.before[block] = self.light
             self._bound_block(block)
             self.light *= np.prod(1.0 - self.alpha_low[block], axis=0)
+        self._improve()
         lower, upper = self._composite()
         alpha = self.alpha_high.max(axis=2).T.astype(np.float32)
         return RayBounds(lower, upper, np.nextafter(alpha, np.float32(2.0)), self.cells)
@@ -353,7 +380,7 @@ class _Work:
             again = []
             for start in range(0, len(items), _BATCH):
                 batch = items.take(slice(start, start + _BATCH))
-                halve, lost = self._bound_batch(level, batch)
+                halve, lost = self._bound_batch(level, batch, _COARSE)
                 again.append(batch.take(halve))
                 halved += int((lost & (self.start[batch.ray, batch.sample] == level)).sum())
             coarse = join_items(again)
@@ -365,8 +392,58 @@ class _Work:
         if tried >= 32:
             self.owner.learn(tried, halved, wide)
 
-    def _bound_batch(self, level: int, items: _Items) -> tuple[np.ndarray, np.ndarray]:
-        """Bound some cells of one level; returns [k] which are worth halving, and for which of them all was lost."""
+    def _improve(self) -> None:
+        """Halve cells that leave colours open beyond the aim, round after round, on the parts where they do."""
+        rays = np.arange(self.light.shape[0])
+        for _ in range(_ROUNDS):
+            low, high, impact = self._impact(rays)
+            able = (self.level[:, rays] >= 0) & (self.level[:, rays] < self.division.levels)
+            threshold = np.full(impact.shape[1:], self.tolerance)
+            if self.aim is not None:
+                excess = np.maximum(high - self.aim[1][rays, None], self.aim[0][rays, None] - low).max(axis=2)
+                able &= excess > 0.0
+                threshold = np.minimum(_SHARE * excess, np.where(able, impact, 0.0).max(axis=0))
+                threshold = np.maximum(threshold, _SHARE * 0.5 * self.tolerance)
+            sample, ray, part = np.nonzero(able & (impact >= threshold))
+            if not sample.size:
+                return
+            ray = rays[ray]
+            level = self.level[sample, ray, part] + 1
+            for deeper in np.unique(level):
+                which = level == deeper
+                cell = self._cell_of(deeper)[part[which]]
+                found = np.unique(np.stack([ray[which], sample[which], cell]), axis=1)
+                for start in range(0, found.shape[1], _BATCH):
+                    self._bound_batch(int(deeper), _Items(*found[:, start : start + _BATCH]), math.inf)
+            rays = np.unique(ray)
+
+    def _cell_of(self, level: int) -> np.ndarray:
+        """[parts] the cell of ``level`` that every part lies in."""
+        members = self._level(level)[2]
+        return np.argsort(members, axis=None) // members.shape[1]
+
+    def _impact(self, rays: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Bounds [r, parts, 3] of ``rays``, and [samples, r, parts] what each sample leaves open of them (about)."""
+        alpha_low, alpha_high = self.alpha_low[:, rays], self.alpha_high[:, rays]
+        color_low, color_high = self.color_low[:, rays], self.color_high[:, rays]
+        light = np.ones_like(alpha_low)
+        np.cumprod(1.0 - alpha_low[:-1], axis=0, out=light[1:])
+        self.before[:, rays] = light
+        span = np.empty_like(alpha_low)
+        low, high = self._background(len(rays)), self._background(len(rays))
+        for k in range(len(span) - 1, -1, -1):
+            rise, fall = color_high[k] - high, color_low[k] - low
+            span[k] = np.maximum(color_high[k] - low, high - color_low[k]).max(axis=-1)
+            high += np.where(rise > 0.0, alpha_high[k][..., None], alpha_low[k][..., None]) * rise
+            low += np.where(fall < 0.0, alpha_high[k][..., None], alpha_low[k][..., None]) * fall
+        return low, high, light * (self.open[:, rays] * span + alpha_high * self.vague[:, rays])
+
+    def _background(self, count: int) -> np.ndarray:
+        """[count, parts, 3] the colour behind the last sample."""
+        return np.tile(np.array(self.owner.sampling.background, np.float64), (count, self.light.shape[1], 1))
+
+    def _bound_batch(self, level: int, items: _Items, coarse: float) -> tuple[np.ndarray, np.ndarray]:
+        """Bound some cells of one level; returns [k] which leave more light open than ``coarse``, or all of it."""
         device, field = self.owner.device, self.field
         monomials, bernstein, members = self._level(level)
         self.cells += len(items)
@@ -393,16 +470,17 @@ class _Work:
         open_ = torch.where(bad, 1.0, open_).cpu().numpy()
         low_a, high_a = alpha_low.cpu().numpy(), alpha_high.cpu().numpy()
         rows = items.sample[:, None], items.ray[:, None], members[items.cell]
-        light = self.light[rows[1], rows[2]]
+        light = self.before[rows]
         self._keep(self.alpha_low, self.alpha_high, rows, low_a, high_a)
-        halve = (open_ * light).max(axis=1) > self.tolerance
-        shines = (high_a * light).max(axis=1) > self.tolerance
+        self.open[rows] = np.minimum(self.open[rows], open_)
+        self.level[rows] = level
+        halve = (open_ * light).max(axis=1) > coarse
+        shines = (high_a * light).max(axis=1) > 0.5 * self.tolerance
         # what is halved gets its colours from the halves, if there are any
         final = ~halve | (level == self.division.levels)
         coloured = np.flatnonzero(shines & final & ~density.failed.cpu().numpy())
         if coloured.size:
-            vague = self._color(pieces, items.take(coloured), coloured, there, bernstein, rows, high_a * light)
-            halve[coloured] |= vague
+            self._color(pieces, items.take(coloured), coloured, there, bernstein, rows)
         return halve, halve & (open_.min(axis=1) > _LOST)
 
     def _color(
@@ -413,9 +491,8 @@ class _Work:
         there: Tensor,
         bernstein: Tensor,
         rows: tuple[np.ndarray, np.ndarray, np.ndarray],
-        shown: np.ndarray,
-    ) -> np.ndarray:
-        """Bound the colours of the pieces ``which``; returns [k] whether they are too vague."""
+    ) -> None:
+        """Bound the colours of the pieces ``which``."""
         device, field = self.owner.device, self.field
         index = torch.from_numpy(which).to(device)
         direction = there[index] @ torch.from_numpy(self.pencil.direction[items.ray]).to(device)
@@ -426,10 +503,11 @@ class _Work:
         bad = color.failed[:, None, None]
         low = torch.where(bad, 0.0, torch.sigmoid(low) * (1.0 - _COMPOSITE)).cpu().numpy()
         high = torch.where(bad, 1.0, (torch.sigmoid(high) * (1.0 + _COMPOSITE)).clamp(max=1.0)).cpu().numpy()
-        self._keep(self.color_low, self.color_high, tuple(r[which] for r in rows), low, high)
+        where = rows[0][which], rows[1][which], rows[2][which]
+        self._keep(self.color_low, self.color_high, where, low, high)
         slack = 2.0 * torch.tanh(0.25 * error.amax(dim=1))
         slack = torch.where(color.failed, 1.0, slack).cpu().numpy()
-        return slack * shown[which].max(axis=1) > self.tolerance
+        self.vague[where] = np.minimum(self.vague[where], slack[:, None])
 
     @staticmethod
     def _keep(lower: np.ndarray, upper: np.ndarray, rows: tuple, low: np.ndarray, high: np.ndarray) -> None:
@@ -444,9 +522,7 @@ class _Work:
 
     def _composite(self) -> tuple[np.ndarray, np.ndarray]:
         """[n, 3] bounds over all parts (design.md, F8)."""
-        background = np.array(self.owner.sampling.background, np.float64)
-        shape = (*self.light.shape, 3)
-        low, high = np.broadcast_to(background, shape).copy(), np.broadcast_to(background, shape).copy()
+        low, high = self._background(len(self.light)), self._background(len(self.light))
         for k in range(self.alpha_low.shape[0] - 1, -1, -1):
             least, most = self.alpha_low[k][..., None], self.alpha_high[k][..., None]
             rise, fall = self.color_high[k] - high, self.color_low[k] - low

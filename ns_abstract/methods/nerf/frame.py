@@ -23,6 +23,8 @@ _TOLERANCE = 0.12
 _MOST_TOLERANCE, _LEAST_TOLERANCE = 0.03, 5e-4
 #: Rays and poses rendered to estimate that variation.
 _LOOK_RAYS, _LOOK_POSES = 256, 7
+#: Poses on the diagonal of a box that are rendered to see which colours it reaches, besides random ones.
+_LOOK_SHARES = np.linspace(0.0, 1.0, 9)
 #: Weights that are multiplied in one call of `NerfFrame.bound`, in units of rays times weights.
 _WORK = 2_500_000
 
@@ -74,6 +76,7 @@ class NerfFrame:
         self.bounds = NerfBounds(scene, sampling, self.box.dimensions, device)
         weights = sum(array.size for array in scene.fine.arrays())
         self.batch = int(np.clip(_WORK // weights, 1, 64))
+        self._witness: tuple[np.ndarray, np.ndarray] | None = None
 
     @property
     def tile_count(self) -> int:
@@ -136,6 +139,7 @@ class NerfFrame:
                 self.bounds.rays(
                     self.pose_set, box, self._pixels(tiles[i : i + self.batch]), self._tolerance(box),
                     None if known is None else known[i : i + self.batch],
+                    self._aim(box, tiles[i : i + self.batch]),
                 )
                 for i in range(0, tiles.size, self.batch)
             ]  # fmt: skip
@@ -152,6 +156,23 @@ class NerfFrame:
             flat = np.zeros((*shape, d), np.float32)
             linear = flat, low, flat, high
         return RayBox(low, high, np.zeros(d), context, linear)
+
+    def watch(self, lower: np.ndarray, upper: np.ndarray) -> None:
+        """Take notice of the inner bounds [t, 1, 1, 3] of a refinement, which change while it works."""
+        self._witness = lower, upper
+
+    def _aim(self, box: ParameterBox, tiles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Colours [n, 3] that are reached over the box or, where a refinement is watched, the set, and some more."""
+        if self._witness is not None:
+            low, high = (side[tiles, 0, 0].astype(np.float64) for side in self._witness)
+        else:
+            rng = np.random.default_rng(0)
+            inside = [box.at(2.0 * (np.arange(box.dimensions) * 0.0 + share) - 1.0) for share in _LOOK_SHARES]
+            values = [*inside, *box.sample(_LOOK_POSES, rng)] if box.dimensions else [box.middle]
+            pictures = np.stack([self.render(v, tiles)[:, 0, 0] for v in values]).astype(np.float64)
+            low, high = pictures.min(axis=0), pictures.max(axis=0)
+        slack = self._tolerance(box)
+        return low - slack, high + slack
 
     def _tolerance(self, box: ParameterBox) -> float:
         """Narrower boxes are asked for when the bounds of wider ones are not good enough."""
