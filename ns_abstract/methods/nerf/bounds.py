@@ -18,6 +18,7 @@ from torch import Tensor
 from ns_abstract.arithmetic.chebyshev import ROUNDING, ChebyshevBasis
 from ns_abstract.arithmetic.taylor import TaylorArray
 from ns_abstract.arithmetic.units import UNIT64
+from ns_abstract.methods.nerf.hsv import Range, shifted_bounds
 from ns_abstract.methods.nerf.render import Sampling, camera_rays
 from ns_abstract.methods.nerf.scene import NerfScene
 from ns_abstract.methods.nerf.zonotope import Affine, FieldBounds, Pieces
@@ -51,8 +52,14 @@ _SHARE = 0.125
 _ROUNDS = 32
 #: Numbers (rays, samples, parts) that are worked on together.
 _NUMBERS = 1 << 21
+#: Light from a sample whose colour's shift is not looked at.
+_UNSEEN = 1e-5
 #: Absolute rounding of activations and compositing, by sample.
 _COMPOSITE = 2.0**-44
+
+
+#: Intervals of hue and saturation.
+Shifts = tuple[Range, Range]
 
 
 def basis_of(dimensions: int) -> ChebyshevBasis:
@@ -103,9 +110,7 @@ class Division:
     def members(self, level: int) -> np.ndarray:
         """[cells, parts of a cell] flat numbers of the parts of every cell."""
         counts, inner = self.counts(level), self.inner(level)
-        whole = np.arange(math.prod(self.parts)).reshape(
-            [n for pair in zip(counts, inner, strict=True) for n in pair]
-        )
+        whole = np.arange(math.prod(self.parts)).reshape([n for pair in zip(counts, inner, strict=True) for n in pair])
         order = [*range(0, 2 * self.dimensions, 2), *range(1, 2 * self.dimensions, 2)]
         return whole.transpose(order).reshape(math.prod(counts), math.prod(inner))
 
@@ -221,6 +226,7 @@ class NerfBounds:
         tolerance: float,
         known: np.ndarray | None = None,
         aim: tuple[np.ndarray, np.ndarray] | None = None,
+        shifts: list[Shifts] | None = None,
     ) -> RayBounds:
         """Bounds of the colours of ``pixels`` [n, 2] over every pose of ``box``.
 
@@ -229,27 +235,26 @@ class NerfBounds:
             pixels: Rows and columns.
             tolerance: What a sample's open opacity or colour may move a pixel by before its cells are halved.
             known: [n, samples] upper bounds of opacities over a larger box.
-            aim: [n, 3] lower and upper colours; bounds between them are good enough.
+            aim: [n, 3] lower and upper colours; bounds between them are good enough (before the shifts).
+            shifts: Intervals of hue and saturation that are added to all colours; bounds hold over all of them.
         """
         n, samples = len(pixels), self.distances.size
         pencil = Pencil(pose_set, box, pixels, self.taylor)
         moves = pencil.displacement(self.distances)
         division = self._division(moves)
-        if division is None or not (
-            np.isfinite(pencil.direction).all() and np.isfinite(pencil.direction_radius).all()
-        ):
+        if division is None or not (np.isfinite(pencil.direction).all() and np.isfinite(pencil.direction_radius).all()):
             return RayBounds(np.zeros((n, 3)), np.ones((n, 3)), np.ones((n, samples), np.float32), 0)
         if n > 1 and n * samples * math.prod(division.parts) > _NUMBERS:
             halves = []
             for which in (slice(0, n // 2), slice(n // 2, n)):
                 part = None if aim is None else (aim[0][which], aim[1][which])
                 given = None if known is None else known[which]
-                halves.append(self.rays(pose_set, box, pixels[which], tolerance, given, part))
+                halves.append(self.rays(pose_set, box, pixels[which], tolerance, given, part, shifts))
             lower, upper, alpha = (
                 np.concatenate([getattr(half, name) for half in halves]) for name in ("lower", "upper", "alpha")
             )
             return RayBounds(lower, upper, alpha, halves[0].cells + halves[1].cells)
-        return _Work(self, pencil, division, moves, tolerance, known, aim).run()
+        return _Work(self, pencil, division, moves, tolerance, known, aim).run(shifts or [])
 
     def _division(self, moves: np.ndarray) -> Division | None:
         """Levels for samples that move by ``moves`` [n, samples, d]; None where the box is far too wide."""
@@ -321,7 +326,7 @@ class _Work:
                 self.alpha_high[k, i] = known[i, k]
         self._levels: dict[int, tuple[Tensor, Tensor, np.ndarray]] = {}
 
-    def run(self) -> RayBounds:
+    def run(self, shifts: list[Shifts]) -> RayBounds:
         """Bound block after block of samples, nearest first, then halve cells where colours are too wide."""
         samples = self.owner.distances.size
         for first in range(0, samples, _BLOCK):
@@ -333,6 +338,13 @@ class _Work:
             self.light *= np.prod(1.0 - self.alpha_low[block], axis=0)
         self._improve()
         lower, upper = self._composite()
+        if shifts:
+            color = self.color_low, self.color_high
+            found = []
+            for shift in shifts:
+                self.color_low, self.color_high = self._shifted(color, shift)
+                found.append(self._composite())
+            lower, upper = np.min([low for low, _ in found], axis=0), np.max([high for _, high in found], axis=0)
         alpha = self.alpha_high.max(axis=2).T.astype(np.float32)
         return RayBounds(lower, upper, np.nextafter(alpha, np.float32(2.0)), self.cells)
 
@@ -519,6 +531,13 @@ class _Work:
         crossed = ~(low <= high)
         lower[rows] = np.where(crossed, old_low, low)
         upper[rows] = np.where(crossed, old_high, high)
+
+    def _shifted(self, color: tuple[np.ndarray, np.ndarray], shift: Shifts) -> tuple[np.ndarray, np.ndarray]:
+        """Bounds of ``color`` (lower, upper) after ``shift``; [0, 1] where next to nothing is seen of it."""
+        seen = self.before * self.alpha_high > _UNSEEN
+        low, high = np.zeros_like(color[0]), np.ones_like(color[1])
+        low[seen], high[seen] = shifted_bounds(color[0][seen], color[1][seen], *shift)
+        return low, high
 
     def _composite(self) -> tuple[np.ndarray, np.ndarray]:
         """[n, 3] bounds over all parts (design.md, F8)."""
