@@ -75,6 +75,26 @@ class Soundness(Scenes):
 
 
 @dataclass
+class Rays(Scenes):
+    """Random rays of a NeRF: CPU seconds by ray to a ratio, then attacks on the bounds."""
+
+    sets: tuple[str, ...] = ("yaw",)
+    """Sets of poses: x, yaw, roll, six, segments, orbit, point."""
+    rays: int = 20
+    """Number of rays."""
+    target_ratio: float = 1.1
+    """Where the rays are tight enough."""
+    seconds: float = 600.0
+    """Time for every scene and set."""
+    poses: int = 200
+    """Poses of the attacks, beside gradient ascent."""
+    scale: float = 1.0
+    """Multiplies the ranges of translations and rotations."""
+    seed: int = 0
+    """Decides every random choice."""
+
+
+@dataclass
 class Stiff:
     """Bound and attack tiny scenes at the ends of what can be loaded and asked."""
 
@@ -143,14 +163,15 @@ def stiff(options: Stiff) -> int:
     return 1 if failed else DONE
 
 
-def bench(options: Cell | Tightness | Soundness | Stiff) -> int:
+def bench(options: Cell | Tightness | Soundness | Rays | Stiff) -> int:
     """Run one benchmark; the exit code of a soundness benchmark with violations is 1."""
     if isinstance(options, Stiff):
         return stiff(options)
     from ns_abstract.bench.sets import open_jobs, pose_set
     from ns_abstract.bench.tables import markdown, write
 
-    jobs = open_jobs(options.load_config, options.camera_path_filename, options.downscale_factor)
+    arithmetic = "real" if isinstance(options, Rays) else "float32"
+    jobs = open_jobs(options.load_config, options.camera_path_filename, options.downscale_factor, arithmetic)
     rows: list[dict[str, object]] = []
     results = {}
     for job in jobs:
@@ -159,6 +180,15 @@ def bench(options: Cell | Tightness | Soundness | Stiff) -> int:
                 from ns_abstract.bench.cell import cell_cost
 
                 rows.append(cell_cost(job, name, options.frame, options.repeats))
+            elif isinstance(options, Rays):
+                from ns_abstract.bench.rays import measure
+
+                rows.append(
+                    measure(
+                        job, name, options.frame, options.scale, rays=options.rays, ratio=options.target_ratio,
+                        seconds=options.seconds, poses=options.poses, seed=options.seed,
+                    )
+                )  # fmt: skip
             elif isinstance(options, Tightness):
                 from ns_abstract.bench.tightness import refine, summary
 
@@ -183,18 +213,14 @@ def bench(options: Cell | Tightness | Soundness | Stiff) -> int:
                 )
             print(markdown(rows[-1:]) if len(rows) == 1 else markdown(rows[-1:]).splitlines()[2], flush=True)
     kind = type(options).__name__.lower()
-    write(
-        rows,
-        options.output_dir,
-        kind,
-        {"cell": "Cost of a cell", "tightness": "Error against run time"}.get(kind, "Soundness"),
-    )
+    titles = {"cell": "Cost of a cell", "tightness": "Error against run time", "rays": "Rays of a NeRF"}
+    write(rows, options.output_dir, kind, titles.get(kind, "Soundness"))
     if results:
         from ns_abstract.bench.plots import save_curves
 
         save_curves(options.output_dir / "tightness.png", results)
     violations = sum(int(str(row.get("violations", 0))) for row in rows)
-    if isinstance(options, Soundness):
+    if isinstance(options, Soundness | Rays):
         total = sum(int(str(row["comparisons"])) for row in rows)
         print(f"{total:,} comparisons, {violations} violations")
     return 1 if violations else DONE
@@ -203,7 +229,7 @@ def bench(options: Cell | Tightness | Soundness | Stiff) -> int:
 def main() -> None:
     """Entry point of the console script."""
     kinds = tyro.extras.subcommand_type_from_defaults(
-        {"cell": Cell(), "tightness": Tightness(), "soundness": Soundness(), "stiff": Stiff()}
+        {"cell": Cell(), "tightness": Tightness(), "soundness": Soundness(), "rays": Rays(), "stiff": Stiff()}
     )
     run(bench, lambda: tyro.cli(kinds, prog="ns-abstract-bench"))
 

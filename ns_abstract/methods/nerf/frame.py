@@ -74,6 +74,7 @@ class NerfFrame:
 
     def __init__(self, scene: NerfScene, sampling: Sampling, pose_set: PoseSet, device: str = "cpu") -> None:
         self.pose_set, self.camera, self.box = pose_set, pose_set.camera, pose_set.box
+        self.view = pose_set.camera
         self.side = 1
         self.across, self.down = tile_grid(self.camera, 1)
         self.renderer = NerfRenderer(scene, sampling, device=device)
@@ -107,7 +108,7 @@ class NerfFrame:
         """Rays [t, 1, 1, 3] float32 of the concrete image at parameter values [d]."""
         which = np.arange(self.tile_count) if tiles is None else tiles
         shift = color_shift(self.pose_set, values)
-        colors = self.renderer.pixels(self.camera, self.pose_set.pose(values), self._pixels(which), shift)
+        colors = self.renderer.pixels(self.view, self.pose_set.pose(values), self._pixels(which), shift)
         return colors.astype(np.float32)[:, None, None, :]
 
     def motion(self, box: ParameterBox) -> np.ndarray:
@@ -182,7 +183,7 @@ class NerfFrame:
             inside = [box.at(2.0 * (np.arange(box.dimensions) * 0.0 + share) - 1.0) for share in _LOOK_SHARES]
             values = [*inside, *box.sample(_LOOK_POSES, rng)] if box.dimensions else [box.middle]
             poses = [self._geometry.pose(v) for v in values]
-            pictures = np.stack([self.renderer.pixels(self.camera, pose, pixels) for pose in poses])
+            pictures = np.stack([self.renderer.pixels(self.view, pose, pixels) for pose in poses])
             low, high = pictures.min(axis=0), pictures.max(axis=0)
         return low - tolerance, high + tolerance
 
