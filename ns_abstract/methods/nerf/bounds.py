@@ -169,9 +169,12 @@ class Pencil:
         pose_set, box: The poses.
         pixels: [n, 2] rows and columns.
         degree: Of the Taylor models.
+        swept: Whether samples lie anywhere in their bins; the last parameter is the place there.
     """
 
-    def __init__(self, pose_set: PoseSet, box: ParameterBox, pixels: np.ndarray, degree: int) -> None:
+    def __init__(
+        self, pose_set: PoseSet, box: ParameterBox, pixels: np.ndarray, degree: int, swept: bool = False
+    ) -> None:
         rotation, position = pose_set.taylor(box, degree)
         in_camera = camera_rays(pose_set.camera, pixels)
         world = (rotation[None, :, :] * TaylorArray.constant(rotation.basis, in_camera)[:, None, :]).sum(2)
@@ -184,23 +187,45 @@ class Pencil:
         self.origin, self.origin_radius = position.coefficients, position.radius
         self.direction = np.ascontiguousarray(direction.coefficients.transpose(1, 0, 2))  # [n, M, 3]
         self.direction_radius = direction.radius + 16.0 * UNIT64
+        self.swept = swept
+        if swept:
+            # the place within a bin is one more parameter: (o + t d) + (h d) tau
+            place = np.repeat([0, 1], len(exponents))[:, None]
+            self.exponents = np.concatenate([np.tile(self.exponents, (2, 1)), place], axis=1)
+            self.origin = np.concatenate([self.origin, np.zeros_like(self.origin)])
+            self.along = np.concatenate([np.zeros_like(self.direction), self.direction], axis=1)
+            self.direction = np.concatenate([self.direction, np.zeros_like(self.direction)], axis=1)
 
-    def displacement(self, distances: np.ndarray) -> np.ndarray:
+    def points(self, ray: np.ndarray, distance: np.ndarray, half: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Polynomials [k, M, 3] and radii [k, 3] of points at ``distance`` [k] on ``ray`` [k], ``half`` [k] swept."""
+        lines = self.origin + distance[:, None, None] * self.direction[ray]
+        far = distance
+        if self.swept:
+            lines = lines + half[:, None, None] * self.along[ray]
+            far = distance + half
+        radius = self.origin_radius + far[:, None] * self.direction_radius[ray]
+        # rounding of the polynomial's evaluation, and of the concrete renderer's point and distance
+        size = np.abs(self.origin).sum(axis=0) + far[:, None] * np.abs(self.direction[ray]).sum(axis=1)
+        return lines, radius + 64.0 * UNIT64 * size
+
+    def displacement(self, distances: np.ndarray, lengths: np.ndarray) -> np.ndarray:
         """[n, samples, d] half of what a sample moves by over each parameter's range, about."""
         found = np.zeros((self.direction.shape[0], distances.size, self.exponents.shape[1]))
         for j in range(self.exponents.shape[1]):
             moving = self.exponents[:, j] > 0
             steps = self.origin[moving] + distances[:, None, None] * self.direction[:, None, moving]
             found[..., j] = np.linalg.norm(np.abs(steps).sum(axis=2), axis=-1)
+        if self.swept:
+            found[..., -1] = 0.5 * lengths
         return found
 
 
 class NerfBounds:
-    """Bounds of a scene's rays for uniform samples of the fine field.
+    """Bounds of a scene's rays.
 
     Args:
         scene: The scene.
-        sampling: A uniform one.
+        sampling: Uniform, or hierarchical: then the samples of the fine field may be anywhere (design.md, F10).
         dimensions: Number of parameters.
         device: Where the network is bounded.
     """
@@ -209,7 +234,8 @@ class NerfBounds:
         self, scene: NerfScene, sampling: Sampling, dimensions: int, device: torch.device | str = "cpu"
     ) -> None:
         self.sampling, self.device = sampling, torch.device(device)
-        self.basis = basis_of(dimensions)
+        self.swept = sampling.kind == "hierarchical"
+        self.basis = basis_of(dimensions + self.swept)
         self.field = FieldBounds(scene.fine, self.basis, device=device)
         edges = sampling.edges
         self.distances = 0.5 * (edges[1:] + edges[:-1])
@@ -239,8 +265,8 @@ class NerfBounds:
             shifts: Intervals of hue and saturation that are added to all colours; bounds hold over all of them.
         """
         n, samples = len(pixels), self.distances.size
-        pencil = Pencil(pose_set, box, pixels, self.taylor)
-        moves = pencil.displacement(self.distances)
+        pencil = Pencil(pose_set, box, pixels, self.taylor, self.swept)
+        moves = pencil.displacement(self.distances, self.lengths)
         division = self._division(moves)
         if division is None or not (np.isfinite(pencil.direction).all() and np.isfinite(pencil.direction_radius).all()):
             return RayBounds(np.zeros((n, 3)), np.ones((n, 3)), np.ones((n, samples), np.float32), 0)
@@ -335,7 +361,7 @@ class _Work:
                 break
             self.before[block] = self.light
             self._bound_block(block)
-            self.light *= np.prod(1.0 - self.alpha_low[block], axis=0)
+            self.light *= np.prod(1.0 - self._anywhere(self.alpha_low[block], np.minimum), axis=0)
         self._improve()
         lower, upper = self._composite()
         if shifts:
@@ -352,6 +378,11 @@ class _Work:
     def _dark(self) -> float:
         """Light that does not matter any more."""
         return 0.1 * self.tolerance
+
+    @property
+    def _faint(self) -> float:
+        """Light from a sample, at most, whose colour does not matter."""
+        return (0.1 if self.owner.swept else 0.5) * self.tolerance
 
     def _level(self, level: int) -> tuple[Tensor, Tensor, np.ndarray]:
         """Monomials at the nodes of every cell [cells, nodes, M], Bernstein matrix [parts, b, m], members."""
@@ -436,19 +467,46 @@ class _Work:
 
     def _impact(self, rays: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Bounds [r, parts, 3] of ``rays``, and [samples, r, parts] what each sample leaves open of them (about)."""
-        alpha_low, alpha_high = self.alpha_low[:, rays], self.alpha_high[:, rays]
-        color_low, color_high = self.color_low[:, rays], self.color_high[:, rays]
+        alpha_low, alpha_high = self._anywhere(self.alpha_low[:, rays], np.minimum), self.alpha_high[:, rays]
+        top = self._anywhere(alpha_high, np.maximum)
         light = np.ones_like(alpha_low)
         np.cumprod(1.0 - alpha_low[:-1], axis=0, out=light[1:])
         self.before[:, rays] = light
+        color_low, color_high, faint = self._mixtures(rays, True)
         span = np.empty_like(alpha_low)
         low, high = self._background(len(rays)), self._background(len(rays))
         for k in range(len(span) - 1, -1, -1):
             rise, fall = color_high[k] - high, color_low[k] - low
             span[k] = np.maximum(color_high[k] - low, high - color_low[k]).max(axis=-1)
-            high += np.where(rise > 0.0, alpha_high[k][..., None], alpha_low[k][..., None]) * rise
-            low += np.where(fall < 0.0, alpha_high[k][..., None], alpha_low[k][..., None]) * fall
-        return low, high, light * (self.open[:, rays] * span + alpha_high * self.vague[:, rays])
+            high += np.where(rise > 0.0, top[k][..., None], alpha_low[k][..., None]) * rise
+            low += np.where(fall < 0.0, top[k][..., None], alpha_low[k][..., None]) * fall
+        return low - faint, high + faint, light * (self.open[:, rays] * span + alpha_high * self.vague[:, rays])
+
+    def _anywhere(self, values: np.ndarray, end: np.ufunc, axis: int = -1) -> np.ndarray:
+        """Where samples lie anywhere in their bins: the ``end`` of ``values`` by parts over the parts of the bin."""
+        if not self.owner.swept:
+            return values
+        inner = self.division.parts[-1]
+        axis %= values.ndim
+        shape = (*values.shape[:axis], values.shape[axis] // inner, inner, *values.shape[axis + 1 :])
+        return np.repeat(end.reduce(values.reshape(shape), axis=axis + 1), inner, axis=axis)
+
+    def _mixtures(self, rays: np.ndarray | slice, apart: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray | float]:
+        """Bounds of the colours that samples or bins contribute, and what must be added to the result's (F10).
+
+        ``apart``: what is faint in a bin is added instead of mixed in.
+        """
+        low, high = self.color_low[:, rays], self.color_high[:, rays]
+        if not self.owner.swept:
+            return low, high, 0.0
+        weight = self.before[:, rays] * self.alpha_high[:, rays]
+        faint = (weight <= self._faint) & apart
+        alone = self._anywhere(faint, np.logical_and)[..., None]
+        low = self._anywhere(np.where(faint[..., None], np.inf, low), np.minimum, -2)
+        high = self._anywhere(np.where(faint[..., None], -np.inf, high), np.maximum, -2)
+        rest = self._anywhere(np.where(faint & ~alone[..., 0], weight, 0.0), np.maximum).sum(axis=0)
+        # the light before a sample is kept in float32
+        return np.where(alone, 0.0, low), np.where(alone, 1.0, high), (rest * (1.0 + 2.0**-20))[..., None]
 
     def _background(self, count: int) -> np.ndarray:
         """[count, parts, 3] the colour behind the last sample."""
@@ -459,13 +517,9 @@ class _Work:
         device, field = self.owner.device, self.field
         monomials, bernstein, members = self._level(level)
         self.cells += len(items)
-        t = self.owner.distances[items.sample]
-        pencil = self.pencil
-        lines = pencil.origin + t[:, None, None] * pencil.direction[items.ray]
-        radius = pencil.origin_radius + t[:, None] * pencil.direction_radius[items.ray]
-        # rounding of the polynomial's evaluation, and of the concrete renderer's point
-        size = np.abs(pencil.origin).sum(axis=0) + t[:, None] * np.abs(pencil.direction[items.ray]).sum(axis=1)
-        radius = radius + 40.0 * UNIT64 * size
+        lines, radius = self.pencil.points(
+            items.ray, self.owner.distances[items.sample], 0.5 * self.owner.lengths[items.sample]
+        )
         there = monomials[torch.from_numpy(items.cell).to(device)]
         nodes = there @ torch.from_numpy(lines).to(device)
         encoded = field.encode(nodes, torch.from_numpy(radius).to(device), field.weights.position)
@@ -487,7 +541,7 @@ class _Work:
         self.open[rows] = np.minimum(self.open[rows], open_)
         self.level[rows] = level
         halve = (open_ * light).max(axis=1) > coarse
-        shines = (high_a * light).max(axis=1) > 0.5 * self.tolerance
+        shines = (high_a * light).max(axis=1) > self._faint
         # what is halved gets its colours from the halves, if there are any
         final = ~halve | (level == self.division.levels)
         coloured = np.flatnonzero(shines & final & ~density.failed.cpu().numpy())
@@ -541,14 +595,24 @@ class _Work:
 
     def _composite(self) -> tuple[np.ndarray, np.ndarray]:
         """[n, 3] bounds over all parts (design.md, F8)."""
+        low, high = self._composited(False)
+        if self.owner.swept:
+            other_low, other_high = self._composited(True)
+            low, high = np.maximum(low, other_low), np.minimum(high, other_high)
+        return low.min(axis=1), high.max(axis=1)
+
+    def _composited(self, apart: bool) -> tuple[np.ndarray, np.ndarray]:
+        """[n, parts, 3] bounds by parts; ``apart``: see `_mixtures`."""
         low, high = self._background(len(self.light)), self._background(len(self.light))
+        color_low, color_high, faint = self._mixtures(slice(None), apart)
         for k in range(self.alpha_low.shape[0] - 1, -1, -1):
-            least, most = self.alpha_low[k][..., None], self.alpha_high[k][..., None]
-            rise, fall = self.color_high[k] - high, self.color_low[k] - low
+            least = self._anywhere(self.alpha_low[k], np.minimum)[..., None]
+            most = self._anywhere(self.alpha_high[k], np.maximum)[..., None]
+            rise, fall = color_high[k] - high, color_low[k] - low
             high += np.where(rise > 0.0, most, least) * rise
             low += np.where(fall < 0.0, most, least) * fall
-        slack = 4.0 * _COMPOSITE * (self.alpha_low.shape[0] + 4)
-        low, high = low.min(axis=1) - slack, high.max(axis=1) + slack
+        slack = 4.0 * _COMPOSITE * (self.alpha_low.shape[0] + self.owner.sampling.importance + 5)
+        low, high = low - faint - slack, high + faint + slack
         return np.clip(low, 0.0, 1.0), np.clip(high, 0.0, 1.0)
 
 
