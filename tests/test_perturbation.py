@@ -38,8 +38,9 @@ REFUSED = [
     ({"units": True}, "units"),
     ({"sweep": "segment"}, "sweep"),
     ({"sweep": 1}, "sweep"),
-    ({"hue": 0.1}, "hue"),
-    ({"saturation": 0.0}, "saturation"),
+    ({"hue": 1.5}, "hue"),
+    ({"hue": [0.2, 0.1]}, "hue"),
+    ({"saturation": "half"}, "saturation"),
     ({"scene": []}, "scene"),
     ({"scene": {}}, "scene"),
     ({"scene": None}, "scene"),
@@ -173,7 +174,7 @@ def test_file(tmp_path):
     path = tmp_path / "path.json"
     path.write_text(json.dumps({"camera_path": [], "perturbation": {"translation": {"x": 0.5}}}))
     assert load_perturbation(spec) == load_perturbation(path) == Perturbation(translation={"x": (-0.5, 0.5)})
-    for text, field in (('{"frame": "up"}', "frame"), ("{", None), ('{"hue": 1}', "hue"), ("[]", None), ("NaN", None)):
+    for text, field in (('{"frame": "up"}', "frame"), ("{", None), ('{"hue": 2}', "hue"), ("[]", None), ("NaN", None)):
         spec.write_text(text)
         with pytest.raises(InputError) as caught:
             load_perturbation(spec)

@@ -149,17 +149,33 @@ def bernstein_matrices(degree: int, parts: int) -> Float64Array:
 
     The monomials between the two bases cancel badly, so the entries are computed in integers and rounded once.
     """
+    numerators, denominator = _bernstein_integers(degree, parts)
+    # Python divides integers with one rounding
+    return np.array([a / denominator for a in numerators.ravel()]).reshape(numerators.shape)
+
+
+def _bernstein_integers(degree: int, parts: int) -> tuple[NDArray[np.object_], int]:
+    """`bernstein_matrices` as numerators [parts, degree + 1, degree + 1] and their common denominator."""
     n = degree + 1
+    if parts % 2 == 0:
+        # de Casteljau: a row of left ends and a row of right ends of the triangle are the halves' coefficients
+        rows, denominator = _bernstein_integers(degree, parts // 2)
+        rows = rows.copy()
+        left, right = np.empty((2, *rows.shape), object)
+        for i in range(n):
+            left[:, i] = rows[:, 0] * 2 ** (degree - i)
+            right[:, degree - i] = rows[:, -1] * 2 ** (degree - i)
+            rows = rows[:, :-1] + rows[:, 1:]
+        return np.stack([left, right], axis=1).reshape(parts, n, n), denominator * 2**degree
     series = [[0] * n for _ in range(n)]  # [monomial][k]
     series[0][0] = 1
     for k in range(1, n):
         for i in range(k + 1):
             twice = (2 if k > 1 else 1) * (series[i - 1][k - 1] if i else 0)
             series[i][k] = twice - (series[i][k - 2] if k > 1 else 0)
-    out = np.empty((parts, n, n))
+    out = np.empty((parts, n, n), object)
     common = math.lcm(*(math.comb(degree, j) for j in range(n)))
     weights = [[math.comb(i, j) * (common // math.comb(degree, j)) for j in range(i + 1)] for i in range(n)]
-    denominator = common * parts**degree
     for part in range(parts):
         # p = (start + 2 u) / parts with u in [0, 1]
         start = 2 * part - parts
@@ -173,6 +189,5 @@ def bernstein_matrices(degree: int, parts: int) -> Float64Array:
         ]
         for i in range(n):
             for k in range(n):
-                # Python divides integers with one rounding
-                out[part, i, k] = sum(weights[i][j] * shifted[j][k] for j in range(i + 1)) / denominator
-    return out
+                out[part, i, k] = sum(weights[i][j] * shifted[j][k] for j in range(i + 1))
+    return out, common * parts**degree

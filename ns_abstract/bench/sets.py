@@ -14,7 +14,7 @@ from ns_abstract.pipeline import Job, Settings
 from ns_abstract.sets.perturbation import Perturbation, parse_perturbation
 from ns_abstract.sets.poses import PoseSet
 
-#: Perturbation objects by name; "orbit" turns about the vertical through the median Gaussian.
+#: Perturbation objects by name; "orbit" turns about the vertical through the median Gaussian, or a NeRF's origin.
 SETS: dict[str, dict[str, Any]] = {
     "x": {"translation": {"x": 0.05}},
     "yaw": {"rotation": {"yaw": 0.05}},
@@ -64,7 +64,8 @@ def pose_set(job: Job, name: str, frame: int, scale: float = 1.0) -> PoseSet:
         raise InputError(f"found {name}", field="--sets", fix=f"the sets are {', '.join(SETS)}")
     spec = dict(SETS[name].items())
     if name == "orbit":
-        target = np.median(job.scene.means.astype(np.float64), axis=0)
+        means = getattr(job.scene, "means", np.zeros((1, 3)))
+        target = np.median(means.astype(np.float64), axis=0)
         spec["orbit"] = {**spec["orbit"], "target": [float(v) for v in target]}
     perturbation = parse_perturbation(spec)
 

@@ -24,6 +24,7 @@ _TITLES = {
     "soundness": "Soundness",
     "plan": "What is left out, taken back",
     "rules": "Our bounds and the paper's rules",
+    "rays": "Rays of a NeRF",
 }
 
 
@@ -114,6 +115,26 @@ class Rules(Scenes):
 
 
 @dataclass
+class Rays(Scenes):
+    """Random rays of a NeRF: CPU seconds by ray to a ratio, then attacks on the bounds."""
+
+    sets: tuple[str, ...] = ("yaw",)
+    """Sets of poses: x, yaw, roll, six, segments, orbit, point."""
+    rays: int = 20
+    """Number of rays."""
+    target_ratio: float = 1.1
+    """Where the rays are tight enough."""
+    seconds: float = 600.0
+    """Time for every scene and set."""
+    poses: int = 200
+    """Poses of the attacks, beside gradient ascent."""
+    scale: float = 1.0
+    """Multiplies the ranges of translations and rotations."""
+    seed: int = 0
+    """Decides every random choice."""
+
+
+@dataclass
 class Stiff:
     """Bound and attack tiny scenes at the ends of what can be loaded and asked."""
 
@@ -182,7 +203,7 @@ def stiff(options: Stiff) -> int:
     return 1 if failed else DONE
 
 
-def rows_of(options: Cell | Plan | Rules, job: Job, name: str) -> list[dict[str, Any]]:
+def rows_of(options: Cell | Plan | Rules | Rays, job: Job, name: str) -> list[dict[str, Any]]:
     """What a benchmark without curves finds for one scene and set of poses."""
     if isinstance(options, Cell):
         from ns_abstract.bench.cell import cell_cost
@@ -192,6 +213,15 @@ def rows_of(options: Cell | Plan | Rules, job: Job, name: str) -> list[dict[str,
         from ns_abstract.bench.plan import without
 
         return without(job, name, options.frame, options.cells, options.scale)
+    if isinstance(options, Rays):
+        from ns_abstract.bench.rays import measure
+
+        return [
+            measure(
+                job, name, options.frame, options.scale, rays=options.rays, ratio=options.target_ratio,
+                seconds=options.seconds, poses=options.poses, seed=options.seed,
+            )
+        ]  # fmt: skip
     from ns_abstract.bench.rules import compare
 
     return [
@@ -201,20 +231,21 @@ def rows_of(options: Cell | Plan | Rules, job: Job, name: str) -> list[dict[str,
     ]
 
 
-def bench(options: Cell | Tightness | Soundness | Plan | Rules | Stiff) -> int:
+def bench(options: Cell | Tightness | Soundness | Plan | Rules | Rays | Stiff) -> int:
     """Run one benchmark; the exit code is 1 if a bound was violated."""
     if isinstance(options, Stiff):
         return stiff(options)
     from ns_abstract.bench.sets import open_jobs, pose_set
     from ns_abstract.bench.tables import markdown, write
 
-    jobs = open_jobs(options.load_config, options.camera_path_filename, options.downscale_factor)
+    arithmetic = "real" if isinstance(options, Rays) else "float32"
+    jobs = open_jobs(options.load_config, options.camera_path_filename, options.downscale_factor, arithmetic)
     rows: list[dict[str, object]] = []
     results = {}
     for job in jobs:
         for name in options.sets:
             told = len(rows)
-            if isinstance(options, Cell | Plan | Rules):
+            if isinstance(options, Cell | Plan | Rules | Rays):
                 rows += rows_of(options, job, name)
             elif isinstance(options, Tightness):
                 from ns_abstract.bench.tightness import refine, summary
@@ -241,18 +272,13 @@ def bench(options: Cell | Tightness | Soundness | Plan | Rules | Stiff) -> int:
             lines = markdown(rows).splitlines()
             print("\n".join(lines[0 if not told else 2 + told :]), flush=True)
     kind = type(options).__name__.lower()
-    write(
-        rows,
-        options.output_dir,
-        kind,
-        _TITLES[kind],
-    )
+    write(rows, options.output_dir, kind, _TITLES[kind])
     if results:
         from ns_abstract.bench.plots import save_curves
 
         save_curves(options.output_dir / "tightness.png", results)
     violations = sum(int(str(row.get("violations", 0))) for row in rows)
-    if isinstance(options, Soundness):
+    if isinstance(options, Soundness | Rays):
         total = sum(int(str(row["comparisons"])) for row in rows)
         print(f"{total:,} comparisons, {violations} violations")
     return 1 if violations else DONE
@@ -267,6 +293,7 @@ def main() -> None:
             "soundness": Soundness(),
             "plan": Plan(),
             "rules": Rules(),
+            "rays": Rays(),
             "stiff": Stiff(),
         }
     )

@@ -45,8 +45,9 @@ class Render:
     arithmetic: Literal["float32", "real"] | None = None
     """float32: enclose every float32 evaluation (splats, the default for them). real: the real-number renderer and
     its float64 evaluation."""
-    sampling: Literal["uniform"] | None = None
-    """NeRF: the fine field in the middles of equal bins."""
+    sampling: Literal["uniform", "hierarchical"] | None = None
+    """NeRF. uniform (default): the fine field in the middles of equal bins. hierarchical: Nerfstudio's own picture,
+    bounded for every choice of samples in the bins of the coarse pass."""
     num_samples: int | None = None
     """NeRF: bins of every ray. Default: 64."""
     near_plane: float | None = None

@@ -154,8 +154,9 @@ class AbstractNerfModel(AbstractOutputs, NeRFModel):
         key = shown.camera_to_world.tobytes(), round(shown.fy / shown.height, 6), box
         best, seconds = (self._drawn[1:] if self._drawn is not None and self._drawn[0] == key else ({}, _FIRST))
         if seconds <= _LAST:
-            rays = self._speed * seconds
-            factor = max(1.0, min(math.sqrt(shown.width * shown.height / rays), shown.height / _ROWS))
+            # pictures of one view never shrink, however slow the machine has become
+            rows = max([_ROWS, *(value.shape[0] for value in best.values())])
+            factor = max(1.0, min(math.sqrt(shown.width * shown.height / (self._speed * seconds)), shown.height / rows))
             small = shown.rescaled(factor)
             pose = camera.camera_to_worlds.reshape(-1, 3, 4)[:1]
             at = Cameras(pose, small.fx, small.fy, small.cx, small.cy, small.width, small.height).to(self.device)

@@ -222,6 +222,9 @@ class Refinement:
         self.outer_lower, self.outer_upper = np.zeros(whole, np.float32), np.ones(whole, np.float32)
         self.witness_lower, self.witness_upper = np.full(whole, np.inf, np.float32), np.full(whole, -np.inf, np.float32)
         self.image = np.zeros(whole, np.float32)
+        watch = getattr(frame, "watch", None)
+        if watch is not None:
+            watch(self.witness_lower, self.witness_upper)
         self.inside = _pixels_inside(frame)[self._numbers_of(None)]
         self.outer_lower[~self.inside] = 0.0
         self.outer_upper[~self.inside] = 0.0
@@ -523,17 +526,15 @@ class Refinement:
         """Bound the parts of ``cell`` in the tiles of ``rows``; returns the bytes of the new leaves."""
         tiles = np.array(list(rows), np.int64)
         children = [self._cell(part) for part in cell.box.split(cell.axis, parts)]
-        found = []
-        for child in children:
-            found.append(self._bound(child, cell, tiles))
-            if cell.box.dimensions > 1:
-                self._witness(child.box.middle, tiles)
+        for child in children if cell.box.dimensions > 1 else ():
+            self._witness(child.box.middle, tiles)
         if cell.box.dimensions == 1:
             steps = self.frame.witnesses
             for number in range(1, steps * len(children)):
                 child, step = children[(number - 1) // steps], (number - 1) % steps + 1
                 end = np.array(child.box.upper)
                 self._witness(end if step == steps else child.box.at(np.array([2.0 * step / steps - 1.0])), tiles)
+        found = [self._bound(child, cell, tiles) for child in children]
         added = 0
         for k, (t, row) in enumerate(rows.items()):
             tile, change = self.tiles[t], changes.setdefault(t, _Change())

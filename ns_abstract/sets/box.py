@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -49,6 +50,12 @@ class ParameterBox:
         """[2^d, d] corners."""
         ends = list(zip(self.lower, self.upper, strict=True))
         return np.array(list(itertools.product(*ends)), np.float64).reshape(2**self.dimensions, self.dimensions)
+
+    def without(self, names: Sequence[str]) -> ParameterBox:
+        """The box without the axes ``names``."""
+        kept = [j for j, name in enumerate(self.names) if name not in names]
+        parts = (self.names, self.units, self.lower, self.upper)
+        return ParameterBox(*(tuple(part[j] for j in kept) for part in parts))  # pyright: ignore[reportArgumentType]
 
     def split(self, axis: int, parts: int = 2) -> list[ParameterBox]:
         """``parts`` boxes of equal width along ``axis`` whose union is this box exactly."""

@@ -51,6 +51,8 @@ class Perturbation:
         sweep: "keyframes", or "segments": the pose also moves from each entry to the next.
         orbit: Optional orbit, applied before translation and rotation.
         scene: What varies of a Splatfacto scene; entry by entry, Gaussian by Gaussian.
+        hue, saturation: Ranges (turns, and of 1) of what is added to the colours of all points of a NeRF together;
+            None: nothing.
     """
 
     frame: Literal["camera", "world"] = "camera"
@@ -59,6 +61,8 @@ class Perturbation:
     sweep: Literal["keyframes", "segments"] = "keyframes"
     orbit: Orbit | None = None
     scene: tuple[SceneVariation, ...] = field(default=(), repr=False)
+    hue: Range | None = None
+    saturation: Range | None = None
 
 
 def load_perturbation(path: str | Path, *, dataset_scale: float = 1.0) -> Perturbation:
@@ -112,9 +116,10 @@ def parse_perturbation(
     frame = _choice(value, "frame", ("camera", "world"), fail)
     units = _choice(value, "units", ("normalised", "dataset"), fail)
     sweep = _choice(value, "sweep", ("keyframes", "segments"), fail)
-    for name in ("hue", "saturation"):
-        if name in value:
-            raise fail(name, "varies the colours of a NeRF, not of a Splatfacto scene", "remove the key")
+    shifts = {name: interval(value[name], name, fail) for name in ("hue", "saturation") if name in value}
+    for name, (low, high) in shifts.items():
+        if low < -1.0 or high > 1.0:
+            raise fail(name, f"found {show(value[name])}", "stay within -1 and 1")
     translation = _ranges(value, "translation", TRANSLATIONS, fail)
     if units == "dataset":
         translation = {name: (dataset_scale * low, dataset_scale * high) for name, (low, high) in translation.items()}
@@ -125,6 +130,8 @@ def parse_perturbation(
         sweep=sweep,  # pyright: ignore[reportArgumentType]
         orbit=_orbit(value, fail),
         scene=_scene(value, fail, field_prefix, folder),
+        hue=shifts.get("hue"),
+        saturation=shifts.get("saturation"),
     )
 
 

@@ -7,7 +7,7 @@ transform that gsplat receives (OpenCV axes, splatfacto.py:128-143).
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -23,6 +23,8 @@ from ns_abstract.sets.perturbation import ROTATIONS, TRANSLATIONS, Perturbation
 
 #: Elementary rotation axes of yaw, pitch and roll in camera axes.
 _CAMERA_AXES = {"yaw": (0.0, 1.0, 0.0), "pitch": (1.0, 0.0, 0.0), "roll": (0.0, 0.0, 1.0)}
+#: Parameters that shift the colours of a NeRF's points and leave the pose alone.
+COLOR_SHIFTS = ("hue", "saturation")
 #: OpenGL to OpenCV camera axes.
 _FLIP = np.array([1.0, -1.0, -1.0])
 # Evaluating a pose in float64 takes fewer than 64 roundings of numbers of this size: five rotations.
@@ -107,7 +109,7 @@ class PoseSet:
     Attributes:
         camera: Intrinsics and image size; the pose of the first keyframe.
         perturbation: What may vary.
-        box: Parameters of positive width, in the order x, y, z, yaw, pitch, roll, segment, azimuth.
+        box: Parameters of positive width, in the order x, y, z, yaw, pitch, roll, segment, azimuth, hue, saturation.
         fixed: Values of the parameters of zero width.
         target_camera: End of the segment, where the sweep is over segments.
     """
@@ -141,6 +143,10 @@ class PoseSet:
             ranges["segment"] = ("of the way", (0.0, 1.0))
         if perturbation.orbit is not None:
             ranges["azimuth"] = ("rad", perturbation.orbit.azimuth)
+        for name, unit in zip(COLOR_SHIFTS, ("turns", "of 1"), strict=True):
+            shift: tuple[float, float] | None = getattr(perturbation, name)
+            if shift is not None:
+                ranges[name] = (unit, shift)
         free = {name: entry for name, entry in ranges.items() if entry[1][0] < entry[1][1]}
         box = ParameterBox(
             tuple(free),
@@ -150,6 +156,11 @@ class PoseSet:
         )
         fixed = {name: low for name, (_, (low, high)) in ranges.items() if low == high}
         return cls(camera, perturbation, box, fixed, segment)
+
+    @property
+    def geometry(self) -> PoseSet:
+        """The same poses without the parameters that shift colours."""
+        return replace(self, box=self.box.without(COLOR_SHIFTS))
 
     def _base(self) -> tuple[Float64Array, Float64Array, Float64Array, float, Float64Array]:
         """Start rotation, start position, segment axis, segment angle, segment displacement."""

@@ -12,6 +12,7 @@ import torch
 from ns_abstract.arithmetic.outward import outward
 from ns_abstract.arithmetic.units import arithmetic as arithmetic_of
 from ns_abstract.errors import InputError
+from ns_abstract.methods.nerf.hsv import color_shift
 from ns_abstract.methods.nerf.render import NerfRenderer, Sampling, camera_rays
 from ns_abstract.methods.nerf.scene import NerfScene
 from ns_abstract.methods.splat.activate import activate
@@ -76,13 +77,14 @@ def nerf_renderer(scene: NerfScene, pose_set: PoseSet, sampling: Sampling) -> tu
     camera, pose = pose_set.camera, pose_twin(pose_set)
 
     def render(values: Float64Array) -> Float64Array:
-        return renderer.image(camera, pose_set.pose(values))
+        return renderer.image(camera, pose_set.pose(values), color_shift(pose_set, values))
 
     def probe(values: Float64Array, pixels: np.ndarray) -> Float64Array:
-        return renderer.pixels(camera, pose_set.pose(values), pixels)
+        return renderer.pixels(camera, pose_set.pose(values), pixels, color_shift(pose_set, values))
 
     def twin(values: torch.Tensor, pixels: torch.Tensor) -> torch.Tensor:
-        return renderer.rays(pose(values), torch.from_numpy(camera_rays(camera, pixels.numpy())))
+        rays = torch.from_numpy(camera_rays(camera, pixels.numpy()))
+        return renderer.rays(pose(values), rays, color_shift(pose_set, values.unbind()))
 
     return render, probe, twin
 

@@ -18,6 +18,7 @@ from torch import Tensor
 from ns_abstract.arithmetic.chebyshev import ROUNDING, ChebyshevBasis
 from ns_abstract.arithmetic.taylor import TaylorArray
 from ns_abstract.arithmetic.units import UNIT64
+from ns_abstract.methods.nerf.hsv import Range, shifted_bounds
 from ns_abstract.methods.nerf.render import Sampling, camera_rays
 from ns_abstract.methods.nerf.scene import NerfScene
 from ns_abstract.methods.nerf.zonotope import Affine, FieldBounds, Pieces
@@ -43,8 +44,22 @@ _PARTS = 4096
 _QUIET = 0.02
 #: A cell on which an opacity is open by this much everywhere was far too wide.
 _LOST = 0.5
+#: Light that a sample may leave open before compositing has shown where it matters.
+_COARSE = 0.1
+#: A sample is worth halving if it can take away this share of what a part has too much.
+_SHARE = 0.125
+#: Rounds of halving where the colours' bounds are too wide.
+_ROUNDS = 32
+#: Numbers (rays, samples, parts) that are worked on together.
+_NUMBERS = 1 << 21
+#: Light from a sample whose colour's shift is not looked at.
+_UNSEEN = 1e-5
 #: Absolute rounding of activations and compositing, by sample.
 _COMPOSITE = 2.0**-44
+
+
+#: Intervals of hue and saturation.
+Shifts = tuple[Range, Range]
 
 
 def basis_of(dimensions: int) -> ChebyshevBasis:
@@ -95,9 +110,7 @@ class Division:
     def members(self, level: int) -> np.ndarray:
         """[cells, parts of a cell] flat numbers of the parts of every cell."""
         counts, inner = self.counts(level), self.inner(level)
-        whole = np.arange(math.prod(self.parts)).reshape(
-            [n for pair in zip(counts, inner, strict=True) for n in pair]
-        )
+        whole = np.arange(math.prod(self.parts)).reshape([n for pair in zip(counts, inner, strict=True) for n in pair])
         order = [*range(0, 2 * self.dimensions, 2), *range(1, 2 * self.dimensions, 2)]
         return whole.transpose(order).reshape(math.prod(counts), math.prod(inner))
 
@@ -156,9 +169,12 @@ class Pencil:
         pose_set, box: The poses.
         pixels: [n, 2] rows and columns.
         degree: Of the Taylor models.
+        swept: Whether samples lie anywhere in their bins; the last parameter is the place there.
     """
 
-    def __init__(self, pose_set: PoseSet, box: ParameterBox, pixels: np.ndarray, degree: int) -> None:
+    def __init__(
+        self, pose_set: PoseSet, box: ParameterBox, pixels: np.ndarray, degree: int, swept: bool = False
+    ) -> None:
         rotation, position = pose_set.taylor(box, degree)
         in_camera = camera_rays(pose_set.camera, pixels)
         world = (rotation[None, :, :] * TaylorArray.constant(rotation.basis, in_camera)[:, None, :]).sum(2)
@@ -171,23 +187,45 @@ class Pencil:
         self.origin, self.origin_radius = position.coefficients, position.radius
         self.direction = np.ascontiguousarray(direction.coefficients.transpose(1, 0, 2))  # [n, M, 3]
         self.direction_radius = direction.radius + 16.0 * UNIT64
+        self.swept = swept
+        if swept:
+            # the place within a bin is one more parameter: (o + t d) + (h d) tau
+            place = np.repeat([0, 1], len(exponents))[:, None]
+            self.exponents = np.concatenate([np.tile(self.exponents, (2, 1)), place], axis=1)
+            self.origin = np.concatenate([self.origin, np.zeros_like(self.origin)])
+            self.along = np.concatenate([np.zeros_like(self.direction), self.direction], axis=1)
+            self.direction = np.concatenate([self.direction, np.zeros_like(self.direction)], axis=1)
 
-    def displacement(self, distances: np.ndarray) -> np.ndarray:
+    def points(self, ray: np.ndarray, distance: np.ndarray, half: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Polynomials [k, M, 3] and radii [k, 3] of points at ``distance`` [k] on ``ray`` [k], ``half`` [k] swept."""
+        lines = self.origin + distance[:, None, None] * self.direction[ray]
+        far = distance
+        if self.swept:
+            lines = lines + half[:, None, None] * self.along[ray]
+            far = distance + half
+        radius = self.origin_radius + far[:, None] * self.direction_radius[ray]
+        # rounding of the polynomial's evaluation, and of the concrete renderer's point and distance
+        size = np.abs(self.origin).sum(axis=0) + far[:, None] * np.abs(self.direction[ray]).sum(axis=1)
+        return lines, radius + 64.0 * UNIT64 * size
+
+    def displacement(self, distances: np.ndarray, lengths: np.ndarray) -> np.ndarray:
         """[n, samples, d] half of what a sample moves by over each parameter's range, about."""
         found = np.zeros((self.direction.shape[0], distances.size, self.exponents.shape[1]))
         for j in range(self.exponents.shape[1]):
             moving = self.exponents[:, j] > 0
             steps = self.origin[moving] + distances[:, None, None] * self.direction[:, None, moving]
             found[..., j] = np.linalg.norm(np.abs(steps).sum(axis=2), axis=-1)
+        if self.swept:
+            found[..., -1] = 0.5 * lengths
         return found
 
 
 class NerfBounds:
-    """Bounds of a scene's rays for uniform samples of the fine field.
+    """Bounds of a scene's rays.
 
     Args:
         scene: The scene.
-        sampling: A uniform one.
+        sampling: Uniform, or hierarchical: then the samples of the fine field may be anywhere (design.md, F10).
         dimensions: Number of parameters.
         device: Where the network is bounded.
     """
@@ -196,7 +234,8 @@ class NerfBounds:
         self, scene: NerfScene, sampling: Sampling, dimensions: int, device: torch.device | str = "cpu"
     ) -> None:
         self.sampling, self.device = sampling, torch.device(device)
-        self.basis = basis_of(dimensions)
+        self.swept = sampling.kind == "hierarchical"
+        self.basis = basis_of(dimensions + self.swept)
         self.field = FieldBounds(scene.fine, self.basis, device=device)
         edges = sampling.edges
         self.distances = 0.5 * (edges[1:] + edges[:-1])
@@ -212,6 +251,8 @@ class NerfBounds:
         pixels: np.ndarray,
         tolerance: float,
         known: np.ndarray | None = None,
+        aim: tuple[np.ndarray, np.ndarray] | None = None,
+        shifts: list[Shifts] | None = None,
     ) -> RayBounds:
         """Bounds of the colours of ``pixels`` [n, 2] over every pose of ``box``.
 
@@ -220,16 +261,26 @@ class NerfBounds:
             pixels: Rows and columns.
             tolerance: What a sample's open opacity or colour may move a pixel by before its cells are halved.
             known: [n, samples] upper bounds of opacities over a larger box.
+            aim: [n, 3] lower and upper colours; bounds between them are good enough (before the shifts).
+            shifts: Intervals of hue and saturation that are added to all colours; bounds hold over all of them.
         """
         n, samples = len(pixels), self.distances.size
-        pencil = Pencil(pose_set, box, pixels, self.taylor)
-        moves = pencil.displacement(self.distances)
+        pencil = Pencil(pose_set, box, pixels, self.taylor, self.swept)
+        moves = pencil.displacement(self.distances, self.lengths)
         division = self._division(moves)
-        if division is None or not (
-            np.isfinite(pencil.direction).all() and np.isfinite(pencil.direction_radius).all()
-        ):
+        if division is None or not (np.isfinite(pencil.direction).all() and np.isfinite(pencil.direction_radius).all()):
             return RayBounds(np.zeros((n, 3)), np.ones((n, 3)), np.ones((n, samples), np.float32), 0)
-        return _Work(self, pencil, division, moves, tolerance, known).run()
+        if n > 1 and n * samples * math.prod(division.parts) > _NUMBERS:
+            halves = []
+            for which in (slice(0, n // 2), slice(n // 2, n)):
+                part = None if aim is None else (aim[0][which], aim[1][which])
+                given = None if known is None else known[which]
+                halves.append(self.rays(pose_set, box, pixels[which], tolerance, given, part, shifts))
+            lower, upper, alpha = (
+                np.concatenate([getattr(half, name) for half in halves]) for name in ("lower", "upper", "alpha")
+            )
+            return RayBounds(lower, upper, alpha, halves[0].cells + halves[1].cells)
+        return _Work(self, pencil, division, moves, tolerance, known, aim).run(shifts or [])
 
     def _division(self, moves: np.ndarray) -> Division | None:
         """Levels for samples that move by ``moves`` [n, samples, d]; None where the box is far too wide."""
@@ -274,14 +325,19 @@ class _Work:
         moves: np.ndarray,
         tolerance: float,
         known: np.ndarray | None,
+        aim: tuple[np.ndarray, np.ndarray] | None,
     ) -> None:
-        self.owner, self.pencil, self.division, self.tolerance = owner, pencil, division, tolerance
+        self.owner, self.pencil, self.division, self.tolerance, self.aim = owner, pencil, division, tolerance, aim
         self.basis, self.field = owner.basis, owner.field
         n, samples = moves.shape[:2]
         parts = math.prod(division.parts)
         self.alpha_low, self.alpha_high = np.zeros((samples, n, parts)), np.ones((samples, n, parts))
         self.color_low, self.color_high = np.zeros((samples, n, parts, 3)), np.ones((samples, n, parts, 3))
-        self.light = np.ones((n, parts))
+        # what the network itself leaves open of opacities and colours, and the level of the cells that showed it
+        self.open, self.vague = (np.ones((samples, n, parts), np.float32) for _ in range(2))
+        self.level = np.full((samples, n, parts), -1, np.int8)
+        # light that reaches a sample, and what all samples so far let through
+        self.before, self.light = np.ones((samples, n, parts), np.float32), np.ones((n, parts))
         self.cells = 0
         inverse = [1.0 / np.array(division.counts(level), np.float64) for level in range(division.levels + 1)]
         # the first level whose cells are narrow enough for the sample
@@ -296,16 +352,25 @@ class _Work:
                 self.alpha_high[k, i] = known[i, k]
         self._levels: dict[int, tuple[Tensor, Tensor, np.ndarray]] = {}
 
-    def run(self) -> RayBounds:
-        """Bound block after block of samples, nearest first, then composite."""
+    def run(self, shifts: list[Shifts]) -> RayBounds:
+        """Bound block after block of samples, nearest first, then halve cells where colours are too wide."""
         samples = self.owner.distances.size
         for first in range(0, samples, _BLOCK):
             block = np.arange(first, min(samples, first + _BLOCK))
             if not (self.light > self._dark).any():
                 break
+            self.before[block] = self.light
             self._bound_block(block)
-            self.light *= np.prod(1.0 - self.alpha_low[block], axis=0)
+            self.light *= np.prod(1.0 - self._anywhere(self.alpha_low[block], np.minimum), axis=0)
+        self._improve()
         lower, upper = self._composite()
+        if shifts:
+            color = self.color_low, self.color_high
+            found = []
+            for shift in shifts:
+                self.color_low, self.color_high = self._shifted(color, shift)
+                found.append(self._composite())
+            lower, upper = np.min([low for low, _ in found], axis=0), np.max([high for _, high in found], axis=0)
         alpha = self.alpha_high.max(axis=2).T.astype(np.float32)
         return RayBounds(lower, upper, np.nextafter(alpha, np.float32(2.0)), self.cells)
 
@@ -313,6 +378,11 @@ class _Work:
     def _dark(self) -> float:
         """Light that does not matter any more."""
         return 0.1 * self.tolerance
+
+    @property
+    def _faint(self) -> float:
+        """Light from a sample, at most, whose colour does not matter."""
+        return (0.1 if self.owner.swept else 0.5) * self.tolerance
 
     def _level(self, level: int) -> tuple[Tensor, Tensor, np.ndarray]:
         """Monomials at the nodes of every cell [cells, nodes, M], Bernstein matrix [parts, b, m], members."""
@@ -353,7 +423,7 @@ class _Work:
             again = []
             for start in range(0, len(items), _BATCH):
                 batch = items.take(slice(start, start + _BATCH))
-                halve, lost = self._bound_batch(level, batch)
+                halve, lost = self._bound_batch(level, batch, _COARSE)
                 again.append(batch.take(halve))
                 halved += int((lost & (self.start[batch.ray, batch.sample] == level)).sum())
             coarse = join_items(again)
@@ -365,18 +435,91 @@ class _Work:
         if tried >= 32:
             self.owner.learn(tried, halved, wide)
 
-    def _bound_batch(self, level: int, items: _Items) -> tuple[np.ndarray, np.ndarray]:
-        """Bound some cells of one level; returns [k] which are worth halving, and for which of them all was lost."""
+    def _improve(self) -> None:
+        """Halve cells that leave colours open beyond the aim, round after round, on the parts where they do."""
+        rays = np.arange(self.light.shape[0])
+        for _ in range(_ROUNDS):
+            low, high, impact = self._impact(rays)
+            able = (self.level[:, rays] >= 0) & (self.level[:, rays] < self.division.levels)
+            threshold = np.full(impact.shape[1:], self.tolerance)
+            if self.aim is not None:
+                excess = np.maximum(high - self.aim[1][rays, None], self.aim[0][rays, None] - low).max(axis=2)
+                able &= excess > 0.0
+                threshold = np.minimum(_SHARE * excess, np.where(able, impact, 0.0).max(axis=0))
+                threshold = np.maximum(threshold, _SHARE * 0.5 * self.tolerance)
+            sample, ray, part = np.nonzero(able & (impact >= threshold))
+            if not sample.size:
+                return
+            ray = rays[ray]
+            level = self.level[sample, ray, part] + 1
+            for deeper in np.unique(level):
+                which = level == deeper
+                cell = self._cell_of(deeper)[part[which]]
+                found = np.unique(np.stack([ray[which], sample[which], cell]), axis=1)
+                for start in range(0, found.shape[1], _BATCH):
+                    self._bound_batch(int(deeper), _Items(*found[:, start : start + _BATCH]), math.inf)
+            rays = np.unique(ray)
+
+    def _cell_of(self, level: int) -> np.ndarray:
+        """[parts] the cell of ``level`` that every part lies in."""
+        members = self._level(level)[2]
+        return np.argsort(members, axis=None) // members.shape[1]
+
+    def _impact(self, rays: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Bounds [r, parts, 3] of ``rays``, and [samples, r, parts] what each sample leaves open of them (about)."""
+        alpha_low, alpha_high = self._anywhere(self.alpha_low[:, rays], np.minimum), self.alpha_high[:, rays]
+        top = self._anywhere(alpha_high, np.maximum)
+        light = np.ones_like(alpha_low)
+        np.cumprod(1.0 - alpha_low[:-1], axis=0, out=light[1:])
+        self.before[:, rays] = light
+        color_low, color_high, faint = self._mixtures(rays, True)
+        span = np.empty_like(alpha_low)
+        low, high = self._background(len(rays)), self._background(len(rays))
+        for k in range(len(span) - 1, -1, -1):
+            rise, fall = color_high[k] - high, color_low[k] - low
+            span[k] = np.maximum(color_high[k] - low, high - color_low[k]).max(axis=-1)
+            high += np.where(rise > 0.0, top[k][..., None], alpha_low[k][..., None]) * rise
+            low += np.where(fall < 0.0, top[k][..., None], alpha_low[k][..., None]) * fall
+        return low - faint, high + faint, light * (self.open[:, rays] * span + alpha_high * self.vague[:, rays])
+
+    def _anywhere(self, values: np.ndarray, end: np.ufunc, axis: int = -1) -> np.ndarray:
+        """Where samples lie anywhere in their bins: the ``end`` of ``values`` by parts over the parts of the bin."""
+        if not self.owner.swept:
+            return values
+        inner = self.division.parts[-1]
+        axis %= values.ndim
+        shape = (*values.shape[:axis], values.shape[axis] // inner, inner, *values.shape[axis + 1 :])
+        return np.repeat(end.reduce(values.reshape(shape), axis=axis + 1), inner, axis=axis)
+
+    def _mixtures(self, rays: np.ndarray | slice, apart: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray | float]:
+        """Bounds of the colours that samples or bins contribute, and what must be added to the result's (F10).
+
+        ``apart``: what is faint in a bin is added instead of mixed in.
+        """
+        low, high = self.color_low[:, rays], self.color_high[:, rays]
+        if not self.owner.swept:
+            return low, high, 0.0
+        weight = self.before[:, rays] * self.alpha_high[:, rays]
+        faint = (weight <= self._faint) & apart
+        alone = self._anywhere(faint, np.logical_and)[..., None]
+        low = self._anywhere(np.where(faint[..., None], np.inf, low), np.minimum, -2)
+        high = self._anywhere(np.where(faint[..., None], -np.inf, high), np.maximum, -2)
+        rest = self._anywhere(np.where(faint & ~alone[..., 0], weight, 0.0), np.maximum).sum(axis=0)
+        # the light before a sample is kept in float32
+        return np.where(alone, 0.0, low), np.where(alone, 1.0, high), (rest * (1.0 + 2.0**-20))[..., None]
+
+    def _background(self, count: int) -> np.ndarray:
+        """[count, parts, 3] the colour behind the last sample."""
+        return np.tile(np.array(self.owner.sampling.background, np.float64), (count, self.light.shape[1], 1))
+
+    def _bound_batch(self, level: int, items: _Items, coarse: float) -> tuple[np.ndarray, np.ndarray]:
+        """Bound some cells of one level; returns [k] which leave more light open than ``coarse``, or all of it."""
         device, field = self.owner.device, self.field
         monomials, bernstein, members = self._level(level)
         self.cells += len(items)
-        t = self.owner.distances[items.sample]
-        pencil = self.pencil
-        lines = pencil.origin + t[:, None, None] * pencil.direction[items.ray]
-        radius = pencil.origin_radius + t[:, None] * pencil.direction_radius[items.ray]
-        # rounding of the polynomial's evaluation, and of the concrete renderer's point
-        size = np.abs(pencil.origin).sum(axis=0) + t[:, None] * np.abs(pencil.direction[items.ray]).sum(axis=1)
-        radius = radius + 40.0 * UNIT64 * size
+        lines, radius = self.pencil.points(
+            items.ray, self.owner.distances[items.sample], 0.5 * self.owner.lengths[items.sample]
+        )
         there = monomials[torch.from_numpy(items.cell).to(device)]
         nodes = there @ torch.from_numpy(lines).to(device)
         encoded = field.encode(nodes, torch.from_numpy(radius).to(device), field.weights.position)
@@ -393,16 +536,17 @@ class _Work:
         open_ = torch.where(bad, 1.0, open_).cpu().numpy()
         low_a, high_a = alpha_low.cpu().numpy(), alpha_high.cpu().numpy()
         rows = items.sample[:, None], items.ray[:, None], members[items.cell]
-        light = self.light[rows[1], rows[2]]
+        light = self.before[rows]
         self._keep(self.alpha_low, self.alpha_high, rows, low_a, high_a)
-        halve = (open_ * light).max(axis=1) > self.tolerance
-        shines = (high_a * light).max(axis=1) > self.tolerance
+        self.open[rows] = np.minimum(self.open[rows], open_)
+        self.level[rows] = level
+        halve = (open_ * light).max(axis=1) > coarse
+        shines = (high_a * light).max(axis=1) > self._faint
         # what is halved gets its colours from the halves, if there are any
         final = ~halve | (level == self.division.levels)
         coloured = np.flatnonzero(shines & final & ~density.failed.cpu().numpy())
         if coloured.size:
-            vague = self._color(pieces, items.take(coloured), coloured, there, bernstein, rows, high_a * light)
-            halve[coloured] |= vague
+            self._color(pieces, items.take(coloured), coloured, there, bernstein, rows)
         return halve, halve & (open_.min(axis=1) > _LOST)
 
     def _color(
@@ -413,9 +557,8 @@ class _Work:
         there: Tensor,
         bernstein: Tensor,
         rows: tuple[np.ndarray, np.ndarray, np.ndarray],
-        shown: np.ndarray,
-    ) -> np.ndarray:
-        """Bound the colours of the pieces ``which``; returns [k] whether they are too vague."""
+    ) -> None:
+        """Bound the colours of the pieces ``which``."""
         device, field = self.owner.device, self.field
         index = torch.from_numpy(which).to(device)
         direction = there[index] @ torch.from_numpy(self.pencil.direction[items.ray]).to(device)
@@ -426,10 +569,11 @@ class _Work:
         bad = color.failed[:, None, None]
         low = torch.where(bad, 0.0, torch.sigmoid(low) * (1.0 - _COMPOSITE)).cpu().numpy()
         high = torch.where(bad, 1.0, (torch.sigmoid(high) * (1.0 + _COMPOSITE)).clamp(max=1.0)).cpu().numpy()
-        self._keep(self.color_low, self.color_high, tuple(r[which] for r in rows), low, high)
+        where = rows[0][which], rows[1][which], rows[2][which]
+        self._keep(self.color_low, self.color_high, where, low, high)
         slack = 2.0 * torch.tanh(0.25 * error.amax(dim=1))
         slack = torch.where(color.failed, 1.0, slack).cpu().numpy()
-        return slack * shown[which].max(axis=1) > self.tolerance
+        self.vague[where] = np.minimum(self.vague[where], slack[:, None])
 
     @staticmethod
     def _keep(lower: np.ndarray, upper: np.ndarray, rows: tuple, low: np.ndarray, high: np.ndarray) -> None:
@@ -442,18 +586,33 @@ class _Work:
         lower[rows] = np.where(crossed, old_low, low)
         upper[rows] = np.where(crossed, old_high, high)
 
+    def _shifted(self, color: tuple[np.ndarray, np.ndarray], shift: Shifts) -> tuple[np.ndarray, np.ndarray]:
+        """Bounds of ``color`` (lower, upper) after ``shift``; [0, 1] where next to nothing is seen of it."""
+        seen = self.before * self.alpha_high > _UNSEEN
+        low, high = np.zeros_like(color[0]), np.ones_like(color[1])
+        low[seen], high[seen] = shifted_bounds(color[0][seen], color[1][seen], *shift)
+        return low, high
+
     def _composite(self) -> tuple[np.ndarray, np.ndarray]:
         """[n, 3] bounds over all parts (design.md, F8)."""
-        background = np.array(self.owner.sampling.background, np.float64)
-        shape = (*self.light.shape, 3)
-        low, high = np.broadcast_to(background, shape).copy(), np.broadcast_to(background, shape).copy()
+        low, high = self._composited(False)
+        if self.owner.swept:
+            other_low, other_high = self._composited(True)
+            low, high = np.maximum(low, other_low), np.minimum(high, other_high)
+        return low.min(axis=1), high.max(axis=1)
+
+    def _composited(self, apart: bool) -> tuple[np.ndarray, np.ndarray]:
+        """[n, parts, 3] bounds by parts; ``apart``: see `_mixtures`."""
+        low, high = self._background(len(self.light)), self._background(len(self.light))
+        color_low, color_high, faint = self._mixtures(slice(None), apart)
         for k in range(self.alpha_low.shape[0] - 1, -1, -1):
-            least, most = self.alpha_low[k][..., None], self.alpha_high[k][..., None]
-            rise, fall = self.color_high[k] - high, self.color_low[k] - low
+            least = self._anywhere(self.alpha_low[k], np.minimum)[..., None]
+            most = self._anywhere(self.alpha_high[k], np.maximum)[..., None]
+            rise, fall = color_high[k] - high, color_low[k] - low
             high += np.where(rise > 0.0, most, least) * rise
             low += np.where(fall < 0.0, most, least) * fall
-        slack = 4.0 * _COMPOSITE * (self.alpha_low.shape[0] + 4)
-        low, high = low.min(axis=1) - slack, high.max(axis=1) + slack
+        slack = 4.0 * _COMPOSITE * (self.alpha_low.shape[0] + self.owner.sampling.importance + 5)
+        low, high = low - faint - slack, high + faint + slack
         return np.clip(low, 0.0, 1.0), np.clip(high, 0.0, 1.0)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
@@ -10,11 +11,12 @@ from typing import Any
 import numpy as np
 
 from ns_abstract.arithmetic.outward import outward
-from ns_abstract.methods.nerf.bounds import NerfBounds
+from ns_abstract.methods.nerf.bounds import NerfBounds, Shifts
+from ns_abstract.methods.nerf.hsv import color_shift
 from ns_abstract.methods.nerf.render import NerfRenderer, Sampling
 from ns_abstract.methods.nerf.scene import NerfScene
 from ns_abstract.sets.box import ParameterBox
-from ns_abstract.sets.poses import PoseSet
+from ns_abstract.sets.poses import COLOR_SHIFTS, PoseSet
 from ns_abstract.sets.tiles import tile_grid
 
 #: What an open sample may move a pixel by on boxes a quarter as wide as the set, as a part of the pixels' mean
@@ -23,6 +25,10 @@ _TOLERANCE = 0.12
 _MOST_TOLERANCE, _LEAST_TOLERANCE = 0.03, 5e-4
 #: Rays and poses rendered to estimate that variation.
 _LOOK_RAYS, _LOOK_POSES = 256, 7
+#: Poses on the diagonal of a box that are rendered to see which colours it reaches, besides random ones.
+_LOOK_SHARES = np.linspace(0.0, 1.0, 9)
+#: Parts of every range of hues and saturations; pixels that a turn of the whole circle counts for.
+_SHIFT_PARTS, _SHIFT_MOTION = 12, 6.0
 #: Weights that are multiplied in one call of `NerfFrame.bound`, in units of rays times weights.
 _WORK = 2_500_000
 
@@ -68,12 +74,15 @@ class NerfFrame:
 
     def __init__(self, scene: NerfScene, sampling: Sampling, pose_set: PoseSet, device: str = "cpu") -> None:
         self.pose_set, self.camera, self.box = pose_set, pose_set.camera, pose_set.box
+        self.view = pose_set.camera
         self.side = 1
         self.across, self.down = tile_grid(self.camera, 1)
         self.renderer = NerfRenderer(scene, sampling, device=device)
-        self.bounds = NerfBounds(scene, sampling, self.box.dimensions, device)
+        self._geometry = pose_set.geometry
+        self.bounds = NerfBounds(scene, sampling, self._geometry.box.dimensions, device)
         weights = sum(array.size for array in scene.fine.arrays())
         self.batch = int(np.clip(_WORK // weights, 1, 64))
+        self._witness: tuple[np.ndarray, np.ndarray] | None = None
 
     @property
     def tile_count(self) -> int:
@@ -92,13 +101,14 @@ class NerfFrame:
         box = self.box
         for axis in range(box.dimensions):
             box = box.split(axis, 1024)[0]
-        self.bounds.rays(self.pose_set, box, self._pixels(np.arange(1)), 1.0)
+        self.bounds.rays(self._geometry, box.without(COLOR_SHIFTS), self._pixels(np.arange(1)), 1.0)
         self.render(box.middle, np.arange(1))
 
     def render(self, values: np.ndarray, tiles: np.ndarray | None = None) -> np.ndarray:
         """Rays [t, 1, 1, 3] float32 of the concrete image at parameter values [d]."""
         which = np.arange(self.tile_count) if tiles is None else tiles
-        colors = self.renderer.pixels(self.camera, self.pose_set.pose(values), self._pixels(which))
+        shift = color_shift(self.pose_set, values)
+        colors = self.renderer.pixels(self.view, self.pose_set.pose(values), self._pixels(which), shift)
         return colors.astype(np.float32)[:, None, None, :]
 
     def motion(self, box: ParameterBox) -> np.ndarray:
@@ -113,6 +123,8 @@ class NerfFrame:
             step[k] = 2.0**-10 * (high[k] - low[k])
             moved = np.linalg.norm(self._point(box.middle + step, distance) - here) * 2.0**10
             found[k] = moved / distance * self.camera.fx
+            if box.names[k] in COLOR_SHIFTS:
+                found[k] = _SHIFT_MOTION * (high[k] - low[k])
         return found
 
     def _point(self, values: np.ndarray, distance: float) -> np.ndarray:
@@ -134,8 +146,11 @@ class NerfFrame:
                 known = within.alpha[np.searchsorted(within.tiles, tiles)]
             parts = [
                 self.bounds.rays(
-                    self.pose_set, box, self._pixels(tiles[i : i + self.batch]), self._tolerance(box),
+                    self._geometry, box.without(COLOR_SHIFTS), self._pixels(tiles[i : i + self.batch]),
+                    self._tolerance(box),
                     None if known is None else known[i : i + self.batch],
+                    self._aim(box, tiles[i : i + self.batch]),
+                    self._shifts(box),
                 )
                 for i in range(0, tiles.size, self.batch)
             ]  # fmt: skip
@@ -153,11 +168,47 @@ class NerfFrame:
             linear = flat, low, flat, high
         return RayBox(low, high, np.zeros(d), context, linear)
 
+    def watch(self, lower: np.ndarray, upper: np.ndarray) -> None:
+        """Take notice of the inner bounds [t, 1, 1, 3] of a refinement, which change while it works."""
+        self._witness = lower, upper
+
+    def _aim(self, box: ParameterBox, tiles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Colours [n, 3] that are reached over the box or, where a refinement is watched, the set, and some more."""
+        tolerance = self._tolerance(box)
+        if self._witness is not None and not self._shifts(box):
+            low, high = (side[tiles, 0, 0].astype(np.float64) for side in self._witness)
+        else:
+            # shifts of colours come on top of what the poses reach
+            rng, pixels, box = np.random.default_rng(0), self._pixels(tiles), box.without(COLOR_SHIFTS)
+            inside = [box.at(2.0 * (np.arange(box.dimensions) * 0.0 + share) - 1.0) for share in _LOOK_SHARES]
+            values = [*inside, *box.sample(_LOOK_POSES, rng)] if box.dimensions else [box.middle]
+            poses = [self._geometry.pose(v) for v in values]
+            pictures = np.stack([self.renderer.pixels(self.view, pose, pixels) for pose in poses])
+            low, high = pictures.min(axis=0), pictures.max(axis=0)
+        return low - tolerance, high + tolerance
+
+    def _shifts(self, box: ParameterBox) -> list[Shifts]:
+        """Equal parts of the box's shifts of colours, which cost nothing to tell apart; empty: there are none."""
+        ranges = []
+        for name in COLOR_SHIFTS:
+            if name in box.names:
+                low, high = (side[box.names.index(name)] for side in (box.lower, box.upper))
+            else:
+                low = high = self.pose_set.fixed.get(name, 0.0)
+            ends = np.linspace(low, high, _SHIFT_PARTS + 1 if low < high else 2).tolist()
+            ends[0], ends[-1] = low, high
+            ranges.append(list(itertools.pairwise(ends)))
+        if not any(low or high for cuts in ranges for low, high in cuts):
+            return []
+        return list(itertools.product(*ranges))
+
     def _tolerance(self, box: ParameterBox) -> float:
         """Narrower boxes are asked for when the bounds of wider ones are not good enough."""
+        box = box.without(COLOR_SHIFTS)
         if not box.dimensions:
             return _LEAST_TOLERANCE
-        whole = np.array(self.box.upper) - np.array(self.box.lower)
+        outer = self._geometry.box
+        whole = np.array(outer.upper) - np.array(outer.lower)
         width = np.array(box.upper) - np.array(box.lower)
         share = float(np.prod(width / whole)) ** (1.0 / box.dimensions)
         return max(_LEAST_TOLERANCE, min(1.0, 4.0 * share) * min(_MOST_TOLERANCE, _TOLERANCE * self._variation))

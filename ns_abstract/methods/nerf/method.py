@@ -27,8 +27,8 @@ class NerfMethod:
         scene: The scene.
         renderer: "paper" (black behind the last sample) or None.
         arithmetic: "real" or None: float32 evaluations of a network are not enclosed.
-        sampling: "uniform" or None.
-        num_samples: N; None: 64.
+        sampling: "uniform" (None: the same), or "hierarchical": Nerfstudio's own picture, by bins (design.md, F10).
+        num_samples: N of uniform samples; None: 64.
         near_plane: Start of the rays, normalised units; None: 0, as in Nerfstudio's evaluation.
 
     Raises:
@@ -52,8 +52,17 @@ class NerfMethod:
                 field="--arithmetic",
                 fix="use real",
             )
-        if sampling not in (None, "uniform"):
-            raise InputError("this version bounds uniform samples", field="--sampling", fix="use uniform")
+        if sampling not in (None, "uniform", "hierarchical"):
+            raise InputError(f"found {sampling}", field="--sampling", fix="use uniform or hierarchical")
+        hierarchical = sampling == "hierarchical"
+        if hierarchical and num_samples is not None:
+            raise InputError(
+                "hierarchical sampling has the run's numbers of samples",
+                field="--num-samples",
+                fix="leave it out, or use --sampling uniform",
+            )
+        if hierarchical and renderer == "paper":
+            raise InputError("the paper's renderer samples uniformly", field="--sampling", fix="use uniform")
         samples = _SAMPLES if num_samples is None else num_samples
         if not 1 <= samples <= _SAMPLES_LIMIT:
             raise InputError(f"found {samples}", field="--num-samples", fix=f"give 1 to {_SAMPLES_LIMIT}")
@@ -65,6 +74,9 @@ class NerfMethod:
         background = np.zeros(3) if self.paper else scene.background
         red, green, blue = (float(v) for v in background)
         self.sampling = Sampling("uniform", near, scene.far, samples, 0, (red, green, blue))
+        if hierarchical:
+            bins, importance = scene.coarse_samples, scene.importance_samples
+            self.sampling = Sampling("hierarchical", near, scene.far, bins, importance, (red, green, blue))
 
     @property
     def program(self) -> dict[str, Any]:
@@ -72,7 +84,7 @@ class NerfMethod:
         s = self.sampling
         version = "algorithm-2" if self.paper else "nerfstudio-1.1.5-field"
         return {
-            "name": "paper-nerf" if self.paper else "nerf-uniform",
+            "name": "paper-nerf" if self.paper else f"nerf-{s.kind}",
             "version": version,
             "sampling": s.kind,
             "samples": s.samples,
@@ -119,6 +131,12 @@ class NerfMethod:
         """What is left out for this scene, whatever the frame."""
         s, scene = self.sampling, self.scene
         shows = scene.coarse_samples + scene.importance_samples + 1
+        if s.kind == "hierarchical":
+            return (
+                f"bounded: Nerfstudio's own {shows} samples from {s.near:g} to {s.far:g}, by what the fine field can "
+                f"show anywhere in the {s.samples} bins of the coarse pass, wherever the coarse field puts samples",
+                "the coarse field left out: the bounds hold for every choice of samples in the bins",
+            )
         return (
             f"bounded: the fine field at the middles of {s.samples} equal bins from {s.near:g} to {s.far:g} "
             f"(Algorithm 2 of the paper); Nerfstudio's own picture puts {shows} samples where the coarse field "
@@ -130,7 +148,8 @@ class NerfMethod:
     def fingerprint(self) -> dict[str, Any]:
         """Scene and program, for results that are continued."""
         digest = hashlib.sha256()
-        for array in self.scene.fine.arrays():
+        fields = [self.scene.fine] + [self.scene.coarse] * (self.sampling.kind == "hierarchical")
+        for array in (array for field in fields for array in field.arrays()):
             digest.update(repr(array.shape).encode())
             digest.update(np.ascontiguousarray(array).tobytes())
         digest.update(repr((self.scene.fine.position, self.scene.fine.direction, self.sampling)).encode())

@@ -8,13 +8,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from ns_abstract.methods.nerf.field import Field
+from ns_abstract.methods.nerf.hsv import shifted
 from ns_abstract.methods.nerf.scene import NerfScene
 from ns_abstract.sets.path import Camera
 
@@ -23,6 +24,8 @@ HISTOGRAM_PADDING = 0.01
 _SUM_EPS = 1e-5
 #: Points whose fields are evaluated at once.
 _CHUNK = 1 << 15
+#: Hue and saturation, numbers or tensors.
+Shift = tuple[Any, Any]
 
 
 @dataclass(frozen=True)
@@ -81,8 +84,11 @@ class NerfRenderer:
         self.coarse = Field(scene.coarse, dtype, device) if sampling.kind == "hierarchical" else self.fine
         self._background = torch.tensor(sampling.background, dtype=dtype, device=device)
 
-    def rays(self, pose: Tensor, directions: Tensor) -> Tensor:
-        """Colours [n, 3] in [0, 1] along camera-axes ``directions`` [n, 3] from ``pose`` [3, 4]; differentiable."""
+    def rays(self, pose: Tensor, directions: Tensor, shift: Shift | None = None) -> Tensor:
+        """Colours [n, 3] in [0, 1] along camera-axes ``directions`` [n, 3] from ``pose`` [3, 4]; differentiable.
+
+        ``shift``: hue and saturation added to every point's colour (`hsv.shifted`).
+        """
         world = directions @ pose[:, :3].T
         world = world / torch.linalg.vector_norm(world, dim=-1, keepdim=True)
         origin = pose[:, 3]
@@ -95,24 +101,26 @@ class NerfRenderer:
         density, base = self._densities(self.fine, origin, world, bins)
         weights = _weights(density, self._lengths(bins))
         color = self.fine.color(base, world[:, None].expand(-1, weights.shape[1], -1))
+        if shift is not None:
+            color = shifted(color, *shift)
         total = (weights[..., None] * color).sum(dim=1)
         total = total + self._background * (1.0 - weights.sum(dim=1))[:, None]
         return total.clamp(0.0, 1.0)
 
-    def pixels(self, camera: Camera, pose: np.ndarray, pixels: np.ndarray) -> np.ndarray:
+    def pixels(self, camera: Camera, pose: np.ndarray, pixels: np.ndarray, shift: Shift | None = None) -> np.ndarray:
         """Colours [n, 3] float64 of ``pixels`` [n, 2] (row, column) from camera-to-world ``pose`` [3, 4]."""
         directions = torch.from_numpy(camera_rays(camera, pixels)).to(self.device, self.dtype)
         matrix = torch.tensor(np.asarray(pose)).to(self.device, self.dtype)
         count = self.sampling.samples + (self.sampling.importance if self.sampling.kind == "hierarchical" else 0)
         step = max(1, _CHUNK // count)
         with torch.inference_mode():
-            parts = [self.rays(matrix, part) for part in directions.split(step)]
+            parts = [self.rays(matrix, part, shift) for part in directions.split(step)]
         return torch.cat(parts).double().cpu().numpy() if parts else np.zeros((0, 3))
 
-    def image(self, camera: Camera, pose: np.ndarray) -> np.ndarray:
+    def image(self, camera: Camera, pose: np.ndarray, shift: Shift | None = None) -> np.ndarray:
         """The image [H, W, 3] float64."""
         grid = np.indices((camera.height, camera.width)).reshape(2, -1).T
-        return self.pixels(camera, pose, grid).reshape(camera.height, camera.width, 3)
+        return self.pixels(camera, pose, grid, shift).reshape(camera.height, camera.width, 3)
 
     def _distances(self, bins: Tensor) -> Tensor:
         s = self.sampling

@@ -10,13 +10,14 @@ import numpy as np
 
 from ns_abstract.arithmetic.units import Arithmetic
 from ns_abstract.arithmetic.units import arithmetic as arithmetic_named
+from ns_abstract.errors import InputError
 from ns_abstract.methods.splat.activate import Splats, activate
 from ns_abstract.methods.splat.constants import RASTERISERS, Rasteriser
 from ns_abstract.methods.splat.frame import SplatFrame
 from ns_abstract.methods.splat.scene import SplatScene
 from ns_abstract.methods.splat.variations import VariedSplats, vary
 from ns_abstract.sets.perturbation import Perturbation
-from ns_abstract.sets.poses import PoseSet, translation_only
+from ns_abstract.sets.poses import COLOR_SHIFTS, PoseSet, translation_only
 from ns_abstract.sets.variations import SceneVariation
 
 #: Bytes that the kernels need by Gaussian, beside the scene itself (record, boxes, colours, buffers).
@@ -65,9 +66,13 @@ class SplatMethod:
         """Find the Gaussians that vary.
 
         Raises:
-            InputError: A selection is empty, or its file cannot be used.
+            InputError: A selection is empty, its file cannot be used, or a variation is one of a NeRF.
         """
         for perturbation in perturbations:
+            for name in COLOR_SHIFTS:
+                if getattr(perturbation, name) is not None:
+                    problem = "varies the colours of a NeRF, not of a Splatfacto scene"
+                    raise InputError(problem, field=name, fix="remove the key")
             self.varied(perturbation.scene)
 
     def varied(self, variations: tuple[SceneVariation, ...]) -> VariedSplats:

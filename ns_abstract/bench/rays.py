@@ -1,0 +1,84 @@
+"""What bounding some random rays of a NeRF costs, how tight it is, and attacks on the result."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import torch
+
+from ns_abstract.bench.sets import pose_set
+from ns_abstract.errors import InputError
+from ns_abstract.methods.nerf.frame import NerfFrame
+from ns_abstract.methods.nerf.method import NerfMethod
+from ns_abstract.pipeline import Job
+from ns_abstract.refine.engine import Refinement
+from ns_abstract.sets.poses import PoseSet
+from ns_abstract.verify.falsify import falsify
+from ns_abstract.verify.soundness import nerf_renderer
+
+
+class RaySample(NerfFrame):
+    """Some rays of a frame, as a picture of one row."""
+
+    def __init__(self, method: NerfMethod, poses: PoseSet, count: int, seed: int) -> None:
+        super().__init__(method.scene, method.sampling, poses)
+        chosen = np.sort(np.random.default_rng(seed).permutation(self.tile_count)[:count])
+        #: [n, 2] rows and columns.
+        self.chosen = np.stack([chosen // self.across, chosen % self.across], axis=1)
+        self.camera = replace(self.camera, width=len(chosen), height=1)
+        self.across, self.down = len(chosen), 1
+
+    def _pixels(self, tiles: np.ndarray) -> np.ndarray:
+        return self.chosen[tiles]
+
+
+def measure(job: Job, name: str, frame: int, scale: float, **options: Any) -> dict[str, object]:
+    """One row: CPU seconds by ray to a ratio, and attacks by random poses, corners and gradient ascent.
+
+    Args:
+        job, name, frame, scale: The scene, and the set of poses (`pose_set`).
+        options: ``rays``, ``ratio``, ``seconds``, ``poses`` and ``seed``.
+
+    Raises:
+        InputError: The run is not a NeRF.
+    """
+    if not isinstance(job.method, NerfMethod):
+        raise InputError("rays are those of a NeRF", field="--load-config", fix="give a run of vanilla-nerf")
+    poses = pose_set(job, name, frame, scale)
+    sample: Any = RaySample(job.method, poses, options["rays"], options["seed"])
+    sample.warm_up()
+    start = time.process_time()
+    refinement = Refinement(sample, frame, job.goal(options["ratio"], options["seconds"]), seed=options["seed"])
+    result = refinement.run()
+    spent = time.process_time() - start
+    _, probe, twin = nerf_renderer(job.method.scene, poses, job.method.sampling)
+    chosen = torch.from_numpy(sample.chosen)
+    found = falsify(
+        result.lower, result.upper, poses.box,
+        lambda values: probe(values, sample.chosen)[None],
+        lambda values, pixels: twin(values, chosen[pixels[:, 1]]),
+        probe=lambda values, pixels: probe(values, sample.chosen[np.asarray(pixels)[:, 1]]),
+        poses=options["poses"], seed=options["seed"],
+    )  # fmt: skip
+    last = result.trace[-1]
+    return {
+        "scene": job.scene.name,
+        "field": job.method.scene.fine.text,
+        "size": f"{sample.view.width}x{sample.view.height}",
+        "set": name,
+        "scale": scale,
+        "rays": sample.tile_count,
+        "CPU s / ray": spent / sample.tile_count,
+        "MPG": last.mpg,
+        "witness MPG": last.mpg_witness,
+        "ratio": last.mpg / last.mpg_witness if last.mpg_witness else float("nan"),
+        "cells": result.cells,
+        "poses": found.poses,
+        "ascent steps": found.steps,
+        "comparisons": found.comparisons,
+        "violations": found.violations,
+        "not finite": found.not_finite,
+    }
