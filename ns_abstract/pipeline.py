@@ -15,6 +15,7 @@ from ns_abstract.arithmetic.units import Arithmetic
 from ns_abstract.errors import InputError
 from ns_abstract.methods.load import load_any
 from ns_abstract.methods.nerf.method import NerfMethod
+from ns_abstract.methods.nerf.occupancy import load_grid
 from ns_abstract.methods.nerf.scene import NerfScene
 from ns_abstract.methods.runs import available_memory
 from ns_abstract.methods.splat.activate import Splats
@@ -46,6 +47,7 @@ class Settings:
         seed: Of the random witnesses.
         memory_limit: GiB.
         resize: Height and width in pixels that pictures are rendered with, in place of the path's.
+        occupancy_grid: File of a grid that is declared as part of a NeRF.
         sampling, num_samples, near_plane: Of the rays of a NeRF; None: the method's own.
     """
 
@@ -61,6 +63,7 @@ class Settings:
     sampling: str | None = None
     num_samples: int | None = None
     near_plane: float | None = None
+    occupancy_grid: Path | None = None
 
 
 class Method(Protocol):
@@ -348,8 +351,9 @@ def open_method(settings: Settings) -> Method:
             settings.sampling,
             settings.num_samples,
             settings.near_plane,
+            None if settings.occupancy_grid is None else load_grid(settings.occupancy_grid),
         )
-    for name in ("sampling", "num_samples", "near_plane"):
+    for name in ("sampling", "num_samples", "near_plane", "occupancy_grid"):
         if getattr(settings, name) is not None:
             field = "--" + name.replace("_", "-")
             raise InputError("is for runs of vanilla-nerf, this run is a splat", field=field, fix="leave it out")

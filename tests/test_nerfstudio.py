@@ -600,7 +600,7 @@ def test_a_nerf_in_the_viewer(nerfstudio: SimpleNamespace, folder: Path, monkeyp
     model.abstract.control._present.set()
     model._speed = 1000.0
     model.abstract._sliders["x"].value = 1.0
-    model.abstract._seconds.value = 20.0
+    model.abstract._seconds.value = 5.0
     assert "± mean" not in {element.name for element in model.abstract.elements}
     try:
         sizes = []

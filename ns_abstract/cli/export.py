@@ -13,6 +13,8 @@ import tyro
 from ns_abstract.cli.common import DONE, run
 from ns_abstract.errors import InputError
 
+#: Along each axis of an occupancy grid.
+_MOST_VOXELS = 512
 Picture = Literal["lower", "upper", "gap", "witness", "image"]
 
 
@@ -97,16 +99,37 @@ class VnnLib:
     """Seconds by box in instances.csv."""
 
 
+@dataclass
+class Occupancy:
+    """Where a NeRF's field is not empty, by sampling it: a grid for the option --occupancy-grid.
+
+    A proposal, not a proof: with the option, the grid is declared to be part of the scene. The npz holds occupied
+    [X, Y, Z] bool and aabb [2, 3], corners in the run's normalised frame.
+    """
+
+    load_config: Path
+    """config.yml of a vanilla-nerf run."""
+    output_filename: Path
+    """The npz file; replaced if it exists."""
+    aabb: tuple[float, float, float, float, float, float] = (-1.5, -1.5, -1.5, 1.5, 1.5, 1.5)
+    """Least x, y, z, then largest x, y, z of the grid, normalised units."""
+    resolution: int = 128
+    """Voxels along each axis."""
+    threshold: float = 0.1
+    """Densities above it, per normalised unit, are kept, with a margin of one voxel."""
+
+
 Command = (
     Annotated[Npz, tyro.conf.subcommand("npz")]
     | Annotated[Png, tyro.conf.subcommand("png")]
     | Annotated[Mp4, tyro.conf.subcommand("mp4")]
     | Annotated[Ply, tyro.conf.subcommand("ply")]
     | Annotated[VnnLib, tyro.conf.subcommand("vnnlib")]
+    | Annotated[Occupancy, tyro.conf.subcommand("occupancy")]
 )
 
 
-def export(options: Npz | Png | Mp4 | Ply | VnnLib) -> int:
+def export(options: Npz | Png | Mp4 | Ply | VnnLib | Occupancy) -> int:
     """Run the command; returns the exit code.
 
     Raises:
@@ -119,6 +142,8 @@ def export(options: Npz | Png | Mp4 | Ply | VnnLib) -> int:
             target.parent.mkdir(parents=True, exist_ok=True)
         if isinstance(options, VnnLib):
             notes = _vnnlib(options)
+        elif isinstance(options, Occupancy):
+            notes = _occupancy(options)
         elif isinstance(options, Ply):
             from ns_abstract.methods.splat.load import load_scene
             from ns_abstract.methods.splat.ply import write_ply
@@ -132,6 +157,38 @@ def export(options: Npz | Png | Mp4 | Ply | VnnLib) -> int:
         print(note, file=sys.stderr)
     print(target)
     return DONE
+
+
+def _occupancy(options: Occupancy) -> list[str]:
+    from rich.console import Console
+    from rich.progress import Progress
+
+    from ns_abstract.methods.load import load_any
+    from ns_abstract.methods.nerf.field import Field
+    from ns_abstract.methods.nerf.occupancy import sample_grid
+    from ns_abstract.methods.nerf.scene import NerfScene
+
+    lower, upper = options.aabb[:3], options.aabb[3:]
+    if not all(-float("inf") < low < high < float("inf") for low, high in zip(lower, upper, strict=True)):
+        raise InputError(f"found {options.aabb}", field="--aabb", fix="give least x y z, then largest x y z")
+    if not 1 <= options.resolution <= _MOST_VOXELS:
+        raise InputError(f"found {options.resolution}", field="--resolution", fix=f"give 1 to {_MOST_VOXELS}")
+    if not 0.0 <= options.threshold < float("inf"):
+        raise InputError(f"found {options.threshold}", field="--threshold", fix="give 0 or more")
+    scene = load_any(options.load_config)
+    if not isinstance(scene, NerfScene):
+        raise InputError("this run is a splat", file=options.load_config, fix="give a run of vanilla-nerf")
+    density = Field(scene.fine).density
+    with Progress(console=Console(stderr=True)) as bar:
+        task = bar.add_task("sampling the field", total=1.0)
+        grid = sample_grid(
+            lambda points: density(points)[0], lower, upper, options.resolution, options.threshold,
+            lambda share: bar.update(task, completed=share),
+        )  # fmt: skip
+    if not grid.occupied.any():
+        raise InputError("no density found", field="--threshold", fix="give a smaller one, or another --aabb")
+    grid.write(options.output_filename)
+    return [grid.describe()]
 
 
 def _vnnlib(options: VnnLib) -> list[str]:

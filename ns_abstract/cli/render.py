@@ -52,6 +52,9 @@ class Render:
     """NeRF: bins of every ray. Default: 64."""
     near_plane: float | None = None
     """NeRF: distance at which rays start. Default: 0, as in Nerfstudio's evaluation."""
+    occupancy_grid: Path | None = None
+    """NeRF: declare the field empty outside of this grid's occupied voxels (.npz, see ns-abstract-export occupancy).
+    That makes it another scene, for which the bounds hold."""
     seed: int = 0
     """Seed of the random witnesses."""
     engine: Literal["local", "dask"] = "local"

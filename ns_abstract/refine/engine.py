@@ -224,7 +224,7 @@ class Refinement:
         self.image = np.zeros(whole, np.float32)
         watch = getattr(frame, "watch", None)
         if watch is not None:
-            watch(self.witness_lower, self.witness_upper)
+            watch(self._numbers_of(None), self.witness_lower, self.witness_upper)
         self.inside = _pixels_inside(frame)[self._numbers_of(None)]
         self.outer_lower[~self.inside] = 0.0
         self.outer_upper[~self.inside] = 0.0

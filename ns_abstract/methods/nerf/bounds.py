@@ -208,6 +208,19 @@ class Pencil:
         size = np.abs(self.origin).sum(axis=0) + far[:, None] * np.abs(self.direction[ray]).sum(axis=1)
         return lines, radius + 64.0 * UNIT64 * size
 
+    def ranges(
+        self, lines: np.ndarray, radius: np.ndarray, low: np.ndarray, high: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Bounds [k, 3] of the ``points`` (lines, radius) on boxes from ``low`` to ``high`` [k, d] in [-1, 1]."""
+        middle, half = 0.5 * (low + high), 0.5 * (high - low)
+        there = np.prod(middle[:, None, :] ** self.exponents, axis=-1)
+        center = (there[..., None] * lines).sum(axis=1)
+        size = np.abs(lines)
+        # on [-1, 1]^d no derivative of a monomial exceeds its exponent
+        slope = (half @ self.exponents.T)[..., None]
+        spread = (slope * size).sum(axis=1) + radius + 64.0 * UNIT64 * size.sum(axis=1)
+        return center - spread, center + spread
+
     def displacement(self, distances: np.ndarray, lengths: np.ndarray) -> np.ndarray:
         """[n, samples, d] half of what a sample moves by over each parameter's range, about."""
         found = np.zeros((self.direction.shape[0], distances.size, self.exponents.shape[1]))
@@ -238,6 +251,7 @@ class NerfBounds:
         self.basis = basis_of(dimensions + self.swept)
         self.field = FieldBounds(scene.fine, self.basis, device=device)
         edges = sampling.edges
+        self.occupancy = scene.occupancy
         self.distances = 0.5 * (edges[1:] + edges[:-1])
         self.lengths = edges[1:] - edges[:-1]
         self.taylor = min(_TAYLOR, max(1, self.basis.degree))
@@ -412,10 +426,9 @@ class _Work:
             if not item.size:
                 continue
             waiting[level] = [_Items(ray[item], block[place[item]], cell)]
-        tried = sum(len(items) for parts in waiting.values() for items in parts)
         # cells that the box itself makes narrow do not show what wider ones would bear
         wide = any(level > 0 for level in waiting)
-        halved = 0
+        halved = tried = 0
         for level in range(self.division.levels + 1):
             if level not in waiting:
                 continue
@@ -423,9 +436,11 @@ class _Work:
             again = []
             for start in range(0, len(items), _BATCH):
                 batch = items.take(slice(start, start + _BATCH))
-                halve, lost = self._bound_batch(level, batch, _COARSE)
+                halve, lost, seen = self._bound_batch(level, batch, _COARSE)
                 again.append(batch.take(halve))
-                halved += int((lost & (self.start[batch.ray, batch.sample] == level)).sum())
+                first = self.start[batch.ray, batch.sample] == level
+                halved += int((lost & first).sum())
+                tried += int((seen & first).sum())
             coarse = join_items(again)
             if level == self.division.levels or not len(coarse):
                 continue
@@ -512,14 +527,53 @@ class _Work:
         """[count, parts, 3] the colour behind the last sample."""
         return np.tile(np.array(self.owner.sampling.background, np.float64), (count, self.light.shape[1], 1))
 
-    def _bound_batch(self, level: int, items: _Items, coarse: float) -> tuple[np.ndarray, np.ndarray]:
-        """Bound some cells of one level; returns [k] which leave more light open than ``coarse``, or all of it."""
-        device, field = self.owner.device, self.field
-        monomials, bernstein, members = self._level(level)
-        self.cells += len(items)
+    def _bound_batch(self, level: int, items: _Items, coarse: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Bound some cells of one level.
+
+        Returns [k] which leave more light open than ``coarse``, which leave all of it, and which needed the network.
+        """
+        halve, lost, tried = (np.zeros(len(items), bool) for _ in range(3))
         lines, radius = self.pencil.points(
             items.ray, self.owner.distances[items.sample], 0.5 * self.owner.lengths[items.sample]
         )
+        which, sure = self._occupied(level, items, lines, radius)
+        if which.size:
+            items, lines, radius, sure = items.take(which), lines[which], radius[which], sure[which]
+            halve[which], lost[which] = self._bound_field(level, items, lines, radius, sure, coarse)
+            tried[which] = True
+        return halve, lost, tried
+
+    def _occupied(
+        self, level: int, items: _Items, lines: np.ndarray, radius: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Which items may see occupied voxels, and [k] whether an item surely does; the others are made empty (F11)."""
+        everything = np.arange(len(items))
+        if self.owner.occupancy is None:
+            return everything, np.ones(len(items), bool)
+        low, high = self.division.boxes(level)
+        ends = self.pencil.ranges(lines, radius, low[items.cell], high[items.cell])
+        empty, sure = self.owner.occupancy.look(*ends)
+        gone = items.take(empty)
+        if len(gone):
+            rows = gone.sample[:, None], gone.ray[:, None], self._level(level)[2][gone.cell]
+            self.alpha_low[rows] = self.alpha_high[rows] = 0.0
+            self.open[rows] = self.vague[rows] = 0.0
+            self.level[rows] = self.division.levels
+        return everything[~empty], sure
+
+    def _bound_field(
+        self,
+        level: int,
+        items: _Items,
+        lines: np.ndarray,
+        radius: np.ndarray,
+        sure: np.ndarray,
+        coarse: float,
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """`_bound_batch` by the network; where it is not ``sure`` [k], density may also be 0."""
+        device, field = self.owner.device, self.field
+        monomials, bernstein, members = self._level(level)
+        self.cells += len(items)
         there = monomials[torch.from_numpy(items.cell).to(device)]
         nodes = there @ torch.from_numpy(lines).to(device)
         encoded = field.encode(nodes, torch.from_numpy(radius).to(device), field.weights.position)
@@ -535,6 +589,9 @@ class _Work:
         open_ = opacity(middle + error[:, :1], length, up=True) - opacity(middle - error[:, :1], length, up=False)
         open_ = torch.where(bad, 1.0, open_).cpu().numpy()
         low_a, high_a = alpha_low.cpu().numpy(), alpha_high.cpu().numpy()
+        if not sure.all():
+            low_a = np.where(sure[:, None], low_a, 0.0)
+            open_ = np.where(sure[:, None], open_, high_a)
         rows = items.sample[:, None], items.ray[:, None], members[items.cell]
         light = self.before[rows]
         self._keep(self.alpha_low, self.alpha_high, rows, low_a, high_a)

@@ -82,7 +82,7 @@ class NerfFrame:
         self.bounds = NerfBounds(scene, sampling, self._geometry.box.dimensions, device)
         weights = sum(array.size for array in scene.fine.arrays())
         self.batch = int(np.clip(_WORK // weights, 1, 64))
-        self._witness: tuple[np.ndarray, np.ndarray] | None = None
+        self._witness: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None
 
     @property
     def tile_count(self) -> int:
@@ -168,15 +168,18 @@ class NerfFrame:
             linear = flat, low, flat, high
         return RayBox(low, high, np.zeros(d), context, linear)
 
-    def watch(self, lower: np.ndarray, upper: np.ndarray) -> None:
-        """Take notice of the inner bounds [t, 1, 1, 3] of a refinement, which change while it works."""
-        self._witness = lower, upper
+    def watch(self, tiles: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> None:
+        """Take notice of the inner bounds [t, 1, 1, 3] of ``tiles`` [t] in a refinement, which change meanwhile."""
+        places = np.full(self.tile_count, -1)
+        places[tiles] = np.arange(tiles.size)
+        self._witness = places, lower, upper
 
     def _aim(self, box: ParameterBox, tiles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Colours [n, 3] that are reached over the box or, where a refinement is watched, the set, and some more."""
         tolerance = self._tolerance(box)
         if self._witness is not None and not self._shifts(box):
-            low, high = (side[tiles, 0, 0].astype(np.float64) for side in self._witness)
+            places, *sides = self._witness
+            low, high = (side[places[tiles], 0, 0].astype(np.float64) for side in sides)
         else:
             # shifts of colours come on top of what the poses reach
             rng, pixels, box = np.random.default_rng(0), self._pixels(tiles), box.without(COLOR_SHIFTS)

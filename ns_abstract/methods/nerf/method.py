@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
 from ns_abstract.errors import InputError
 from ns_abstract.methods.nerf.frame import NerfFrame
+from ns_abstract.methods.nerf.occupancy import OccupancyGrid
 from ns_abstract.methods.nerf.render import Sampling
 from ns_abstract.methods.nerf.scene import NerfScene
 from ns_abstract.sets.perturbation import Perturbation
@@ -30,6 +32,7 @@ class NerfMethod:
         sampling: "uniform" (None: the same), or "hierarchical": Nerfstudio's own picture, by bins (design.md, F10).
         num_samples: N of uniform samples; None: 64.
         near_plane: Start of the rays, normalised units; None: 0, as in Nerfstudio's evaluation.
+        occupancy: Declared as part of the scene: density is 0 outside of its occupied voxels.
 
     Raises:
         InputError: An option does not go with a NeRF.
@@ -43,6 +46,7 @@ class NerfMethod:
         sampling: str | None = None,
         num_samples: int | None = None,
         near_plane: float | None = None,
+        occupancy: OccupancyGrid | None = None,
     ) -> None:
         if renderer not in (None, "paper"):
             raise InputError(f"{renderer} draws splats, this run is a NeRF", field="--renderer", fix="leave it out")
@@ -69,7 +73,7 @@ class NerfMethod:
         near = scene.near if near_plane is None else near_plane
         if not 0.0 <= near < scene.far:
             raise InputError(f"found {near}", field="--near-plane", fix=f"give 0 or more, below {scene.far:g}")
-        self.scene = scene
+        self.scene = scene if occupancy is None else replace(scene, occupancy=occupancy)
         self.paper = renderer == "paper"
         background = np.zeros(3) if self.paper else scene.background
         red, green, blue = (float(v) for v in background)
@@ -88,6 +92,7 @@ class NerfMethod:
             "version": version,
             "sampling": s.kind,
             "samples": s.samples,
+            **({} if self.scene.occupancy is None else {"occupancy": self.scene.occupancy.describe()}),
             "near": s.near,
             "far": s.far,
         }
@@ -130,18 +135,22 @@ class NerfMethod:
     def plan(self) -> tuple[str, ...]:
         """What is left out for this scene, whatever the frame."""
         s, scene = self.sampling, self.scene
+        grid = scene.occupancy
+        declared = () if grid is None else (f"density declared 0 outside of a grid: {grid.describe()}",)
         shows = scene.coarse_samples + scene.importance_samples + 1
         if s.kind == "hierarchical":
             return (
                 f"bounded: Nerfstudio's own {shows} samples from {s.near:g} to {s.far:g}, by what the fine field can "
                 f"show anywhere in the {s.samples} bins of the coarse pass, wherever the coarse field puts samples",
                 "the coarse field left out: the bounds hold for every choice of samples in the bins",
+                *declared,
             )
         return (
             f"bounded: the fine field at the middles of {s.samples} equal bins from {s.near:g} to {s.far:g} "
             f"(Algorithm 2 of the paper); Nerfstudio's own picture puts {shows} samples where the coarse field "
             "has weight and differs from it",
             "the coarse field left out: uniform samples do not need it",
+            *declared,
         )
 
     @property
@@ -152,6 +161,8 @@ class NerfMethod:
         for array in (array for field in fields for array in field.arrays()):
             digest.update(repr(array.shape).encode())
             digest.update(np.ascontiguousarray(array).tobytes())
+        if self.scene.occupancy is not None:
+            digest.update(self.scene.occupancy.digest)
         digest.update(repr((self.scene.fine.position, self.scene.fine.direction, self.sampling)).encode())
         return {"scene": digest.hexdigest(), "renderer": self.program["name"], "arithmetic": "real"}
 

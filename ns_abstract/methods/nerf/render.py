@@ -82,6 +82,7 @@ class NerfRenderer:
         self.sampling, self.dtype, self.device = sampling, dtype, torch.device(device)
         self.fine = Field(scene.fine, dtype, device)
         self.coarse = Field(scene.coarse, dtype, device) if sampling.kind == "hierarchical" else self.fine
+        self.occupancy = scene.occupancy
         self._background = torch.tensor(sampling.background, dtype=dtype, device=device)
 
     def rays(self, pose: Tensor, directions: Tensor, shift: Shift | None = None) -> Tensor:
@@ -134,7 +135,11 @@ class NerfRenderer:
         """Densities [n, k] and base outputs [n, k, width] in the middles of the bins [n, k + 1]."""
         distances = self._distances(bins)
         middles = (distances[:, :-1] + distances[:, 1:]) / 2.0
-        return field.density(origin + world[:, None] * middles[..., None])
+        points = origin + world[:, None] * middles[..., None]
+        density, base = field.density(points)
+        if self.occupancy is not None:
+            density = torch.where(self.occupancy.at(points), density, 0.0)
+        return density, base
 
     def _refined(self, bins: Tensor, weights: Tensor) -> Tensor:
         """``PDFSampler.generate_ray_samples`` outside training: the union of old and new edges, sorted."""

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from ns_abstract.methods.nerf.occupancy import OccupancyGrid
 from ns_abstract.methods.transform import DataparserTransform
 
 Float32Array = NDArray[np.float32]
@@ -91,6 +92,7 @@ class NerfScene:
         dataparser: Units of the training data against the normalised frame.
         name: Short name for reports.
         source: The file the parameters were read from.
+        occupancy: Declared by the user: density is 0 outside of its occupied voxels.
         notes: What was assumed where the source says nothing, one sentence each.
     """
 
@@ -104,4 +106,5 @@ class NerfScene:
     dataparser: DataparserTransform = field(default_factory=DataparserTransform)
     name: str = "scene"
     source: str = ""
+    occupancy: OccupancyGrid | None = None
     notes: tuple[str, ...] = ()
