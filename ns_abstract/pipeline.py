@@ -47,6 +47,7 @@ class Settings:
         seed: Of the random witnesses.
         memory_limit: GiB.
         resize: Height and width in pixels that pictures are rendered with, in place of the path's.
+        workers: Processes that bound the rays of a NeRF.
         occupancy_grid: File of a grid that is declared as part of a NeRF.
         sampling, num_samples, near_plane: Of the rays of a NeRF; None: the method's own.
     """
@@ -64,6 +65,7 @@ class Settings:
     num_samples: int | None = None
     near_plane: float | None = None
     occupancy_grid: Path | None = None
+    workers: int = 1
 
 
 class Method(Protocol):
@@ -352,6 +354,7 @@ def open_method(settings: Settings) -> Method:
             settings.num_samples,
             settings.near_plane,
             None if settings.occupancy_grid is None else load_grid(settings.occupancy_grid),
+            settings.workers,
         )
     for name in ("sampling", "num_samples", "near_plane", "occupancy_grid"):
         if getattr(settings, name) is not None:

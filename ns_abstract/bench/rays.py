@@ -50,10 +50,14 @@ def measure(job: Job, name: str, frame: int, scale: float, **options: Any) -> di
     poses = pose_set(job, name, frame, scale)
     sample: Any = RaySample(job.method, poses, options["rays"], options["seed"])
     sample.warm_up()
+    threads = torch.get_num_threads()
+    # threads that wait for one another would count
+    torch.set_num_threads(1)
     start = time.process_time()
     refinement = Refinement(sample, frame, job.goal(options["ratio"], options["seconds"]), seed=options["seed"])
     result = refinement.run()
     spent = time.process_time() - start
+    torch.set_num_threads(threads)
     _, probe, twin = nerf_renderer(job.method.scene, poses, job.method.sampling)
     chosen = torch.from_numpy(sample.chosen)
     found = falsify(

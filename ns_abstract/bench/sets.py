@@ -30,7 +30,11 @@ SETS: dict[str, dict[str, Any]] = {
 
 
 def open_jobs(
-    load_config: tuple[Path, ...], camera_path: Path | None, downscale_factor: float, arithmetic: str = "float32"
+    load_config: tuple[Path, ...],
+    camera_path: Path | None,
+    downscale_factor: float,
+    arithmetic: str = "float32",
+    occupancy_grid: Path | None = None,
 ) -> list[Job]:
     """The runs, or the demo scene where none is named.
 
@@ -49,7 +53,9 @@ def open_jobs(
     jobs = []
     for config in load_config:
         path = camera_path if camera_path is not None else config.resolve().parents[2] / "camera_path.json"
-        settings = Settings(config, path, downscale_factor=downscale_factor, arithmetic=arithmetic)
+        settings = Settings(
+            config, path, downscale_factor=downscale_factor, arithmetic=arithmetic, occupancy_grid=occupancy_grid
+        )
         jobs.append(Job(settings, Perturbation()))
     return jobs
 

@@ -128,6 +128,8 @@ class Rays(Scenes):
     """Time for every scene and set."""
     poses: int = 200
     """Poses of the attacks, beside gradient ascent."""
+    occupancy_grid: Path | None = None
+    """Declare the fields empty outside of this grid's occupied voxels."""
     scale: float = 1.0
     """Multiplies the ranges of translations and rotations."""
     seed: int = 0
@@ -238,8 +240,8 @@ def bench(options: Cell | Tightness | Soundness | Plan | Rules | Rays | Stiff) -
     from ns_abstract.bench.sets import open_jobs, pose_set
     from ns_abstract.bench.tables import markdown, write
 
-    arithmetic = "real" if isinstance(options, Rays) else "float32"
-    jobs = open_jobs(options.load_config, options.camera_path_filename, options.downscale_factor, arithmetic)
+    arithmetic, grid = ("real", options.occupancy_grid) if isinstance(options, Rays) else ("float32", None)
+    jobs = open_jobs(options.load_config, options.camera_path_filename, options.downscale_factor, arithmetic, grid)
     rows: list[dict[str, object]] = []
     results = {}
     for job in jobs:

@@ -182,4 +182,5 @@ def _with_whole_paths(settings: Settings) -> Settings:
         camera_path_filename=settings.camera_path_filename.absolute(),
         perturbation_filename=None if file is None else file.absolute(),
         occupancy_grid=None if settings.occupancy_grid is None else settings.occupancy_grid.absolute(),
+        workers=1,
     )

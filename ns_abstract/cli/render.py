@@ -61,6 +61,8 @@ class Render:
     """dask: spread the frames, and tiles where frames are few, over a Dask cluster (needs the extra "cluster")."""
     scheduler_address: str | None = None
     """HOST:PORT of a running Dask scheduler. Default: a cluster on this machine."""
+    workers: int | None = None
+    """NeRF: processes that bound rays. Default: one for every core."""
     resume: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
     """Keep the frames that an interrupted run with the same inputs has finished."""
     save_cells: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
@@ -82,6 +84,8 @@ def render(options: Render) -> int:
             raise InputError(f"found {value}", field=name, fix="give a positive number")
     if options.target_ratio < 1.0:
         raise InputError(f"found {options.target_ratio}", field="--target-ratio", fix="give a number of at least 1")
+    if options.workers is not None and options.workers < 1:
+        raise InputError(f"found {options.workers}", field="--workers", fix="give at least 1")
     if options.seed < 0:
         raise InputError(f"found {options.seed}", field="--seed", fix="give a number of at least 0")
     if options.engine == "local" and options.scheduler_address is not None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import os
 import sys
 import time
 from collections.abc import Callable, Iterator
@@ -24,7 +25,10 @@ if TYPE_CHECKING:
 def settings_of(options: Render) -> Settings:
     """The part of the options that says what is bounded."""
     names = {field.name for field in dataclasses.fields(Settings)}
-    return Settings(**{name: value for name, value in vars(options).items() if name in names})
+    given = {name: value for name, value in vars(options).items() if name in names}
+    if options.workers is None:
+        given["workers"] = 1 if options.engine == "dask" else len(os.sched_getaffinity(0))
+    return Settings(**given)
 
 
 def make_run(job: Job, options: Render, frames: tuple[int, ...], problems: list[str]) -> Run:

@@ -8,6 +8,7 @@ part by part, where it is exact for independent samples.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -134,12 +135,14 @@ class RayBounds:
         lower, upper: [n, 3] float64 bounds of the colours.
         alpha: [n, samples] float32 upper bounds of the opacity of every sample over the box.
         cells: Cells of the network that were bounded.
+        reach: Half the way of a sample over a cell that the network's bounds bear, as far as these rays tell.
     """
 
     lower: np.ndarray
     upper: np.ndarray
     alpha: np.ndarray
     cells: int
+    reach: float
 
 
 @dataclass
@@ -255,7 +258,7 @@ class NerfBounds:
         self.distances = 0.5 * (edges[1:] + edges[:-1])
         self.lengths = edges[1:] - edges[:-1]
         self.taylor = min(_TAYLOR, max(1, self.basis.degree))
-        #: Half the way of a sample over a cell that the network's bounds bear, learned while working.
+        #: Where to begin to look for `RayBounds.reach`.
         self.reach = 0.02
 
     def rays(
@@ -283,7 +286,7 @@ class NerfBounds:
         moves = pencil.displacement(self.distances, self.lengths)
         division = self._division(moves)
         if division is None or not (np.isfinite(pencil.direction).all() and np.isfinite(pencil.direction_radius).all()):
-            return RayBounds(np.zeros((n, 3)), np.ones((n, 3)), np.ones((n, samples), np.float32), 0)
+            return RayBounds(np.zeros((n, 3)), np.ones((n, 3)), np.ones((n, samples), np.float32), 0, self.reach)
         if n > 1 and n * samples * math.prod(division.parts) > _NUMBERS:
             halves = []
             for which in (slice(0, n // 2), slice(n // 2, n)):
@@ -293,7 +296,7 @@ class NerfBounds:
             lower, upper, alpha = (
                 np.concatenate([getattr(half, name) for half in halves]) for name in ("lower", "upper", "alpha")
             )
-            return RayBounds(lower, upper, alpha, halves[0].cells + halves[1].cells)
+            return RayBounds(lower, upper, alpha, halves[0].cells + halves[1].cells, typical_reach(halves))
         return _Work(self, pencil, division, moves, tolerance, known, aim).run(shifts or [])
 
     def _division(self, moves: np.ndarray) -> Division | None:
@@ -319,13 +322,10 @@ class NerfBounds:
             widest[axis] *= 0.5
         return Division(tuple(axes), d, finer)
 
-    def learn(self, tried: int, lost: int, widen: bool) -> None:
-        """Narrow the starting cells if many of those ``tried`` were lost, or ``widen`` them if few were."""
-        share = lost / max(1, tried)
-        if share > 0.2:
-            self.reach *= 0.85
-        elif widen and share < 0.1:
-            self.reach *= 1.08
+
+def typical_reach(parts: Sequence[RayBounds]) -> float:
+    """The geometric mean of what ``parts`` tell; the order in which they were worked on plays no part."""
+    return math.exp(sum(math.log(part.reach) for part in parts) / len(parts))
 
 
 class _Work:
@@ -352,7 +352,7 @@ class _Work:
         self.level = np.full((samples, n, parts), -1, np.int8)
         # light that reaches a sample, and what all samples so far let through
         self.before, self.light = np.ones((samples, n, parts), np.float32), np.ones((n, parts))
-        self.cells = 0
+        self.cells, self.reach = 0, owner.reach
         inverse = [1.0 / np.array(division.counts(level), np.float64) for level in range(division.levels + 1)]
         # the first level whose cells are narrow enough for the sample
         reach = [moves @ row for row in inverse]
@@ -386,7 +386,7 @@ class _Work:
                 found.append(self._composite())
             lower, upper = np.min([low for low, _ in found], axis=0), np.max([high for _, high in found], axis=0)
         alpha = self.alpha_high.max(axis=2).T.astype(np.float32)
-        return RayBounds(lower, upper, np.nextafter(alpha, np.float32(2.0)), self.cells)
+        return RayBounds(lower, upper, np.nextafter(alpha, np.float32(2.0)), self.cells, self.reach)
 
     @property
     def _dark(self) -> float:
@@ -448,7 +448,14 @@ class _Work:
             finer = _Items(np.tile(coarse.ray, 2), np.tile(coarse.sample, 2), children)
             waiting.setdefault(level + 1, []).append(finer)
         if tried >= 32:
-            self.owner.learn(tried, halved, wide)
+            self._learn(halved / tried, wide)
+
+    def _learn(self, lost: float, widen: bool) -> None:
+        """Cells should have started narrower if many of them were ``lost``, wider if few were and ``widen``."""
+        if lost > 0.2:
+            self.reach *= 0.85
+        elif widen and lost < 0.1:
+            self.reach *= 1.08
 
     def _improve(self) -> None:
         """Halve cells that leave colours open beyond the aim, round after round, on the parts where they do."""

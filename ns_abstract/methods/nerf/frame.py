@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import itertools
+import secrets
 from collections.abc import Iterator
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import Any
 
 import numpy as np
 
 from ns_abstract.arithmetic.outward import outward
-from ns_abstract.methods.nerf.bounds import NerfBounds, Shifts
+from ns_abstract.engines import Processes
+from ns_abstract.methods.nerf.bounds import NerfBounds, RayBounds, Shifts, typical_reach
 from ns_abstract.methods.nerf.hsv import color_shift
 from ns_abstract.methods.nerf.render import NerfRenderer, Sampling
 from ns_abstract.methods.nerf.scene import NerfScene
@@ -29,8 +31,10 @@ _LOOK_RAYS, _LOOK_POSES = 256, 7
 _LOOK_SHARES = np.linspace(0.0, 1.0, 9)
 #: Parts of every range of hues and saturations; pixels that a turn of the whole circle counts for.
 _SHIFT_PARTS, _SHIFT_MOTION = 12, 6.0
-#: Weights that are multiplied in one call of `NerfFrame.bound`, in units of rays times weights.
-_WORK = 2_500_000
+#: Weights that a worker multiplies between two looks at the clock, in units of rays times weights.
+_WORK = 1_250_000
+#: Seconds between looks at results of other processes.
+_PATIENCE = 60.0
 
 
 @dataclass(frozen=True)
@@ -57,6 +61,25 @@ class RayBox:
     linear: tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray] | None
 
 
+@lru_cache(maxsize=1)
+def _processes(count: int) -> Processes:
+    """Kept until this process ends: what they import and compile is worth seconds."""
+    return Processes(count)
+
+
+#: In a worker: the scene it works on, and its bounds by frame.
+_here: dict[bytes, NerfBounds] = {}
+
+
+def _bound_share(frame: bytes, bounds: tuple[Any, ...], reach: float, arguments: tuple[Any, ...]) -> RayBounds:
+    """`NerfBounds.rays` in another process; ``bounds`` are the constructor's arguments."""
+    if frame not in _here:
+        _here.clear()
+        _here[frame] = NerfBounds(*bounds)
+    _here[frame].reach = reach
+    return _here[frame].rays(*arguments)
+
+
 class NerfFrame:
     """Bounds and renders one frame's set of poses. Every ray is a tile of its own.
 
@@ -67,21 +90,28 @@ class NerfFrame:
         sampling: Where they are evaluated.
         pose_set: The poses.
         device: Where the network is bounded.
+        workers: Processes that bound rays side by side, one core each: the matrices are too small to be shared
+            among cores. Results do not depend on where a ray is bounded, but on what is bounded together.
     """
 
     #: Poses rendered in every part of a cell that is split.
     witnesses = 8
 
-    def __init__(self, scene: NerfScene, sampling: Sampling, pose_set: PoseSet, device: str = "cpu") -> None:
+    def __init__(
+        self, scene: NerfScene, sampling: Sampling, pose_set: PoseSet, device: str = "cpu", workers: int = 1
+    ) -> None:
         self.pose_set, self.camera, self.box = pose_set, pose_set.camera, pose_set.box
         self.view = pose_set.camera
         self.side = 1
         self.across, self.down = tile_grid(self.camera, 1)
         self.renderer = NerfRenderer(scene, sampling, device=device)
         self._geometry = pose_set.geometry
-        self.bounds = NerfBounds(scene, sampling, self._geometry.box.dimensions, device)
+        self._recipe = scene, sampling, self._geometry.box.dimensions, device
+        self._token = secrets.token_bytes(16)
+        self.bounds = NerfBounds(*self._recipe)
         weights = sum(array.size for array in scene.fine.arrays())
-        self.batch = int(np.clip(_WORK // weights, 1, 64))
+        self.workers = workers
+        self.batch = workers * int(np.clip(_WORK // weights, 1, 32))
         self._witness: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None
 
     @property
@@ -144,16 +174,10 @@ class NerfFrame:
             known = None
             if within is not None:
                 known = within.alpha[np.searchsorted(within.tiles, tiles)]
-            parts = [
-                self.bounds.rays(
-                    self._geometry, box.without(COLOR_SHIFTS), self._pixels(tiles[i : i + self.batch]),
-                    self._tolerance(box),
-                    None if known is None else known[i : i + self.batch],
-                    self._aim(box, tiles[i : i + self.batch]),
-                    self._shifts(box),
-                )
-                for i in range(0, tiles.size, self.batch)
-            ]  # fmt: skip
+            parts = []
+            for i in range(0, tiles.size, self.batch):
+                mine = slice(i, i + self.batch)
+                parts += self._batch(box, tiles[mine], None if known is None else known[mine])
             lower, upper, alpha = (
                 np.concatenate([getattr(part, name) for part in parts]) for name in ("lower", "upper", "alpha")
             )
@@ -167,6 +191,38 @@ class NerfFrame:
             flat = np.zeros((*shape, d), np.float32)
             linear = flat, low, flat, high
         return RayBox(low, high, np.zeros(d), context, linear)
+
+    def _batch(self, box: ParameterBox, tiles: np.ndarray, known: np.ndarray | None) -> list[RayBounds]:
+        """Bounds of rays that are worked on together, in one share for every worker."""
+        tolerance, aim, shifts = self._tolerance(box), self._aim(box, tiles), self._shifts(box)
+        poses = box.without(COLOR_SHIFTS)
+        size = -(-tiles.size // self.workers)
+        shares = []
+        for start in range(0, tiles.size, size):
+            part = slice(start, start + size)
+            shares.append(
+                (
+                    self._geometry, poses, self._pixels(tiles[part]), tolerance,
+                    None if known is None else known[part], (aim[0][part], aim[1][part]), shifts,
+                )
+            )  # fmt: skip
+        if len(shares) == 1:
+            found = [self.bounds.rays(*shares[0])]
+        else:
+            engine = _processes(self.workers)
+            for number, share in enumerate(shares):
+                engine.submit(number, _bound_share, self._token, self._recipe, self.bounds.reach, share)
+            done: dict[int, RayBounds] = {}
+            try:
+                while len(done) < len(shares):
+                    done.update(engine.collect(_PATIENCE))
+            except BaseException:
+                _processes.cache_clear()
+                engine.close()
+                raise
+            found = [done[number] for number in range(len(shares))]
+        self.bounds.reach = typical_reach(found)
+        return found
 
     def watch(self, tiles: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> None:
         """Take notice of the inner bounds [t, 1, 1, 3] of ``tiles`` [t] in a refinement, which change meanwhile."""

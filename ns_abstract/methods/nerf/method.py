@@ -32,6 +32,7 @@ class NerfMethod:
         sampling: "uniform" (None: the same), or "hierarchical": Nerfstudio's own picture, by bins (design.md, F10).
         num_samples: N of uniform samples; None: 64.
         near_plane: Start of the rays, normalised units; None: 0, as in Nerfstudio's evaluation.
+        workers: Processes that bound rays.
         occupancy: Declared as part of the scene: density is 0 outside of its occupied voxels.
 
     Raises:
@@ -47,6 +48,7 @@ class NerfMethod:
         num_samples: int | None = None,
         near_plane: float | None = None,
         occupancy: OccupancyGrid | None = None,
+        workers: int = 1,
     ) -> None:
         if renderer not in (None, "paper"):
             raise InputError(f"{renderer} draws splats, this run is a NeRF", field="--renderer", fix="leave it out")
@@ -74,6 +76,7 @@ class NerfMethod:
         if not 0.0 <= near < scene.far:
             raise InputError(f"found {near}", field="--near-plane", fix=f"give 0 or more, below {scene.far:g}")
         self.scene = scene if occupancy is None else replace(scene, occupancy=occupancy)
+        self.workers = workers
         self.paper = renderer == "paper"
         background = np.zeros(3) if self.paper else scene.background
         red, green, blue = (float(v) for v in background)
@@ -109,7 +112,7 @@ class NerfMethod:
 
     def frame(self, poses: PoseSet) -> NerfFrame:
         """One frame, ready for refinement."""
-        return NerfFrame(self.scene, self.sampling, poses)
+        return NerfFrame(self.scene, self.sampling, poses, workers=self.workers)
 
     def prepare(self, perturbations: Sequence[Perturbation]) -> None:
         """Refuse what needs Gaussians.
