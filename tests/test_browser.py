@@ -121,6 +121,13 @@ def test_slider_to_picture(server: Server, tmp_path: Path) -> None:
         still = np.abs(gap - TURBO_ZERO).max(axis=-1) < 30
         assert still.mean() > 0.3 and (gap[..., 1] > 150).mean() > 0.005
         assert (np.abs(picture - TURBO_ZERO).max(axis=-1) < 30).mean() < 0.05
+
+        # a part of the scene, by its button
+        fields = "[...document.querySelectorAll('input')].map(e => e.value).join('; ')"
+        assert "box" not in browser.ask(fields)
+        button = "[...document.querySelectorAll('button')].find(e => e.innerText === 'select what is in the middle')"
+        browser.click(*browser.place(button))
+        until(lambda: '{"box": [[' in browser.ask(fields), 60, "the selection")
         assert "Traceback" not in server.said()
     # the viewer outlives its client
     assert server.url

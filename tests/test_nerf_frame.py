@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
+import os
+import signal
 
 import numpy as np
 import pytest
@@ -10,6 +12,7 @@ import torch
 from nerfs import UNIFORM, images, pixels_of, poses, tiny_scene
 
 from ns_abstract.methods.nerf import bounds as bounds_module
+from ns_abstract.methods.nerf import frame as frame_module
 from ns_abstract.methods.nerf.bounds import Division, NerfBounds, RayBounds
 from ns_abstract.methods.nerf.frame import NerfFrame
 from ns_abstract.methods.nerf.scene import NerfScene
@@ -214,3 +217,29 @@ def test_bounds_that_are_no_numbers_are_not_kept(monkeypatch: pytest.MonkeyPatch
     assert np.isfinite(found.lower).all() and np.isfinite(found.upper).all()
     assert attack(scene, pose_set, found)[1] == 0
     assert torch.isfinite(torch.from_numpy(found.alpha)).all()
+
+
+def test_processes_find_what_this_process_finds_and_survive_a_kill() -> None:
+    scene, pose_set = tiny_scene(2, density=30.0), poses(SETS["yaw"])
+    box = pose_set.box.split(0, 2)[0]
+    tiles = np.arange(12)
+    shared, alone = NerfFrame(scene, UNIFORM, pose_set, workers=2), NerfFrame(scene, UNIFORM, pose_set)
+    assert shared.batch == 2 * alone.batch
+    engine = frame_module._processes(2)
+    try:
+        together = shared.bound(box, tiles)
+        reach = alone.bounds.reach
+        halves = []
+        for part in (tiles[:6], tiles[6:]):
+            alone.bounds.reach = reach
+            halves.append(alone.bound(box, part))
+        for name in ("lower", "upper"):
+            assert (getattr(together, name) == np.concatenate([getattr(half, name) for half in halves])).all()
+        for pid in engine.pids:
+            os.kill(pid, signal.SIGKILL)
+        shared.bounds.reach = reach
+        again = shared.bound(box, tiles)
+        assert (again.lower == together.lower).all() and (again.upper == together.upper).all()
+    finally:
+        frame_module._processes.cache_clear()
+        engine.close()

@@ -188,6 +188,7 @@ class AbstractPanel(torch.nn.Module):
     def select_middle(self) -> None:
         """Select the Gaussians in a box around the surface in the middle of the picture."""
         if self._last is None or self.depth is None:
+            self._figures.show("**Abstract images**: nothing to select, no picture with a depth is on screen")
             return
         pose = self._last.camera.camera_to_world
         middle, side = pose[:, 3] - self.depth * pose[:, 2], 0.5 * _BOX * self.depth
