@@ -70,6 +70,7 @@ def main() -> None:
     parser.add_argument("--skip", type=int, default=4)
     parser.add_argument("--head-width", type=int, default=128)
     parser.add_argument("--minutes", type=float, default=30.0, help="of processor time")
+    parser.add_argument("--smoothness-penalty", type=float, default=0.0, help="of abstract-nerf (design.md, W5)")
     parser.add_argument("--rays", type=int, default=1024)
     parser.add_argument("--name", default="lego")
     parser.add_argument("--device", default="cuda" if torch.cuda.is_available() else "cpu")
@@ -129,6 +130,10 @@ def main() -> None:
         a, b, e = voxel.clamp(0, HULL - 1).unbind(-1)
         free = free[~(occupied[a, b, e] & ((voxel >= 0) & (voxel < HULL)).all(dim=-1))]
         loss = loss + 1e-2 * functional.relu(network.raw_density(free)[0] + 8.0).mean()
+        if options.smoothness_penalty > 0.0:
+            from ns_abstract.nerfstudio.nerf import log_lipschitz
+
+            loss = loss + options.smoothness_penalty * log_lipschitz(network)
         optimizer.zero_grad(set_to_none=True)
         loss.backward()
         optimizer.step()

@@ -720,7 +720,7 @@ def _forward(
         ended = False
         for lane in range(n):
             high = s[_HI + lane]
-            q = pixels[lane]
+            q = int(pixels[lane])
             if high < alpha_min:
                 continue
             marks[i] = 1
@@ -776,7 +776,7 @@ def _forward(
                 s[_REACH + q] = max(s[_REACH + q], float(last[k]))
         if slot_count > 0:
             for lane in range(n):
-                q = pixels[lane]
+                q = int(pixels[lane])
                 if s[_THI + q] <= stop_low and s[_REACH + q] <= k:
                     live &= ~(1 << q)
                     ended = True
