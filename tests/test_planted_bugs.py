@@ -21,9 +21,9 @@ def test_every_change_applies() -> None:
 
 
 def test_kernels_run_interpreted() -> None:
-    test = f"{ROOT / 'tests' / 'test_bounds.py'}::test_near_plane_alone"
+    tests = [f"{ROOT / 'tests' / 'test_bounds.py'}::{name}" for name in ("test_near_plane_alone", "test_ties")]
     done = subprocess.run(
-        [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", test],
+        [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", *tests],
         check=False,
         cwd=ROOT,
         capture_output=True,

@@ -979,7 +979,7 @@ def _interval_blend(
             value_high = background[channel]
             suffix_low = value_low
             suffix_high = value_high
-            stop = lengths[q]
+            stop = int(lengths[q])
             while stop > 0:
                 start = stop - 1
                 while start > 0 and chain[sources[start - 1, q]] == chain[sources[stop - 1, q]]:
@@ -1008,7 +1008,7 @@ def _blend_group(
     for q in range(n):
         s[_MIN + q] = min(background[0], background[1], background[2])
         s[_MAX + q] = max(background[0], background[1], background[2])
-        count = max(count, lengths[first + q])
+        count = max(count, int(lengths[first + q]))
     state[:] = 0.0
     radius[:] = 0.0
     for channel in range(3):
@@ -1381,7 +1381,7 @@ def _block(
         return True
     deepest = 0
     for q in range(PIXELS):
-        deepest = max(deepest, lengths[q])
+        deepest = max(deepest, int(lengths[q]))
     moved[:deepest] = False
     if slot_count > 0:
         _settle_stops(
