@@ -303,6 +303,24 @@ def test_numpy_scalars_of_both_major_versions(run: Run, tmp_path: Path, module: 
     assert load_scene(run.config).count == GAUSSIANS
 
 
+@pytest.mark.parametrize("module", ["numpy.core", "numpy._core"])
+def test_what_others_allow_plays_no_part(run: Run, module: str) -> None:
+    """Whatever wins where a name is allowed twice, it is not theirs; afterwards theirs is allowed as before."""
+
+    before = torch.serialization.get_safe_globals()
+    names = [f"{module}.multiarray.scalar", "numpy.dtype", "numpy.dtypes.Float64DType"]
+    # of equal names any may win: theirs are many
+    theirs = [type(f"Theirs{k}", (), {}) for k in range(32)]
+    torch.serialization.add_safe_globals([(one, name) for one in theirs for name in names])
+    try:
+        given = set(map(str, torch.serialization.get_safe_globals()))
+        test_numpy_scalars_of_both_major_versions(run, run.config.parent, f"{module}.multiarray")
+        assert set(map(str, torch.serialization.get_safe_globals())) == given
+    finally:
+        torch.serialization.clear_safe_globals()
+        torch.serialization.add_safe_globals(before)
+
+
 def test_old_and_distributed_key_layouts(run: Run) -> None:
     expected = load_scene(run.config)
     for prefix in ("_model.", "module._model.gauss_params."):

@@ -15,6 +15,8 @@ import re
 import warnings
 import zipfile
 from collections import Counter
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath, PureWindowsPath
 from typing import TYPE_CHECKING, Any, cast
@@ -454,12 +456,27 @@ def _check_members(archive: zipfile.ZipFile, path: Path, size: int) -> None:
         raise InputError(f"damaged checkpoint: {problem}", file=path, fix=_RECOPY)
 
 
+@contextmanager
+def _allowed_alone(names: list[Any]) -> Iterator[None]:
+    """Let ``torch.load`` see these names only: others' objects of the same names would take turns with ours."""
+    import torch
+
+    others = torch.serialization.get_safe_globals()
+    torch.serialization.clear_safe_globals()
+    try:
+        with torch.serialization.safe_globals(names):
+            yield
+    finally:
+        torch.serialization.clear_safe_globals()
+        torch.serialization.add_safe_globals(others)
+
+
 def _load_checkpoint(path: Path) -> Any:
     import torch
 
     inert: list[Any] = [(_Inert, name) for name in _NUMPY_NAMES]
     try:
-        with torch.serialization.safe_globals(inert), warnings.catch_warnings():
+        with _allowed_alone(inert), warnings.catch_warnings():
             warnings.simplefilter("ignore")
             try:
                 return torch.load(str(path), map_location="cpu", weights_only=True, mmap=True)
