@@ -23,6 +23,7 @@ from ns_abstract.demo.nerf_fit import NerfNetwork
 from ns_abstract.demo.nerf_runs import write_nerf_run
 from ns_abstract.methods.nerf.render import NerfRenderer, Sampling, camera_rays
 from ns_abstract.methods.nerf.scene import NerfScene
+from ns_abstract.methods.nerf.smoothness import log_lipschitz
 from ns_abstract.sets.path import Camera
 
 HULL, REACH = 96, 1.4
@@ -131,8 +132,6 @@ def main() -> None:
         free = free[~(occupied[a, b, e] & ((voxel >= 0) & (voxel < HULL)).all(dim=-1))]
         loss = loss + 1e-2 * functional.relu(network.raw_density(free)[0] + 8.0).mean()
         if options.smoothness_penalty > 0.0:
-            from ns_abstract.nerfstudio.nerf import log_lipschitz
-
             loss = loss + options.smoothness_penalty * log_lipschitz(network)
         optimizer.zero_grad(set_to_none=True)
         loss.backward()
