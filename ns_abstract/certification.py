@@ -20,7 +20,7 @@ from ns_abstract.jsonio import load_json
 from ns_abstract.methods.splat.frame import SplatFrame
 from ns_abstract.methods.splat.method import SplatMethod
 from ns_abstract.methods.splat.reference import Reference
-from ns_abstract.pipeline import Job, Settings
+from ns_abstract.pipeline import Job, Settings, check_content, with_whole_paths
 from ns_abstract.report.record import file_stamp
 from ns_abstract.sets.box import ParameterBox
 from ns_abstract.sets.perturbation import Perturbation
@@ -71,12 +71,7 @@ class CertifySettings:
 
     def absolute(self) -> CertifySettings:
         """The same for a process with another working directory."""
-        paths = {
-            field.name: value.absolute()
-            for field in dataclasses.fields(self)
-            if isinstance(value := getattr(self, field.name), Path)
-        }
-        return dataclasses.replace(self, **paths)
+        return with_whole_paths(self)
 
 
 class FramePictures:
@@ -364,11 +359,6 @@ def examine_block(
         numba.set_num_threads(1)
         torch.set_num_threads(1)
         job = Certification(settings)
-        if job.fingerprint != fingerprint:
-            raise InputError(
-                "the worker finds other content than this machine",
-                file=settings.load_config,
-                fix="give the workers the same files under the same paths",
-            )
+        check_content(job.fingerprint, fingerprint, settings.load_config)
         _opened[settings] = job
     return _opened[settings].search(index, grid).examine(cells)

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, Protocol, TypeVar
 
 import numpy as np
 
@@ -66,6 +66,30 @@ class Settings:
     near_plane: float | None = None
     occupancy_grid: Path | None = None
     workers: int = 1
+
+
+SomeSettings = TypeVar("SomeSettings")
+
+
+def with_whole_paths(settings: SomeSettings) -> SomeSettings:
+    """The same dataclass for a process with another working directory."""
+    record: Any = settings
+    given = {field.name: getattr(record, field.name) for field in fields(record)}
+    return replace(record, **{name: value.absolute() for name, value in given.items() if isinstance(value, Path)})
+
+
+def check_content(found: dict[str, Any], expected: dict[str, Any], file: Path) -> None:
+    """Refuse to work on other content than the command that asks for it.
+
+    Raises:
+        InputError: A worker reads other files under the same names.
+    """
+    if found != expected:
+        raise InputError(
+            "the worker finds other content than this machine",
+            file=file,
+            fix="give the workers the same files under the same paths",
+        )
 
 
 class Method(Protocol):

@@ -71,7 +71,7 @@ def measure(job: Job, name: str, frame: int, scale: float, **options: Any) -> di
     return {
         "scene": job.scene.name,
         "field": job.method.scene.fine.text,
-        "size": f"{sample.view.width}x{sample.view.height}",
+        "size": f"{poses.camera.width}x{poses.camera.height}",
         "set": name,
         "scale": scale,
         "rays": sample.tile_count,

@@ -205,12 +205,21 @@ def stiff(options: Stiff) -> int:
     return 1 if failed else DONE
 
 
-def rows_of(options: Cell | Plan | Rules | Rays, job: Job, name: str) -> list[dict[str, Any]]:
+def rows_of(options: Cell | Soundness | Plan | Rules | Rays, job: Job, name: str) -> list[dict[str, Any]]:
     """What a benchmark without curves finds for one scene and set of poses."""
     if isinstance(options, Cell):
         from ns_abstract.bench.cell import cell_cost
 
         return [cell_cost(job, name, options.frame, options.repeats)]
+    if isinstance(options, Soundness):
+        from ns_abstract.bench.soundness import attack
+
+        return [
+            attack(
+                job, name, options.frame, options.seconds, options.poses, options.reference_poses, options.seed,
+                options.scale,
+            )
+        ]  # fmt: skip
     if isinstance(options, Plan):
         from ns_abstract.bench.plan import without
 
@@ -247,9 +256,7 @@ def bench(options: Cell | Tightness | Soundness | Plan | Rules | Rays | Stiff) -
     for job in jobs:
         for name in options.sets:
             told = len(rows)
-            if isinstance(options, Cell | Plan | Rules | Rays):
-                rows += rows_of(options, job, name)
-            elif isinstance(options, Tightness):
+            if isinstance(options, Tightness):
                 from ns_abstract.bench.tightness import refine, summary
 
                 poses = pose_set(job, name, options.frame, options.scale)
@@ -257,20 +264,7 @@ def bench(options: Cell | Tightness | Soundness | Plan | Rules | Rays | Stiff) -
                 results[f"{job.scene.name} {name}"] = result
                 rows.append(summary(job, name, result))
             else:
-                from ns_abstract.bench.soundness import attack
-
-                rows.append(
-                    attack(
-                        job,
-                        name,
-                        options.frame,
-                        options.seconds,
-                        options.poses,
-                        options.reference_poses,
-                        options.seed,
-                        options.scale,
-                    )
-                )
+                rows += rows_of(options, job, name)
             lines = markdown(rows).splitlines()
             print("\n".join(lines[0 if not told else 2 + told :]), flush=True)
     kind = type(options).__name__.lower()

@@ -15,7 +15,7 @@ import numpy as np
 
 from ns_abstract.engines import Cluster
 from ns_abstract.errors import InputError
-from ns_abstract.pipeline import LEAST_SECONDS, Job, Settings
+from ns_abstract.pipeline import LEAST_SECONDS, Job, Settings, check_content, with_whole_paths
 from ns_abstract.refine.engine import Goal, groups, shared_goal
 from ns_abstract.refine.result import FrameResult, PartResult
 
@@ -66,12 +66,7 @@ def bound_part(
         if settings not in _jobs or _jobs[settings][0].fingerprint != fingerprint:
             _jobs.clear()
             job = Job(settings)
-            if job.fingerprint != fingerprint:
-                raise InputError(
-                    "the worker finds other content than this machine",
-                    file=settings.load_config,
-                    fix="give the workers the same files under the same paths",
-                )
+            check_content(job.fingerprint, fingerprint, settings.load_config)
             _jobs[settings] = job, set()
         job, warm = _jobs[settings]
         if part.index not in warm:
@@ -110,7 +105,8 @@ def bound_on_cluster(
     engine = Cluster(client)
     count = -(-_GROUPS_BY_THREAD * engine.threads // len(pending)) if engine.threads > len(pending) else 1
     neighbours, leaf_bytes = _shares(client, job)
-    settings, fingerprint = _with_whole_paths(job.settings), job.fingerprint
+    settings = dataclasses.replace(with_whole_paths(job.settings), workers=1)
+    fingerprint = job.fingerprint
     deadline = time.perf_counter() + budget
     queue = [
         Part(index, tiles) for index in pending for tiles in ([None] if count == 1 else groups(job.frame(index), count))
@@ -171,16 +167,3 @@ def _shares(client: Any, job: Job) -> tuple[int, int]:
         )
     neighbours = max(1, max(tasks.values(), default=1))
     return neighbours, job.leaf_bytes(most) // neighbours
-
-
-def _with_whole_paths(settings: Settings) -> Settings:
-    """The same for a worker, whose working directory is another one."""
-    file = settings.perturbation_filename
-    return dataclasses.replace(
-        settings,
-        load_config=settings.load_config.absolute(),
-        camera_path_filename=settings.camera_path_filename.absolute(),
-        perturbation_filename=None if file is None else file.absolute(),
-        occupancy_grid=None if settings.occupancy_grid is None else settings.occupancy_grid.absolute(),
-        workers=1,
-    )

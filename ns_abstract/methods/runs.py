@@ -463,9 +463,9 @@ def _allowed_alone(names: list[Any]) -> Iterator[None]:
 
     others = torch.serialization.get_safe_globals()
     torch.serialization.clear_safe_globals()
+    torch.serialization.add_safe_globals(names)
     try:
-        with torch.serialization.safe_globals(names):
-            yield
+        yield
     finally:
         torch.serialization.clear_safe_globals()
         torch.serialization.add_safe_globals(others)

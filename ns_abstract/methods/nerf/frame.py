@@ -101,7 +101,6 @@ class NerfFrame:
         self, scene: NerfScene, sampling: Sampling, pose_set: PoseSet, device: str = "cpu", workers: int = 1
     ) -> None:
         self.pose_set, self.camera, self.box = pose_set, pose_set.camera, pose_set.box
-        self.view = pose_set.camera
         self.side = 1
         self.across, self.down = tile_grid(self.camera, 1)
         self.renderer = NerfRenderer(scene, sampling, device=device)
@@ -138,7 +137,7 @@ class NerfFrame:
         """Rays [t, 1, 1, 3] float32 of the concrete image at parameter values [d]."""
         which = np.arange(self.tile_count) if tiles is None else tiles
         shift = color_shift(self.pose_set, values)
-        colors = self.renderer.pixels(self.view, self.pose_set.pose(values), self._pixels(which), shift)
+        colors = self.renderer.pixels(self.pose_set.camera, self.pose_set.pose(values), self._pixels(which), shift)
         return colors.astype(np.float32)[:, None, None, :]
 
     def motion(self, box: ParameterBox) -> np.ndarray:
@@ -194,7 +193,9 @@ class NerfFrame:
 
     def _batch(self, box: ParameterBox, tiles: np.ndarray, known: np.ndarray | None) -> list[RayBounds]:
         """Bounds of rays that are worked on together, in one share for every worker."""
-        tolerance, aim, shifts = self._tolerance(box), self._aim(box, tiles), self._shifts(box)
+        tolerance, shifts = self._tolerance(box), self._shifts(box)
+        low, high = self._reached(box, tiles, bool(shifts))
+        low, high = low - tolerance, high + tolerance
         poses = box.without(COLOR_SHIFTS)
         size = -(-tiles.size // self.workers)
         shares = []
@@ -203,7 +204,7 @@ class NerfFrame:
             shares.append(
                 (
                     self._geometry, poses, self._pixels(tiles[part]), tolerance,
-                    None if known is None else known[part], (aim[0][part], aim[1][part]), shifts,
+                    None if known is None else known[part], (low[part], high[part]), shifts,
                 )
             )  # fmt: skip
         if len(shares) == 1:
@@ -230,21 +231,22 @@ class NerfFrame:
         places[tiles] = np.arange(tiles.size)
         self._witness = places, lower, upper
 
-    def _aim(self, box: ParameterBox, tiles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Colours [n, 3] that are reached over the box or, where a refinement is watched, the set, and some more."""
-        tolerance = self._tolerance(box)
-        if self._witness is not None and not self._shifts(box):
+    def _reached(self, box: ParameterBox, tiles: np.ndarray, shifted: bool) -> tuple[np.ndarray, np.ndarray]:
+        """Ends [n, 3] of the colours reached over the box or, where a refinement is watched, the set.
+
+        Before any shift of colours: where they are ``shifted``, what a refinement sees is of no use.
+        """
+        if self._witness is not None and not shifted:
             places, *sides = self._witness
             low, high = (side[places[tiles], 0, 0].astype(np.float64) for side in sides)
         else:
-            # shifts of colours come on top of what the poses reach
             rng, pixels, box = np.random.default_rng(0), self._pixels(tiles), box.without(COLOR_SHIFTS)
-            inside = [box.at(2.0 * (np.arange(box.dimensions) * 0.0 + share) - 1.0) for share in _LOOK_SHARES]
+            inside = [box.at(np.full(box.dimensions, 2.0 * share - 1.0)) for share in _LOOK_SHARES]
             values = [*inside, *box.sample(_LOOK_POSES, rng)] if box.dimensions else [box.middle]
             poses = [self._geometry.pose(v) for v in values]
-            pictures = np.stack([self.renderer.pixels(self.view, pose, pixels) for pose in poses])
+            pictures = np.stack([self.renderer.pixels(self.pose_set.camera, pose, pixels) for pose in poses])
             low, high = pictures.min(axis=0), pictures.max(axis=0)
-        return low - tolerance, high + tolerance
+        return low, high
 
     def _shifts(self, box: ParameterBox) -> list[Shifts]:
         """Equal parts of the box's shifts of colours, which cost nothing to tell apart; empty: there are none."""

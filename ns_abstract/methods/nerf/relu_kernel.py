@@ -14,7 +14,7 @@ from ns_abstract.arithmetic.units import UNIT64
 _UP = 1.0 + 2.0**-40
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(cache=True, error_model="numpy")
 def _on_grid(p, half, even, odd, values):
     """``values[i] = sum_k p[k] T_k(x_i)`` from ``half`` [m, (g + 1) / 2], the grid's first half and its middle."""
     count = half.shape[1]
@@ -33,7 +33,7 @@ def _on_grid(p, half, even, odd, values):
         values[i] = even[i] + odd[i]
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(cache=True, error_model="numpy")
 def _series(values, fit_even, fit_odd, sum_even, sum_odd, q):
     """``q[k] = sum_i fit[k, i] values[i]`` from the grid's first half and its middle, by even and odd degrees."""
     count = fit_even.shape[0]
@@ -52,7 +52,7 @@ def _series(values, fit_even, fit_odd, sum_even, sum_odd, q):
     q[1::2] = sum_odd
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(cache=True, error_model="numpy")
 def _smallest(values, scratch):
     """The least of ``values`` by folding, which the processor does many at a time; NaN may be passed over."""
     n = values.shape[0]
@@ -70,7 +70,7 @@ def _smallest(values, scratch):
     return scratch[0]
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(cache=True, error_model="numpy")
 def relu(poly, rho, box, failed, half, fit_even, fit_odd, chord, norming, slope, size, which, neuron, error):
     """max(0, z) in place (design.md, F5); returns the number of new error terms.
 

@@ -35,7 +35,7 @@ def _rounding(inputs: int) -> float:
     return 2.0 * gamma(inputs + 4)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(cache=True, error_model="numpy")
 def _sum_by_owner(columns, owner, out):
     """``out[owner[c]] += |columns[c]|``."""
     for c in range(columns.shape[0]):
@@ -44,7 +44,7 @@ def _sum_by_owner(columns, owner, out):
             out[b, j] += abs(columns[c, j])
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(cache=True, error_model="numpy")
 def _scale_by_owner(columns, owner, slope):
     """``columns[c] *= slope[owner[c]]``."""
     for c in range(columns.shape[0]):
