@@ -9,10 +9,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ns_abstract.bench import plan, rules
+from ns_abstract.bench import paper as paper_tables
+from ns_abstract.bench import plan, rules, scale
 from ns_abstract.bench.sets import open_jobs, pose_set
-from ns_abstract.cli.bench import Plan, Rules, bench
+from ns_abstract.cli.bench import Plan, Rules, Scale, Tightness, bench
 from ns_abstract.cli.common import DONE
+from ns_abstract.errors import InputError
 from ns_abstract.methods.splat import paper
 from ns_abstract.methods.splat.activate import activate
 from ns_abstract.methods.splat.constants import PAPER
@@ -89,3 +91,52 @@ def test_commands(blobs, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> 
         with open(tmp_path / f"{name}.csv", newline="") as stream:
             assert len(list(csv.DictReader(stream))) == count
         assert (tmp_path / f"{name}.md").read_text().startswith("# ")
+
+
+def test_tables_in_the_papers_shape(blobs, tmp_path: Path) -> None:
+    options = Tightness(
+        (blobs.config,), blobs.path, tmp_path, sets=("x", "opacity"), seconds=2.0, target_ratio=1.2, downscale_factor=2
+    )
+    assert bench(options) == DONE
+    for number, name in ((2, "x"), (6, "opacity")):
+        with open(tmp_path / f"table-{number}.csv", newline="") as stream:
+            ours, *others = csv.DictReader(stream)
+        assert ours["by"] == "ns-abstract" and ours["Dim"] == name and {row["by"] for row in others} == {"paper"}
+        assert 0.0 < float(ours["empirical MPG"]) <= float(ours["MPG"]) <= float(ours["XPG"])
+        # a table's ratio is that of its own columns
+        for row in others:
+            ratio = float(row["MPG"]) / float(row["empirical MPG"])
+            assert float(row["MPG / empirical"]) == pytest.approx(ratio, rel=1e-12)
+    assert paper_tables.TABLES[2][0]["MPG"] == 0.51
+
+
+@pytest.mark.parametrize("count", [5, 40, 130])
+def test_resampled_scenes_cover_as_much(job: Job, count: int) -> None:
+    scene = job.scene
+    found = scale.resampled(scene, count)
+    assert found.count == count
+
+    def area(some) -> float:
+        return float(np.exp(2.0 * some.log_scales.astype(np.float64)).mean()) * some.count
+
+    chosen = scale.resampled(replace(scene, log_scales=np.zeros_like(scene.log_scales)), count)
+    assert area(chosen) == pytest.approx(scene.count, rel=1e-5)
+    if count <= scene.count:
+        # a part of the stored means, otherwise new ones near them
+        assert {tuple(m) for m in found.means} <= {tuple(m) for m in scene.means}
+
+
+def test_cost_by_scale(blobs, tmp_path: Path) -> None:
+    options = Scale(
+        (blobs.config,), blobs.path, tmp_path, gaussians=(10, 60), widths=(24,), repeats=1, seconds=1.0
+    )
+    assert bench(options) == DONE
+    with open(tmp_path / "scale.csv", newline="") as stream:
+        small, large = csv.DictReader(stream)
+    assert small["Gaussians"] == "10" and small["ratio"] == "" and float(large["ratio"]) >= 1.0
+    assert 0.0 < float(large["peak GiB"]) < 4.0 and (tmp_path / "scale.png").stat().st_size > 10_000
+
+
+def test_scale_needs_one_run(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="found 0 runs"):
+        bench(Scale(output_dir=tmp_path))

@@ -10,9 +10,11 @@ import numpy as np
 from ns_abstract.bench.sets import pose_set
 from ns_abstract.methods.splat.frame import SplatFrame
 from ns_abstract.pipeline import Job
+from ns_abstract.sets.box import ParameterBox
+from ns_abstract.sets.poses import PoseSet
 
 #: Width of the measured cell as a part of the set's: about what refinement ends with.
-_PART = 1.0 / 32.0
+PART = 1.0 / 32.0
 
 
 def measure(functions: Sequence[Callable[[], object]], repeats: int) -> np.ndarray:
@@ -28,6 +30,15 @@ def measure(functions: Sequence[Callable[[], object]], repeats: int) -> np.ndarr
     return seconds
 
 
+def small_cell(poses: PoseSet, part: float) -> ParameterBox:
+    """The middle ``part`` of a set's range in every parameter."""
+    cell = poses.box
+    for axis in range(cell.dimensions):
+        middle, half = float(cell.middle[axis]), 0.5 * part * (cell.upper[axis] - cell.lower[axis])
+        cell = cell.replace(axis, middle - half, middle + half)
+    return cell
+
+
 def cell_cost(job: Job, name: str, frame: int, repeats: int) -> dict[str, object]:
     """Times of the render, of a cell from nothing and of a cell inside a bounded one, and their ratios.
 
@@ -36,10 +47,7 @@ def cell_cost(job: Job, name: str, frame: int, repeats: int) -> dict[str, object
     """
     poses = pose_set(job, name, frame)
     view = SplatFrame(job.splats, job.rasteriser, job.arithmetic, poses)
-    cell = poses.box
-    for axis in range(cell.dimensions):
-        middle, half = float(cell.middle[axis]), 0.5 * _PART * (cell.upper[axis] - cell.lower[axis])
-        cell = cell.replace(axis, middle - half, middle + half)
+    cell = small_cell(poses, PART)
     tiles = np.arange(view.tile_count)
     around = view.bound(cell, tiles).context
     seconds = measure(

@@ -1,9 +1,10 @@
-"""The picture of error against run time."""
+"""Pictures of what the benchmarks find."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 from ns_abstract.refine.result import FrameResult
 
@@ -24,8 +25,32 @@ def save_curves(path: Path, results: Mapping[str, FrameResult]) -> None:
         right.semilogx(seconds, [p.mpg_witness for p in points], color=line.get_color(), linestyle="--")
     left.set(xlabel="seconds", ylabel="MPG / witness MPG - 1")
     right.set(xlabel="seconds", ylabel="MPG (dashed: witness)")
-    for axes in (left, right):
+    _finish(left, right)
+    figure.savefig(path, dpi=130)
+
+
+def save_scale(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
+    """Left: nanoseconds by Gaussian-pixel pair against Gaussians, by size of the picture. Right: peak memory."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(11.0, 4.4), layout="constrained")
+    FigureCanvasAgg(figure)
+    left, right = figure.subplots(1, 2)
+    for size in dict.fromkeys(row["size"] for row in rows):
+        found = [row for row in rows if row["size"] == size]
+        counts = [row["Gaussians"] for row in found]
+        (line,) = left.loglog(counts, [row["cell ns / pair"] for row in found], marker="o", label=f"{size}, cell")
+        left.loglog(counts, [row["render ns / pair"] for row in found], color=line.get_color(), linestyle="--")
+        right.semilogx(counts, [row["peak GiB"] for row in found], marker="o", color=line.get_color(), label=size)
+    left.set(xlabel="Gaussians", ylabel="ns by Gaussian and pixel (dashed: concrete render)")
+    right.set(xlabel="Gaussians", ylabel="peak memory of the process, GiB")
+    _finish(left, right)
+    figure.savefig(path, dpi=130)
+
+
+def _finish(*panels: Any) -> None:
+    for axes in panels:
         axes.grid(True, which="both", alpha=0.3)
         axes.spines[["top", "right"]].set_visible(False)
-    left.legend(fontsize=8)
-    figure.savefig(path, dpi=130)
+    panels[0].legend(fontsize=8)

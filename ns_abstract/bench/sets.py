@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import tempfile
 from dataclasses import replace
 from pathlib import Path
@@ -14,7 +15,8 @@ from ns_abstract.pipeline import Job, Settings
 from ns_abstract.sets.perturbation import Perturbation, parse_perturbation
 from ns_abstract.sets.poses import PoseSet
 
-#: Perturbation objects by name; "orbit" turns about the vertical through the median Gaussian, or a NeRF's origin.
+#: Perturbation objects by name; "orbit" turns about the vertical through the median Gaussian, or a NeRF's origin, and
+#: what varies of a splat scene is the half of it with x above the median.
 SETS: dict[str, dict[str, Any]] = {
     "x": {"translation": {"x": 0.05}},
     "yaw": {"rotation": {"yaw": 0.05}},
@@ -26,20 +28,27 @@ SETS: dict[str, dict[str, Any]] = {
     "segments": {"sweep": "segments"},
     "orbit": {"orbit": {"target": None, "axis": [0.0, 0.0, 1.0], "azimuth": [0.0, 0.1]}},
     "point": {},
+    "mean": {"scene": [{"select": {"box": None}, "mean": 0.002}]},
+    "opacity": {"scene": [{"select": {"box": None}, "opacity": 0.05}]},
+    "color": {"scene": [{"select": {"box": None}, "color": 0.05}]},
+    "hue": {"hue": 0.075},
+    "saturation": {"saturation": 0.15},
 }
+#: What the command line says of them.
+SET_NAMES = ", ".join(SETS)
 
 
 def open_jobs(
     load_config: tuple[Path, ...],
     camera_path: Path | None,
     downscale_factor: float,
-    arithmetic: str = "float32",
+    arithmetic: str | None = None,
     occupancy_grid: Path | None = None,
 ) -> list[Job]:
     """The runs, or the demo scene where none is named.
 
-    Without ``camera_path`` each run's own ``camera_path.json``, in the folder that holds the method's
-    folder, is used.
+    Without ``arithmetic`` it is the strongest that the method has. Without ``camera_path`` each run's own
+    ``camera_path.json``, in the folder that holds the method's folder, is used.
 
     Raises:
         InputError: A file cannot be used.
@@ -64,16 +73,20 @@ def pose_set(job: Job, name: str, frame: int, scale: float = 1.0) -> PoseSet:
     """The set ``name`` around entry ``frame`` of the job's path; ``scale`` multiplies every range.
 
     Raises:
-        InputError: There is no such set.
+        InputError: There is no such set, or not for this method.
     """
     if name not in SETS:
-        raise InputError(f"found {name}", field="--sets", fix=f"the sets are {', '.join(SETS)}")
-    spec = dict(SETS[name].items())
+        raise InputError(f"found {name}", field="--sets", fix=f"the sets are {SET_NAMES}")
+    spec = copy.deepcopy(SETS[name])
+    means = getattr(job.scene, "means", np.zeros((1, 3))).astype(np.float64)
     if name == "orbit":
-        means = getattr(job.scene, "means", np.zeros((1, 3)))
-        target = np.median(means.astype(np.float64), axis=0)
-        spec["orbit"] = {**spec["orbit"], "target": [float(v) for v in target]}
+        spec["orbit"]["target"] = [float(v) for v in np.median(means, axis=0)]
+    for entry in spec.get("scene", ()):
+        low, high = means.min(axis=0), means.max(axis=0)
+        low[0] = np.median(means[:, 0])
+        entry["select"]["box"] = [low.tolist(), high.tolist()]
     perturbation = parse_perturbation(spec)
+    job.method.prepare([perturbation])
 
     def scaled(ranges):
         return {key: (scale * low, scale * high) for key, (low, high) in ranges.items()}

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from ns_abstract.methods.splat.frame import SplatFrame
 from ns_abstract.pipeline import Job
 from ns_abstract.refine.engine import Refinement
 from ns_abstract.refine.result import FrameResult, max_pixel_gap
@@ -14,9 +13,9 @@ MARKS = (1.5, 1.25, 1.1, 1.05, 1.02, 1.01)
 
 def refine(job: Job, poses: PoseSet, frame: int, seconds: float, ratio: float) -> FrameResult:
     """The abstract image of ``poses`` about entry ``frame``; kernels are compiled before the clock starts."""
-    view = SplatFrame(job.splats, job.rasteriser, job.arithmetic, poses)
+    view, seed = job.method.frame(poses), job.settings.seed
     view.warm_up()
-    return Refinement(view, frame, job.goal(ratio, seconds), seed=job.settings.seed).run()
+    return Refinement(view, frame, job.goal(ratio, seconds), seed=seed, members=view.members(seed)).run()
 
 
 def summary(job: Job, name: str, result: FrameResult) -> dict[str, object]:

@@ -59,11 +59,13 @@ class Tightness(Scenes):
     """Error against run time: ratio of outer to inner gap, with curves."""
 
     sets: tuple[str, ...] = ("x", "yaw")
-    """Sets of poses: x, yaw, roll, six, segments, orbit, point."""
+    """Sets: x, yaw, roll, six, segments, orbit, point; mean, opacity, color of a splat; hue, saturation of a NeRF."""
     seconds: float = 60.0
     """Time for every scene and set."""
     target_ratio: float = 1.01
     """Where a set is tight enough."""
+    occupancy_grid: Path | None = None
+    """Declare the fields of a NeRF empty outside of this grid's occupied voxels."""
     scale: float = 1.0
     """Multiplies the ranges of translations and rotations."""
 
@@ -137,6 +139,24 @@ class Rays(Scenes):
 
 
 @dataclass
+class Scale(Scenes):
+    """Cost and peak memory of a cell, by number of Gaussians (the scene is resampled) and size of the picture."""
+
+    set: str = "x"
+    """Set of poses; wider pictures have proportionally smaller ones."""
+    gaussians: tuple[int, ...] = (10_000, 30_000, 100_000, 300_000, 1_000_000)
+    """Numbers of Gaussians."""
+    widths: tuple[int, ...] = (100, 200, 400, 800)
+    """Widths of pictures in pixels."""
+    repeats: int = 3
+    """Times that everything is measured."""
+    seconds: float = 120.0
+    """Refinement of the last, largest case."""
+    memory_limit: float = 8.0
+    """GiB that refinement plans with."""
+
+
+@dataclass
 class Stiff:
     """Bound and attack tiny scenes at the ends of what can be loaded and asked."""
 
@@ -205,6 +225,27 @@ def stiff(options: Stiff) -> int:
     return 1 if failed else DONE
 
 
+def scale(options: Scale) -> int:
+    """Measure how cost grows; the table and the picture are written after every row."""
+    from ns_abstract.bench.plots import save_scale
+    from ns_abstract.bench.scale import curve
+    from ns_abstract.bench.tables import markdown, write
+
+    if len(options.load_config) != 1:
+        problem = f"found {len(options.load_config)} runs"
+        raise InputError(problem, field="--load-config", fix="give one run, whose Gaussians are resampled")
+    rows: list[dict[str, Any]] = []
+    for row in curve(
+        options.load_config[0], options.camera_path_filename, options.frame, options.set, options.gaussians,
+        options.widths, options.repeats, options.seconds, options.memory_limit,
+    ):  # fmt: skip
+        rows.append(row)
+        print("\n".join(markdown([row]).splitlines()[0 if len(rows) == 1 else 2 :]), flush=True)
+        write(rows, options.output_dir, "scale", "Cost against Gaussians and pixels")
+        save_scale(options.output_dir / "scale.png", rows)
+    return DONE
+
+
 def rows_of(options: Cell | Soundness | Plan | Rules | Rays, job: Job, name: str) -> list[dict[str, Any]]:
     """What a benchmark without curves finds for one scene and set of poses."""
     if isinstance(options, Cell):
@@ -242,16 +283,20 @@ def rows_of(options: Cell | Soundness | Plan | Rules | Rays, job: Job, name: str
     ]
 
 
-def bench(options: Cell | Tightness | Soundness | Plan | Rules | Rays | Stiff) -> int:
+def bench(options: Cell | Tightness | Soundness | Plan | Rules | Rays | Scale | Stiff) -> int:
     """Run one benchmark; the exit code is 1 if a bound was violated."""
     if isinstance(options, Stiff):
         return stiff(options)
+    if isinstance(options, Scale):
+        return scale(options)
+    from ns_abstract.bench import paper
     from ns_abstract.bench.sets import open_jobs, pose_set
     from ns_abstract.bench.tables import markdown, write
 
-    arithmetic, grid = ("real", options.occupancy_grid) if isinstance(options, Rays) else ("float32", None)
-    jobs = open_jobs(options.load_config, options.camera_path_filename, options.downscale_factor, arithmetic, grid)
-    rows: list[dict[str, object]] = []
+    grid = options.occupancy_grid if isinstance(options, Rays | Tightness) else None
+    jobs = open_jobs(options.load_config, options.camera_path_filename, options.downscale_factor, None, grid)
+    rows: list[dict[str, Any]] = []
+    tables: dict[int, list[dict[str, Any]]] = {}
     results = {}
     for job in jobs:
         for name in options.sets:
@@ -263,6 +308,7 @@ def bench(options: Cell | Tightness | Soundness | Plan | Rules | Rays | Stiff) -
                 result = refine(job, poses, options.frame, options.seconds, options.target_ratio)
                 results[f"{job.scene.name} {name}"] = result
                 rows.append(summary(job, name, result))
+                tables.setdefault(paper.table_of(poses), []).append(paper.ours(job, name, poses, result))
             else:
                 rows += rows_of(options, job, name)
             lines = markdown(rows).splitlines()
@@ -273,6 +319,13 @@ def bench(options: Cell | Tightness | Soundness | Plan | Rules | Rays | Stiff) -
         from ns_abstract.bench.plots import save_curves
 
         save_curves(options.output_dir / "tightness.png", results)
+    for number, ours in tables.items():
+        write(
+            [{"by": "ns-abstract", **row} for row in ours] + [{"by": "paper", **row} for row in paper.TABLES[number]],
+            options.output_dir,
+            f"table-{number}",
+            f"Beside the paper's Table {number}",
+        )
     violations = sum(int(str(row.get("violations", 0))) for row in rows)
     if isinstance(options, Soundness | Rays):
         total = sum(int(str(row["comparisons"])) for row in rows)
@@ -290,6 +343,7 @@ def main() -> None:
             "plan": Plan(),
             "rules": Rules(),
             "rays": Rays(),
+            "scale": Scale(),
             "stiff": Stiff(),
         }
     )

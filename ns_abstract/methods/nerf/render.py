@@ -97,13 +97,14 @@ class NerfRenderer:
         bins = torch.linspace(0.0, 1.0, s.samples + 1, dtype=self.dtype, device=self.device)
         bins = bins.expand(directions.shape[0], -1)
         if s.kind == "hierarchical":
-            density, _ = self._densities(self.coarse, origin, world, bins)
+            density, _, _ = self._densities(self.coarse, origin, world, bins)
             bins = self._refined(bins, _weights(density, self._lengths(bins)))
-        density, base = self._densities(self.fine, origin, world, bins)
+        density, base, inside = self._densities(self.fine, origin, world, bins)
         weights = _weights(density, self._lengths(bins))
-        color = self.fine.color(base, world[:, None].expand(-1, weights.shape[1], -1))
+        color = self.fine.color(base, world[:, None].expand(-1, weights.shape[1], -1)[inside])
         if shift is not None:
             color = shifted(color, *shift)
+        color = _filled(color, inside)
         total = (weights[..., None] * color).sum(dim=1)
         total = total + self._background * (1.0 - weights.sum(dim=1))[:, None]
         return total.clamp(0.0, 1.0)
@@ -131,15 +132,19 @@ class NerfRenderer:
         distances = self._distances(bins)
         return distances[:, 1:] - distances[:, :-1]
 
-    def _densities(self, field: Field, origin: Tensor, world: Tensor, bins: Tensor) -> tuple[Tensor, Tensor]:
-        """Densities [n, k] and base outputs [n, k, width] in the middles of the bins [n, k + 1]."""
+    def _densities(self, field: Field, origin: Tensor, world: Tensor, bins: Tensor) -> tuple[Tensor, Tensor, Any]:
+        """Densities [n, k] in the middles of the bins [n, k + 1], and base outputs [..., width] where it is evaluated.
+
+        The last value selects these points of [n, k]: where nothing is declared empty, all of them.
+        """
         distances = self._distances(bins)
         middles = (distances[:, :-1] + distances[:, 1:]) / 2.0
         points = origin + world[:, None] * middles[..., None]
-        density, base = field.density(points)
-        if self.occupancy is not None:
-            density = torch.where(self.occupancy.at(points), density, 0.0)
-        return density, base
+        if self.occupancy is None:
+            return *field.density(points), ...
+        inside = self.occupancy.at(points)
+        density, base = field.density(points[inside])
+        return _filled(density, inside), base, inside
 
     def _refined(self, bins: Tensor, weights: Tensor) -> Tensor:
         """``PDFSampler.generate_ray_samples`` outside training: the union of old and new edges, sorted."""
@@ -159,6 +164,13 @@ class NerfRenderer:
         start = bins.gather(1, below)
         new = start + part * (bins.gather(1, above) - start)
         return torch.sort(torch.cat([bins, new], dim=-1), dim=-1).values.detach()
+
+
+def _filled(values: Tensor, inside: Any) -> Tensor:
+    """``values`` [p, ...] in the places ``inside`` [n, k], zeros elsewhere; all of them where it selects all."""
+    if inside is ...:
+        return values
+    return values.new_zeros((*inside.shape, *values.shape[1:])).index_put(inside.nonzero(as_tuple=True), values)
 
 
 def _weights(density: Tensor, lengths: Tensor) -> Tensor:

@@ -307,13 +307,13 @@ class Renderer:
         across, down = tile_grid(camera, self.side)
         if wanted is None:
             wanted = np.arange(across * down)
-        offsets, entries = self._lists(splats, camera, rotation, position, wanted)
+        offsets, entries = self.lists(splats, camera, rotation, position, wanted)
         return self._blend(camera, wanted, offsets, entries, self._record, splats.background)
 
-    def _lists(
+    def lists(
         self, splats: Splats, camera: Camera, rotation: np.ndarray, position: np.ndarray, wanted: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Project every Gaussian; the lists of the tiles ``wanted`` (offsets and entries)."""
+        """Project every Gaussian; offsets and entries of the lists of the tiles ``wanted``, nearest first."""
         _project(
             splats.means, splats.axes, splats.opacity, splats.sh, splats.degree, splats.color_shift,
             splats.color_max, np.ascontiguousarray(rotation, np.float64), np.ascontiguousarray(position, np.float64),
@@ -359,7 +359,7 @@ class Renderer:
         """
         across, down = tile_grid(camera, self.side)
         wanted = np.arange(across * down)
-        offsets, entries = self._lists(self.splats, camera, rotation, position, wanted)
+        offsets, entries = self.lists(self.splats, camera, rotation, position, wanted)
         image = self._blend(camera, wanted, offsets, entries, self._record, self.splats.background)
         # the same weights, with depths as colours; the blending clamps to [0, 1]
         seen = self._visible.astype(bool)
