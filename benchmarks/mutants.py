@@ -189,6 +189,23 @@ MUTANTS = (
         "test_poses.py::test_enclosure[orbit_six-2]",
     ),
     Mutant(
+        "slanted box loses its ends", POSES,
+        "box = box.replace(axis, low - sum(b for _, b in ends) - room, high - sum(a for a, _ in ends) + room)",
+        "box = box.replace(axis, low - room, high + room)",
+        "test_slanted.py::test_every_pose_has_slanted_parameters[six]",
+    ),
+    Mutant(
+        "slanted cells are bounded upright", POSES,
+        "found = found + plain(other) * factor", "found = found - plain(other) * factor",
+        "test_slanted.py::test_enclosure[six-1]",
+    ),
+    Mutant(
+        "feasible part forgets the other terms", POSES,
+        "bottom, top = low - room - (most - ends[i][1]), high + room - (least - ends[i][0])",
+        "bottom, top = low - room, high + room",
+        "test_slanted.py::test_feasible_loses_no_pose[six]",
+    ),
+    Mutant(
         "split leaves a gap", BOX,
         "[self.replace(axis, ends[i], ends[i + 1]) for i in range(parts)]",
         "[self.replace(axis, ends[i], min(ends[i + 1], high - (high - low) * 1e-9)) for i in range(parts)]",

@@ -138,8 +138,11 @@ class Method(Protocol):
         """Bytes that bounding pictures of ``pixels`` needs beside the leaves."""
         ...
 
-    def frame(self, poses: PoseSet) -> Any:
-        """One frame, ready for refinement (`ns_abstract.refine.engine.Frame`), with ``warm_up()``."""
+    def frame(self, poses: PoseSet, slanted: bool = False) -> Any:
+        """One frame, ready for refinement (`ns_abstract.refine.engine.Frame`), with ``warm_up()``.
+
+        ``slanted``: its box may count parameters otherwise than the set does, where that is tighter.
+        """
         ...
 
     def frame_plan(self, frame: Any, shown: int | None, lower: np.ndarray, upper: np.ndarray) -> list[str]:
@@ -313,7 +316,8 @@ class Job:
         progress: Callable[[TracePoint, float], None] = lambda point, share: None,
     ) -> PartResult:
         """Refine some tiles of frame ``index``, or all of them."""
-        frame = self.frame(index)
+        # kept leaves are boxes of the set's parameters
+        frame = self.method.frame(self.pose_sets[index], slanted=not keep_leaves)
         refinement = Refinement(
             frame, index, goal, seed=self.settings.seed, keep_leaves=keep_leaves, stopped=stopped, progress=progress,
             members=frame.members(self.settings.seed), tiles=tiles,
@@ -327,7 +331,7 @@ class Job:
             ValueError: Tiles are missing or there twice.
         """
         frame = self.frame(parts[0].index)
-        result = joined(parts, frame.camera)
+        result = replace(joined(parts, frame.camera), box=self.pose_sets[parts[0].index].box)
         shown = [part.shown for part in parts]
         known = [numbers for numbers in shown if numbers is not None]
         count = int(np.unique(np.concatenate(known)).size) if len(known) == len(shown) else None

@@ -116,10 +116,15 @@ def escapes(poses: PoseSet, box: ParameterBox, order: int, count: int = 4, seed:
             half = max(high - middle, middle - low) * (1.0 + 4.0 * UNIT64)
             point.append((v - rational(middle)) / rational(half) if half > 0 else fmpq(0))
         assert all(abs(p) <= 1 for p in point)
+        own = dict(values)
+        for name, factors in poses.shear.items():
+            values[name] += sum((rational(f) * own[other] for other, f in factors.items()), fmpq(0))
         with mpmath.workprec(BITS):
             rotation, position = reference(poses, values)
             check(forms, rotation, position, origin, point, found, "definition")
             # what PoseSet.pose evaluates, where the parameters are float64 numbers
+            if poses.shear:
+                continue
             numbers = [int(values[name].p) / int(values[name].q) for name in box.names]
             if all(rational(n) == values[name] for n, name in zip(numbers, box.names, strict=True)):
                 pose = exact_matrix(poses.pose(np.array(numbers)))

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 from ns_abstract.pipeline import Job
 from ns_abstract.refine.engine import Refinement
 from ns_abstract.refine.result import FrameResult, max_pixel_gap
@@ -13,9 +15,10 @@ MARKS = (1.5, 1.25, 1.1, 1.05, 1.02, 1.01)
 
 def refine(job: Job, poses: PoseSet, frame: int, seconds: float, ratio: float) -> FrameResult:
     """The abstract image of ``poses`` about entry ``frame``; kernels are compiled before the clock starts."""
-    view, seed = job.method.frame(poses), job.settings.seed
+    view, seed = job.method.frame(poses, slanted=True), job.settings.seed
     view.warm_up()
-    return Refinement(view, frame, job.goal(ratio, seconds), seed=seed, members=view.members(seed)).run()
+    result = Refinement(view, frame, job.goal(ratio, seconds), seed=seed, members=view.members(seed)).run()
+    return replace(result, box=poses.box)
 
 
 def summary(job: Job, name: str, result: FrameResult) -> dict[str, object]:

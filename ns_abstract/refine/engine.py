@@ -25,7 +25,7 @@ _ROUND_SHARE = 0.8
 #: Excess over what the goal allows from which on cells are cut into four parts rather than two.
 _FAR = 4.0
 #: Cells are cut until typical Gaussians move by fewer pixels, before any is bounded.
-FIRST_MOTION = 2.0
+FIRST_MOTION = 0.5
 #: The same for one parameter, where fine cells are affordable from the start.
 FIRST_MOTION_LINE = 0.5
 #: Leaves whose box is narrower than this part of the set are not split: rounding rules there.
@@ -113,14 +113,14 @@ class Goal:
 
 
 class _Cell:
-    """A box, the context for boxes inside it, and the axis to split along."""
+    """A box, the context for boxes inside it, and how much the picture varies along each axis [d]."""
 
-    __slots__ = ("axis", "box", "context", "narrow", "number")
+    __slots__ = ("box", "context", "narrow", "number", "slopes")
 
     def __init__(self, number: int, box: ParameterBox, narrow: bool) -> None:
         self.number, self.box, self.narrow = number, box, narrow
         self.context: Any = None
-        self.axis = 0
+        self.slopes = np.zeros(box.dimensions)
 
 
 @dataclass
@@ -282,13 +282,23 @@ class Refinement:
     def _take(self, cell: _Cell, bounds: Bounds) -> tuple[np.ndarray, np.ndarray, Bounds]:
         self.cells += 1
         cell.context = bounds.context
-        cell.axis = self._axis(cell.box, bounds.slopes)
+        cell.slopes = bounds.slopes
         return (*_usable(bounds.lower, bounds.upper), bounds)
+
+    def _halved(self, cell: _Cell, parts: int) -> list[ParameterBox]:
+        """Up to ``parts`` equal parts of a cell, from halving it again and again."""
+        if cell.box.dimensions == 1:
+            return cell.box.split(0, parts)
+        boxes, slopes = [cell.box], cell.slopes
+        while 2 * len(boxes) <= parts:
+            axis = self._axis(boxes[0], slopes)
+            boxes = [half for box in boxes for half in box.split(axis)]
+            slopes = slopes.copy()
+            slopes[axis] *= 0.5
+        return boxes
 
     def _axis(self, box: ParameterBox, slopes: np.ndarray) -> int:
         """The axis that the picture varies most along, of those that can be halved."""
-        if box.dimensions < 2:
-            return 0
         slopes = np.nan_to_num(slopes, nan=0.0, posinf=float(np.finfo(np.float64).max))
         # a parameter that only moves what the linear part does not see still has to be split
         if not np.any(slopes > 0.0):
@@ -481,8 +491,7 @@ class Refinement:
             jobs += [(cell, dict(ordered[i : i + step])) for i in range(0, len(ordered), step)]
         # excess falls at least in proportion to the width: far from the goal, levels are skipped
         allowed = (self.goal.ratio - 1.0) * float((self.witness_upper - self.witness_lower)[self.inside].sum())
-        far = self.frame.box.dimensions == 1 and running[-1] > _FAR * allowed
-        return jobs, 4 if far else 2
+        return jobs, 4 if running[-1] > _FAR * allowed else 2
 
     def _excess(self) -> tuple[np.ndarray, list[tuple[int, int]]]:
         """What every open leaf leaves open beyond the witnesses, and its tile and row.
@@ -525,7 +534,7 @@ class Refinement:
     def _split(self, cell: _Cell, rows: dict[int, int], parts: int, changes: dict[int, _Change]) -> int:
         """Bound the parts of ``cell`` in the tiles of ``rows``; returns the bytes of the new leaves."""
         tiles = np.array(list(rows), np.int64)
-        children = [self._cell(part) for part in cell.box.split(cell.axis, parts)]
+        children = [self._cell(part) for part in self._halved(cell, parts)]
         for child in children if cell.box.dimensions > 1 else ():
             self._witness(child.box.middle, tiles)
         if cell.box.dimensions == 1:

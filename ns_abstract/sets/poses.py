@@ -7,7 +7,7 @@ transform that gsplat receives (OpenCV axes, splatfacto.py:128-143).
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -29,6 +29,8 @@ COLOR_SHIFTS = ("hue", "saturation")
 _FLIP = np.array([1.0, -1.0, -1.0])
 # Evaluating a pose in float64 takes fewer than 64 roundings of numbers of this size: five rotations.
 _POSE_ROUNDING = 64.0 * UNIT64
+# Sums of up to ten products in float64.
+_SHEAR_ROUNDING = 64.0 * UNIT64
 
 
 def _cross_matrix(axis: Float64Array) -> Float64Array:
@@ -112,6 +114,8 @@ class PoseSet:
         box: Parameters of positive width, in the order x, y, z, yaw, pitch, roll, segment, azimuth, hue, saturation.
         fixed: Values of the parameters of zero width.
         target_camera: End of the segment, where the sweep is over segments.
+        shear: [name][other] factors: ``box`` counts the rotation ``name`` from the sum of factor * other, so that its
+            cells are slanted (`sheared`).
     """
 
     camera: Camera
@@ -119,6 +123,7 @@ class PoseSet:
     box: ParameterBox
     fixed: dict[str, float]
     target_camera: Camera | None = None
+    shear: dict[str, dict[str, float]] = field(default_factory=dict)
 
     @classmethod
     def around(cls, camera: Camera, perturbation: Perturbation, following: Camera | None = None) -> PoseSet:
@@ -162,6 +167,45 @@ class PoseSet:
         """The same poses without the parameters that shift colours."""
         return replace(self, box=self.box.without(COLOR_SHIFTS))
 
+    def sheared(self, shear: dict[str, dict[str, float]]) -> PoseSet:
+        """The same poses in slanted parameters: rotation = own + sum of factor * other (design.md, P2).
+
+        The box holds every pose of the set and, near its ends, parameters of none: see `feasible`; `pose` takes them to
+        the nearest angle of the set.
+        """
+        box = self.box
+        for name, factors in shear.items():
+            axis = box.names.index(name)
+            low, high = box.lower[axis], box.upper[axis]
+            ends = [
+                sorted((factor * self.box.lower[i], factor * self.box.upper[i]))
+                for i, factor in ((self.box.names.index(other), factor) for other, factor in factors.items())
+            ]
+            room = _SHEAR_ROUNDING * (abs(low) + abs(high) + sum(abs(end) for pair in ends for end in pair))
+            box = box.replace(axis, low - sum(b for _, b in ends) - room, high - sum(a for a, _ in ends) + room)
+        return replace(self, box=box, shear=shear)
+
+    def feasible(self, box: ParameterBox) -> ParameterBox | None:
+        """A box that holds all parameters of ``box`` that belong to poses of the set; None where there are none."""
+        for name, factors in self.shear.items():
+            low, high = self.perturbation.rotation[name]
+            terms = {box.names.index(name): 1.0} | {box.names.index(other): f for other, f in factors.items()}
+            ends = {i: sorted((f * box.lower[i], f * box.upper[i])) for i, f in terms.items()}
+            room = _SHEAR_ROUNDING * (abs(low) + abs(high) + sum(abs(end) for pair in ends.values() for end in pair))
+            least, most = sum(a for a, _ in ends.values()), sum(b for _, b in ends.values())
+            if least > high + room or most < low - room:
+                return None
+            for i, factor in terms.items():
+                # what the other terms leave of [low, high]
+                bottom, top = low - room - (most - ends[i][1]), high + room - (least - ends[i][0])
+                first, last = sorted((bottom / factor, top / factor))
+                first, last = first - room / abs(factor), last + room / abs(factor)
+                first, last = max(first, box.lower[i]), min(last, box.upper[i])
+                if first > last:
+                    return None
+                box = box.replace(i, first, last)
+        return box
+
     def _base(self) -> tuple[Float64Array, Float64Array, Float64Array, float, Float64Array]:
         """Start rotation, start position, segment axis, segment angle, segment displacement."""
         start = self.camera.camera_to_world
@@ -175,6 +219,9 @@ class PoseSet:
     def pose(self, values: Float64Array) -> Float64Array:
         """Camera-to-world [3, 4] at parameter values [d] (physical units, in the order of ``box``)."""
         p = dict(self.fixed) | dict(zip(self.box.names, np.asarray(values, np.float64).tolist(), strict=True))
+        for name, factors in self.shear.items():
+            low, high = self.perturbation.rotation[name]
+            p[name] = min(max(p[name] + sum(factor * p[other] for other, factor in factors.items()), low), high)
         rotation, position, axis, angle, displacement = self._base()
         if self.target_camera is not None:
             rotation = rotation @ rotation_about(axis, p["segment"] * angle)
@@ -224,6 +271,12 @@ class PoseSet:
         """Camera-to-world rotation and position over ``box`` in the arithmetic ``kind``, without rounding of `pose`."""
 
         def parameter(name: str) -> Any:
+            found = plain(name)
+            for other, factor in self.shear.get(name, {}).items():
+                found = found + plain(other) * factor
+            return found
+
+        def plain(name: str) -> Any:
             if name in self.fixed:
                 return kind.constant(basis, self.fixed[name])
             index = box.names.index(name)

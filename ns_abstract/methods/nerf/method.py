@@ -110,8 +110,8 @@ class NerfMethod:
         """The scene in a few words."""
         return f"vanilla NeRF, {self.scene.fine.text}"
 
-    def frame(self, poses: PoseSet) -> NerfFrame:
-        """One frame, ready for refinement."""
+    def frame(self, poses: PoseSet, slanted: bool = False) -> NerfFrame:
+        """One frame, ready for refinement; its cells are never ``slanted``."""
         return NerfFrame(self.scene, self.sampling, poses, workers=self.workers)
 
     def prepare(self, perturbations: Sequence[Perturbation]) -> None:

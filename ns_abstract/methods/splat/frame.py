@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -15,6 +17,7 @@ from ns_abstract.methods.splat.constants import Rasteriser
 from ns_abstract.methods.splat.render import Renderer
 from ns_abstract.methods.splat.variations import VariedSplats
 from ns_abstract.sets.box import ParameterBox
+from ns_abstract.sets.perturbation import ROTATIONS
 from ns_abstract.sets.poses import PoseSet
 from ns_abstract.sets.tiles import tile_grid
 
@@ -26,6 +29,8 @@ _MOTION_GAUSSIANS = 2000
 _MOTION_POSES = 9
 #: Step of the difference quotient, as a part of the parameter's range.
 _MOTION_STEP = 2.0**-10
+#: A compensation by less than this part of a rotation's range is left out.
+_SHEAR_MATTERS = 2.0**-7
 #: A context that is larger than this part of the one around it is not kept beside it.
 _WORTH_KEEPING = 0.8
 
@@ -41,6 +46,10 @@ class Context:
 
     visible: np.ndarray
     reach: np.ndarray
+
+
+#: Of a cell without poses.
+_NOTHING = Context(np.empty(0, np.int32), np.empty((0, 4), np.int32))
 
 
 @dataclass(frozen=True)
@@ -72,6 +81,8 @@ class SplatFrame:
         pose_set: The poses.
         order: Order of the forms; by default 2 for one parameter and 1 for more.
         varied: The scenes of the set; None: ``splats`` alone.
+        slanted: Whether cells may be slanted, so that rotations make up for what other parameters move (P2). Their
+            parameters are then not those of ``pose_set``.
     """
 
     #: Every call bounds as many tiles as it is given.
@@ -87,6 +98,7 @@ class SplatFrame:
         pose_set: PoseSet,
         order: int | None = None,
         varied: VariedSplats | None = None,
+        slanted: bool = False,
     ) -> None:
         self.pose_set = pose_set
         self.camera = pose_set.camera
@@ -97,6 +109,9 @@ class SplatFrame:
         self.renderer = Renderer(self.varied.nearest, rasteriser)
         self.side = rasteriser.work_tile
         self.across, self.down = tile_grid(self.camera, self.side)
+        if slanted and (shear := self._shear()):
+            self.pose_set = pose_set.sheared(shear)
+            self.box = self.pose_set.box
 
     @property
     def tile_count(self) -> int:
@@ -131,6 +146,12 @@ class SplatFrame:
         self, box: ParameterBox, tiles: np.ndarray, within: Context | None = None, keep_linear: bool = False
     ) -> TileBounds:
         """Bounds of ``tiles`` over ``box``; ``within`` is the context of these tiles and a box around it."""
+        inside = self.pose_set.feasible(box)
+        if inside is None:
+            # no image at all: one that is known anyhow does no harm
+            picture = self._middle_picture[tiles]
+            return TileBounds(picture, picture, np.zeros(box.dimensions), _NOTHING, None, 0)
+        box = inside
         candidates = self._candidates(tiles, within)
         cell = self.bounds.cell(
             self.camera, self.pose_set.enclosure(box, self.order), tiles, candidates, keep_linear or box.dimensions > 1
@@ -160,25 +181,61 @@ class SplatFrame:
         hits = sums[y1, x1] - sums[y0, x1] - sums[y1, x0] + sums[y0, x0]
         return within.visible[hits > 0]
 
+    @cached_property
+    def _middle_picture(self) -> np.ndarray:
+        return self.render(self.box.middle)
+
+    def _shear(self) -> dict[str, dict[str, float]]:
+        """For each rotation, how much of it undoes what one unit of another parameter moves typical Gaussians by."""
+        box, middle = self.box, self.box.middle
+        names = [name for name in ROTATIONS if name in box.names]
+        others = [name for name in box.names if name not in ROTATIONS]
+        means, width = self._typical_means(), np.array(box.upper) - np.array(box.lower)
+        here, seen = self._seen(middle, means)
+        if not names or not others or not seen.any():
+            return {}
+
+        def moved(name: str) -> np.ndarray:
+            step = np.zeros(box.dimensions)
+            step[box.names.index(name)] = _MOTION_STEP * width[box.names.index(name)]
+            return ((self._project(middle + step, means)[0] - here)[seen] / step.sum()).ravel()
+
+        turns, shifts = (np.stack([moved(name) for name in group], axis=1) for group in (names, others))
+        factors = -np.linalg.lstsq(turns, shifts, rcond=None)[0]
+        found: dict[str, dict[str, float]] = {}
+        # few bits: the last ones depend on the library's threads, results must not
+        mantissa, exponent = np.frexp(factors)
+        factors = np.ldexp(np.round(mantissa * 256.0), exponent - 8)
+        for name, row in zip(names, factors.tolist(), strict=True):
+            least = _SHEAR_MATTERS * width[box.names.index(name)]
+            useful = {
+                other: factor
+                for other, factor in zip(others, row, strict=True)
+                if math.isfinite(factor) and abs(factor) * width[box.names.index(other)] > least
+            }
+            if useful:
+                found[name] = useful
+        return found
+
+    def _typical_means(self) -> np.ndarray:
+        means = self.bounds.splats.means
+        if means.shape[0] > _MOTION_GAUSSIANS:
+            means = means[np.random.default_rng(0).choice(means.shape[0], _MOTION_GAUSSIANS, replace=False)]
+        return means
+
+    def _seen(self, values: np.ndarray, means: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Pixels [n, 2] of ``means`` and which of them [n] lie in the picture."""
+        here, z = self._project(values, means)
+        size = self.camera.width, self.camera.height
+        return here, (z > 0.01) & (here > 0).all(axis=1) & (here < size).all(axis=1)
+
     def motion(self, box: ParameterBox) -> np.ndarray:
         """[d] pixels that typical Gaussians move by over each parameter's range (an estimate)."""
-        d = box.dimensions
-        means = self.bounds.splats.means
-        rng = np.random.default_rng(0)
-        if means.shape[0] > _MOTION_GAUSSIANS:
-            means = means[rng.choice(means.shape[0], _MOTION_GAUSSIANS, replace=False)]
+        d, means = box.dimensions, self._typical_means()
         low, high = np.array(box.lower), np.array(box.upper)
         total = np.zeros(d)
-        poses = [box.middle, *box.sample(_MOTION_POSES - 1, rng)]
-        for values in poses:
-            here, z = self._project(values, means)
-            seen = (
-                (z > 0.01)
-                & (here[:, 0] > 0)
-                & (here[:, 0] < self.camera.width)
-                & (here[:, 1] > 0)
-                & (here[:, 1] < self.camera.height)
-            )
+        for values in (box.middle, *box.sample(_MOTION_POSES - 1, np.random.default_rng(0))):
+            here, seen = self._seen(values, means)
             if not seen.any():
                 continue
             for k in range(d):

@@ -57,10 +57,10 @@ class SplatMethod:
         """The scene in a few words."""
         return f"{self.scene.count:,} Gaussians"
 
-    def frame(self, poses: PoseSet) -> SplatFrame:
-        """One frame, ready for refinement."""
+    def frame(self, poses: PoseSet, slanted: bool = False) -> SplatFrame:
+        """One frame, ready for refinement; ``slanted``: see `SplatFrame`."""
         varied = self.varied(poses.perturbation.scene)
-        return SplatFrame(self.splats, self.rasteriser, self.arithmetic, poses, varied=varied)
+        return SplatFrame(self.splats, self.rasteriser, self.arithmetic, poses, varied=varied, slanted=slanted)
 
     def prepare(self, perturbations: Sequence[Perturbation]) -> None:
         """Find the Gaussians that vary.
