@@ -246,6 +246,7 @@ class SplatSource:
             arithmetic_named(self.arithmetic),
             PoseSet.around(camera, perturbation),
             varied=self._varied(perturbation),
+            slanted=True,
         )
 
     def _varied(self, perturbation: Perturbation) -> VariedSplats:
