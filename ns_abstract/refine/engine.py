@@ -22,6 +22,8 @@ from ns_abstract.sets.box import ParameterBox
 
 #: Part of the whole excess that one round of splitting takes on.
 _ROUND_SHARE = 0.8
+#: Times in a round that the goal is looked at.
+_LOOKS = 16
 #: Excess over what the goal allows from which on cells are cut into four parts rather than two.
 _FAR = 4.0
 #: Cells are cut until typical Gaussians move by fewer pixels, before any is bounded.
@@ -166,14 +168,19 @@ class _Tile:
         self.cells = [cell for cell, s in zip(self.cells, stay, strict=True) if s]
         self.lower, self.upper = (self.lower[stay], self.upper[stay]) if self.cells else (None, None)
 
-    def outer(self) -> tuple[np.ndarray, np.ndarray]:
-        """[side, side, 3] bounds over all leaves."""
-        if self.lower is None or self.upper is None:
-            return self.closed_lower, self.closed_upper
-        return (
-            np.minimum(self.closed_lower, self.lower.min(axis=0)),
-            np.maximum(self.closed_upper, self.upper.max(axis=0)),
-        )
+    def outer(self, change: _Change | None = None) -> tuple[np.ndarray, np.ndarray]:
+        """[side, side, 3] bounds over all leaves, as they will be after ``change``."""
+        lower, upper = [self.closed_lower[None]], [self.closed_upper[None]]
+        if self.lower is not None and self.upper is not None:
+            keep = np.ones(len(self.cells), bool)
+            if change is not None:
+                keep[change.gone] = False
+            lower.append(self.lower[keep])
+            upper.append(self.upper[keep])
+        if change is not None:
+            lower += [a[None] for a in change.lower]
+            upper += [a[None] for a in change.upper]
+        return np.concatenate(lower).min(axis=0), np.concatenate(upper).max(axis=0)
 
 
 class Refinement:
@@ -305,10 +312,10 @@ class Refinement:
             slopes = np.nan_to_num(self.frame.motion(box), nan=0.0)
         return int(np.argmax(np.where(_narrow_axes(box, self.frame.box), -1.0, slopes)))
 
-    def _settle(self, tiles: np.ndarray) -> None:
-        """Update the outer bound of ``tiles``."""
+    def _settle(self, tiles: np.ndarray, changes: dict[int, _Change] | None = None) -> None:
+        """Update the outer bound of ``tiles``, given what has changed since the round began."""
         for t in tiles:
-            lower, upper = self.tiles[t].outer()
+            lower, upper = self.tiles[t].outer(None if changes is None else changes[t])
             self.outer_lower[t] = np.clip(lower, 0.0, 1.0)
             self.outer_upper[t] = np.clip(upper, 0.0, 1.0)
 
@@ -454,13 +461,18 @@ class Refinement:
                 return
             jobs, parts = self._choose()
             changes: dict[int, _Change] = {}
-            added = 0
-            for cell, rows in jobs:
+            added, look = 0, max(1, len(jobs) // _LOOKS)
+            for number, (cell, rows) in enumerate(jobs):
                 room = self._held_bytes + added < self.goal.leaf_bytes
                 count = min(parts, self._cells_left())
                 if self._over() or count < 2 or (changes and not room):
                     break
                 added += self._split(cell, rows, count, changes)
+                # by number, not by time: where a round ends must not depend on the machine
+                if (number + 1) % look == 0 and number + 1 < len(jobs):
+                    self._settle(np.array(sorted(changes), np.int64), changes)
+                    if self.goal.met(self._record(1.0)):
+                        break
             if not changes:
                 return
             for t, change in changes.items():
