@@ -11,8 +11,10 @@ rules; Open3D's is float32 with rules of its own, so the pictures agree only rou
 from __future__ import annotations
 
 import argparse
+import multiprocessing
 import tempfile
 import time
+from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +26,6 @@ from ns_abstract.bench.tables import markdown, write
 from ns_abstract.methods.splat.frame import SplatFrame
 from ns_abstract.methods.splat.ply import write_ply
 from ns_abstract.methods.splat.scene import SplatScene
-from ns_abstract.pipeline import Job
 from ns_abstract.sets.path import Camera
 
 
@@ -58,8 +59,10 @@ class Open3DRenderer:
         return np.asarray(self.renderer.render_to_image())
 
 
-def compare(job: Job, repeats: int, folder: Path) -> dict[str, Any]:
+def compare(config: Path, size: int, repeats: int, folder: Path) -> dict[str, Any]:
     """One row: seconds of both programs over the same poses, and how far their pictures are apart."""
+    width = open_jobs((config,), None, 1.0)[0].path.cameras[0].width
+    (job,) = open_jobs((config,), None, width / size)
     poses = pose_set(job, "x", 0)
     view = SplatFrame(job.splats, job.rasteriser, job.arithmetic, poses)
     camera = view.camera
@@ -103,11 +106,11 @@ def main() -> None:
     parser.add_argument("--output-dir", type=Path, default=Path("bench"))
     options = parser.parse_args()
     options.output_dir.mkdir(parents=True, exist_ok=True)
-    width = open_jobs((options.config,), None, 1.0)[0].path.cameras[0].width
     rows = []
     for size in options.sizes:
-        job = open_jobs((options.config,), None, width / size)[0]
-        rows.append(compare(job, options.repeats, options.output_dir))
+        # Open3D's renderer can be opened once in a process
+        with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as pool:
+            rows.append(pool.submit(compare, options.config, size, options.repeats, options.output_dir).result())
         print(markdown(rows), flush=True)
     write(rows, options.output_dir, "open3d", f"Beside Open3D, {numba.get_num_threads()} threads")
 
