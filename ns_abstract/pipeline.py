@@ -283,9 +283,9 @@ class Job:
         """Bytes for the leaves that ``processes`` on one machine may have together."""
         return max(processes * _LEAST_LEAF_BYTES, (self.memory - processes * self.base_memory) // 2)
 
-    def frame(self, index: int) -> Any:
-        """Frame ``index``, ready for refinement."""
-        return self.method.frame(self.pose_sets[index])
+    def frame(self, index: int, slanted: bool = False) -> Any:
+        """Frame ``index``, ready for refinement; see `Method.frame`."""
+        return self.method.frame(self.pose_sets[index], slanted)
 
     def warm_up(self, index: int | None) -> None:
         """Compile the kernels that frame ``index`` needs, so that its clock measures bounding alone."""
@@ -317,7 +317,7 @@ class Job:
     ) -> PartResult:
         """Refine some tiles of frame ``index``, or all of them."""
         # kept leaves are boxes of the set's parameters
-        frame = self.method.frame(self.pose_sets[index], slanted=not keep_leaves)
+        frame = self.frame(index, slanted=not keep_leaves)
         refinement = Refinement(
             frame, index, goal, seed=self.settings.seed, keep_leaves=keep_leaves, stopped=stopped, progress=progress,
             members=frame.members(self.settings.seed), tiles=tiles,

@@ -28,8 +28,6 @@ _LOOKS = 16
 _FAR = 4.0
 #: Cells are cut until typical Gaussians move by fewer pixels, before any is bounded.
 FIRST_MOTION = 0.5
-#: The same for one parameter, where fine cells are affordable from the start.
-FIRST_MOTION_LINE = 0.5
 #: Leaves whose box is narrower than this part of the set are not split: rounding rules there.
 _NARROWEST = 2.0**-40
 #: Most corners of the set that are rendered at the start.
@@ -427,9 +425,7 @@ class Refinement:
         frame, box = self.frame, self.frame.box
         boxes, motion = [box], np.nan_to_num(np.array(frame.motion(box), np.float64), nan=0.0)
         history: list[list[ParameterBox]] = [boxes]
-        limit = FIRST_MOTION_LINE if box.dimensions == 1 else FIRST_MOTION
-        if frame.batch is not None:
-            limit = np.inf
+        limit = FIRST_MOTION if frame.batch is None else np.inf
         while motion.size and motion.max() > limit and 2 * len(boxes) <= _COVER_CELLS:
             axis = int(np.argmax(motion))
             boxes = [half for b in boxes for half in b.split(axis)]
@@ -461,6 +457,7 @@ class Refinement:
                 return
             jobs, parts = self._choose()
             changes: dict[int, _Change] = {}
+            fresh: set[int] = set()
             added, look = 0, max(1, len(jobs) // _LOOKS)
             for number, (cell, rows) in enumerate(jobs):
                 room = self._held_bytes + added < self.goal.leaf_bytes
@@ -468,9 +465,11 @@ class Refinement:
                 if self._over() or count < 2 or (changes and not room):
                     break
                 added += self._split(cell, rows, count, changes)
+                fresh.update(rows)
                 # by number, not by time: where a round ends must not depend on the machine
                 if (number + 1) % look == 0 and number + 1 < len(jobs):
-                    self._settle(np.array(sorted(changes), np.int64), changes)
+                    self._settle(np.array(sorted(fresh), np.int64), changes)
+                    fresh.clear()
                     if self.goal.met(self._record(1.0)):
                         break
             if not changes:
