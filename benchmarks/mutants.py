@@ -29,14 +29,18 @@ _TIMEOUT_S = 600.0
 _PASSED, _FAILED = 0, 1
 
 FORMS = "arithmetic/forms.py"
+LINE_FORMS = "arithmetic/line_forms.py"
 ELEMENTARY = "arithmetic/elementary.py"
 TRIGONOMETRY = "arithmetic/trigonometry.py"
 UNITS = "arithmetic/units.py"
 POSES = "sets/poses.py"
 BOX = "sets/box.py"
 GAUSSIANS = "methods/splat/gaussians.py"
+LINE = "methods/splat/line_projection.py"
+RECORDS = "methods/splat/records.py"
 PIXELS = "methods/splat/pixels.py"
 COLORS = "methods/splat/colors.py"
+LINE_COLORS = "methods/splat/line_colors.py"
 
 
 @dataclass(frozen=True)
@@ -211,20 +215,46 @@ MUTANTS = (
         "[self.replace(axis, ends[i], min(ends[i + 1], high - (high - low) * 1e-9)) for i in range(parts)]",
         "test_box.py::test_split",
     ),
+    # forms of one parameter
+    Mutant(
+        "one parameter: product without its slopes' product", LINE_FORMS,
+        "a[0] * b[2] + b[0] * a[2] + a[1] * b[1],", "a[0] * b[2] + b[0] * a[2],",
+        "test_line_forms.py::test_pairs[multiplied-plain]",
+    ),
+    Mutant(
+        "one parameter: third order is dropped", LINE_FORMS,
+        " + f3 * e * e * e + rounding", " + rounding",
+        "test_line_forms.py::test_functions[inverse-exact]",
+    ),
+    Mutant(
+        "one parameter: rounding of products is dropped", LINE_FORMS,
+        " + _COEFFICIENT * (pa * pb) + l * w", " + l * w",
+        "test_line_forms.py::test_pairs[multiplied-constant]",
+    ),
+    Mutant(
+        "one parameter: the vertex is no end", LINE_FORMS,
+        "    inside = g < 2.0 * abs(s)\n", "    inside = False\n",
+        "test_line_forms.py::test_ends[exact]",
+    ),
+    Mutant(
+        "one parameter: a clamp without its chord", LINE_FORMS,
+        "    shift = 0.5 * (s * below)\n", "    shift = 0.0 * (s * below)\n",
+        "test_line_forms.py::test_raised[exact-0.0]",
+    ),
     # Gaussians
     Mutant(
-        "near plane is not uncertain", GAUSSIANS,
-        "    if not (z_low >= near * (1.0 + 4.0 * unit) and z_high < np.inf):",
-        "    if not (z_low > 0.0 and z_high < np.inf):",
+        "near plane is not uncertain", RECORDS,
+        "    if not (s[ZLOW + q] >= near * (1.0 + 4.0 * unit) and z_high < np.inf):",
+        "    if not (s[ZLOW + q] > 0.0 and z_high < np.inf):",
         "test_bounds.py::test_near_plane_alone[2]",
     ),
     Mutant(
         "near plane culls what crosses it", GAUSSIANS,
-        "        if not (scalars[_ZHI, q] + spread_z >= near and scalars[_ZLO, q] - spread_z <= far):\n"
+        "        if not (farthest[q] + spread_z >= near and nearest[q] - spread_z <= far):\n"
         "            # a bound that is not a number keeps the Gaussian\n"
-        "            if scalars[_ZHI, q] + spread_z < near or",
-        "        if not (scalars[_ZLO, q] + spread_z >= near and scalars[_ZLO, q] - spread_z <= far):\n"
-        "            if scalars[_ZLO, q] + spread_z < near or",
+        "            if farthest[q] + spread_z < near or",
+        "        if not (nearest[q] + spread_z >= near and nearest[q] - spread_z <= far):\n"
+        "            if nearest[q] + spread_z < near or",
         "test_bounds.py::test_near_plane[2]",
     ),
     Mutant(
@@ -235,15 +265,27 @@ MUTANTS = (
         "test_bounds.py::test_tile_cut[2]",
     ),
     Mutant(
-        "tile cut-off by the smallest radius", GAUSSIANS,
-        "_tile_range(mean_x_low - radius_high - snap_x, mean_x_high + radius_high + snap_x, tile, tiles_x)",
-        "_tile_range(mean_x_low - radius_low + 1.0, mean_x_high + radius_low - 1.0, tile, tiles_x)",
+        "tile cut-off by the smallest radius", RECORDS,
+        "tile_range(mean_x_low - radius_high - snap_x, mean_x_high + radius_high + snap_x, tile, tiles_x)",
+        "tile_range(mean_x_low - radius_low + 1.0, mean_x_high + radius_low - 1.0, tile, tiles_x)",
         "test_bounds.py::test_tile_cut[1]",
     ),
     Mutant(
         "Jacobian without its clamp", GAUSSIANS,
         "    # the Jacobian's clamped ratios\n    if margin >= 0.0:", "    if False:",
+        "test_bounds.py::test_jacobian_clamp[1]",
+    ),
+    Mutant(
+        "Jacobian without its clamp, one parameter", LINE,
+        "    left, right, top, bottom = np.inf, np.inf, np.inf, np.inf\n    if margin >= 0.0:",
+        "    left, right, top, bottom = np.inf, np.inf, np.inf, np.inf\n    if False:",
         "test_bounds.py::test_jacobian_clamp[2]",
+    ),
+    Mutant(
+        "clamped on one side only, one parameter", LINE,
+        "    a = raised((-a[0], -a[1], -a[2], a[3]), -limit_high, -high, -low)\n",
+        "    a = (-a[0], -a[1], -a[2], a[3])\n",
+        "test_bounds.py::test_jacobian_clamp_all_sides[2]",
     ),
     Mutant(
         "clamped on one side only", GAUSSIANS,
@@ -252,17 +294,40 @@ MUTANTS = (
     ),
     Mutant(
         "no compensation when antialiased", GAUSSIANS,
-        "        if antialiased and record[index, WILD] == 0.0:\n            _form_to_record(work[_K]",
-        "        if antialiased and record[index, WILD] == 0.0:\n            _form_to_record(work[_S]",
+        "form = work[_K if f == 5 else _FORMS + f]", "form = work[_FORMS + 2 if f == 5 else _FORMS + f]",
+        "test_bounds.py::test_antialiased[1]",
+    ),
+    Mutant(
+        "no compensation when antialiased, one parameter", LINE,
+        "store(scaled((out[0, q], out[1, q], out[2, q], out[3, q]), -0.5)",
+        "store(scaled((out[0, q], out[1, q], out[2, q], out[3, q]), 0.0)",
         "test_bounds.py::test_antialiased[2]",
     ),
     Mutant(
         "blur left out of the determinant", GAUSSIANS,
         "    add_product(work[_T1], work[_T2], 1.0, work[_DET], d, order, m)\n", "",
+        "test_bounds.py::test_depth_swap[1]",
+    ),
+    Mutant(
+        "blur left out of the determinant, one parameter", LINE,
+        "det = combined(k, 1.0, multiplied(blurred, z2), 1.0)", "det = k",
         "test_bounds.py::test_depth_swap[2]",
     ),
     Mutant(
-        "region of pixels without the mean's range", GAUSSIANS,
+        "a ratio's slope has the wrong sign", LINE,
+        "n10 = _lowered(_rotated(r1, b0, b1, b2, still, 0.0, 0.0), v, deep)\n        b0, b1, b2 = s[row.B01",
+        "n10 = _lowered(_rotated(r1, b0, b1, b2, still, 0.0, 0.0), (v[0], -v[1], v[2], v[3]), deep)\n"
+        "        b0, b1, b2 = s[row.B01",
+        "test_bounds.py::test_needle[2]",
+    ),
+    Mutant(
+        "pixels are blended as others", PIXELS,
+        "                lane = ranked[first + q]\n                state[channel, 0, lane] = t[_P0 + q]",
+        "                lane = first + q\n                state[channel, 0, lane] = t[_P0 + q]",
+        "test_bounds.py::test_one_layer[2]",
+    ),
+    Mutant(
+        "region of pixels without the mean's range", RECORDS,
         "    box[index, 1] = mean_x_high + extent_x", "    box[index, 1] = mean_x_low + extent_x",
         "test_bounds.py::test_alpha_threshold_of_all[2]",
     ),
@@ -360,7 +425,12 @@ MUTANTS = (
     Mutant(
         "wrong sign in band 1", COLORS,
         "scale_add(work[7], -0.48860251190292, work[7]", "scale_add(work[7], 0.48860251190292, work[7]",
-        "test_bounds.py::test_view_dependence[1-2]",
+        "test_bounds.py::test_view_dependence[1-1]",
+    ),
+    Mutant(
+        "wrong sign in band 1, one parameter", LINE_COLORS,
+        "_multiple(s, n, _Y, -0.48860251190292)", "_multiple(s, n, _Y, 0.48860251190292)",
+        "test_bounds.py::test_view_dependence[2-2]",
     ),
     Mutant(
         "colours are not clamped at 0", COLORS,

@@ -12,9 +12,10 @@ from ns_abstract.arithmetic.units import UNIT64, Arithmetic
 from ns_abstract.methods.splat.activate import Splats
 from ns_abstract.methods.splat.colors import BASIS_SIZE, BASIS_SLOPE, fixed_colors, moving_colors
 from ns_abstract.methods.splat.constants import Rasteriser, rules_array
-from ns_abstract.methods.splat.gaussians import FORMS, covariance_noise, gaussian_stage
+from ns_abstract.methods.splat.gaussians import covariance_noise, gaussian_stage
 from ns_abstract.methods.splat.lists import depth_order, tile_lists
 from ns_abstract.methods.splat.pixels import pixel_stage
+from ns_abstract.methods.splat.records import FORMS
 from ns_abstract.methods.splat.render import camera_array
 from ns_abstract.methods.splat.variations import VariedSplats
 from ns_abstract.sets.path import Camera

@@ -7,6 +7,7 @@ import math
 import numpy as np
 from numba import njit, prange
 
+from ns_abstract.arithmetic.compiled import borrowed
 from ns_abstract.arithmetic.forms import (
     bounds,
     clamp_below,
@@ -17,7 +18,8 @@ from ns_abstract.arithmetic.forms import (
     square,
 )
 from ns_abstract.arithmetic.units import UNIT64
-from ns_abstract.methods.splat.gaussians import LANES
+from ns_abstract.methods.splat.line_colors import accumulate_line, basis_line, directions_line
+from ns_abstract.methods.splat.records import LANES
 
 _COEFFICIENT = 8.0 * UNIT64
 _UP = 1.0 + 128.0 * UNIT64
@@ -161,6 +163,33 @@ def _accumulate(target, form, weights, m):
         target[m, q] = (target[m, q] + w * form[m, q] + _COEFFICIENT * (w * size + total)) * _UP
 
 
+@njit(cache=True, error_model="numpy")
+def _directions(work, scratch, low, high, degree, d, order, m):
+    """Unit directions and their products from the directions; ``low`` [lanes]: bound of the squared lengths."""
+    square(work[0], work[3], d, order, m)
+    for axis in range(1, 3):
+        square(work[axis], work[4], d, order, m)
+        scale_add(work[3], 1.0, work[4], 1.0, 0.0, work[3], d, order, m)
+    bounds(work[3], low, high, d, order, m)
+    reciprocal_square_root(work[3], scratch, work[5], d, order, m)
+    for axis in range(3):
+        multiply(work[axis], work[5], work[6 + axis], d, order, m)
+    if degree >= 2:
+        square(work[8], work[9], d, order, m)
+        square(work[6], work[10], d, order, m)
+        square(work[7], work[4], d, order, m)
+        scale_add(work[10], 1.0, work[4], -1.0, 0.0, work[10], d, order, m)
+        multiply(work[6], work[7], work[4], d, order, m)
+        scale_add(work[4], 2.0, work[4], 0.0, 0.0, work[11], d, order, m)
+    if degree >= 3:
+        multiply(work[6], work[10], work[12], d, order, m)
+        multiply(work[7], work[11], work[4], d, order, m)
+        scale_add(work[12], 1.0, work[4], -1.0, 0.0, work[12], d, order, m)
+        multiply(work[6], work[11], work[13], d, order, m)
+        multiply(work[7], work[10], work[4], d, order, m)
+        scale_add(work[13], 1.0, work[4], 1.0, 0.0, work[13], d, order, m)
+
+
 @njit(cache=True, parallel=True, error_model="numpy")
 def moving_colors(
     indices, means, mean_radius, color_low, color_high, sh, degree, position, origin, position_error, unit,
@@ -180,12 +209,12 @@ def moving_colors(
     for chunk in prange((n + _CHUNK - 1) // _CHUNK):
         # 0-2 direction, 3 squared length, 4 spare, 5 inverse length, 6-8 x y z, 9 z^2, 10 c1, 11 s1,
         # 12 c2, 13 s2, 14 basis, 15 spare, 16-18 channels
-        work = np.empty((19, m + 3, LANES))
-        scratch = np.empty((5, LANES))
-        weights = np.empty(LANES)
-        low = np.empty(LANES)
-        high = np.empty(LANES)
-        distance = np.empty(LANES)
+        work_ = np.empty((19, m + 3, LANES))
+        ends_ = np.empty((9, LANES))
+        work, scratch = borrowed(work_), borrowed(ends_[:5])
+        weights, low, high, distance = borrowed(ends_[5]), borrowed(ends_[6]), borrowed(ends_[7]), borrowed(ends_[8])
+        s = borrowed(work_.reshape(-1))
+        line = d == 1 and order == 2
         for first in range(chunk * _CHUNK, min(n, (chunk + 1) * _CHUNK), LANES):
             lanes = min(LANES, min(n, (chunk + 1) * _CHUNK) - first)
             for axis in range(3):
@@ -199,17 +228,14 @@ def moving_colors(
                     form[m, q] = position[m, axis] + _COEFFICIENT * (
                         abs(means[i, axis] - origin[axis]) + abs(origin[axis] - position[0, axis])
                     )
-                settle(form, d, order, m)
-            square(work[0], work[3], d, order, m)
-            for axis in range(1, 3):
-                square(work[axis], work[4], d, order, m)
-                scale_add(work[3], 1.0, work[4], 1.0, 0.0, work[3], d, order, m)
-            bounds(work[3], low, high, d, order, m)
+                if not line:
+                    settle(form, d, order, m)
+            if line:
+                directions_line(s, low.shape[0], degree, low)
+            else:
+                _directions(work, scratch, low, high, degree, d, order, m)
             for q in range(LANES):
                 distance[q] = math.sqrt(low[q]) * (1.0 - _COEFFICIENT) if low[q] > 0.0 else 0.0
-            reciprocal_square_root(work[3], scratch, work[5], d, order, m)
-            for axis in range(3):
-                multiply(work[axis], work[5], work[6 + axis], d, order, m)
             for channel in range(3):
                 form = work[16 + channel]
                 for k in range(m + 3):
@@ -219,26 +245,18 @@ def moving_colors(
                     i = indices[first + min(q, lanes - 1), 1]
                     form[0, q] = 0.2820947917738781 * sh[i, 0, channel] + 0.5
                     form[m, q] = _COEFFICIENT * (abs(sh[i, 0, channel]) + 1.0)
-            if degree >= 2:
-                square(work[8], work[9], d, order, m)
-                square(work[6], work[10], d, order, m)
-                square(work[7], work[4], d, order, m)
-                scale_add(work[10], 1.0, work[4], -1.0, 0.0, work[10], d, order, m)
-                multiply(work[6], work[7], work[4], d, order, m)
-                scale_add(work[4], 2.0, work[4], 0.0, 0.0, work[11], d, order, m)
-            if degree >= 3:
-                multiply(work[6], work[10], work[12], d, order, m)
-                multiply(work[7], work[11], work[4], d, order, m)
-                scale_add(work[12], 1.0, work[4], -1.0, 0.0, work[12], d, order, m)
-                multiply(work[6], work[11], work[13], d, order, m)
-                multiply(work[7], work[10], work[4], d, order, m)
-                scale_add(work[13], 1.0, work[4], 1.0, 0.0, work[13], d, order, m)
             for k in range(1, count):
-                _basis_form(work, k, d, order, m)
+                if line:
+                    basis_line(s, low.shape[0], k)
+                else:
+                    _basis_form(work, k, d, order, m)
                 for channel in range(3):
                     for q in range(LANES):
                         weights[q] = sh[indices[first + min(q, lanes - 1), 1], k, channel]
-                    _accumulate(work[16 + channel], work[14], weights, m)
+                    if line:
+                        accumulate_line(s, low.shape[0], weights, channel)
+                    else:
+                        _accumulate(work[16 + channel], work[14], weights, m)
             for channel in range(3):
                 form = work[16 + channel]
                 settle(form, d, order, m)

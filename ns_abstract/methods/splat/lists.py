@@ -75,11 +75,13 @@ def block_lists(entries, box, x0, y0, tile, offsets, out):
     """
     side = tile // BLOCK
     offsets[:] = 0
+    ranges = np.empty((entries.size, 4), np.uint16)
     for k in range(entries.size):
         prefetch(box, entries[min(k + AHEAD, entries.size - 1)], 0)
         i = entries[k]
         bx0, bx1 = _block_range(box[i, 0], box[i, 1], x0, side)
         by0, by1 = _block_range(box[i, 2], box[i, 3], y0, side)
+        ranges[k, 0], ranges[k, 1], ranges[k, 2], ranges[k, 3] = bx0, bx1, by0, by1
         for by in range(by0, by1):
             for bx in range(bx0, bx1):
                 offsets[by * side + bx + 1] += 1
@@ -90,10 +92,8 @@ def block_lists(entries, box, x0, y0, tile, offsets, out):
     position = offsets[:-1].copy()
     for k in range(entries.size):
         i = entries[k]
-        bx0, bx1 = _block_range(box[i, 0], box[i, 1], x0, side)
-        by0, by1 = _block_range(box[i, 2], box[i, 3], y0, side)
-        for by in range(by0, by1):
-            for bx in range(bx0, bx1):
+        for by in range(ranges[k, 2], ranges[k, 3]):
+            for bx in range(ranges[k, 0], ranges[k, 1]):
                 b = by * side + bx
                 out[position[b]] = i
                 position[b] += 1

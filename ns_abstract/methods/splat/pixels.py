@@ -16,7 +16,9 @@ from numba import njit, prange
 from ns_abstract.arithmetic.compiled import borrowed, lowest_bit, prefetch
 from ns_abstract.arithmetic.elementary import EXP_RELATIVE_ERROR, exp_kernel
 from ns_abstract.arithmetic.units import UNIT64
-from ns_abstract.methods.splat.gaussians import (
+from ns_abstract.methods.splat.lists import AHEAD, BLOCK, PIXELS, block_lists
+from ns_abstract.methods.splat.records import (
+    FAINT,
     FORMS,
     KAPPA,
     MEAN_X,
@@ -25,7 +27,6 @@ from ns_abstract.methods.splat.gaussians import (
     OPACITY_LOW,
     WILD,
 )
-from ns_abstract.methods.splat.lists import AHEAD, BLOCK, PIXELS, block_lists
 
 _ROUND = 16.0 * UNIT64
 _UP = 1.0 + 128.0 * UNIT64
@@ -65,14 +66,14 @@ def _spread(rows, first, last, n, s, out):
             s[out + q] += abs(rows[k, q])
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", forceinline=True)
 def _alpha_forms(record, i, n, s, y1, y2, poly, sigma_max, d, order, m, antialiased, sure, rules, errors):
     """Alpha of one Gaussian on the lanes of a block (design.md, B1-B4).
 
     Takes the pixel offsets of ``n`` lanes from rows _AX, _AY of ``s``. Leaves the polynomial's
-    coefficients in ``poly`` [m, lanes] and the radius, lower and upper bound in rows _AR, _LO, _HI;
-    ``sure`` tells whether the Gaussian surely belongs to the tile. Returns False where alpha is
-    below the threshold on all lanes.
+    coefficients in ``poly`` [m, lanes] (one parameter and order 2: in rows _A0, _LINEAR, _QUADRATIC) and the
+    radius, lower and upper bound in rows _AR, _LO, _HI; ``sure`` tells whether the Gaussian surely belongs to the
+    tile. Returns False where alpha is below the threshold on all lanes.
     """
     unit = errors[0]
     alpha_min = rules[7] * (1.0 - 2.0 * unit)
@@ -84,6 +85,9 @@ def _alpha_forms(record, i, n, s, y1, y2, poly, sigma_max, d, order, m, antialia
         poly[:] = 0.0
         for q in range(n):
             poly[0, q] = 0.5 * high
+            s[_A0 + q] = 0.5 * high
+            s[_LINEAR + q] = 0.0
+            s[_QUADRATIC + q] = 0.0
             s[_AR + q] = 0.5 * high * _UP
             s[_LO + q] = 0.0
             s[_HI + q] = high
@@ -106,11 +110,9 @@ def _alpha_forms(record, i, n, s, y1, y2, poly, sigma_max, d, order, m, antialia
     )  # fmt: skip
     if line:
         for q in range(n):
-            poly[0, q] = s[_A0 + q]
-        for q in range(n):
-            poly[1, q] = s[_WEIGHT + q] * s[_LINEAR + q]
-        for q in range(n):
-            poly[2, q] = s[_WEIGHT + q] * s[_QUADRATIC + q] + s[_CURVE + q] * (s[_LINEAR + q] * s[_LINEAR + q])
+            weight, linear = s[_WEIGHT + q], s[_LINEAR + q]
+            s[_QUADRATIC + q] = weight * s[_QUADRATIC + q] + s[_CURVE + q] * (linear * linear)
+            s[_LINEAR + q] = weight * linear
         return True
     if order == 2:
         # alpha_q = weight * sigma_q + curve * (linear part of sigma) squared, before sigma's rows are scaled
@@ -246,7 +248,7 @@ def _exponent(record, i, n, s, y1, y2, poly, d, order, m, antialiased):
         s[_SLO + q] = max(s[_SLO + q], s[_MIN + q])
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", forceinline=True)
 def _exponent_line(record, i, n, s, antialiased):
     """`_exponent` for one parameter and order 2 in a single loop; coefficients into rows _LINEAR, _QUADRATIC."""
     p0, p1, p2, pr = record[i, FORMS], record[i, FORMS + 1], record[i, FORMS + 2], record[i, FORMS + 3]
@@ -347,7 +349,7 @@ def _add_range(poly, d, n, s):
             row += 1
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", forceinline=True)
 def _fit_exponential(
     n, s, opacity_low, opacity_high, kappa, sigma_max, alpha_min, alpha_min_high, alpha_max, sure, unit, order
 ):
@@ -428,8 +430,8 @@ _GIVE_UP = -1
 _GROW = -2
 
 
-@njit(cache=True, error_model="numpy")
-def _uncertain(i, j, depth, delta, depth_error, slope, m):
+@njit(cache=True, error_model="numpy", forceinline=True)
+def _uncertain(i, j, delta, depth_error, slope, m):
     """Whether the depth order of Gaussians i and j is not the same over the whole cell (design.md, O1).
 
     ``slope`` [rows, 3] is the third row of the rotation: depths differ by ``slope . (delta_i - delta_j)``.
@@ -450,11 +452,11 @@ def _uncertain(i, j, depth, delta, depth_error, slope, m):
 
 
 @njit(cache=True, error_model="numpy")
-def _depth_reach(entries, depth, delta, depth_error, slope, ray, m, reach):
+def _depth_reach(entries, depth, delta, depth_error, slope, ray, m, reach, deep):
     """How far in depth each entry may move against the block's central ray (design.md, O1).
 
-    Entries i, j keep their order where ``room |depth_i - depth_j| > reach_i + reach_j``. Returns
-    ``room`` (not positive where nothing can be said) and the largest reach of all but a few entries.
+    Entries i, j keep their order where ``room |depth_i - depth_j| > reach_i + reach_j``; ``deep`` receives the
+    depths. Returns ``room`` (not positive where nothing can be said) and the largest reach of all but a few entries.
     ``ray`` [3] is the ray scaled to unit depth at the middle pose.
     """
     count = entries.size
@@ -469,6 +471,7 @@ def _depth_reach(entries, depth, delta, depth_error, slope, ray, m, reach):
         prefetch(depth, ahead, 0)
         prefetch(depth_error, ahead, 0)
         i = entries[k]
+        deep[k] = depth[i]
         # offset from the central ray: what a rotation moves in depth relative to the ray
         x = delta[i, 0] - depth[i] * ray[0]
         y = delta[i, 1] - depth[i] * ray[1]
@@ -491,9 +494,9 @@ def _depth_reach(entries, depth, delta, depth_error, slope, ray, m, reach):
     return room, largest
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", forceinline=True)
 def _find_pairs(
-    k, entries, depth, delta, depth_error, slope, m, reach, room, largest, farthest, far, far_count, first, last,
+    k, entries, deep, delta, depth_error, slope, m, reach, room, largest, farthest, far, far_count, first, last,
     pairs, count,
 ):  # fmt: skip
     """Append the pairs (k, later entry) of uncertain order to ``pairs`` and widen ``first``, ``last``.
@@ -504,12 +507,12 @@ def _find_pairs(
     window = reach[k] + largest
     beyond = entries.size
     for other in range(k + 1, entries.size):
-        gap = (depth[entries[other]] - depth[i]) * room
+        gap = (deep[other] - deep[k]) * room
         if gap > window:
             beyond = other
             break
         if gap <= reach[k] + reach[other] and _uncertain(
-            i, entries[other], depth, delta, depth_error, slope, m
+            i, entries[other], delta, depth_error, slope, m
         ):
             if count >= pairs.shape[0]:
                 return -1
@@ -522,11 +525,11 @@ def _find_pairs(
         other = far[f]
         if other < beyond:
             continue
-        gap = (depth[entries[other]] - depth[i]) * room
+        gap = (deep[other] - deep[k]) * room
         if gap > reach[k] + farthest:
             break
         if gap <= reach[k] + reach[other] and _uncertain(
-            i, entries[other], depth, delta, depth_error, slope, m
+            i, entries[other], delta, depth_error, slope, m
         ):
             if count >= pairs.shape[0]:
                 return -1
@@ -538,18 +541,7 @@ def _find_pairs(
     return count
 
 
-@njit(cache=True, error_model="numpy")
-def _largest_exponent(record, i, alpha_min, unit):
-    """The exponent from which on alpha is below the threshold, however it is evaluated (design.md, B4)."""
-    opacity = record[i, OPACITY_HIGH]
-    if record[i, WILD] != 0.0 or not opacity > 0.0:
-        return -1.0
-    # room for the rounding of the exponential, which grows more slowly than the exponent's own error
-    exponent = math.log(opacity * (1.0 + 64.0 * unit) / alpha_min) * (1.0 + 2.0**-40) + 2.0**-40
-    return exponent / (1.0 - record[i, KAPPA])
-
-
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", forceinline=True)
 def _list_lanes(record, i, ox, oy, left, right, top, bottom, sigma_max, m, live, s, pixels):
     """List the pixels of a range that take light and where the exponent may stay below ``sigma_max``.
 
@@ -588,8 +580,9 @@ def _list_lanes(record, i, ox, oy, left, right, top, bottom, sigma_max, m, live,
         inverse = 1.0 / p
         reach = 2.0 * sigma_max * _ROOM
         first, past = float(left), float(right)
-        for row in range(bottom - top + 1):
-            ay = oy + (top + row)
+        # all rows, in number one that the compiler does not know: vector code
+        for row in range(s.size // (_ROWS * BLOCK)):
+            ay = oy + row
             near = max(0.0, abs(g * ay - w2) - spread2)
             rest = reach - near * near * (2.0 - _ROOM)
             half = (math.sqrt(max(rest, 0.0)) + spread1) * inverse * _ROOM
@@ -597,10 +590,10 @@ def _list_lanes(record, i, ox, oy, left, right, top, bottom, sigma_max, m, live,
             slack = (_ROOM - 1.0) * (abs(center) + abs(ox) + half)
             s[_C1 + row] = np.ceil(min(max(center - half - slack, first), past + 1.0))
             s[_C2 + row] = np.floor(max(min(center + half + slack, past), first - 1.0)) if rest >= 0.0 else -1.0
-        for row in range(bottom - top + 1):
+        for row in range(top, bottom + 1):
             start, stop = int(s[_C1 + row]), int(s[_C2 + row])
             if start <= stop:
-                mask |= ((2 << stop) - (1 << start)) << ((top + row) * BLOCK)
+                mask |= ((2 << stop) - (1 << start)) << (row * BLOCK)
     else:
         for row in range(top, bottom + 1):
             mask |= ((2 << right) - (1 << left)) << (row * BLOCK)
@@ -619,7 +612,7 @@ def _list_lanes(record, i, ox, oy, left, right, top, bottom, sigma_max, m, live,
 @njit(cache=True, error_model="numpy")
 def _forward(
     entries, record, box, tiles, tile_x, tile_y, colors, depth, delta, depth_error, slope, ray,
-    s, y1, y2, poly, pixels, layers, sources, lengths, reach, far, first, last, slots, heights, places, pairs,
+    s, y1, y2, poly, pixels, layers, sources, lengths, reach, deep, far, first, last, slots, heights, places, pairs,
     x0, y0, d, order, m, antialiased, rules, errors, marks,
 ):  # fmt: skip
     """Collect the layers of every lane, nearest first (design.md, B5-B6).
@@ -648,7 +641,7 @@ def _forward(
         s[_RHO + q] = 0.0
         s[_TMP + q] = 0.0
         lengths[q] = 0
-    room, largest = _depth_reach(entries, depth, delta, depth_error, slope, ray, m, reach)
+    room, largest = _depth_reach(entries, depth, delta, depth_error, slope, ray, m, reach, deep)
     if not room > 0.0:
         return _GIVE_UP, 0
     far_count = 0
@@ -686,7 +679,7 @@ def _forward(
         bottom = min(live_last, int(math.floor(min(max(box[i, 3] - 0.5 - y0, -1.0), BLOCK - 1.0))))
         if top > bottom or left > right:
             continue
-        sigma_max = _largest_exponent(record, i, alpha_min, unit)
+        sigma_max = record[i, FAINT]
         n = _list_lanes(
             record, i, x0 + 0.5 - record[i, MEAN_X], y0 + 0.5 - record[i, MEAN_Y], left, right, top, bottom,
             sigma_max, m, live, s, pixels,
@@ -704,7 +697,7 @@ def _forward(
         ):
             continue
         pair_count = _find_pairs(
-            k, entries, depth, delta, depth_error, slope, m, reach, room, largest, farthest, far, far_count,
+            k, entries, deep, delta, depth_error, slope, m, reach, room, largest, farthest, far, far_count,
             first, last, pairs, pair_count,
         )  # fmt: skip
         if pair_count < 0:
@@ -752,9 +745,9 @@ def _forward(
                 row[m] = 0.5 * high * _UP
                 low = 0.0
             elif line:
-                row[0] = poly[0, lane]
-                row[1] = poly[1, lane]
-                row[2] = poly[2, lane]
+                row[0] = s[_A0 + lane]
+                row[1] = s[_LINEAR + lane]
+                row[2] = s[_QUADRATIC + lane]
                 row[3] = s[_AR + lane]
             else:
                 for r in range(m):
@@ -995,10 +988,10 @@ def _interval_blend(
 
 @njit(cache=True, error_model="numpy")
 def _blend_group(
-    first, layers, sources, entries, colors, lengths, layer, extra, moved, background, d, order, m, color_rows,
+    ranked, layers, sources, entries, colors, lengths, layer, extra, moved, background, d, order, m, color_rows,
     state, radius, low, high, value, s,
 ):  # fmt: skip
-    """Blend the layers of the lanes from ``first`` on back to front, as forms and as intervals (design.md, B7).
+    """Blend the layers of the pixels ``ranked`` back to front, as forms and as intervals (design.md, B7).
 
     ``state`` [3, m, lanes] and ``radius`` [3, lanes] receive the polynomial forms, ``low`` and
     ``high`` [3, lanes] the intervals; rows _MIN and _MAX of ``s`` the range of all colours.
@@ -1008,7 +1001,7 @@ def _blend_group(
     for q in range(n):
         s[_MIN + q] = min(background[0], background[1], background[2])
         s[_MAX + q] = max(background[0], background[1], background[2])
-        count = max(count, int(lengths[first + q]))
+        count = max(count, int(lengths[ranked[q]]))
     state[:] = 0.0
     radius[:] = 0.0
     for channel in range(3):
@@ -1020,7 +1013,7 @@ def _blend_group(
     for e in range(count - 1, -1, -1):
         # lane by lane in memory, row by row for the arithmetic
         for q in range(n):
-            lane = first + q
+            lane = ranked[q]
             if e < lengths[lane]:
                 for r in range(m + 3):
                     layer[r, q] = layers[e, lane, r]
@@ -1129,43 +1122,42 @@ def _blend_group(
             if moved[e]:
                 lower = 2 * channel
                 lift = 2 * channel + 1
-                reorder = extra[e, :, first : first + n]
                 for q in range(n):
-                    p[0, q] += 0.5 * (reorder[lift, q] - reorder[lower, q])
-                for q in range(n):
-                    r[q] += 0.5 * (reorder[lift, q] + reorder[lower, q]) * _UP
-                for q in range(n):
-                    top[q] += reorder[lift, q]
-                for q in range(n):
-                    bottom[q] -= reorder[lower, q]
+                    falls, rises = extra[e, lower, ranked[q]], extra[e, lift, ranked[q]]
+                    p[0, q] += 0.5 * (rises - falls)
+                    r[q] += 0.5 * (rises + falls) * _UP
+                    top[q] += rises
+                    bottom[q] -= falls
 
 
 @njit(cache=True, error_model="numpy")
 def _blend(
-    layers, sources, entries, colors, lengths, layer, extra, moved, background, d, order, m, color_rows,
+    ranked, layers, sources, entries, colors, lengths, layer, extra, moved, background, d, order, m, color_rows,
     group, group_ends, state, radius, low, high, value, s,
 ):  # fmt: skip
-    """`_blend_group` of all lanes; rows _DARKEST and _BRIGHTEST of ``s`` receive the range of all colours.
+    """`_blend_group` of all pixels, in the order ``ranked``.
 
-    ``group`` [3, m, lanes] and ``group_ends`` [3, 3, lanes] are scratch for a group.
+    Rows _DARKEST and _BRIGHTEST of ``s`` receive the range of all colours; ``group`` [3, m, lanes] and
+    ``group_ends`` [3, 3, lanes] are scratch for a group.
     """
     n = value.shape[1]
     for first in range(0, PIXELS, n):
+        some = ranked[first : first + n]
         _blend_group(
-            first, layers, sources, entries, colors, lengths, layer, extra, moved, background, d, order, m, color_rows,
+            some, layers, sources, entries, colors, lengths, layer, extra, moved, background, d, order, m, color_rows,
             group, group_ends[0], group_ends[1], group_ends[2], value, s,
         )  # fmt: skip
         for q in range(n):
-            s[_DARKEST + first + q] = s[_MIN + q]
-            s[_BRIGHTEST + first + q] = s[_MAX + q]
+            s[_DARKEST + some[q]] = s[_MIN + q]
+            s[_BRIGHTEST + some[q]] = s[_MAX + q]
         for channel in range(3):
             for k in range(m):
                 for q in range(n):
-                    state[channel, k, first + q] = group[channel, k, q]
+                    state[channel, k, some[q]] = group[channel, k, q]
             for q in range(n):
-                radius[channel, first + q] = group_ends[0, channel, q]
-                low[channel, first + q] = group_ends[1, channel, q]
-                high[channel, first + q] = group_ends[2, channel, q]
+                radius[channel, some[q]] = group_ends[0, channel, q]
+                low[channel, some[q]] = group_ends[1, channel, q]
+                high[channel, some[q]] = group_ends[2, channel, q]
 
 
 # rows of one channel of the one-parameter blend: coefficients, radius, interval, then the layer's colour
@@ -1173,7 +1165,7 @@ _P0, _P1, _P2, _PR, _PLO, _PHI, _K0, _K1, _K2, _KR = range(0, 10 * _GROUP, _GROU
 _CHANNEL_ROWS = 10
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", forceinline=True)
 def _blend_channel_line(n, s, t):
     """Blend one layer (rows _A0, _LINEAR, _QUADRATIC, _AR, _LO, _HI of ``s``) into one channel's rows ``t``."""
     for q in range(n):
@@ -1219,7 +1211,7 @@ def _blend_channel_line(n, s, t):
 
 @njit(cache=True, error_model="numpy")
 def _blend_line(
-    layers, sources, entries, colors, lengths, extra, moved, background, color_rows, state, radius, low, high,
+    ranked, layers, sources, entries, colors, lengths, extra, moved, background, color_rows, state, radius, low, high,
     red, green, blue, s,
 ):  # fmt: skip
     """`_blend` for one parameter and order 2; ``red``, ``green``, ``blue`` [rows * lanes] are scratch for a group."""
@@ -1238,11 +1230,11 @@ def _blend_line(
         for q in range(n):
             s[_MIN + q] = darkest
             s[_MAX + q] = brightest
-            deepest = max(deepest, lengths[first + q])
+            deepest = max(deepest, lengths[ranked[first + q]])
         for e in range(deepest - 1, -1, -1):
             # lane by lane in memory, row by row for the arithmetic
             for q in range(n):
-                lane = first + q
+                lane = ranked[first + q]
                 if e < lengths[lane]:
                     row = layers[e, lane]
                     s[_A0 + q] = row[0]
@@ -1282,24 +1274,25 @@ def _blend_line(
                 for channel in range(3):
                     t = red if channel == 0 else (green if channel == 1 else blue)
                     for q in range(n):
-                        lower = extra[e, 2 * channel, first + q]
-                        lift = extra[e, 2 * channel + 1, first + q]
+                        lower = extra[e, 2 * channel, ranked[first + q]]
+                        lift = extra[e, 2 * channel + 1, ranked[first + q]]
                         t[_P0 + q] += 0.5 * (lift - lower)
                         t[_PR + q] += 0.5 * (lift + lower) * _UP
                         t[_PHI + q] += lift
                         t[_PLO + q] -= lower
         for q in range(n):
-            s[_DARKEST + first + q] = s[_MIN + q]
-            s[_BRIGHTEST + first + q] = s[_MAX + q]
+            s[_DARKEST + ranked[first + q]] = s[_MIN + q]
+            s[_BRIGHTEST + ranked[first + q]] = s[_MAX + q]
         for channel in range(3):
             t = red if channel == 0 else (green if channel == 1 else blue)
             for q in range(n):
-                state[channel, 0, first + q] = t[_P0 + q]
-                state[channel, 1, first + q] = t[_P1 + q]
-                state[channel, 2, first + q] = t[_P2 + q]
-                radius[channel, first + q] = t[_PR + q]
-                low[channel, first + q] = t[_PLO + q]
-                high[channel, first + q] = t[_PHI + q]
+                lane = ranked[first + q]
+                state[channel, 0, lane] = t[_P0 + q]
+                state[channel, 1, lane] = t[_P1 + q]
+                state[channel, 2, lane] = t[_P2 + q]
+                radius[channel, lane] = t[_PR + q]
+                low[channel, lane] = t[_PLO + q]
+                high[channel, lane] = t[_PHI + q]
 
 
 @njit(cache=True, error_model="numpy")
@@ -1337,10 +1330,26 @@ def _chains(last):
 
 
 @njit(cache=True, error_model="numpy")
+def _rank(lengths, deepest, counts, ranked):
+    """Sort the pixels by their ``lengths``, at most ``deepest``, into ``ranked``; ``counts`` is scratch."""
+    counts[: deepest + 1] = 0
+    for q in range(PIXELS):
+        counts[lengths[q]] += 1
+    position = 0
+    for length in range(deepest + 1):
+        count = counts[length]
+        counts[length] = position
+        position += count
+    for q in range(PIXELS):
+        ranked[counts[lengths[q]]] = q
+        counts[lengths[q]] += 1
+
+
+@njit(cache=True, error_model="numpy")
 def _block(
     listed, x0, y0, tile_x, tile_y, record, box, tiles, depth, delta, depth_error, colors, color_radius,
     slope, direction, camera, rules, errors, background, negligible, d, order, m, antialiased,
-    s, y1, y2, poly, value, layer, pixels, layers, sources, lengths, reach, far, first, last, slots, heights,
+    s, y1, y2, poly, value, layer, pixels, layers, sources, lengths, reach, deep, far, first, last, slots, heights,
     places, pairs, moves, most, extra, moved, line, group, group_ends, state, radius, low, high, ray, lower, upper,
     linear, statistics, marks,
 ):  # fmt: skip
@@ -1358,7 +1367,7 @@ def _block(
         ray[k] = direction[k] * u + direction[3 + k] * v + direction[6 + k]
     pair_count, slot_count = _forward(
         listed, record, box, tiles, tile_x, tile_y, colors, depth, delta, depth_error, slope, ray,
-        s, y1, y2, poly, pixels, layers, sources, lengths, reach, far, first, last, slots, heights, places, pairs,
+        s, y1, y2, poly, pixels, layers, sources, lengths, reach, deep, far, first, last, slots, heights, places, pairs,
         x0, y0, d, order, m, antialiased, rules, errors, marks,
     )  # fmt: skip
     if pair_count == _GROW:
@@ -1389,14 +1398,17 @@ def _block(
         )
         _swap_bounds(pairs, pair_count, slots, slot_count, heights, listed, colors, color_rows, moves, most)
         _collect_moves(moves, slot_count, places, extra, moved)
+    # pixels of like depth are blended together; the pixels' numbers are of no more use
+    ranked = pixels
+    _rank(lengths, deepest, far, ranked)
     if d == 1 and order == 2:
         _blend_line(
-            layers, sources, listed, colors, lengths, extra, moved, background, color_rows, state, radius, low, high,
-            line[0], line[1], line[2], s,
+            ranked, layers, sources, listed, colors, lengths, extra, moved, background, color_rows, state, radius,
+            low, high, line[0], line[1], line[2], s,
         )  # fmt: skip
     else:
         _blend(
-            layers, sources, listed, colors, lengths, layer, extra, moved, background, d, order, m, color_rows,
+            ranked, layers, sources, listed, colors, lengths, layer, extra, moved, background, d, order, m, color_rows,
             group, group_ends, state, radius, low, high, value, s,
         )  # fmt: skip
     if slot_count > 0:
@@ -1477,7 +1489,7 @@ def _pixel_worker(
     heights_ = np.empty((64, PIXELS))
     places_ = np.empty((64, PIXELS), np.int64)
     moves_ = np.empty((2, 64, 6, PIXELS))
-    reach_ = np.empty(1024)
+    reach_ = np.empty((2, 1024))
     order_ = np.empty((4, 1024), np.int64)
     pairs_ = np.empty((pair_limit, 2), np.int64)
     block_offsets = np.empty(blocks * blocks + 1, np.int64)
@@ -1496,14 +1508,15 @@ def _pixel_worker(
             if x0 >= image_width or y0 >= image_height:
                 continue
             listed = block_entries[block_offsets[b] : block_offsets[b + 1]]
-            if listed.size > reach_.size:
-                reach_ = np.empty(2 * listed.size)
+            if listed.size >= reach_.shape[1]:
+                reach_ = np.empty((2, 2 * listed.size))
                 order_ = np.empty((4, 2 * listed.size), np.int64)
             while not _block(
                 borrowed(listed), x0, y0, tile_x, tile_y, record, box, tiles, depth, delta, depth_error, colors,
                 color_radius, slope, direction, camera, rules, errors, background, negligible, d, order, m,
                 antialiased, s, y1, y2, poly, value, layer, pixels, borrowed(layers_), borrowed(sources_), lengths,
-                borrowed(reach_), borrowed(order_[0]), borrowed(order_[1]), borrowed(order_[2]), borrowed(order_[3]),
+                borrowed(reach_[0]), borrowed(reach_[1]), borrowed(order_[0]), borrowed(order_[1]),
+                borrowed(order_[2]), borrowed(order_[3]),
                 borrowed(heights_), borrowed(places_), borrowed(pairs_), borrowed(moves_[0]), borrowed(moves_[1]),
                 borrowed(extra_), borrowed(moved_), line, group, group_ends, state, radius, low, high, ray,
                 lower[number], upper[number], linear[min(number, linear.shape[0]) :],

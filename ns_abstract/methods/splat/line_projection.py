@@ -1,0 +1,194 @@
+"""Projection of Gaussians over cells of one parameter with forms of order 2 (design.md, G4-G9): one loop over lanes."""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+from ns_abstract.arithmetic.forms import logarithm
+from ns_abstract.arithmetic.line_forms import (
+    combined,
+    ends,
+    inverse,
+    inverse_root,
+    load,
+    multiplied,
+    raised,
+    scaled,
+    size,
+    store,
+)
+from ns_abstract.arithmetic.units import UNIT64
+from ns_abstract.methods.splat import records as row
+from ns_abstract.methods.splat.records import LANES
+
+_COEFFICIENT = 8.0 * UNIT64
+_UP = 1.0 + 128.0 * UNIT64
+
+
+@njit(cache=True, error_model="numpy", inline="always")
+def _rotation_row(rotation, k):
+    """The forms of one row of the rotation [6, 9] and the sizes of their polynomials."""
+    a, b, c = 3 * k, 3 * k + 1, 3 * k + 2
+    return (
+        rotation[0, a], rotation[0, b], rotation[0, c],
+        rotation[1, a], rotation[1, b], rotation[1, c],
+        rotation[2, a], rotation[2, b], rotation[2, c],
+        rotation[3, a], rotation[3, b], rotation[3, c],
+        abs(rotation[0, a]) + rotation[4, a] + rotation[5, a],
+        abs(rotation[0, b]) + rotation[4, b] + rotation[5, b],
+        abs(rotation[0, c]) + rotation[4, c] + rotation[5, c],
+    )  # fmt: skip
+
+
+@njit(cache=True, error_model="numpy", inline="always")
+def _rotated(r, x, y, z, shift, shift_size, spread):
+    """``r . (x, y, z) + shift`` for exact x, y, z and a form ``shift`` (`gaussians._rotate`), widened by ``spread``."""
+    a, b, c = abs(x), abs(y), abs(z)
+    radius = r[9] * a + r[10] * b + r[11] * c + shift[3]
+    radius += _COEFFICIENT * (r[12] * a + r[13] * b + r[14] * c + shift_size)
+    return (
+        r[0] * x + r[1] * y + r[2] * z + shift[0],
+        r[3] * x + r[4] * y + r[5] * z + shift[1],
+        r[6] * x + r[7] * y + r[8] * z + shift[2],
+        radius * _UP + spread,
+    )
+
+
+@njit(cache=True, error_model="numpy", inline="always")
+def _clamped(a, low, high, limit_low, limit_high):
+    """``min(limit_high, max(-limit_low, a))`` given bounds of ``a`` (`gaussians._clamp_ratio`)."""
+    a = raised(a, -limit_low, low, high)
+    low, high = max(low, -limit_low), max(high, -limit_low)
+    a = raised((-a[0], -a[1], -a[2], a[3]), -limit_high, -high, -low)
+    return -a[0], -a[1], -a[2], a[3]
+
+
+@njit(cache=True, error_model="numpy", inline="always")
+def _pixels(a, z, ratio, focal):
+    """``focal a - (focal ratio) z``, which vanishes at the middle of the cell: a pixel offset times depth."""
+    # the pixel offset used later is exactly focal * ratio in float64
+    shift = focal * ratio
+    radius = focal * a[3] + abs(shift) * z[3] + _COEFFICIENT * (focal * size(a) + abs(shift) * size(z))
+    return focal * a[0] - shift * z[0], focal * a[1] - shift * z[1], focal * a[2] - shift * z[2], radius * _UP
+
+
+@njit(cache=True, error_model="numpy", inline="always")
+def _lowered(c, a, b):
+    """``c - a b``."""
+    return combined(c, 1.0, multiplied(a, b), -1.0)
+
+
+@njit(cache=True, error_model="numpy", inline="always")
+def _sum_of_products(a0, b0, a1, b1, a2, b2):
+    return combined(combined(multiplied(a0, b0), 1.0, multiplied(a1, b1), 1.0), 1.0, multiplied(a2, b2), 1.0)
+
+
+@njit(cache=True, error_model="numpy", inline="always")
+def _crossed(a, b, c, d):
+    """``(a d - b c)^2``."""
+    found = combined(multiplied(a, d), 1.0, multiplied(b, c), -1.0)
+    return multiplied(found, found)
+
+
+@njit(cache=True, error_model="numpy")
+def project_line(s, n, rotation, offset, camera, rules):
+    """Bounds and forms of ``n`` Gaussians from the rows that `records.gather` filled (design.md, G4-G9).
+
+    ``rotation`` [6, 9] and ``offset`` [6, 3] are the pose's forms. Fills the rows ZLO .. HI, DEEP0 .. Y0, and the forms
+    FP .. FW2, of K before the logarithm and of the determinant.
+    """
+    eps2d, margin = rules[2], rules[6]
+    fx, fy, cx, cy, width, height = camera[0], camera[1], camera[2], camera[3], camera[4], camera[5]
+    r0, r1, r2 = _rotation_row(rotation, 0), _rotation_row(rotation, 1), _rotation_row(rotation, 2)
+    offset_x = (offset[0, 0], offset[1, 0], offset[2, 0], offset[3, 0])
+    offset_y = (offset[0, 1], offset[1, 1], offset[2, 1], offset[3, 1])
+    offset_z = (offset[0, 2], offset[1, 2], offset[2, 2], offset[3, 2])
+    size_x, size_y, size_z = size(offset_x), size(offset_y), size(offset_z)
+    still = (0.0, 0.0, 0.0, 0.0)
+    left, right, top, bottom = np.inf, np.inf, np.inf, np.inf
+    if margin >= 0.0:
+        left, right = cx / fx + margin * 0.5 * width / fx, (width - cx) / fx + margin * 0.5 * width / fx
+        top, bottom = cy / fy + margin * 0.5 * height / fy, (height - cy) / fy + margin * 0.5 * height / fy
+    for q in range(n):
+        v0, v1, v2 = s[row.V0 + q], s[row.V1 + q], s[row.V2 + q]
+        x = _rotated(r0, v0, v1, v2, offset_x, size_x, s[row.SX + q])
+        y = _rotated(r1, v0, v1, v2, offset_y, size_y, s[row.SY + q])
+        z = _rotated(r2, v0, v1, v2, offset_z, size_z, s[row.SZ + q])
+        s[row.ZLO + q], s[row.ZHI + q] = ends(z)
+        s[row.Z0 + q] = z[0]
+        inverse_z = inverse(z)
+        u, v = multiplied(x, inverse_z), multiplied(y, inverse_z)
+        u_low, u_high = ends(u)
+        v_low, v_high = ends(v)
+        s[row.ULO + q], s[row.UHI + q] = u_low, u_high
+        s[row.VLO + q], s[row.VHI + q] = v_low, v_high
+        s[row.X0 + q], s[row.Y0 + q] = fx * u[0], fy * v[0]
+        dx, dy = _pixels(x, z, u[0], fx), _pixels(y, z, v[0], fy)
+        # the Jacobian's clamped ratios
+        u = _clamped(u, u_low, u_high, left, right)
+        v = _clamped(v, v_low, v_high, top, bottom)
+        # w = R B, then n0 = w0 - u w2, n1 = w1 - v w2
+        b0, b1, b2 = s[row.B00 + q], s[row.B10 + q], s[row.B20 + q]
+        deep = _rotated(r2, b0, b1, b2, still, 0.0, 0.0)
+        s[row.DEEP0 + q] = size(deep) + deep[3]
+        n00 = _lowered(_rotated(r0, b0, b1, b2, still, 0.0, 0.0), u, deep)
+        n10 = _lowered(_rotated(r1, b0, b1, b2, still, 0.0, 0.0), v, deep)
+        b0, b1, b2 = s[row.B01 + q], s[row.B11 + q], s[row.B21 + q]
+        deep = _rotated(r2, b0, b1, b2, still, 0.0, 0.0)
+        s[row.DEEP1 + q] = size(deep) + deep[3]
+        n01 = _lowered(_rotated(r0, b0, b1, b2, still, 0.0, 0.0), u, deep)
+        n11 = _lowered(_rotated(r1, b0, b1, b2, still, 0.0, 0.0), v, deep)
+        b0, b1, b2 = s[row.B02 + q], s[row.B12 + q], s[row.B22 + q]
+        deep = _rotated(r2, b0, b1, b2, still, 0.0, 0.0)
+        s[row.DEEP2 + q] = size(deep) + deep[3]
+        n02 = _lowered(_rotated(r0, b0, b1, b2, still, 0.0, 0.0), u, deep)
+        n12 = _lowered(_rotated(r1, b0, b1, b2, still, 0.0, 0.0), v, deep)
+        # a' = fx^2 |n0|^2 + eps z^2, c' = fy^2 |n1|^2 + eps z^2, b' = fx fy n0.n1 (covariance times z^2)
+        z2 = multiplied(z, z)
+        n0 = _sum_of_products(n00, n00, n01, n01, n02, n02)
+        n1 = _sum_of_products(n10, n10, n11, n11, n12, n12)
+        b = scaled(_sum_of_products(n00, n10, n01, n11, n02, n12), fx * fy)
+        # det' = fx^2 fy^2 |n0 x n1|^2 + eps z^2 (fx^2 |n0|^2 + fy^2 |n1|^2) + eps^2 z^4, sums of squares only
+        k = combined(_crossed(n00, n01, n10, n11), 1.0, _crossed(n00, n02, n10, n12), 1.0)
+        k = scaled(combined(k, 1.0, _crossed(n01, n02, n11, n12), 1.0), (fx * fy) * (fx * fy))
+        blurred = combined(combined(n0, fx * fx, n1, fy * fy), eps2d, z2, eps2d * eps2d)
+        det = combined(k, 1.0, multiplied(blurred, z2), 1.0)
+        a = combined(n0, fx * fx, z2, eps2d)
+        c = combined(n1, fy * fy, z2, eps2d)
+        s[row.ALO + q], s[row.AHI + q] = ends(a)
+        s[row.CLO + q], s[row.CHI + q] = ends(c)
+        s[row.BLO + q], s[row.BHI + q] = ends(b)
+        s[row.DLO + q], s[row.DHI + q] = ends(det)
+        # (a' - c')/2, for the radius
+        s[row.LO + q], s[row.HI + q] = ends(combined(a, 0.5, c, -0.5))
+        # S' = 1/sqrt(c'), P' = sqrt(c'/det'), Q' = P' b'/c'
+        root = inverse_root(c)
+        along = multiplied(multiplied(c, root), inverse_root(det))
+        across = multiplied(along, multiplied(multiplied(b, root), root))
+        # P = P' z, Q = Q' z, S = S' z, W1 = P' X^ - Q' Y^, W2 = S' Y^
+        store(multiplied(along, z), s, row.FP, LANES, q)
+        store(multiplied(across, z), s, row.FQ, LANES, q)
+        store(multiplied(root, z), s, row.FS, LANES, q)
+        store(combined(multiplied(along, dx), 1.0, multiplied(across, dy), -1.0), s, row.FW1, LANES, q)
+        store(multiplied(root, dy), s, row.FW2, LANES, q)
+        store(k, s, row.FK, LANES, q)
+        store(det, s, row.FD, LANES, q)
+
+
+@njit(cache=True, error_model="numpy")
+def compensate_line(s, n, ratios, scratch, out):
+    """K = -log(compensation) into the rows FK, a lower bound of compensation^2 = |n0 x n1|^2 / det' into DISC.
+
+    ``ratios``, ``out`` [6, lanes] and ``scratch`` [5, lanes] are scratch: the logarithm is no vector code.
+    """
+    for q in range(n):
+        ratio = multiplied(load(s, row.FK, LANES, q), inverse(load(s, row.FD, LANES, q)))
+        s[row.DISC + q], _ = ends(ratio)
+        for r in range(4):
+            ratios[r, q] = ratio[r]
+        ratios[4, q] = abs(ratio[1])
+        ratios[5, q] = abs(ratio[2])
+    logarithm(ratios, scratch, out, 1, 2, 3)
+    for q in range(n):
+        store(scaled((out[0, q], out[1, q], out[2, q], out[3, q]), -0.5), s, row.FK, LANES, q)
