@@ -244,8 +244,8 @@ MUTANTS = (
     # Gaussians
     Mutant(
         "near plane is not uncertain", RECORDS,
-        "    if not (s[ZLOW + q] >= near * (1.0 + 4.0 * unit) and z_high < np.inf):",
-        "    if not (s[ZLOW + q] > 0.0 and z_high < np.inf):",
+        "front = (s[ZLOW + q] >= near * (1.0 + 4.0 * unit)) & (z_high < np.inf)",
+        "front = (s[ZLOW + q] > 0.0) & (z_high < np.inf)",
         "test_bounds.py::test_near_plane_alone[2]",
     ),
     Mutant(
@@ -266,8 +266,8 @@ MUTANTS = (
     ),
     Mutant(
         "tile cut-off by the smallest radius", RECORDS,
-        "tile_range(mean_x_low - radius_high - snap_x, mean_x_high + radius_high + snap_x, tile, tiles_x)",
-        "tile_range(mean_x_low - radius_low + 1.0, mean_x_high + radius_low - 1.0, tile, tiles_x)",
+        "left, right = mean_x_low - radius_high - snap_x, mean_x_high + radius_high + snap_x",
+        "left, right = mean_x_low - radius_low + 1.0, mean_x_high + radius_low - 1.0",
         "test_bounds.py::test_tile_cut[1]",
     ),
     Mutant(
@@ -328,7 +328,8 @@ MUTANTS = (
     ),
     Mutant(
         "region of pixels without the mean's range", RECORDS,
-        "    box[index, 1] = mean_x_high + extent_x", "    box[index, 1] = mean_x_low + extent_x",
+        "left, right = mean_x_low - extent_x, mean_x_high + extent_x",
+        "left, right = mean_x_low - extent_x, mean_x_low + extent_x",
         "test_bounds.py::test_alpha_threshold_of_all[2]",
     ),
     # pixels

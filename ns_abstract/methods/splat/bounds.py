@@ -15,7 +15,7 @@ from ns_abstract.methods.splat.constants import Rasteriser, rules_array
 from ns_abstract.methods.splat.gaussians import covariance_noise, gaussian_stage
 from ns_abstract.methods.splat.lists import depth_order, tile_lists
 from ns_abstract.methods.splat.pixels import pixel_stage
-from ns_abstract.methods.splat.records import FORMS
+from ns_abstract.methods.splat.records import FORMS, faint_exponents
 from ns_abstract.methods.splat.render import camera_array
 from ns_abstract.methods.splat.variations import VariedSplats
 from ns_abstract.sets.path import Camera
@@ -71,6 +71,7 @@ class SplatBounds:
         a = arithmetic
         self._errors = np.array([a.unit, a.flush, a.division, a.sqrt, a.rsqrt, a.exp, a.overflow])
         self._buffers: dict[str, np.ndarray] = {}
+        self._faint = faint_exponents(self.varied.opacity_high, self.rules[7], a.unit)
         self._noise = covariance_noise(splats.axes, a.unit, a.flush)
         self._color_radius = 8.0 * a.unit * float(np.abs(splats.sh).max(initial=1.0)) if splats.degree == 0 else 0.0
         self._plain_colors = _shifted_colors(self.varied, a.unit) if splats.degree == 0 else None
@@ -126,7 +127,7 @@ class SplatBounds:
         state = self._buffer("state", (n,), np.uint8)
         gaussian_stage(
             candidates, self.varied.mean_middle, splats.axes, self._noise,
-            self.varied.opacity_low, self.varied.opacity_high, self.varied.mean_radius,
+            self.varied.opacity_low, self.varied.opacity_high, self._faint, self.varied.mean_radius,
             rotation, offset, forms.origin, camera_reach, rotation_reach, view, self.rules, self._errors,
             d, order, m, splats.antialiased, record, box, tiles, depth, delta, depth_error, state,
         )  # fmt: skip

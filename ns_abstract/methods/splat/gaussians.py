@@ -32,15 +32,18 @@ from ns_abstract.methods.splat.line_projection import compensate_line, project_l
 from ns_abstract.methods.splat.records import (
     FAINT,
     FORMS,
+    KAPPA,
     LANES,
     MEAN_X,
     MEAN_Y,
+    OPACITY_HIGH,
+    OPACITY_LOW,
     REGION,
     WILD,
     coordinate_errors,
-    finish,
     float_errors,
     gather,
+    regions,
 )
 
 _CHUNK = 1024
@@ -143,7 +146,7 @@ def _clamp_ratio(a, low, high, limit_low, limit_high, other, d, order, m):
 
 @njit(cache=True, error_model="numpy")
 def _stage_chunk(
-    chunk, candidates_, means_, axes_, noise_, opacity_low_, opacity_high_, mean_radius_,
+    chunk, candidates_, means_, axes_, noise_, opacity_low_, opacity_high_, faint_, mean_radius_,
     rotation_, offset_, origin_, camera_reach_, rotation_reach_, camera_, rules_, errors_,
     d, order, m, antialiased,
     record_, box_, tiles_, depth_, delta_, depth_error_, state_,
@@ -155,6 +158,7 @@ def _stage_chunk(
     noise = borrowed(noise_)
     opacity_low = borrowed(opacity_low_)
     opacity_high = borrowed(opacity_high_)
+    faint = borrowed(faint_)
     mean_radius = borrowed(mean_radius_)
     rotation = borrowed(rotation_)
     offset = borrowed(offset_)
@@ -194,7 +198,7 @@ def _stage_chunk(
     for first in range(0, count, LANES):
         lanes = min(LANES, count - first)
         _project_block(
-            candidates, alive[first : first + lanes], means, axes, noise, opacity_low, opacity_high, mean_radius,
+            candidates, alive[first : first + lanes], means, axes, noise, opacity_low, opacity_high, faint, mean_radius,
             rotation, offset, origin, camera_reach, rotation_reach, camera, rules, errors,
             d, order, m, antialiased, work, table, s, scratch, record, box, tiles, depth, delta, depth_error, state,
         )  # fmt: skip
@@ -204,7 +208,7 @@ def _stage_chunk(
 
 @njit(cache=True, parallel=True, error_model="numpy")
 def gaussian_stage(
-    candidates, means, axes, noise, opacity_low, opacity_high, mean_radius,
+    candidates, means, axes, noise, opacity_low, opacity_high, faint, mean_radius,
     rotation, offset, origin, camera_reach, rotation_reach, camera, rules, errors,
     d, order, m, antialiased,
     record, box, tiles, depth, delta, depth_error, state,
@@ -216,6 +220,7 @@ def gaussian_stage(
         means, axes: [N, 3], [N, 3, 3] of the scene; means in the middle of their ranges.
         noise: [N, 12] see `covariance_noise`.
         opacity_low, opacity_high: [N] ends of the opacities' ranges.
+        faint: [N] see `records.faint_exponents`.
         mean_radius: [N, 3] half-widths of independent mean ranges, world axes, or [0, 3].
         rotation, offset: [rows, 9], [rows, 3] pose forms; see `PoseForms`.
         origin: [3].
@@ -230,7 +235,7 @@ def gaussian_stage(
     """
     for chunk in prange((candidates.shape[0] + _CHUNK - 1) // _CHUNK):
         _stage_chunk(
-            chunk, candidates, means, axes, noise, opacity_low, opacity_high, mean_radius,
+            chunk, candidates, means, axes, noise, opacity_low, opacity_high, faint, mean_radius,
             rotation, offset, origin, camera_reach, rotation_reach, camera, rules, errors,
             d, order, m, antialiased,
             record, box, tiles, depth, delta, depth_error, state,
@@ -296,7 +301,7 @@ def _cull_block(
             # a bound that is not a number keeps the Gaussian
             if farthest[q] + spread_z < near or nearest[q] - spread_z > far:
                 continue
-        # antialiased, rounding may raise it: see `finish`
+        # antialiased, rounding may raise it: see `regions`
         if not antialiased and opacity_high[i] * (1.0 + 64.0 * unit) < alpha_min:
             continue
         size = 0.0
@@ -344,7 +349,7 @@ def _linear_top(a, b, q, s, t, m):
 
 @njit(cache=True, error_model="numpy")
 def _project_block(
-    candidates, block, means, axes, noise, opacity_low, opacity_high, mean_radius,
+    candidates, block, means, axes, noise, opacity_low, opacity_high, faint, mean_radius,
     rotation, offset, origin, camera_reach, rotation_reach, camera, rules, errors,
     d, order, m, antialiased, work, table, s, scratch, record, box, tiles, depth, delta, depth_error, state,
 ):  # fmt: skip
@@ -353,7 +358,7 @@ def _project_block(
     # loops of a length that the compiler does not know become vector code
     n = table.shape[1]
     line = d == 1 and order == 2
-    gather(candidates, block, means, axes, noise, mean_radius, origin, s)
+    gather(candidates, block, means, axes, noise, mean_radius, opacity_low, opacity_high, faint, origin, s)
     coordinate_errors(s, n, rotation_reach, camera_reach, unit)
     if line:
         project_line(s, n, rotation, offset, camera, rules)
@@ -362,13 +367,15 @@ def _project_block(
     else:
         _project_forms(work, table, s, scratch, rotation, offset, camera, rules, d, order, m, antialiased)
     float_errors(s, n, rules, camera, errors, rotation_reach)
+    regions(s, n, rules, camera, errors, antialiased)
     stride = m + 1
+    count = 6 if antialiased else 5
     reach0, reach1, reach2 = rotation_reach[6], rotation_reach[7], rotation_reach[8]
     for q in range(block.shape[0]):
         index = block[q]
-        i = candidates[index]
-        record[index, MEAN_X] = s[row.X0 + q] + cx
-        record[index, MEAN_Y] = s[row.Y0 + q] + cy
+        if s[row.GONE + q] != 0.0:
+            state[index] = 0
+            continue
         depth[index] = s[row.Z0 + q]
         # G10: rounding of the depth against that of another Gaussian; what both share is in the slope, whose own
         # rounding is charged for the means in the middle of their ranges (S3), hence twice
@@ -382,15 +389,20 @@ def _project_block(
         )
         for k in range(3):
             delta[index, k] = s[row.V0 + k * LANES + q]
-        finish(
-            index, i, q, opacity_low, opacity_high, rules, camera, errors, stride, antialiased, s,
-            record, box, tiles, state,
-        )  # fmt: skip
-        if record[index, WILD] != 0.0:
+        for k in range(4):
+            box[index, k] = s[row.BOX0 + k * LANES + q]
+        for k in range(8):
+            tiles[index, k] = int(s[row.T0 + k * LANES + q])
+        record[index, MEAN_X] = s[row.X0 + q] + cx
+        record[index, MEAN_Y] = s[row.Y0 + q] + cy
+        record[index, OPACITY_LOW] = s[row.LOWER + q]
+        record[index, OPACITY_HIGH] = s[row.UPPER + q]
+        record[index, KAPPA] = s[row.BEND + q]
+        record[index, FAINT] = s[row.LAST + q]
+        record[index, WILD] = 1.0 - s[row.KNOWN + q]
+        if s[row.KNOWN + q] == 0.0:
             continue
-        # `finish` left the float error of the mean, in units of y, in the radius of W1
-        error = record[index, FORMS + 4 * stride - 1]
-        count = 6 if antialiased else 5
+        total = 0.0
         for f in range(count):
             start = FORMS + f * stride
             if line:
@@ -400,12 +412,14 @@ def _project_block(
                 form = work[_K if f == 5 else _FORMS + f]
                 for k in range(stride):
                     record[index, start + k] = form[k, q]
-        record[index, FORMS + 4 * stride - 1] += error
-        record[index, FORMS + 5 * stride - 1] += error
-        for k in range(FORMS, FORMS + count * stride):
-            if not math.isfinite(record[index, k]):
-                record[index, WILD] = 1.0
-                record[index, FAINT] = -1.0
+            for k in range(stride):
+                total += abs(record[index, start + k])
+        # float error of the mean, in units of y
+        record[index, FORMS + 4 * stride - 1] += s[row.EW + q]
+        record[index, FORMS + 5 * stride - 1] += s[row.EW + q]
+        if not math.isfinite(total + s[row.EW + q]):
+            record[index, WILD] = 1.0
+            record[index, FAINT] = -1.0
 
 
 @njit(cache=True, error_model="numpy")

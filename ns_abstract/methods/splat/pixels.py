@@ -1148,8 +1148,8 @@ def _blend(
             group, group_ends[0], group_ends[1], group_ends[2], value, s,
         )  # fmt: skip
         for q in range(n):
-            s[_DARKEST + some[q]] = s[_MIN + q]
-            s[_BRIGHTEST + some[q]] = s[_MAX + q]
+            s[_DARKEST + int(some[q])] = s[_MIN + q]
+            s[_BRIGHTEST + int(some[q])] = s[_MAX + q]
         for channel in range(3):
             for k in range(m):
                 for q in range(n):
@@ -1281,8 +1281,8 @@ def _blend_line(
                         t[_PHI + q] += lift
                         t[_PLO + q] -= lower
         for q in range(n):
-            s[_DARKEST + ranked[first + q]] = s[_MIN + q]
-            s[_BRIGHTEST + ranked[first + q]] = s[_MAX + q]
+            s[_DARKEST + int(ranked[first + q])] = s[_MIN + q]
+            s[_BRIGHTEST + int(ranked[first + q])] = s[_MAX + q]
         for channel in range(3):
             t = red if channel == 0 else (green if channel == 1 else blue)
             for q in range(n):

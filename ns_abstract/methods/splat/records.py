@@ -16,8 +16,6 @@ so that for a pixel at offset (ax, ay) from the mean
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 from numba import njit
 
@@ -26,6 +24,8 @@ from ns_abstract.arithmetic.units import UNIT64
 #: Lanes of one block of the compiled stage.
 LANES = 32
 _UP = 1.0 + 128.0 * UNIT64
+#: Rounding of the opacity in units: a sigmoid is two exponentials or divisions and an addition.
+_SIGMOID = 12.0
 #: Room for rounding where a region of pixels or tiles is computed from bounds.
 REGION = 1.0 + 2.0**-30
 
@@ -34,13 +34,15 @@ MEAN_X, MEAN_Y, OPACITY_LOW, OPACITY_HIGH, KAPPA, WILD, FAINT, FORMS = range(8)
 
 # Scratch of a block is flat: row r holds its lanes at r * LANES .. r * LANES + LANES - 1. With constant offsets the
 # compiler sees that rows do not overlap, so that long loops over lanes become vector code.
-ROWS = 103
+ROWS = 124
 (
-    # means minus origin; principal axes, column by column; float error of their covariance; |mean| and half-width
+    # means minus origin; principal axes by column; float error of their covariance; |mean|, half-width of its range
     V0, V1, V2,
     B00, B10, B20, B01, B11, B21, B02, B12, B22,
     N0, N1, N2, N3, N4, N5, N6, N7, N8, N9, N10, N11,
     M0, M1, M2, R0, R1, R2,
+    # ends of the opacity's range, exponent at which it reaches the threshold
+    OPLOW, OPHIGH, OPFAINT,
     # bounds that the projection leaves: depth, ratios, scaled covariance entries, determinant, half difference,
     # squared compensation, reach of the third row of rotation times axes
     ZLO, ZHI, ULO, UHI, VLO, VHI, ALO, AHI, CLO, CHI, BLO, BHI, DLO, DHI, LO, HI, DISC, DEEP0, DEEP1, DEEP2,
@@ -50,14 +52,16 @@ ROWS = 103
     EX, EY, EZ, SX, SY, SZ,
     # what `float_errors` leaves
     ZLOW, ZHIGH, MXLO, MXHI, MYLO, MYHI, A, C, DET, EDET, SHARP, RHIGH, RLOW, ETA, EW, TAME,
+    # what `regions` leaves: state, columns of the record, box and tiles
+    GONE, KNOWN, LOWER, UPPER, BEND, LAST, BOX0, BOX1, BOX2, BOX3, T0, T1, T2, T3, T4, T5, T6, T7,
     # forms of one parameter, four rows each: those of a record and the determinant
     FP, FQ, FS, FW1, FW2, FK, FD,
-) = (*range(0, 75 * LANES, LANES), *range(75 * LANES, ROWS * LANES, 4 * LANES))  # fmt: skip
+) = (*range(0, 96 * LANES, LANES), *range(96 * LANES, 124 * LANES, 4 * LANES))  # fmt: skip
 
 
 @njit(cache=True, error_model="numpy")
-def gather(candidates, block, means, axes, noise, mean_radius, origin, s):
-    """Copy what the Gaussians ``block`` are made of into the rows V0 .. R2; lanes in excess repeat the last one."""
+def gather(candidates, block, means, axes, noise, mean_radius, opacity_low, opacity_high, faint, origin, s):
+    """Copy what the Gaussians ``block`` are made of to the rows V0 .. OPFAINT; lanes in excess repeat the last one."""
     lanes = block.shape[0]
     for q in range(LANES):
         i = candidates[block[min(q, lanes - 1)]]
@@ -70,6 +74,9 @@ def gather(candidates, block, means, axes, noise, mean_radius, origin, s):
                 s[B00 + (3 * column + k) * LANES + q] = axes[i, k, column]
         for k in range(12):
             s[N0 + k * LANES + q] = noise[i, k]
+        s[OPLOW + q] = opacity_low[i]
+        s[OPHIGH + q] = opacity_high[i]
+        s[OPFAINT + q] = faint[i]
 
 
 @njit(cache=True, error_model="numpy")
@@ -93,7 +100,7 @@ def coordinate_errors(s, n, rotation_reach, camera_reach, unit):
 def float_errors(s, n, rules, camera, errors, rotation_reach):
     """Float errors of mean, covariance and exponent, and the radius' range (design.md, G5-G8): rows ZLOW .. TAME.
 
-    Numbers of Gaussians that may come too near are of no use; `finish` does not look at them.
+    Numbers of Gaussians that may come too near are of no use; `regions` does not look at them.
     """
     sigmas, discriminant_min, margin = rules[4], rules[5], rules[6]
     fx, fy, cx, cy, width, height = camera[0], camera[1], camera[2], camera[3], camera[4], camera[5]
@@ -169,9 +176,9 @@ def float_errors(s, n, rules, camera, errors, rotation_reach):
         det = s[DLO + q] / (z2_high * z2_high)
         jump_x = jx * error_u
         jump_y = jy * error_v
-        deep = math.sqrt(depth_variance)
-        root_a = math.sqrt(a)
-        root_c = math.sqrt(c)
+        deep = np.sqrt(depth_variance)
+        root_a = np.sqrt(a)
+        root_c = np.sqrt(c)
         error_a = (
             error_a + 2.0 * jump_x * deep * root_a + jump_x * jump_x * depth_variance + 2.0 * unit * a
         ) * 1.01
@@ -197,11 +204,11 @@ def float_errors(s, n, rules, camera, errors, rotation_reach):
         )
         disc_high = max(discriminant_min, difference * difference + b * b + error_disc)
         disc_low = max(discriminant_min, nearest * nearest + b_nearest * b_nearest - error_disc)
-        top_high = (half_high + error_half + math.sqrt(disc_high)) * (1.0 + 2.0 * root * unit)
-        top_low = max(0.0, half_low - error_half + math.sqrt(disc_low)) * (1.0 - 2.0 * root * unit)
+        top_high = (half_high + error_half + np.sqrt(disc_high)) * (1.0 + 2.0 * root * unit)
+        top_low = max(0.0, half_low - error_half + np.sqrt(disc_low)) * (1.0 - 2.0 * root * unit)
         # np.ceil: math.ceil is an int64, which a huge Gaussian overflows
-        s[RHIGH + q] = np.ceil(sigmas * math.sqrt(top_high) * (1.0 + 2.0 * root * unit) * REGION)
-        s[RLOW + q] = np.ceil(sigmas * math.sqrt(top_low) * (1.0 - 2.0 * root * unit) / REGION)
+        s[RHIGH + q] = np.ceil(sigmas * np.sqrt(top_high) * (1.0 + 2.0 * root * unit) * REGION)
+        s[RLOW + q] = np.ceil(sigmas * np.sqrt(top_low) * (1.0 - 2.0 * root * unit) / REGION)
         # what is not finite, or not a number, in any of them is not so in the sum
         s[TAME + q] = a + c + error_a + error_b + error_c
         s[A + q] = a
@@ -214,150 +221,114 @@ def float_errors(s, n, rules, camera, errors, rotation_reach):
             (c * error_a + 2.0 * (root_a * root_c) * error_b + a * error_c) / det + 80.0 * unit * (a * c) / det
         ) * 1.01
         # float error of the mean, in units of y
-        s[EW + q] = (math.sqrt(c / det) * error_mean_x + math.sqrt(a / det) * error_mean_y) * 1.01
+        s[EW + q] = (np.sqrt(c / det) * error_mean_x + np.sqrt(a / det) * error_mean_y) * 1.01
+
+
+def faint_exponents(opacity_high: np.ndarray, alpha_min: float, unit: float) -> np.ndarray:
+    """Exponents [N] from which on opacities [N] leave less than ``alpha_min``, however they are evaluated (B4)."""
+    with np.errstate(divide="ignore"):
+        exponent = np.log(opacity_high * (1.0 + _SIGMOID * unit) * (1.0 + 64.0 * unit) / alpha_min)
+    # room for the rounding of the exponential, which grows more slowly than the exponent's own error
+    return exponent * REGION + 2.0**-30
+
+
+@njit(cache=True, error_model="numpy", inline="always")
+def _within(x, most):
+    return min(max(x, 0.0), most)
 
 
 @njit(cache=True, error_model="numpy")
-def tile_range(low, high, size, count):
-    """Tiles [first, past) that the interval of pixels [low, high] touches, clipped to the image."""
-    first = math.floor(min(max(low / size, 0.0), float(count)))
-    past = math.ceil(min(max(high / size, 0.0), float(count)))
-    return int(first), int(past)
+def regions(s, n, rules, camera, errors, antialiased):
+    """What is known of each Gaussian, from the rows of `float_errors` (design.md, G5-G9): rows GONE .. T7.
 
-
-@njit(cache=True, error_model="numpy")
-def finish(
-    index, i, q, opacity_low, opacity_high, rules, camera, errors, stride, antialiased, s, record, box, tiles, state,
-):  # fmt: skip
-    """Decide from the rows of `float_errors` what is known of one Gaussian (design.md, G5-G9).
-
-    Writes the record but for its forms, of which it leaves what the radii of W1 and W2 have to be widened by in the
-    radius of W1, its pixel region ``box`` and its ranges of ``tiles``; ``state`` becomes 0 where no pose shows it.
+    GONE is 1 where no pose shows it, KNOWN where its forms may be relied on. The others may cover every pixel.
     """
-    near, tile, alpha_min, work_tile = rules[0], rules[3], rules[7], rules[10]
+    near, far, tile, alpha_min, work_tile = rules[0], rules[1], rules[3], rules[7], rules[10]
     width, height = camera[4], camera[5]
     unit, division, root, overflow = errors[0], errors[2], errors[3], errors[6]
-    spread = FORMS + 4 * stride - 1
-    record[index, spread] = 0.0
-    record[index, KAPPA] = 0.0
-    record[index, WILD] = 1.0
-    record[index, FAINT] = -1.0
-    # sigmoid: two exponentials or divisions and an addition
-    slack = 12.0 * unit
-    record[index, OPACITY_LOW] = opacity_low[i] * (1.0 - slack)
+    cut = tile > 0.0
+    side = tile if cut else work_tile
+    across, down = np.ceil(width / side), np.ceil(height / side)
     # the compensation's own division and root
-    above = 1.0 + (0.5 * division + root + 2.0) * unit if antialiased else 1.0
-    opacity = opacity_high[i] * (1.0 + slack) * above
-    # det0/det exceeds 1 where rounding lowers det: nothing is known before its error is
-    record[index, OPACITY_HIGH] = 1.0 if antialiased else opacity
-    tiles_x = int(math.ceil(width / (tile if tile > 0.0 else work_tile)))
-    tiles_y = int(math.ceil(height / (tile if tile > 0.0 else work_tile)))
-    box[index, 0] = -np.inf
-    box[index, 1] = np.inf
-    box[index, 2] = -np.inf
-    box[index, 3] = np.inf
-    tiles[index, 0] = 0
-    tiles[index, 1] = tiles_x
-    tiles[index, 2] = 0
-    tiles[index, 3] = tiles_y
-    for k in range(4, 8):
-        tiles[index, k] = 0
-    z_high = s[ZHIGH + q]
-    if not (s[ZLOW + q] >= near * (1.0 + 4.0 * unit) and z_high < np.inf):
-        return
-    a, c = s[A + q], s[C + q]
-    # products of covariances that may overflow leave nothing known
-    if not (a * c < overflow and s[TAME + q] < np.inf):
-        return
-    mean_x_low, mean_x_high, mean_y_low, mean_y_high = s[MXLO + q], s[MXHI + q], s[MYLO + q], s[MYHI + q]
-    if tile > 0.0:
+    above = (0.5 * division + root + 2.0) * unit if antialiased else 0.0
+    for q in range(n):
+        a, c, det, error_det = s[A + q], s[C + q], s[DET + q], s[EDET + q]
+        mean_x_low, mean_x_high, mean_y_low, mean_y_high = s[MXLO + q], s[MXHI + q], s[MYLO + q], s[MYHI + q]
+        z_high = s[ZHIGH + q]
+        # in front of the camera; products of covariances that may overflow leave nothing known
+        front = (s[ZLOW + q] >= near * (1.0 + 4.0 * unit)) & (z_high < np.inf)
+        front = front & (a * c < overflow) & (s[TAME + q] < np.inf)
         radius_high, radius_low = s[RHIGH + q], s[RLOW + q]
         snap_x = 8.0 * unit * (abs(mean_x_low) + abs(mean_x_high) + radius_high)
         snap_y = 8.0 * unit * (abs(mean_y_low) + abs(mean_y_high) + radius_high)
+        left, right = mean_x_low - radius_high - snap_x, mean_x_high + radius_high + snap_x
+        top, bottom = mean_y_low - radius_high - snap_y, mean_y_high + radius_high + snap_y
+        # a place that is not finite is no number in some of these
+        placed = front & (right - left < np.inf) & (bottom - top < np.inf)
+        bounded = placed & cut
         # image-border culls of fully_fused_projection_fwd.cu:171-180
-        if (
-            mean_x_high + radius_high + snap_x <= 0.0
-            or mean_x_low - radius_high - snap_x >= width
-            or mean_y_high + radius_high + snap_y <= 0.0
-            or mean_y_low - radius_high - snap_y >= height
-        ):
-            state[index] = 0
-            return
-        x0, x1 = tile_range(mean_x_low - radius_high - snap_x, mean_x_high + radius_high + snap_x, tile, tiles_x)
-        y0, y1 = tile_range(mean_y_low - radius_high - snap_y, mean_y_high + radius_high + snap_y, tile, tiles_y)
-        tiles[index, 0] = x0
-        tiles[index, 1] = x1
-        tiles[index, 2] = y0
-        tiles[index, 3] = y1
+        gone = bounded & ((right <= 0.0) | (left >= width) | (bottom <= 0.0) | (top >= height))
+        s[T0 + q] = np.floor(_within(left / side, across)) if bounded else 0.0
+        s[T1 + q] = np.ceil(_within(right / side, across)) if bounded else across
+        s[T2 + q] = np.floor(_within(top / side, down)) if bounded else 0.0
+        s[T3 + q] = np.ceil(_within(bottom / side, down)) if bounded else down
         # surely hit: the tile range of every mean and radius contains it
-        if (
-            mean_x_high - radius_low + snap_x < width
-            and mean_y_high - radius_low + snap_y < height
-            and mean_x_low + radius_low - snap_x > 0.0
-            and mean_y_low + radius_low - snap_y > 0.0
-        ):
-            x0, x1 = tile_range(mean_x_high - radius_low + snap_x, mean_x_low + radius_low - snap_x, tile, tiles_x)
-            y0, y1 = tile_range(mean_y_high - radius_low + snap_y, mean_y_low + radius_low - snap_y, tile, tiles_y)
-            tiles[index, 4] = x0
-            tiles[index, 5] = x1
-            tiles[index, 6] = y0
-            tiles[index, 7] = y1
-    else:
-        tiles[index, 4] = 0
-        tiles[index, 5] = tiles_x
-        tiles[index, 6] = 0
-        tiles[index, 7] = tiles_y
-    if z_high > rules[1]:
-        tiles[index, 5] = tiles[index, 4]
-    # G7: relative error of the exponent
-    det, error_det = s[DET + q], s[EDET + q]
-    if not (det > 0.0 and error_det < 0.5 * det):
-        return
-    if antialiased:
-        # compensation_fl^2 <= (det + e0)/(det - e), which falls in det
-        excess = math.sqrt((1.0 + s[SHARP + q]) / (1.0 - error_det / det)) * REGION
-        record[index, OPACITY_HIGH] = min(1.0, opacity * excess)
-        if record[index, OPACITY_HIGH] * (1.0 + 64.0 * unit) < alpha_min:
-            state[index] = 0
-            return
-    kappa = s[ETA + q]
-    if not kappa < 0.25:
-        return
-    kappa = kappa * (1.0 + 4.0 * kappa)
-    if antialiased:
-        # compensation_fl^2 = max(0, (det0 + e)/(det + e))
-        sharp, ratio_low = s[SHARP + q], s[DISC + q]
-        relative = sharp / ratio_low + sharp + (division + 2.0) * unit if ratio_low > 0.0 else np.inf
-        if not (relative < 0.25):
-            # the compensation may vanish
-            return
-        compensation_slack = 0.51 * relative * (1.0 + relative) + (root + 1.0) * unit
-        record[index, OPACITY_LOW] *= 1.0 - compensation_slack
-        record[index, OPACITY_HIGH] = opacity * (1.0 + compensation_slack)
-    record[index, KAPPA] = kappa
-    record[index, WILD] = 0.0
-    record[index, spread] = s[EW + q]
-    # room for the rounding of the exponential, which grows more slowly than the exponent's own error
-    exponent = math.log(record[index, OPACITY_HIGH] * (1.0 + 64.0 * unit) / alpha_min) * REGION + 2.0**-30
-    if exponent < 0.0:
-        state[index] = 0
-        return
-    exponent /= 1.0 - kappa
-    record[index, FAINT] = exponent
-    # pixels where alpha may reach the threshold
-    extent_x = math.sqrt(2.0 * exponent * a) * REGION
-    extent_y = math.sqrt(2.0 * exponent * c) * REGION
-    box[index, 0] = mean_x_low - extent_x
-    box[index, 1] = mean_x_high + extent_x
-    box[index, 2] = mean_y_low - extent_y
-    box[index, 3] = mean_y_high + extent_y
-    # no pixel centre inside
-    if box[index, 1] < 0.5 or box[index, 0] > width - 0.5 or box[index, 3] < 0.5 or box[index, 2] > height - 0.5:
-        state[index] = 0
-        return
-    # tiles without such pixels need not look at it
-    side = tile if tile > 0.0 else work_tile
-    tiles[index, 0] = max(tiles[index, 0], int(math.floor(max(box[index, 0] - 0.5, 0.0) / side)))
-    tiles[index, 1] = min(tiles[index, 1], int(math.floor(min(box[index, 1] - 0.5, width) / side)) + 1)
-    tiles[index, 2] = max(tiles[index, 2], int(math.floor(max(box[index, 2] - 0.5, 0.0) / side)))
-    tiles[index, 3] = min(tiles[index, 3], int(math.floor(min(box[index, 3] - 0.5, height) / side)) + 1)
+        left, right = mean_x_high - radius_low + snap_x, mean_x_low + radius_low - snap_x
+        top, bottom = mean_y_high - radius_low + snap_y, mean_y_low + radius_low - snap_y
+        sure = bounded & (left < width) & (top < height) & (right > 0.0) & (bottom > 0.0)
+        whole = front & (not cut)
+        s[T4 + q] = np.floor(_within(left / side, across)) if sure else 0.0
+        last = np.ceil(_within(right / side, across)) if sure else (across if whole else 0.0)
+        s[T5 + q] = s[T4 + q] if z_high > far else last
+        s[T6 + q] = np.floor(_within(top / side, down)) if sure else 0.0
+        s[T7 + q] = np.ceil(_within(bottom / side, down)) if sure else (down if whole else 0.0)
+        # G7: relative error of the exponent
+        sharp_enough = front & (det > 0.0) & (error_det < 0.5 * det)
+        kappa = s[ETA + q]
+        known = placed & sharp_enough & (kappa < 0.25)
+        kappa = kappa * (1.0 + 4.0 * kappa)
+        # sigmoid: two exponentials or divisions and an addition
+        lower = s[OPLOW + q] * (1.0 - _SIGMOID * unit)
+        opacity = s[OPHIGH + q] * (1.0 + _SIGMOID * unit) * (1.0 + above)
+        upper = opacity
+        faint = s[OPFAINT + q]
+        if antialiased:
+            # det0/det exceeds 1 where rounding lowers det: nothing is known before its error is.
+            # compensation_fl^2 <= (det + e0)/(det - e), which falls in det
+            excess = np.sqrt((1.0 + s[SHARP + q]) / (1.0 - error_det / det)) * REGION
+            upper = min(1.0, opacity * excess) if sharp_enough else 1.0
+            gone = gone | (sharp_enough & (upper * (1.0 + 64.0 * unit) < alpha_min))
+            # compensation_fl^2 = max(0, (det0 + e)/(det + e)) may vanish
+            ratio_low = s[DISC + q]
+            relative = s[SHARP + q] / ratio_low + s[SHARP + q] + (division + 2.0) * unit
+            known = known & (ratio_low > 0.0) & (relative < 0.25)
+            slack = 0.51 * relative * (1.0 + relative) + (root + 1.0) * unit
+            lower = lower * (1.0 - slack) if known else lower
+            upper = opacity * (1.0 + slack) if known else upper
+            faint = (faint + (above + slack) * REGION) if known else faint
+        s[LOWER + q] = lower
+        s[UPPER + q] = upper
+        s[BEND + q] = kappa if known else 0.0
+        # pixels where alpha may reach the threshold
+        gone = gone | (known & (faint < 0.0))
+        faint = faint / (1.0 - kappa)
+        s[LAST + q] = faint if known else -1.0
+        extent_x = np.sqrt(2.0 * faint * a) * REGION
+        extent_y = np.sqrt(2.0 * faint * c) * REGION
+        left, right = mean_x_low - extent_x, mean_x_high + extent_x
+        top, bottom = mean_y_low - extent_y, mean_y_high + extent_y
+        # no pixel centre inside
+        gone = gone | (
+            known & ((right < 0.5) | (left > width - 0.5) | (bottom < 0.5) | (top > height - 0.5))
+        )
+        s[BOX0 + q] = left if known else -np.inf
+        s[BOX1 + q] = right if known else np.inf
+        s[BOX2 + q] = top if known else -np.inf
+        s[BOX3 + q] = bottom if known else np.inf
+        # tiles without such pixels need not look at it
+        s[T0 + q] = max(s[T0 + q], np.floor(max(left - 0.5, 0.0) / side)) if known else s[T0 + q]
+        s[T1 + q] = min(s[T1 + q], np.floor(min(right - 0.5, width) / side) + 1.0) if known else s[T1 + q]
+        s[T2 + q] = max(s[T2 + q], np.floor(max(top - 0.5, 0.0) / side)) if known else s[T2 + q]
+        s[T3 + q] = min(s[T3 + q], np.floor(min(bottom - 0.5, height) / side) + 1.0) if known else s[T3 + q]
+        s[GONE + q] = 1.0 if gone else 0.0
+        s[KNOWN + q] = 1.0 if known else 0.0
