@@ -10,7 +10,7 @@ from numba import get_num_threads
 from ns_abstract.arithmetic.forms import Basis
 from ns_abstract.arithmetic.units import UNIT64, Arithmetic
 from ns_abstract.methods.splat.activate import Splats
-from ns_abstract.methods.splat.colors import BASIS_SIZE, BASIS_SLOPE, fixed_colors, moving_colors
+from ns_abstract.methods.splat.colors import color_reach, fixed_colors, moving_colors
 from ns_abstract.methods.splat.constants import Rasteriser, rules_array
 from ns_abstract.methods.splat.gaussians import covariance_noise, gaussian_stage
 from ns_abstract.methods.splat.lists import depth_order, tile_lists
@@ -74,6 +74,7 @@ class SplatBounds:
         self._faint = faint_exponents(self.varied.opacity_high, self.rules[7], a.unit)
         self._noise = covariance_noise(splats.axes, a.unit, a.flush)
         self._color_radius = 8.0 * a.unit * float(np.abs(splats.sh).max(initial=1.0)) if splats.degree == 0 else 0.0
+        self._color_reach = color_reach(splats.sh, splats.degree)
         self._plain_colors = _shifted_colors(self.varied, a.unit) if splats.degree == 0 else None
 
     def _buffer(self, name: str, shape: tuple[int, ...], dtype: type = np.float64) -> np.ndarray:
@@ -178,15 +179,14 @@ class SplatBounds:
             position_error += 2.0 * float(forms.position.radius.max())
             fixed_colors(
                 indices, varied.mean_middle, varied.mean_radius, varied.color_low, varied.color_high,
-                splats.sh, splats.degree, forms.position.center, position_error, unit,
-                BASIS_SIZE, BASIS_SLOPE, colors,
+                splats.sh, self._color_reach, splats.degree, forms.position.center, position_error, unit, colors,
             )  # fmt: skip
             return colors
         colors = self._buffer("colors", (n, 3 * (basis.monomials + 1)))
         moving_colors(
             indices, varied.mean_middle, varied.mean_radius, varied.color_low, varied.color_high,
-            splats.sh, splats.degree, forms.position.data, forms.origin, position_error, unit,
-            BASIS_SIZE, BASIS_SLOPE, basis.dimensions, basis.order, basis.monomials, colors,
+            splats.sh, self._color_reach, splats.degree, forms.position.data, forms.origin, position_error, unit,
+            basis.dimensions, basis.order, basis.monomials, colors,
         )  # fmt: skip
         return colors
 

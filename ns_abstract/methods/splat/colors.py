@@ -26,16 +26,27 @@ _UP = 1.0 + 128.0 * UNIT64
 _CHUNK = 1024
 
 #: Largest change of each basis function per unit change of the direction, rounded up.
-BASIS_SLOPE = np.array(
+_SLOPE = np.array(
     [0.0]
     + [0.489] * 3
     + [1.093, 1.093, 1.893, 1.093, 1.093]
     + [1.771, 2.891, 3.2, 3.8, 3.2, 2.891, 1.771]
 )
 #: Largest absolute value of each basis function, rounded up.
-BASIS_SIZE = np.array(
+_SIZE = np.array(
     [0.283] + [0.489] * 3 + [0.547, 0.547, 0.631, 0.547, 0.547] + [0.591, 0.557, 0.64, 0.747, 0.64, 0.557, 0.591]
 )
+
+
+def color_reach(sh: np.ndarray, degree: int) -> np.ndarray:
+    """[N, 6] by channel: most that ``sh`` [N, K, 3] can add up to, and most that it changes by with the direction."""
+    reach = np.zeros((sh.shape[0], 6))
+    for k in range((degree + 1) * (degree + 1)):
+        sizes = np.abs(sh[:, k])
+        reach[:, :3] += _SIZE[k] * sizes
+        reach[:, 3:] += _SLOPE[k] * sizes
+    # rounding of the sums
+    return reach * (1.0 + 2.0**-40)
 
 
 @njit(cache=True, error_model="numpy")
@@ -83,13 +94,9 @@ def sh_color(sh, direction, degree, basis, out):
 
 
 @njit(cache=True, error_model="numpy")
-def _color_error(sh, i, channel, count, unit, direction_error, sizes, slopes):
-    """Float error of one colour (design.md, C3)."""
-    error = unit
-    for k in range(count):
-        size = abs(sh[i, k, channel])
-        error += size * (40.0 * unit * sizes[k] + direction_error * slopes[k])
-    return error
+def _color_error(size, change, unit, direction_error):
+    """Float error of one colour, see `color_reach` (design.md, C3)."""
+    return unit + 40.0 * unit * size + direction_error * change
 
 
 @njit(cache=True, error_model="numpy")
@@ -113,8 +120,7 @@ def _direction_error(length, position_error, means, mean_radius, i, unit):
 
 @njit(cache=True, parallel=True, error_model="numpy")
 def fixed_colors(
-    indices, means, mean_radius, color_low, color_high, sh, degree, position, position_error, unit, sizes, slopes,
-    colors,
+    indices, means, mean_radius, color_low, color_high, sh, reach, degree, position, position_error, unit, colors,
 ):  # fmt: skip
     """Colours seen from one camera position: centre and radius by Gaussian (design.md, C1, C3, S4).
 
@@ -123,9 +129,9 @@ def fixed_colors(
             Gaussian's number in the scene in the second column: [n, 2].
         mean_radius: [N, 3] or [0, 3]; see `gaussians.gaussian_stage`.
         color_low, color_high: [N, 3] ranges of what is added to the colours, or [0, 3].
+        reach: [N, 6] see `color_reach`.
         position: [3]; ``position_error`` bounds what float evaluation and the set add to it.
     """
-    count = (degree + 1) * (degree + 1)
     for chunk in prange((indices.shape[0] + _CHUNK - 1) // _CHUNK):
         basis = np.empty(16)
         color = np.empty(3)
@@ -139,7 +145,7 @@ def fixed_colors(
             sh_color(sh[i], direction, degree, basis, color)
             error = _direction_error(length, position_error, means, mean_radius, i, unit)
             for c in range(3):
-                radius = _color_error(sh, i, c, count, unit, error, sizes, slopes)
+                radius = _color_error(reach[i, c], reach[i, 3 + c], unit, error)
                 if color_low.shape[0] > 0 and (color_low[i, c] != 0.0 or color_high[i, c] != 0.0):
                     rounding = 4.0 * unit * (color[c] + radius + max(abs(color_low[i, c]), abs(color_high[i, c])))
                     low = max(0.0, max(0.0, color[c] - radius) + color_low[i, c] - rounding)
@@ -192,14 +198,14 @@ def _directions(work, scratch, low, high, degree, d, order, m):
 
 @njit(cache=True, parallel=True, error_model="numpy")
 def moving_colors(
-    indices, means, mean_radius, color_low, color_high, sh, degree, position, origin, position_error, unit,
-    sizes, slopes, d, order, m, colors,
+    indices, means, mean_radius, color_low, color_high, sh, reach, degree, position, origin, position_error, unit,
+    d, order, m, colors,
 ):  # fmt: skip
     """Colours over a cell in which the camera moves, as forms (design.md, C2, C3, S4).
 
     Args:
         indices: [n, 2] row of ``colors`` and number of the Gaussian in the scene.
-        mean_radius, color_low, color_high: See `fixed_colors`.
+        mean_radius, color_low, color_high, reach: See `fixed_colors`.
         position: [rows, 3] forms of the camera position, centred at ``origin`` [3].
         position_error: Bound of the float error of the camera position.
         colors: [., 3 (m + 1)] output: coefficients and radius by channel.
@@ -212,7 +218,7 @@ def moving_colors(
         work_ = np.empty((19, m + 3, LANES))
         ends_ = np.empty((9, LANES))
         work, scratch = borrowed(work_), borrowed(ends_[:5])
-        weights, low, high, distance = borrowed(ends_[5]), borrowed(ends_[6]), borrowed(ends_[7]), borrowed(ends_[8])
+        weights, low, high, angle = borrowed(ends_[5]), borrowed(ends_[6]), borrowed(ends_[7]), borrowed(ends_[8])
         s = borrowed(work_.reshape(-1))
         line = d == 1 and order == 2
         for first in range(chunk * _CHUNK, min(n, (chunk + 1) * _CHUNK), LANES):
@@ -235,7 +241,9 @@ def moving_colors(
             else:
                 _directions(work, scratch, low, high, degree, d, order, m)
             for q in range(LANES):
-                distance[q] = math.sqrt(low[q]) * (1.0 - _COEFFICIENT) if low[q] > 0.0 else 0.0
+                i = indices[first + min(q, lanes - 1), 1]
+                distance = math.sqrt(low[q]) * (1.0 - _COEFFICIENT) if low[q] > 0.0 else 0.0
+                angle[q] = _direction_error(distance, position_error, means, mean_radius, i, unit)
             for channel in range(3):
                 form = work[16 + channel]
                 for k in range(m + 3):
@@ -262,17 +270,14 @@ def moving_colors(
                 settle(form, d, order, m)
                 for q in range(LANES):
                     i = indices[first + min(q, lanes - 1), 1]
-                    error = _direction_error(distance[q], position_error, means, mean_radius, i, unit)
-                    size = 0.0
-                    for k in range(count):
-                        size += abs(sh[i, k, channel]) * sizes[k]
-                    form[m, q] += _color_error(sh, i, channel, count, unit, error, sizes, slopes)
+                    size, change = reach[i, channel], reach[i, 3 + channel]
+                    form[m, q] += _color_error(size, change, unit, angle[q])
                     # a camera that may stand in the Gaussian's centre: any direction
                     if not form[m, q] + form[m + 1, q] + form[m + 2, q] <= 2.0 * size + 1.0:
                         for r in range(1, m + 3):
                             form[r, q] = 0.0
                         form[0, q] = 0.5
-                        form[m, q] = size * 1.01 + _color_error(sh, i, channel, count, unit, 2.0, sizes, slopes)
+                        form[m, q] = size * 1.01 + _color_error(size, change, unit, 2.0)
                 bounds(form, low, high, d, order, m)
                 clamp_below(form, 0.0, low, high, d, order, m)
                 if color_low.shape[0] > 0:
