@@ -95,8 +95,10 @@ def _alpha_forms(record, i, n, s, y1, y2, poly, sigma_max, d, order, m, antialia
     line = d == 1 and order == 2
     if line:
         _exponent_line(record, i, n, s, antialiased)
+    elif order == 1:
+        _exponent_affine(record, i, n, s, poly, m, antialiased)
     else:
-        _exponent(record, i, n, s, y1, y2, poly, d, order, m, antialiased)
+        _exponent(record, i, n, s, y1, y2, poly, d, m, antialiased)
     kappa = record[i, KAPPA]
     # nothing to do where the exponent keeps alpha below the threshold on every lane
     reachable = 0
@@ -132,8 +134,8 @@ def _alpha_forms(record, i, n, s, y1, y2, poly, sigma_max, d, order, m, antialia
 
 
 @njit(cache=True, error_model="numpy")
-def _exponent(record, i, n, s, y1, y2, poly, d, order, m, antialiased):
-    """Form sigma = (y1^2 + y2^2)/2 + K (design.md, B1-B2).
+def _exponent(record, i, n, s, y1, y2, poly, d, m, antialiased):
+    """Form sigma = (y1^2 + y2^2)/2 + K of order 2 (design.md, B1-B2).
 
     Coefficients go into ``poly`` (row 0 unused), centre, radius and bounds into rows _S0, _SR, _SLO, _SHI,
     sums of absolute coefficients into _SL, _SB.
@@ -152,9 +154,8 @@ def _exponent(record, i, n, s, y1, y2, poly, d, order, m, antialiased):
             y2[k, q] = g * s[_AY + q] - w2
     _spread(y1, 1, 1 + d, n, s, _L1)
     _spread(y2, 1, 1 + d, n, s, _L2)
-    if order == 2:
-        _spread(y1, 1 + d, m, n, s, _B1)
-        _spread(y2, 1 + d, m, n, s, _B2)
+    _spread(y1, 1 + d, m, n, s, _B1)
+    _spread(y2, 1 + d, m, n, s, _B2)
     rp = record[i, base + m] + _ROUND * abs(record[i, base])
     rc = record[i, base + stride + m] + _ROUND * abs(record[i, base + stride])
     rs = record[i, base + 2 * stride + m] + _ROUND * abs(record[i, base + 2 * stride])
@@ -163,16 +164,15 @@ def _exponent(record, i, n, s, y1, y2, poly, d, order, m, antialiased):
     for k in range(1, m):
         for q in range(n):
             poly[k, q] = y1[0, q] * y1[k, q] + y2[0, q] * y2[k, q]
-    if order == 2:
-        row = 1 + d
-        for k in range(1, d + 1):
+    row = 1 + d
+    for k in range(1, d + 1):
+        for q in range(n):
+            poly[row, q] += 0.5 * (y1[k, q] * y1[k, q] + y2[k, q] * y2[k, q])
+        row += 1
+        for l in range(k + 1, d + 1):
             for q in range(n):
-                poly[row, q] += 0.5 * (y1[k, q] * y1[k, q] + y2[k, q] * y2[k, q])
+                poly[row, q] += y1[k, q] * y1[l, q] + y2[k, q] * y2[l, q]
             row += 1
-            for l in range(k + 1, d + 1):
-                for q in range(n):
-                    poly[row, q] += y1[k, q] * y1[l, q] + y2[k, q] * y2[l, q]
-                row += 1
     k_middle = 0.0
     k_radius = 0.0
     k_spread = 0.0
@@ -186,8 +186,6 @@ def _exponent(record, i, n, s, y1, y2, poly, d, order, m, antialiased):
                 poly[k, q] += extra
     k_low = max(0.0, k_middle - k_spread - k_radius)
     k_high = abs(k_middle) + k_spread + k_radius
-    curved = 1.0 if order == 2 else 0.0
-    affine = 1.0 - curved
     for q in range(n):
         s[_C1 + q] = abs(y1[0, q])
     for q in range(n):
@@ -199,16 +197,14 @@ def _exponent(record, i, n, s, y1, y2, poly, d, order, m, antialiased):
         c2 = s[_C2 + q]
         l1 = s[_L1 + q]
         l2 = s[_L2 + q]
-        b1 = curved * s[_B1 + q]
-        b2 = curved * s[_B2 + q]
+        b1 = s[_B1 + q]
+        b2 = s[_B2 + q]
         r1 = rp * ax + rc * ay + rw1 + _ROUND * (l1 + b1)
         r2 = rs * ay + rw2 + _ROUND * (l2 + b2)
         s0 = 0.5 * (c1 * c1 + c2 * c2)
-        # order 1 keeps (g.p)^2 / 2 in [0, l^2 / 2] as half centre, half radius
-        curve = affine * (0.25 * (l1 * l1 + l2 * l2))
         e1 = l1 + b1 + r1
         e2 = l2 + b2 + r2
-        s[_S0 + q] = s0 + curve + k_middle
+        s[_S0 + q] = s0 + k_middle
         s[_SR + q] = (
             c1 * r1
             + c2 * r2
@@ -217,7 +213,6 @@ def _exponent(record, i, n, s, y1, y2, poly, d, order, m, antialiased):
             + 0.5 * (b1 * b1 + b2 * b2)
             + r1 * (l1 + b1 + 0.5 * r1)
             + r2 * (l2 + b2 + 0.5 * r2)
-            + curve
             + k_radius
             + _ROUND * (s0 + c1 * e1 + c2 * e2 + k_high)
         ) * _UP
@@ -228,14 +223,6 @@ def _exponent(record, i, n, s, y1, y2, poly, d, order, m, antialiased):
         s[_SLO + q] = 0.5 * (near1 * near1 + near2 * near2) * (1.0 - _ROUND) + k_low
         s[_SHI + q] = (0.5 * (far1 * far1 + far2 * far2) + k_high) * _UP
     _spread(poly, 1, 1 + d, n, s, _SL)
-    if order == 1:
-        for q in range(n):
-            spread = (s[_SL + q] + s[_SR + q] + _ROUND * s[_S0 + q]) * _UP
-            s[_SHI + q] = min(s[_SHI + q], s[_S0 + q] + spread)
-            s[_SLO + q] = max(s[_SLO + q], s[_S0 + q] - spread)
-        for q in range(n):
-            s[_SB + q] = 0.0
-        return
     _spread(poly, 1 + d, m, n, s, _SB)
     # range of the polynomial, exact in each p_k alone
     for q in range(n):
@@ -246,6 +233,81 @@ def _exponent(record, i, n, s, y1, y2, poly, d, order, m, antialiased):
     for q in range(n):
         s[_SHI + q] = min(s[_SHI + q], s[_MAX + q])
         s[_SLO + q] = max(s[_SLO + q], s[_MIN + q])
+
+
+@njit(cache=True, error_model="numpy", forceinline=True)
+def _exponent_affine(record, i, n, s, poly, m, antialiased):
+    """`_exponent` for order 1: one loop by parameter."""
+    stride = m + 1
+    p, c, g = record[i, FORMS], record[i, FORMS + stride], record[i, FORMS + 2 * stride]
+    w1, w2 = record[i, FORMS + 3 * stride], record[i, FORMS + 4 * stride]
+    rp = record[i, FORMS + m] + _ROUND * abs(p)
+    rc = record[i, FORMS + stride + m] + _ROUND * abs(c)
+    rs = record[i, FORMS + 2 * stride + m] + _ROUND * abs(g)
+    rw1 = record[i, FORMS + 3 * stride + m] + _ROUND * abs(w1)
+    rw2 = record[i, FORMS + 4 * stride + m] + _ROUND * abs(w2)
+    for q in range(n):
+        s[_C1 + q] = p * s[_AX + q] - c * s[_AY + q] - w1
+        s[_C2 + q] = g * s[_AY + q] - w2
+        s[_L1 + q] = 0.0
+        s[_L2 + q] = 0.0
+        s[_SL + q] = 0.0
+        s[_SB + q] = 0.0
+    k_middle, k_radius, k_spread = 0.0, 0.0, 0.0
+    if antialiased:
+        k_middle = record[i, FORMS + 5 * stride]
+        k_radius = record[i, FORMS + 5 * stride + m]
+    for k in range(1, m):
+        p, c, g = record[i, FORMS + k], record[i, FORMS + stride + k], record[i, FORMS + 2 * stride + k]
+        w1, w2 = record[i, FORMS + 3 * stride + k], record[i, FORMS + 4 * stride + k]
+        extra = 0.0
+        if antialiased:
+            extra = record[i, FORMS + 5 * stride + k]
+            k_spread += abs(extra)
+        row = poly[k]
+        for q in range(n):
+            g1 = p * s[_AX + q] - c * s[_AY + q] - w1
+            g2 = g * s[_AY + q] - w2
+            slope = s[_C1 + q] * g1 + s[_C2 + q] * g2 + extra
+            row[q] = slope
+            s[_L1 + q] += abs(g1)
+            s[_L2 + q] += abs(g2)
+            s[_SL + q] += abs(slope)
+    k_low = max(0.0, k_middle - k_spread - k_radius)
+    k_high = abs(k_middle) + k_spread + k_radius
+    for q in range(n):
+        ax = abs(s[_AX + q])
+        ay = abs(s[_AY + q])
+        c1 = abs(s[_C1 + q])
+        c2 = abs(s[_C2 + q])
+        l1 = s[_L1 + q]
+        l2 = s[_L2 + q]
+        r1 = rp * ax + rc * ay + rw1 + _ROUND * l1
+        r2 = rs * ay + rw2 + _ROUND * l2
+        s0 = 0.5 * (c1 * c1 + c2 * c2)
+        # (g.p)^2 / 2 lies in [0, l^2 / 2]: half centre, half radius
+        curve = 0.25 * (l1 * l1 + l2 * l2)
+        e1 = l1 + r1
+        e2 = l2 + r2
+        center = s0 + curve + k_middle
+        radius = (
+            c1 * r1
+            + c2 * r2
+            + r1 * (l1 + 0.5 * r1)
+            + r2 * (l2 + 0.5 * r2)
+            + curve
+            + k_radius
+            + _ROUND * (s0 + c1 * e1 + c2 * e2 + k_high)
+        ) * _UP
+        near1 = max(0.0, c1 - e1)
+        near2 = max(0.0, c2 - e2)
+        far1 = c1 + e1
+        far2 = c2 + e2
+        spread = (s[_SL + q] + radius + _ROUND * center) * _UP
+        s[_S0 + q] = center
+        s[_SR + q] = radius
+        s[_SLO + q] = max(0.5 * (near1 * near1 + near2 * near2) * (1.0 - _ROUND) + k_low, center - spread)
+        s[_SHI + q] = min((0.5 * (far1 * far1 + far2 * far2) + k_high) * _UP, center + spread)
 
 
 @njit(cache=True, error_model="numpy", forceinline=True)
@@ -711,12 +773,13 @@ def _forward(
             places[slot_count] = -1
             slot_count += 1
         ended = False
+        seen = False
         for lane in range(n):
             high = s[_HI + lane]
             q = int(pixels[lane])
             if high < alpha_min:
                 continue
-            marks[i] = 1
+            seen = True
             low = s[_LO + lane]
             before = s[_THI + q]
             # two roundings of the running transmittance
@@ -767,6 +830,9 @@ def _forward(
                 places[slots[k], q] = count
                 # layers up to the last one whose order is uncertain may still come first
                 s[_REACH + q] = max(s[_REACH + q], float(last[k]))
+        # threads share these bytes: written no more than once each
+        if seen and marks[i] == 0:
+            marks[i] = 1
         if slot_count > 0:
             for lane in range(n):
                 q = int(pixels[lane])
@@ -986,6 +1052,111 @@ def _interval_blend(
             high[channel, q] = min(high[channel, q], value_high)
 
 
+@njit(cache=True, error_model="numpy", forceinline=True)
+def _step_affine(n, s, layer, start, p, m, color_rows):
+    """One layer over one channel's polynomials ``p`` [m, lanes] of order 1 (design.md, B7): one loop by parameter.
+
+    Leaves the colour's middle, spread and radius in rows _C1, _CC, _C2, the sizes of colour - P and of its slopes in
+    _SR and _SB, one more than those of alpha in _SL, what is left of the products in _TMP, and |P| in _S0.
+    """
+    moving = color_rows > 2
+    color, middle = layer[start], p[0]
+    for q in range(n):
+        # value = colour - P, a form without radius
+        value = color[q] - middle[q]
+        s[_C1 + q] = color[q]
+        s[_WEIGHT + q] = value
+        s[_SR + q] = abs(value)
+        s[_S0 + q] = middle[q] + s[_A0 + q] * value
+        s[_CC + q] = 0.0
+        s[_SB + q] = 0.0
+        s[_TMP + q] = 0.0
+    for k in range(1, m):
+        alpha, slope = layer[k], p[k]
+        if moving:
+            color = layer[start + k]
+            for q in range(n):
+                change = color[q] - slope[q]
+                curve = 0.5 * (alpha[q] * change)
+                slope[q] += s[_A0 + q] * change + s[_WEIGHT + q] * alpha[q]
+                s[_S0 + q] += curve
+                s[_TMP + q] -= abs(curve)
+                s[_SB + q] += abs(change)
+                s[_CC + q] += abs(color[q])
+        else:
+            for q in range(n):
+                change = -slope[q]
+                curve = 0.5 * (alpha[q] * change)
+                slope[q] += s[_A0 + q] * change + s[_WEIGHT + q] * alpha[q]
+                s[_S0 + q] += curve
+                s[_TMP + q] -= abs(curve)
+                s[_SB + q] += abs(change)
+    # the last row of a colour is its radius
+    color = layer[start + color_rows - 1]
+    has_radius = 1.0 if color_rows > 1 else 0.0
+    for q in range(n):
+        spread = has_radius * abs(color[q])
+        s[_C2 + q] = spread
+        s[_CC + q] += spread
+        s[_TMP + q] += s[_L1 + q] * s[_SB + q]
+        s[_SL + q] = 1.0 + s[_L1 + q]
+        middle[q] = s[_S0 + q]
+        s[_S0 + q] = abs(s[_S0 + q])
+
+
+@njit(cache=True, error_model="numpy")
+def _step_curved(n, s, layer, start, p, value, d, m, color_rows):
+    """`_step_affine` for order 2; ``value`` [m, lanes] is scratch."""
+    moving = color_rows > 2
+    for q in range(n):
+        s[_C1 + q] = layer[start, q]
+        s[_CC + q] = 0.0
+    for k in range(1, color_rows):
+        for q in range(n):
+            s[_CC + q] += abs(layer[start + k, q])
+    if color_rows > 1:
+        for q in range(n):
+            s[_C2 + q] = layer[start + color_rows - 1, q]
+    else:
+        for q in range(n):
+            s[_C2 + q] = 0.0
+    # value = colour - P, a form without radius
+    for q in range(n):
+        value[0, q] = s[_C1 + q] - p[0, q]
+    for k in range(1, m):
+        if moving:
+            for q in range(n):
+                value[k, q] = layer[start + k, q] - p[k, q]
+        else:
+            for q in range(n):
+                value[k, q] = -p[k, q]
+    _spread(value, 1, 1 + d, n, s, _L2)
+    for q in range(n):
+        p[0, q] += s[_A0 + q] * value[0, q]
+    for k in range(1, m):
+        for q in range(n):
+            p[k, q] += s[_A0 + q] * value[k, q] + value[0, q] * layer[k, q]
+    _spread(value, 1 + d, m, n, s, _B2)
+    row = 1 + d
+    for k in range(1, d + 1):
+        for q in range(n):
+            p[row, q] += layer[k, q] * value[k, q]
+        row += 1
+        for l in range(k + 1, d + 1):
+            for q in range(n):
+                p[row, q] += layer[k, q] * value[l, q] + layer[l, q] * value[k, q]
+            row += 1
+    for q in range(n):
+        s[_TMP + q] = s[_L1 + q] * s[_B2 + q] + s[_B1 + q] * (s[_L2 + q] + s[_B2 + q])
+    for q in range(n):
+        s[_SL + q] = 1.0 + s[_L1 + q] + s[_B1 + q]
+        s[_SB + q] = s[_L2 + q] + s[_B2 + q]
+    for q in range(n):
+        s[_SR + q] = abs(value[0, q])
+    for q in range(n):
+        s[_S0 + q] = abs(p[0, q])
+
+
 @njit(cache=True, error_model="numpy")
 def _blend_group(
     ranked, layers, sources, entries, colors, lengths, layer, extra, moved, background, d, order, m, color_rows,
@@ -1009,7 +1180,6 @@ def _blend_group(
             state[channel, 0, q] = background[channel]
             low[channel, q] = background[channel]
             high[channel, q] = background[channel]
-    moving = color_rows > 2
     for e in range(count - 1, -1, -1):
         # lane by lane in memory, row by row for the arithmetic
         for q in range(n):
@@ -1037,69 +1207,11 @@ def _blend_group(
             s[_HI + q] = layer[m + 2, q]
         for channel in range(3):
             start = m + 3 + channel * color_rows
-            p = state[channel]
-            for q in range(n):
-                s[_C1 + q] = layer[start, q]
-                s[_CC + q] = 0.0
-            for k in range(1, color_rows):
-                for q in range(n):
-                    s[_CC + q] += abs(layer[start + k, q])
-            if color_rows > 1:
-                for q in range(n):
-                    s[_C2 + q] = layer[start + color_rows - 1, q]
+            p, r, top, bottom = state[channel], radius[channel], high[channel], low[channel]
+            if order == 1:
+                _step_affine(n, s, layer, start, p, m, color_rows)
             else:
-                for q in range(n):
-                    s[_C2 + q] = 0.0
-            # value = colour - P, a form without radius
-            for q in range(n):
-                value[0, q] = s[_C1 + q] - p[0, q]
-            for k in range(1, m):
-                if moving:
-                    for q in range(n):
-                        value[k, q] = layer[start + k, q] - p[k, q]
-                else:
-                    for q in range(n):
-                        value[k, q] = -p[k, q]
-            _spread(value, 1, 1 + d, n, s, _L2)
-            for q in range(n):
-                p[0, q] += s[_A0 + q] * value[0, q]
-            for k in range(1, m):
-                for q in range(n):
-                    p[k, q] += s[_A0 + q] * value[k, q] + value[0, q] * layer[k, q]
-            if order == 2:
-                _spread(value, 1 + d, m, n, s, _B2)
-                row = 1 + d
-                for k in range(1, d + 1):
-                    for q in range(n):
-                        p[row, q] += layer[k, q] * value[k, q]
-                    row += 1
-                    for l in range(k + 1, d + 1):
-                        for q in range(n):
-                            p[row, q] += layer[k, q] * value[l, q] + layer[l, q] * value[k, q]
-                        row += 1
-                for q in range(n):
-                    s[_TMP + q] = s[_L1 + q] * s[_B2 + q] + s[_B1 + q] * (s[_L2 + q] + s[_B2 + q])
-                for q in range(n):
-                    s[_SL + q] = 1.0 + s[_L1 + q] + s[_B1 + q]
-                    s[_SB + q] = s[_L2 + q] + s[_B2 + q]
-            else:
-                for q in range(n):
-                    s[_TMP + q] = s[_L1 + q] * s[_L2 + q]
-                for k in range(1, d + 1):
-                    for q in range(n):
-                        s[_CURVE + q] = 0.5 * (layer[k, q] * value[k, q])
-                    for q in range(n):
-                        p[0, q] += s[_CURVE + q]
-                    for q in range(n):
-                        s[_TMP + q] -= abs(s[_CURVE + q])
-                for q in range(n):
-                    s[_SL + q] = 1.0 + s[_L1 + q]
-                    s[_SB + q] = s[_L2 + q]
-            r, top, bottom = radius[channel], high[channel], low[channel]
-            for q in range(n):
-                s[_SR + q] = abs(value[0, q])
-            for q in range(n):
-                s[_S0 + q] = abs(p[0, q])
+                _step_curved(n, s, layer, start, p, value, d, m, color_rows)
             for q in range(n):
                 size = s[_SR + q] + s[_SB + q]
                 r[q] = (
