@@ -315,6 +315,12 @@ MUTANTS = (
     ),
     Mutant(
         "a ratio's slope has the wrong sign", LINE,
+        "n00 = _lowered(_rotated(r0, b0, b1, b2, still, 0.0, 0.0), u, deep)",
+        "n00 = _lowered(_rotated(r0, b0, b1, b2, still, 0.0, 0.0), (u[0], -u[1], u[2], u[3]), deep)",
+        "test_bounds.py::test_needle[2]",
+    ),
+    Mutant(
+        "the vertical ratio's slope has the wrong sign", LINE,
         "n10 = _lowered(_rotated(r1, b0, b1, b2, still, 0.0, 0.0), v, deep)\n        b0, b1, b2 = s[row.B01",
         "n10 = _lowered(_rotated(r1, b0, b1, b2, still, 0.0, 0.0), (v[0], -v[1], v[2], v[3]), deep)\n"
         "        b0, b1, b2 = s[row.B01",

@@ -377,8 +377,9 @@ def test_needle(order):
     )
     case = Case(splats, moves(x=0.02))
     case.check(order, parts=2)
-    case.poses = PoseSet.around(case.camera, moves(roll=0.05))
-    case.check(order, parts=2)
+    for motion in (moves(y=0.02), moves(roll=0.05)):
+        case.poses = PoseSet.around(case.camera, motion)
+        case.check(order, parts=2)
 
 
 def permuted(splats: Splats, order: list[int]) -> Splats:
