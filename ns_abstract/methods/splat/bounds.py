@@ -74,7 +74,7 @@ class SplatBounds:
         self._faint = faint_exponents(self.varied.opacity_high, self.rules[7], a.unit)
         self._noise = covariance_noise(splats.axes, a.unit, a.flush)
         self._color_radius = 8.0 * a.unit * float(np.abs(splats.sh).max(initial=1.0)) if splats.degree == 0 else 0.0
-        self._color_reach = color_reach(splats.sh, splats.degree)
+        self._color_reach = color_reach(splats.sh, splats.degree) if splats.degree > 0 else None
         self._plain_colors = _shifted_colors(self.varied, a.unit) if splats.degree == 0 else None
 
     def _buffer(self, name: str, shape: tuple[int, ...], dtype: type = np.float64) -> np.ndarray:

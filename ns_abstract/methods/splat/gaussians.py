@@ -43,6 +43,7 @@ from ns_abstract.methods.splat.records import (
     coordinate_errors,
     float_errors,
     gather,
+    gather_means,
     regions,
 )
 
@@ -129,19 +130,14 @@ def _rotate(rotation, row, vectors, offset, out, d, order, m):
 
 @njit(cache=True, error_model="numpy")
 def _clamp_ratio(a, low, high, limit_low, limit_high, other, d, order, m):
-    """Replace ``a`` by ``min(limit_high, max(-limit_low, a))`` and its bounds accordingly."""
+    """Replace ``a`` by ``min(limit_high, max(-limit_low, a))`` given its bounds; ``other`` [2, n] is scratch."""
     clamp_below(a, -limit_low, low, high, d, order, m)
     for q in range(a.shape[1]):
-        low[q] = max(low[q], -limit_low)
-        high[q] = max(high[q], -limit_low)
-        other[0, q] = -high[q]
-        other[1, q] = -low[q]
+        other[0, q] = -max(high[q], -limit_low)
+        other[1, q] = -max(low[q], -limit_low)
     negate(a, m)
     clamp_below(a, -limit_high, other[0], other[1], d, order, m)
     negate(a, m)
-    for q in range(a.shape[1]):
-        low[q] = min(low[q], limit_high)
-        high[q] = min(high[q], limit_high)
 
 
 @njit(cache=True, error_model="numpy")
@@ -187,13 +183,15 @@ def _stage_chunk(
     alive = borrowed(alive_)
     start = chunk * _CHUNK
     stop = min(n, start + _CHUNK)
+    everyone_ = np.arange(start, stop)
+    everyone = borrowed(everyone_)
     count = 0
     for first in range(start, stop, LANES):
         lanes = min(LANES, stop - first)
         count = _cull_block(
-            candidates, first, lanes, means, axes, opacity_high, mean_radius, rotation, offset, origin,
-            camera_reach, rotation_reach, camera, rules, errors, d, order, m, antialiased, work, table,
-            state, alive, count,
+            candidates, everyone[first - start : first - start + lanes], means, axes, opacity_high, mean_radius,
+            rotation, offset, origin, camera_reach, rotation_reach, camera, rules, errors, d, order, m, antialiased,
+            work, table, s, state, alive, count,
         )  # fmt: skip
     for first in range(0, count, LANES):
         lanes = min(LANES, count - first)
@@ -203,7 +201,7 @@ def _stage_chunk(
             d, order, m, antialiased, work, table, s, scratch, record, box, tiles, depth, delta, depth_error, state,
         )  # fmt: skip
     # the owners of the borrowed arrays live to here
-    return work_.size + table_.size + scratch_.size + alive_.size
+    return work_.size + table_.size + scratch_.size + alive_.size + everyone_.size
 
 
 @njit(cache=True, parallel=True, error_model="numpy")
@@ -243,45 +241,21 @@ def gaussian_stage(
 
 
 @njit(cache=True, error_model="numpy")
-def _coordinate_error(rotation_reach, camera_reach, means, mean_radius, i, row, unit):
-    """Float error of one camera coordinate (design.md, G2, S2): ten units of the sum of absolute products."""
-    total = 0.0
-    for k in range(3):
-        size = abs(means[i, k])
-        if mean_radius.shape[0] > 0:
-            size += mean_radius[i, k]
-        total += rotation_reach[3 * row + k] * (size + camera_reach[k])
-    return 10.0 * unit * total * _UP
-
-
-@njit(cache=True, error_model="numpy")
-def _mean_spread(rotation_reach, mean_radius, i, row):
-    """How far a Gaussian's own range moves one camera coordinate (design.md, S2); 0 without ranges."""
-    total = 0.0
-    if mean_radius.shape[0] > 0:
-        for k in range(3):
-            total += rotation_reach[3 * row + k] * mean_radius[i, k]
-    return total * _UP
-
-
-@njit(cache=True, error_model="numpy")
 def _cull_block(
-    candidates, first, lanes, means, axes, opacity_high, mean_radius, rotation, offset, origin,
-    camera_reach, rotation_reach, camera, rules, errors, d, order, m, antialiased, work, table, state, alive, count,
+    candidates, block, means, axes, opacity_high, mean_radius, rotation, offset, origin, camera_reach, rotation_reach,
+    camera, rules, errors, d, order, m, antialiased, work, table, s, state, alive, count,
 ):  # fmt: skip
-    """Drop the Gaussians that no pose of the cell shows (design.md, G3); append the others to ``alive``."""
+    """Drop the Gaussians of ``block`` that no pose of the cell shows (design.md, G3); others go to ``alive``."""
     near, far, alpha_min, margin = rules[0], rules[1], rules[7], rules[6]
     fx, fy, cx, cy, width, height = camera[0], camera[1], camera[2], camera[3], camera[4], camera[5]
     unit = errors[0]
-    vectors = table[:3]
-    for q in range(LANES):
-        i = candidates[first + min(q, lanes - 1)]
-        for k in range(3):
-            vectors[k, q] = means[i, k] - origin[k]
+    gather_means(candidates, block, means, mean_radius, origin, s)
+    coordinate_errors(s, table.shape[1], rotation_reach, camera_reach, unit)
+    vectors = table[row.V0 // LANES : row.V2 // LANES + 1]
     _rotate(rotation, 0, vectors, offset, work[_X], d, order, m)
     _rotate(rotation, 1, vectors, offset, work[_Y], d, order, m)
     _rotate(rotation, 2, vectors, offset, work[_Z], d, order, m)
-    nearest, farthest = table[3], table[4]
+    nearest, farthest = table[row.ZLO // LANES], table[row.ZHI // LANES]
     bounds(work[_Z], nearest, farthest, d, order, m)
     limit_x = max(cx, width - cx) / fx + margin * 0.5 * width / fx
     limit_y = max(cy, height - cy) / fy + margin * 0.5 * height / fy
@@ -291,12 +265,11 @@ def _cull_block(
         stretch = np.inf
     # radius <= 3 sqrt(lambda + 0.1) + 1 <= 3 |J| s + 3 sqrt(eps2d + 0.1) + 1, times z
     blur = rules[4] * math.sqrt(rules[2] + math.sqrt(rules[5])) + 2.0
-    for q in range(lanes):
-        index = first + q
+    for q in range(block.shape[0]):
+        index = block[q]
         i = candidates[index]
         state[index] = 0
-        error_z = _coordinate_error(rotation_reach, camera_reach, means, mean_radius, i, 2, unit)
-        spread_z = _mean_spread(rotation_reach, mean_radius, i, 2) + error_z
+        spread_z = s[row.SZ + q] + s[row.EZ + q]
         if not (farthest[q] + spread_z >= near and nearest[q] - spread_z <= far):
             # a bound that is not a number keeps the Gaussian
             if farthest[q] + spread_z < near or nearest[q] - spread_z > far:
@@ -306,8 +279,7 @@ def _cull_block(
             continue
         size = 0.0
         for k in range(3):
-            s = axes[i, 0, k] ** 2 + axes[i, 1, k] ** 2 + axes[i, 2, k] ** 2
-            size = max(size, s)
+            size = max(size, axes[i, 0, k] ** 2 + axes[i, 1, k] ** 2 + axes[i, 2, k] ** 2)
         reach = rules[4] * stretch * math.sqrt(size) * REGION
         outside = False
         for axis in range(2):
@@ -318,10 +290,8 @@ def _cull_block(
             if -center * work[_Z, 0, q] <= middle and middle <= (extent - center) * work[_Z, 0, q]:
                 # inside the image at the middle pose
                 continue
-            error = focal * (
-                _coordinate_error(rotation_reach, camera_reach, means, mean_radius, i, axis, unit)
-                + _mean_spread(rotation_reach, mean_radius, i, axis)
-            ) + (max(extent, abs(center), abs(extent - center)) + blur) * spread_z
+            error = focal * (s[row.EX + axis * LANES + q] + s[row.SX + axis * LANES + q])
+            error += (max(extent, abs(center), abs(extent - center)) + blur) * spread_z
             # focal x + (center + blur) z + reach < 0: left of the image at every pose with z > 0
             low_side = _linear_top(work[_X + axis], work[_Z], q, focal, center + blur, m)
             high_side = _linear_top(work[_X + axis], work[_Z], q, -focal, extent - center + blur, m)

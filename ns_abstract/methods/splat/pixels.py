@@ -133,6 +133,33 @@ def _alpha_forms(record, i, n, s, y1, y2, poly, sigma_max, d, order, m, antialia
     return True
 
 
+@njit(cache=True, error_model="numpy", inline="always")
+def _square_sum_range(c1, c2, e1, e2, k_low, k_high):
+    """Bounds of (y1^2 + y2^2)/2 + K for |y - c| <= e, c >= 0 (design.md, B2)."""
+    near1 = max(0.0, c1 - e1)
+    near2 = max(0.0, c2 - e2)
+    far1 = c1 + e1
+    far2 = c2 + e2
+    low = 0.5 * (near1 * near1 + near2 * near2) * (1.0 - _ROUND) + k_low
+    return low, (0.5 * (far1 * far1 + far2 * far2) + k_high) * _UP
+
+
+@njit(cache=True, error_model="numpy", inline="always")
+def _curved_radius(c1, c2, l1, l2, b1, b2, r1, r2, s0, k_radius, k_high):
+    """Radius of (y1^2 + y2^2)/2 + K of order 2 from the sizes c, l, b, r of the parts of y1 and y2 (design.md, B2)."""
+    return (
+        c1 * r1
+        + c2 * r2
+        + l1 * b1
+        + l2 * b2
+        + 0.5 * (b1 * b1 + b2 * b2)
+        + r1 * (l1 + b1 + 0.5 * r1)
+        + r2 * (l2 + b2 + 0.5 * r2)
+        + k_radius
+        + _ROUND * (s0 + c1 * (l1 + b1 + r1) + c2 * (l2 + b2 + r2) + k_high)
+    ) * _UP
+
+
 @njit(cache=True, error_model="numpy")
 def _exponent(record, i, n, s, y1, y2, poly, d, m, antialiased):
     """Form sigma = (y1^2 + y2^2)/2 + K of order 2 (design.md, B1-B2).
@@ -205,23 +232,8 @@ def _exponent(record, i, n, s, y1, y2, poly, d, m, antialiased):
         e1 = l1 + b1 + r1
         e2 = l2 + b2 + r2
         s[_S0 + q] = s0 + k_middle
-        s[_SR + q] = (
-            c1 * r1
-            + c2 * r2
-            + l1 * b1
-            + l2 * b2
-            + 0.5 * (b1 * b1 + b2 * b2)
-            + r1 * (l1 + b1 + 0.5 * r1)
-            + r2 * (l2 + b2 + 0.5 * r2)
-            + k_radius
-            + _ROUND * (s0 + c1 * e1 + c2 * e2 + k_high)
-        ) * _UP
-        near1 = max(0.0, c1 - e1)
-        near2 = max(0.0, c2 - e2)
-        far1 = c1 + e1
-        far2 = c2 + e2
-        s[_SLO + q] = 0.5 * (near1 * near1 + near2 * near2) * (1.0 - _ROUND) + k_low
-        s[_SHI + q] = (0.5 * (far1 * far1 + far2 * far2) + k_high) * _UP
+        s[_SR + q] = _curved_radius(c1, c2, l1, l2, b1, b2, r1, r2, s0, k_radius, k_high)
+        s[_SLO + q], s[_SHI + q] = _square_sum_range(c1, c2, e1, e2, k_low, k_high)
     _spread(poly, 1, 1 + d, n, s, _SL)
     _spread(poly, 1 + d, m, n, s, _SB)
     # range of the polynomial, exact in each p_k alone
@@ -299,15 +311,12 @@ def _exponent_affine(record, i, n, s, poly, m, antialiased):
             + k_radius
             + _ROUND * (s0 + c1 * e1 + c2 * e2 + k_high)
         ) * _UP
-        near1 = max(0.0, c1 - e1)
-        near2 = max(0.0, c2 - e2)
-        far1 = c1 + e1
-        far2 = c2 + e2
+        low, high = _square_sum_range(c1, c2, e1, e2, k_low, k_high)
         spread = (s[_SL + q] + radius + _ROUND * center) * _UP
         s[_S0 + q] = center
         s[_SR + q] = radius
-        s[_SLO + q] = max(0.5 * (near1 * near1 + near2 * near2) * (1.0 - _ROUND) + k_low, center - spread)
-        s[_SHI + q] = min((0.5 * (far1 * far1 + far2 * far2) + k_high) * _UP, center + spread)
+        s[_SLO + q] = max(low, center - spread)
+        s[_SHI + q] = min(high, center + spread)
 
 
 @njit(cache=True, error_model="numpy", forceinline=True)
@@ -350,21 +359,8 @@ def _exponent_line(record, i, n, s, antialiased):
         r2 = gr * abs(ay) + wr + _ROUND * (l2 + b2)
         e1 = l1 + b1 + r1
         e2 = l2 + b2 + r2
-        radius = (
-            y1 * r1
-            + y2 * r2
-            + l1 * b1
-            + l2 * b2
-            + 0.5 * (b1 * b1 + b2 * b2)
-            + r1 * (l1 + b1 + 0.5 * r1)
-            + r2 * (l2 + b2 + 0.5 * r2)
-            + kr
-            + _ROUND * (s0 + y1 * e1 + y2 * e2 + k_high)
-        ) * _UP
-        near1 = max(0.0, y1 - e1)
-        near2 = max(0.0, y2 - e2)
-        far1 = y1 + e1
-        far2 = y2 + e2
+        radius = _curved_radius(y1, y2, l1, l2, b1, b2, r1, r2, s0, kr, k_high)
+        low, high = _square_sum_range(y1, y2, e1, e2, k_low, k_high)
         s0 += k0
         slope = abs(linear)
         bend = abs(quadratic)
@@ -380,10 +376,8 @@ def _exponent_line(record, i, n, s, antialiased):
         s[_SB + q] = bend
         s[_LINEAR + q] = linear
         s[_QUADRATIC + q] = quadratic
-        s[_SLO + q] = max(
-            0.5 * (near1 * near1 + near2 * near2) * (1.0 - _ROUND) + k_low, s0 + bottom - radius - rounding
-        )
-        s[_SHI + q] = min((0.5 * (far1 * far1 + far2 * far2) + k_high) * _UP, s0 + top + radius + rounding)
+        s[_SLO + q] = max(low, s0 + bottom - radius - rounding)
+        s[_SHI + q] = min(high, s0 + top + radius + rounding)
 
 
 @njit(cache=True, error_model="numpy")

@@ -60,8 +60,8 @@ ROWS = 124
 
 
 @njit(cache=True, error_model="numpy")
-def gather(candidates, block, means, axes, noise, mean_radius, opacity_low, opacity_high, faint, origin, s):
-    """Copy what the Gaussians ``block`` are made of to the rows V0 .. OPFAINT; lanes in excess repeat the last one."""
+def gather_means(candidates, block, means, mean_radius, origin, s):
+    """Copy the means of the Gaussians ``block`` to the rows V0 .. V2, M0 .. R2; lanes in excess repeat the last one."""
     lanes = block.shape[0]
     for q in range(LANES):
         i = candidates[block[min(q, lanes - 1)]]
@@ -69,6 +69,15 @@ def gather(candidates, block, means, axes, noise, mean_radius, opacity_low, opac
             s[V0 + k * LANES + q] = means[i, k] - origin[k]
             s[M0 + k * LANES + q] = abs(means[i, k])
             s[R0 + k * LANES + q] = mean_radius[i, k] if mean_radius.shape[0] > 0 else 0.0
+
+
+@njit(cache=True, error_model="numpy")
+def gather(candidates, block, means, axes, noise, mean_radius, opacity_low, opacity_high, faint, origin, s):
+    """Copy what the Gaussians ``block`` are made of to the rows V0 .. OPFAINT; lanes in excess repeat the last one."""
+    gather_means(candidates, block, means, mean_radius, origin, s)
+    lanes = block.shape[0]
+    for q in range(LANES):
+        i = candidates[block[min(q, lanes - 1)]]
         for column in range(3):
             for k in range(3):
                 s[B00 + (3 * column + k) * LANES + q] = axes[i, k, column]
