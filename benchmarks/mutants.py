@@ -259,9 +259,8 @@ MUTANTS = (
     ),
     Mutant(
         "tile cut-off taken for sure", PIXELS,
-        "        sure = tiles[i, 4] <= tile_x and tile_x < tiles[i, 5] and "
-        "tiles[i, 6] <= tile_y and tile_y < tiles[i, 7]",
-        "        sure = True",
+        "sure = core[0] <= tile_x and tile_x < core[1] and core[2] <= tile_y and tile_y < core[3]",
+        "sure = True",
         "test_bounds.py::test_tile_cut[2]",
     ),
     Mutant(
@@ -328,8 +327,8 @@ MUTANTS = (
     ),
     Mutant(
         "pixels are blended as others", PIXELS,
-        "                lane = ranked[first + q]\n                state[channel, 0, lane] = t[_P0 + q]",
-        "                lane = first + q\n                state[channel, 0, lane] = t[_P0 + q]",
+        "            state[channel, k, q] = t[4 * k + channel]",
+        "            state[channel, k, PIXELS - 1 - q] = t[4 * k + channel]",
         "test_bounds.py::test_one_layer[2]",
     ),
     Mutant(
@@ -346,11 +345,11 @@ MUTANTS = (
     ),
     Mutant(
         "order swap raises but does not lower", PIXELS,
-        "                        t[_PR + q] += 0.5 * (lift + lower) * _UP\n"
-        "                        t[_PHI + q] += lift\n"
-        "                        t[_PLO + q] -= lower",
-        "                        t[_PR + q] += 0.5 * (lift + lower) * _UP\n"
-        "                        t[_PHI + q] += lift",
+        "                p0 = p0 + 0.5 * (rises - falls)\n"
+        "                r = r + 0.5 * (rises + falls) * _UP\n"
+        "                bottom = bottom - falls\n",
+        "                p0 = p0 + 0.5 * (rises - falls)\n"
+        "                r = r + 0.5 * (rises + falls) * _UP\n",
         "test_bounds.py::test_depth_swap[2]",
     ),
     Mutant(
@@ -366,33 +365,32 @@ MUTANTS = (
     ),
     Mutant(
         "1/255 is not a jump", PIXELS,
-        "jump = min(alpha_min_high, a_high) if skips else 0.0", "jump = 0.0",
+        "jump = where(skips, minimum(alpha_min_high, a_high), 0.0)", "jump = 0.0 * a_high",
         "test_bounds.py::test_alpha_threshold[2]",
     ),
     Mutant(
         "1/255 does not make 0 possible", PIXELS,
-        "a_low = 0.0 if skips else sure * a_low", "a_low = sure * a_low",
+        "a_low = where(skips, 0.0, sure * a_low)", "a_low = sure * a_low",
         "test_bounds.py::test_alpha_threshold[2]",
     ),
     Mutant(
         "0.999 clamp missing from the interval", PIXELS,
-        "        a_low = min(a_low, alpha_max * (1.0 - 2.0 * unit))\n", "",
+        "    a_low = minimum(a_low, alpha_max * (1.0 - 2.0 * unit))\n", "",
         "test_bounds.py::test_alpha_clamp[2]",
     ),
     Mutant(
         "0.999 clamp missing from the form", PIXELS,
-        "excess = max(0.0, a_high - alpha_max)", "excess = 0.0",
+        "excess = maximum(0.0, a_high - alpha_max)", "excess = 0.0 * a_high",
         "test_bounds.py::test_alpha_clamp_crossed[2]",
     ),
     Mutant(
         "stop ignored", PIXELS,
-        "            dropped = False\n            if alone and t_low <= stop_high:",
-        "            dropped = False\n            if False and t_low <= stop_high:",
+        "                if alone and t_low <= stop_high:", "                if False and t_low <= stop_high:",
         "test_bounds.py::test_stop[2]",
     ),
     Mutant(
         "stop drops layers that may be drawn", PIXELS,
-        "            if alone and t_high <= stop_low:", "            if alone and t_low <= stop_low:",
+        "                if alone and t_high <= stop_low:", "                if alone and t_low <= stop_low:",
         "test_bounds.py::test_stop[2]",
     ),
     Mutant(
@@ -403,25 +401,35 @@ MUTANTS = (
     ),
     Mutant(
         "remainder of the exponential's fit is dropped", PIXELS,
-        "        fit += 1.2e-4 * x * x2 * x2 + (1.0 - quadratic) * (2.0 * x * j2)", "        fit = 0.0 * x",
+        "    fit = fma(1.2e-4 * x, x2 * x2, fma(1.0 - quadratic, 2.0 * x * j2, fit))", "    fit = 0.0 * x",
         "test_bounds.py::test_linear[x-1]",
     ),
     Mutant(
         "exponent's vertex counted for the wrong end", PIXELS,
-        "bottom = min(quadratic - slope, vertex) if inside else quadratic - slope",
+        "bottom = where(inside, minimum(quadratic - slope, vertex), quadratic - slope)",
         "bottom = quadratic + slope",
         "test_bounds.py::test_one_layer[2]",
     ),
     Mutant(
         "blend picks alpha's other end", PIXELS,
-        "        t[_PHI + q] += (high if v > 0.0 else low) * v",
-        "        t[_PHI + q] += (low if v > 0.0 else high) * v",
+        "fma(where(v > 0.0, a_high, a_low), v, high)", "fma(where(v > 0.0, a_low, a_high), v, high)",
         "test_bounds.py::test_one_layer[2]",
     ),
     Mutant(
         "blend drops the radius of alpha", PIXELS,
-        "            + s[_AR + q] * size\n            + a1 * v2", "            + a1 * v2",
+        "fma(layers[at + _FORM + 3], size, fma(_ROUND, fma(1.0 + a1 + a2, size, abs(p0)), added))",
+        "fma(_ROUND, fma(1.0 + a1 + a2, size, abs(p0)), added)",
         "test_bounds.py::test_linear[x-2]",
+    ),
+    Mutant(
+        "pixels that the batch has hidden take further layers", PIXELS,
+        "            if live != begun:\n", "            if False:\n",
+        "test_bounds.py::test_stop_everywhere[2]",
+    ),
+    Mutant(
+        "columns that a Gaussian may reach without the forms' spread", PIXELS,
+        "half = (root(maximum(rest, 0.0)) + spread1) * inverse * _ROOM", "half = root(maximum(rest, 0.0)) * inverse",
+        "test_bounds.py::test_alpha_threshold[2]",
     ),
     # colours
     Mutant(

@@ -59,6 +59,33 @@ def prefetch(typingctx, array, row, byte):  # pyright: ignore[reportRedeclaratio
 
 
 @intrinsic
+def pointer(typingctx, array):  # pyright: ignore[reportRedeclaration]
+    """The elements of a contiguous array, in memory order, to be indexed from 0.
+
+    Unlike an array it is not counted, has no size and knows no negative index, which short loops notice. The caller
+    keeps the owner alive for as long as the result is used.
+    """
+    if not isinstance(array, types.Array) or array.layout != "C":
+        raise TypeError(f"pointer() takes a contiguous array, not {array}")
+
+    def codegen(context, builder, signature, args):
+        return arrayobj.make_array(signature.args[0])(context, builder, args[0]).data
+
+    return types.CPointer(array.dtype)(array), codegen
+
+
+@intrinsic
+def advanced(typingctx, elements, count):  # pyright: ignore[reportRedeclaration]
+    """The `pointer` to the element ``count`` further on."""
+
+    def codegen(context, builder, signature, args):
+        kind = context.get_data_type(signature.return_type.dtype)
+        return builder.gep(args[0], [args[1]], source_etype=kind)
+
+    return elements(elements, types.intp), codegen
+
+
+@intrinsic
 def lowest_bit(typingctx, mask):  # pyright: ignore[reportRedeclaration]
     """Number of the lowest bit that is set in an int64 that is not 0."""
 
@@ -66,6 +93,12 @@ def lowest_bit(typingctx, mask):  # pyright: ignore[reportRedeclaration]
         return builder.cttz(args[0], ir.IntType(1)(1))
 
     return types.int64(types.int64), codegen
+
+
+@intrinsic
+def signed(typingctx, bits):  # pyright: ignore[reportRedeclaration]
+    """64 bits as an int64."""
+    return types.int64(types.int64), lambda context, builder, signature, args: args[0]
 
 
 if config.DISABLE_JIT:  # pyright: ignore[reportAttributeAccessIssue]
@@ -77,7 +110,19 @@ if config.DISABLE_JIT:  # pyright: ignore[reportAttributeAccessIssue]
     def prefetch(array, row, byte):
         """Nothing: the interpreter has no say in caches."""
 
+    def pointer(array):
+        """The elements of an array."""
+        return array.reshape(-1)
+
+    def advanced(elements, count):
+        """The elements without the first ``count``."""
+        return elements[count:]
+
     def lowest_bit(mask):
         """Number of the lowest bit that is set."""
         mask = int(mask)
         return (mask & -mask).bit_length() - 1
+
+    def signed(bits):
+        """The lowest 64 bits as an int64."""
+        return (int(bits) + 2**63) % 2**64 - 2**63

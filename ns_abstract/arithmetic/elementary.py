@@ -10,9 +10,13 @@ import math
 import struct
 from fractions import Fraction
 
+import numpy as np
 from llvmlite import ir
-from numba import config, njit, types
+from numba import config, njit
+from numba.core import cgutils
 from numba.extending import intrinsic
+
+from ns_abstract.arithmetic.lanes import LanesType, common_type, operands
 
 #: Proven bound of ``|exp_kernel(x) - exp(x)| / exp(x)`` for ``EXP_LOWEST <= x <= EXP_HIGHEST``
 #: (design.md, E1): truncation 2.4e-16, reduction and Horner rounding 3 units, scaling exact.
@@ -32,50 +36,59 @@ _C8, _C9, _C10, _C11, _C12 = _INVERSE_FACTORIALS[8:13]
 
 @intrinsic
 def fma(typingctx, x, y, z):  # pyright: ignore[reportRedeclaration]
-    """``x * y + z`` with one rounding."""
-    signature = types.float64(types.float64, types.float64, types.float64)
+    """``x * y + z`` with one rounding, of floats or lanes."""
 
     def codegen(context, builder, sig, args):
-        return builder.fma(*args)
+        values = operands(builder, sig, args)
+        if not isinstance(sig.return_type, LanesType):
+            return builder.fma(*values)
+        kind = values[0].type
+        function = ir.FunctionType(kind, [kind] * 3)
+        return builder.call(
+            cgutils.get_or_insert_function(builder.module, function, f"llvm.fma.v{kind.count}f64"), values
+        )
 
-    return signature, codegen
+    return common_type(x, y, z)(x, y, z), codegen
 
 
 @intrinsic
-def _bits_of_double(typingctx, x):  # pyright: ignore[reportRedeclaration]
+def _power_of_low_bits(typingctx, shifted):  # pyright: ignore[reportRedeclaration]
+    """2 to the power of the low bits of ``shifted``: moved into the exponent field, after its bias of 1023."""
+
     def codegen(context, builder, sig, args):
-        return builder.bitcast(args[0], ir.IntType(64))
+        kind, bits = args[0].type, ir.IntType(64)
+        if isinstance(sig.return_type, LanesType):
+            bits = ir.VectorType(bits, kind.count)
+            bias, place = (ir.Constant(bits, [n] * kind.count) for n in (1023, 52))
+        else:
+            bias, place = bits(1023), bits(52)
+        moved = builder.shl(builder.add(builder.bitcast(args[0], bits), bias), place)
+        return builder.bitcast(moved, kind)
 
-    return types.int64(types.float64), codegen
-
-
-@intrinsic
-def _double_of_bits(typingctx, bits):  # pyright: ignore[reportRedeclaration]
-    def codegen(context, builder, sig, args):
-        return builder.bitcast(args[0], ir.DoubleType())
-
-    return types.float64(types.int64), codegen
+    return shifted(shifted), codegen
 
 
 if config.DISABLE_JIT:  # pyright: ignore[reportAttributeAccessIssue]
 
     def fma(x, y, z):
-        """``x * y + z`` with one rounding."""
+        """``x * y + z`` with one rounding, of floats or arrays."""
+        if np.ndim(x) or np.ndim(y) or np.ndim(z):
+            return np.array([fma(*one) for one in zip(*np.broadcast_arrays(x, y, z), strict=True)])
         if not (math.isfinite(x) and math.isfinite(y) and math.isfinite(z)):
             return float(x) * float(y) + float(z)
         return float(Fraction(float(x)) * Fraction(float(y)) + Fraction(float(z)))
 
-    def _bits_of_double(x):
-        return struct.unpack("<q", struct.pack("<d", x))[0]
-
-    def _double_of_bits(bits):
+    def _power_of_low_bits(shifted):
+        if np.ndim(shifted):
+            return np.array([_power_of_low_bits(one) for one in shifted])
+        bits = struct.unpack("<q", struct.pack("<d", shifted))[0]
         # the shift of an int64 drops what leaves its 64 bits
-        return struct.unpack("<d", struct.pack("<Q", bits & 0xFFFFFFFFFFFFFFFF))[0]
+        return struct.unpack("<d", struct.pack("<Q", ((bits + 1023) << 52) & 0xFFFFFFFFFFFFFFFF))[0]
 
 
 @njit(inline="always", error_model="numpy")
 def exp_kernel(x):
-    """exp(x) for ``EXP_LOWEST <= x <= EXP_HIGHEST``, relative error at most ``EXP_RELATIVE_ERROR``."""
+    """exp(x), ``EXP_LOWEST <= x <= EXP_HIGHEST``, of floats or lanes; relative error ``<= EXP_RELATIVE_ERROR``."""
     shifted = fma(x, _LOG2E, _ROUND_TO_INTEGER)
     k = shifted - _ROUND_TO_INTEGER
     r = fma(-k, _LN2_HIGH, x)
@@ -88,5 +101,5 @@ def exp_kernel(x):
     c = fma(r2, fma(r, _C11, _C10), fma(r, _C9, _C8))
     c = fma(r4, _C12, c)
     p = 1.0 + fma(r4, fma(r4, c, b), a)
-    # the low bits of `shifted` hold k; moved into the exponent field they make 2**k
-    return p * _double_of_bits((_bits_of_double(shifted) + 1023) << 52)
+    # the low bits of `shifted` hold k
+    return p * _power_of_low_bits(shifted)

@@ -22,6 +22,7 @@ non-finite radius, which every later rule keeps.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -56,7 +57,7 @@ class Basis:
         if self.order not in (1, 2):
             raise ValueError(f"order must be 1 or 2, got {self.order}")
 
-    @property
+    @cached_property
     def pairs(self) -> tuple[tuple[int, int], ...]:
         """Parameter pairs (k, l), k <= l, of the quadratic monomials."""
         if self.order == 1:
@@ -64,7 +65,7 @@ class Basis:
         d = self.dimensions
         return tuple((k, l) for k in range(d) for l in range(k, d))
 
-    @property
+    @cached_property
     def monomials(self) -> int:
         """Number m of polynomial coefficients."""
         return 1 + self.dimensions + len(self.pairs)

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
+from numba import njit
 
 from ns_abstract.arithmetic.outward import outward
 from ns_abstract.arithmetic.units import Arithmetic
@@ -70,6 +71,19 @@ class TileBounds:
     context: Context
     linear: tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray] | None
     trivial: int
+
+
+@njit(cache=True, error_model="numpy")
+def _mean_slopes(linear, d):
+    """Mean absolute linear coefficients [d] of forms [t, side, side, 3, ...]."""
+    total = np.zeros(d)
+    for tile in range(linear.shape[0]):
+        for row in range(linear.shape[1]):
+            for column in range(linear.shape[2]):
+                for channel in range(3):
+                    for k in range(d):
+                        total[k] += abs(linear[tile, row, column, channel, 1 + k])
+    return total / max(linear.shape[0] * linear.shape[1] * linear.shape[2] * 3, 1)
 
 
 class SplatFrame:
@@ -158,7 +172,7 @@ class SplatFrame:
         )
         lower, upper = outward(cell.lower, cell.upper)
         d = box.dimensions
-        slopes = np.zeros(d) if cell.linear is None else np.abs(cell.linear[..., 1 : 1 + d]).mean(axis=(0, 1, 2, 3))
+        slopes = np.zeros(d) if cell.linear is None else _mean_slopes(cell.linear, d)
         # hardly smaller: not worth its memory
         kept = within is not None and cell.visible.size > _WORTH_KEEPING * within.visible.size
         context = within if within is not None and kept else Context(cell.visible, cell.reach)

@@ -13,8 +13,19 @@ import math
 import numpy as np
 from numba import njit, prange
 
-from ns_abstract.arithmetic.compiled import borrowed, lowest_bit, prefetch
-from ns_abstract.arithmetic.elementary import EXP_RELATIVE_ERROR, exp_kernel
+from ns_abstract.arithmetic.compiled import advanced, borrowed, lowest_bit, pointer, prefetch, signed
+from ns_abstract.arithmetic.elementary import EXP_RELATIVE_ERROR, exp_kernel, fma
+from ns_abstract.arithmetic.lanes import (
+    bits,
+    load4,
+    load8,
+    maximum,
+    minimum,
+    root,
+    store,
+    store_columns,
+    where,
+)
 from ns_abstract.arithmetic.units import UNIT64
 from ns_abstract.methods.splat.lists import AHEAD, BLOCK, PIXELS, block_lists
 from ns_abstract.methods.splat.records import (
@@ -38,22 +49,25 @@ _FIT_LIMIT = 2.0
 _EXPONENT_LIMIT = 60.0
 #: Reordering that moves no channel of a pixel by more is not examined beyond the swap bound.
 _REORDERING_MATTERS = 1e-4
-#: Lane loops run over multiples of this many lanes: short loops of one vector each, or many of several.
-_VECTOR_LINE, _VECTOR = 4, 16
-#: Lanes that are blended together, down to the deepest of their lists.
-_GROUP = 16
+#: List entries that pass the steps of `_forward` together: no step waits for the one before.
+_BATCH = 8
 #: Pixel q of a block lies in row q >> _ROW_SHIFT; sets of pixels are the bits of an int64.
 _ROW_SHIFT = BLOCK.bit_length() - 1
-assert PIXELS == 64
+assert PIXELS == 64 and BLOCK == 8
 
 # Scratch is flat: row r holds its lanes at r * PIXELS .. r * PIXELS + PIXELS - 1. With constant
 # offsets the compiler sees that rows do not overlap. Lane loops run to a length taken from an array:
 # with a constant length they would be unrolled into scalar code, as it is they become vector code.
 (
-    _AX, _AY, _C1, _C2, _L1, _L2, _B1, _B2, _CC, _S0, _SR, _SL, _SB, _SLO, _SHI, _WEIGHT, _CURVE,
-    _A0, _AR, _LO, _HI, _TLO, _THI, _REACH, _RHO, _TMP, _MIN, _MAX, _LINEAR, _QUADRATIC, _DARKEST, _BRIGHTEST,
-) = range(0, 32 * PIXELS, PIXELS)  # fmt: skip
-_ROWS = 32
+    _C1, _C2, _L1, _L2, _B1, _B2, _S0, _SR, _SL, _SB, _SLO, _SHI, _WEIGHT, _CURVE,
+    _TLO, _THI, _REACH, _RHO, _LOST, _MIN, _MAX, _DARKEST, _BRIGHTEST, _NUMBERS,
+) = range(0, 24 * PIXELS, PIXELS)  # fmt: skip
+_ROWS = 24
+#: The set of all of 8 lanes.
+_ALL = 255
+#: Columns of a layer: bounds of alpha, transmittance behind it at its least and before it at its most, alpha's
+#: coefficients and then its radius.
+_ALPHA_LOW, _ALPHA_HIGH, _LEFT, _LIGHT, _FORM = range(5)
 
 
 @njit(cache=True, error_model="numpy", inline="always")
@@ -67,101 +81,105 @@ def _spread(rows, first, last, n, s, out):
 
 
 @njit(cache=True, error_model="numpy", forceinline=True)
-def _alpha_forms(record, i, n, s, y1, y2, poly, sigma_max, d, order, m, antialiased, sure, rules, errors):
-    """Alpha of one Gaussian on the lanes of a block (design.md, B1-B4).
+def _alphas(
+    record, n, ax, ay, s, y1, y2, poly, rows, layers, given, width, d, order, m, antialiased, sure, rules, errors
+):
+    """Alpha of one Gaussian on ``n`` pixels of a block (design.md, B1-B4).
 
-    Takes the pixel offsets of ``n`` lanes from rows _AX, _AY of ``s``. Leaves the polynomial's
-    coefficients in ``poly`` [m, lanes] (one parameter and order 2: in rows _A0, _LINEAR, _QUADRATIC) and the
-    radius, lower and upper bound in rows _AR, _LO, _HI; ``sure`` tells whether the Gaussian surely belongs to the
-    tile. Returns False where alpha is below the threshold on all lanes.
+    ``record`` is the Gaussian's; ``ax`` and ``ay`` hold the pixels' offsets from the mean. Writes what is known of
+    alpha pixel by pixel to ``layers[given : ...]``; ``rows`` [columns of a layer, lanes], flat, and its part ``poly``
+    [m, lanes] are scratch. ``sure`` tells whether the Gaussian surely belongs to the tile. Returns the set of those
+    of the ``n`` pixels on which alpha may reach the threshold.
     """
     unit = errors[0]
     alpha_min = rules[7] * (1.0 - 2.0 * unit)
+    alpha_min_high = rules[7] * (1.0 + 2.0 * unit)
     alpha_max = rules[8]
-    opacity_low = record[i, OPACITY_LOW]
-    opacity_high = record[i, OPACITY_HIGH]
-    if record[i, WILD] != 0.0:
+    opacity_low = record[OPACITY_LOW]
+    opacity_high = record[OPACITY_HIGH]
+    sigma_max = record[FAINT]
+    found = 0
+    if record[WILD] != 0.0:
         high = min(opacity_high, alpha_max) * (1.0 + 2.0 * unit)
-        poly[:] = 0.0
-        for q in range(n):
-            poly[0, q] = 0.5 * high
-            s[_A0 + q] = 0.5 * high
-            s[_LINEAR + q] = 0.0
-            s[_QUADRATIC + q] = 0.0
-            s[_AR + q] = 0.5 * high * _UP
-            s[_LO + q] = 0.0
-            s[_HI + q] = high
-        return high >= alpha_min
-    line = d == 1 and order == 2
-    if line:
-        _exponent_line(record, i, n, s, antialiased)
-    elif order == 1:
-        _exponent_affine(record, i, n, s, poly, m, antialiased)
+        if high >= alpha_min:
+            for q in range(n):
+                _set_unknown(layers, given + q * width, high, m)
+            found = -1
+    elif d == 1 and order == 2:
+        found = _alpha_line(
+            record, n, ax, ay, layers, given, sigma_max, opacity_low, opacity_high, alpha_min, alpha_min_high,
+            alpha_max, 1.0 if sure else 0.0, unit, antialiased,
+        )  # fmt: skip
     else:
-        _exponent(record, i, n, s, y1, y2, poly, d, m, antialiased)
-    kappa = record[i, KAPPA]
-    # nothing to do where the exponent keeps alpha below the threshold on every lane
-    reachable = 0
-    for q in range(n):
-        reachable += 1 if s[_SLO + q] <= sigma_max else 0
-    if reachable == 0:
-        return False
-    _fit_exponential(
-        n, s, opacity_low, opacity_high, kappa, sigma_max, alpha_min, rules[7] * (1.0 + 2.0 * unit), alpha_max,
-        1.0 if sure else 0.0, unit, order,
-    )  # fmt: skip
-    if line:
-        for q in range(n):
-            weight, linear = s[_WEIGHT + q], s[_LINEAR + q]
-            s[_QUADRATIC + q] = weight * s[_QUADRATIC + q] + s[_CURVE + q] * (linear * linear)
-            s[_LINEAR + q] = weight * linear
-        return True
-    if order == 2:
-        # alpha_q = weight * sigma_q + curve * (linear part of sigma) squared, before sigma's rows are scaled
-        row = 1 + d
-        for k in range(1, d + 1):
-            for l in range(k, d + 1):
-                factor = 1.0 if l == k else 2.0
-                for q in range(n):
-                    poly[row, q] = s[_WEIGHT + q] * poly[row, q] + factor * s[_CURVE + q] * (poly[k, q] * poly[l, q])
-                row += 1
-    for k in range(1, 1 + d):
-        for q in range(n):
-            poly[k, q] *= s[_WEIGHT + q]
-    for q in range(n):
-        poly[0, q] = s[_A0 + q]
-    return True
+        if order == 1:
+            _exponent_affine(record, n, ax, ay, s, rows, m, antialiased)
+        else:
+            _exponent(record, -(-n // 8) * 8, ax, ay, s, y1, y2, poly, d, m, antialiased)
+        found = _fit_exponential(
+            n, s, rows, opacity_low, opacity_high, record[KAPPA], sigma_max, alpha_min, alpha_min_high, alpha_max,
+            1.0 if sure else 0.0, unit, order, m,
+        )  # fmt: skip
+        if found != 0:
+            if order == 2:
+                # alpha_q = weight * sigma_q + curve * (linear part of sigma) squared, before sigma's rows are scaled
+                row = 1 + d
+                for k in range(1, d + 1):
+                    for l in range(k, d + 1):
+                        factor = 1.0 if l == k else 2.0
+                        for q in range(0, n, 8):
+                            square = load8(rows, (_FORM + k) * PIXELS + q) * load8(rows, (_FORM + l) * PIXELS + q)
+                            at = (_FORM + row) * PIXELS + q
+                            curved = load8(s, _WEIGHT + q) * load8(rows, at) + factor * load8(s, _CURVE + q) * square
+                            store(rows, at, curved)
+                        row += 1
+            for k in range(_FORM + 1, _FORM + 1 + d):
+                for q in range(0, n, 8):
+                    store(rows, k * PIXELS + q, load8(s, _WEIGHT + q) * load8(rows, k * PIXELS + q))
+            for q in range(0, n, 8):
+                for k in range(0, width, 8):
+                    at = k * PIXELS + q
+                    store_columns(
+                        layers, given + q * width + k, width, load8(rows, at), load8(rows, at + PIXELS),
+                        load8(rows, at + 2 * PIXELS), load8(rows, at + 3 * PIXELS), load8(rows, at + 4 * PIXELS),
+                        load8(rows, at + 5 * PIXELS), load8(rows, at + 6 * PIXELS), load8(rows, at + 7 * PIXELS),
+                    )  # fmt: skip
+    # not the lanes in excess
+    return signed(found & ((2 << (int(n) - 1)) - 1))
+
+
+@njit(cache=True, error_model="numpy", forceinline=True)
+def _set_unknown(layers, at, high, m):
+    """Let the layer at ``at`` have any alpha from 0 to ``high``."""
+    layers[at + _ALPHA_LOW] = 0.0
+    layers[at + _ALPHA_HIGH] = high
+    layers[at + _FORM] = 0.5 * high
+    for k in range(1, m):
+        layers[at + _FORM + k] = 0.0
+    layers[at + _FORM + m] = 0.5 * high * _UP
 
 
 @njit(cache=True, error_model="numpy", inline="always")
 def _square_sum_range(c1, c2, e1, e2, k_low, k_high):
     """Bounds of (y1^2 + y2^2)/2 + K for |y - c| <= e, c >= 0 (design.md, B2)."""
-    near1 = max(0.0, c1 - e1)
-    near2 = max(0.0, c2 - e2)
+    near1 = maximum(0.0, c1 - e1)
+    near2 = maximum(0.0, c2 - e2)
     far1 = c1 + e1
     far2 = c2 + e2
-    low = 0.5 * (near1 * near1 + near2 * near2) * (1.0 - _ROUND) + k_low
-    return low, (0.5 * (far1 * far1 + far2 * far2) + k_high) * _UP
+    low = fma(0.5 * (1.0 - _ROUND), fma(near1, near1, near2 * near2), k_low)
+    return low, fma(0.5, fma(far1, far1, far2 * far2), k_high) * _UP
 
 
 @njit(cache=True, error_model="numpy", inline="always")
 def _curved_radius(c1, c2, l1, l2, b1, b2, r1, r2, s0, k_radius, k_high):
     """Radius of (y1^2 + y2^2)/2 + K of order 2 from the sizes c, l, b, r of the parts of y1 and y2 (design.md, B2)."""
-    return (
-        c1 * r1
-        + c2 * r2
-        + l1 * b1
-        + l2 * b2
-        + 0.5 * (b1 * b1 + b2 * b2)
-        + r1 * (l1 + b1 + 0.5 * r1)
-        + r2 * (l2 + b2 + 0.5 * r2)
-        + k_radius
-        + _ROUND * (s0 + c1 * (l1 + b1 + r1) + c2 * (l2 + b2 + r2) + k_high)
-    ) * _UP
+    first = fma(c1, r1, fma(l1 + 0.5 * b1, b1, r1 * (l1 + b1 + 0.5 * r1)))
+    second = fma(c2, r2, fma(l2 + 0.5 * b2, b2, r2 * (l2 + b2 + 0.5 * r2)))
+    size = fma(c1, l1 + b1 + r1, fma(c2, l2 + b2 + r2, s0)) + k_high
+    return (first + second + fma(_ROUND, size, k_radius)) * _UP
 
 
 @njit(cache=True, error_model="numpy")
-def _exponent(record, i, n, s, y1, y2, poly, d, m, antialiased):
+def _exponent(record, n, offset_x, offset_y, s, y1, y2, poly, d, m, antialiased):
     """Form sigma = (y1^2 + y2^2)/2 + K of order 2 (design.md, B1-B2).
 
     Coefficients go into ``poly`` (row 0 unused), centre, radius and bounds into rows _S0, _SR, _SLO, _SHI,
@@ -170,24 +188,24 @@ def _exponent(record, i, n, s, y1, y2, poly, d, m, antialiased):
     stride = m + 1
     base = FORMS
     for k in range(m):
-        p = record[i, base + k]
-        c = record[i, base + stride + k]
-        g = record[i, base + 2 * stride + k]
-        w1 = record[i, base + 3 * stride + k]
-        w2 = record[i, base + 4 * stride + k]
+        p = record[base + k]
+        c = record[base + stride + k]
+        g = record[base + 2 * stride + k]
+        w1 = record[base + 3 * stride + k]
+        w2 = record[base + 4 * stride + k]
         for q in range(n):
-            y1[k, q] = p * s[_AX + q] - c * s[_AY + q] - w1
+            y1[k, q] = p * offset_x[q] - c * offset_y[q] - w1
         for q in range(n):
-            y2[k, q] = g * s[_AY + q] - w2
+            y2[k, q] = g * offset_y[q] - w2
     _spread(y1, 1, 1 + d, n, s, _L1)
     _spread(y2, 1, 1 + d, n, s, _L2)
     _spread(y1, 1 + d, m, n, s, _B1)
     _spread(y2, 1 + d, m, n, s, _B2)
-    rp = record[i, base + m] + _ROUND * abs(record[i, base])
-    rc = record[i, base + stride + m] + _ROUND * abs(record[i, base + stride])
-    rs = record[i, base + 2 * stride + m] + _ROUND * abs(record[i, base + 2 * stride])
-    rw1 = record[i, base + 3 * stride + m] + _ROUND * abs(record[i, base + 3 * stride])
-    rw2 = record[i, base + 4 * stride + m] + _ROUND * abs(record[i, base + 4 * stride])
+    rp = record[base + m] + _ROUND * abs(record[base])
+    rc = record[base + stride + m] + _ROUND * abs(record[base + stride])
+    rs = record[base + 2 * stride + m] + _ROUND * abs(record[base + 2 * stride])
+    rw1 = record[base + 3 * stride + m] + _ROUND * abs(record[base + 3 * stride])
+    rw2 = record[base + 4 * stride + m] + _ROUND * abs(record[base + 4 * stride])
     for k in range(1, m):
         for q in range(n):
             poly[k, q] = y1[0, q] * y1[k, q] + y2[0, q] * y2[k, q]
@@ -204,10 +222,10 @@ def _exponent(record, i, n, s, y1, y2, poly, d, m, antialiased):
     k_radius = 0.0
     k_spread = 0.0
     if antialiased:
-        k_middle = record[i, base + 5 * stride]
-        k_radius = record[i, base + 5 * stride + m]
+        k_middle = record[base + 5 * stride]
+        k_radius = record[base + 5 * stride + m]
         for k in range(1, m):
-            extra = record[i, base + 5 * stride + k]
+            extra = record[base + 5 * stride + k]
             k_spread += abs(extra)
             for q in range(n):
                 poly[k, q] += extra
@@ -218,8 +236,8 @@ def _exponent(record, i, n, s, y1, y2, poly, d, m, antialiased):
     for q in range(n):
         s[_C2 + q] = abs(y2[0, q])
     for q in range(n):
-        ax = abs(s[_AX + q])
-        ay = abs(s[_AY + q])
+        ax = abs(offset_x[q])
+        ay = abs(offset_y[q])
         c1 = s[_C1 + q]
         c2 = s[_C2 + q]
         l1 = s[_L1 + q]
@@ -248,85 +266,77 @@ def _exponent(record, i, n, s, y1, y2, poly, d, m, antialiased):
 
 
 @njit(cache=True, error_model="numpy", forceinline=True)
-def _exponent_affine(record, i, n, s, poly, m, antialiased):
-    """`_exponent` for order 1: one loop by parameter."""
+def _exponent_affine(record, n, offset_x, offset_y, s, rows, m, antialiased):
+    """`_exponent` for order 1, eight pixels at a time."""
     stride = m + 1
-    p, c, g = record[i, FORMS], record[i, FORMS + stride], record[i, FORMS + 2 * stride]
-    w1, w2 = record[i, FORMS + 3 * stride], record[i, FORMS + 4 * stride]
-    rp = record[i, FORMS + m] + _ROUND * abs(p)
-    rc = record[i, FORMS + stride + m] + _ROUND * abs(c)
-    rs = record[i, FORMS + 2 * stride + m] + _ROUND * abs(g)
-    rw1 = record[i, FORMS + 3 * stride + m] + _ROUND * abs(w1)
-    rw2 = record[i, FORMS + 4 * stride + m] + _ROUND * abs(w2)
-    for q in range(n):
-        s[_C1 + q] = p * s[_AX + q] - c * s[_AY + q] - w1
-        s[_C2 + q] = g * s[_AY + q] - w2
-        s[_L1 + q] = 0.0
-        s[_L2 + q] = 0.0
-        s[_SL + q] = 0.0
-        s[_SB + q] = 0.0
+    p, c, g = record[FORMS], record[FORMS + stride], record[FORMS + 2 * stride]
+    w1, w2 = record[FORMS + 3 * stride], record[FORMS + 4 * stride]
+    rp = record[FORMS + m] + _ROUND * abs(p)
+    rc = record[FORMS + stride + m] + _ROUND * abs(c)
+    rs = record[FORMS + 2 * stride + m] + _ROUND * abs(g)
+    rw1 = record[FORMS + 3 * stride + m] + _ROUND * abs(w1)
+    rw2 = record[FORMS + 4 * stride + m] + _ROUND * abs(w2)
     k_middle, k_radius, k_spread = 0.0, 0.0, 0.0
     if antialiased:
-        k_middle = record[i, FORMS + 5 * stride]
-        k_radius = record[i, FORMS + 5 * stride + m]
-    for k in range(1, m):
-        p, c, g = record[i, FORMS + k], record[i, FORMS + stride + k], record[i, FORMS + 2 * stride + k]
-        w1, w2 = record[i, FORMS + 3 * stride + k], record[i, FORMS + 4 * stride + k]
-        extra = 0.0
-        if antialiased:
-            extra = record[i, FORMS + 5 * stride + k]
-            k_spread += abs(extra)
-        row = poly[k]
-        for q in range(n):
-            g1 = p * s[_AX + q] - c * s[_AY + q] - w1
-            g2 = g * s[_AY + q] - w2
-            slope = s[_C1 + q] * g1 + s[_C2 + q] * g2 + extra
-            row[q] = slope
-            s[_L1 + q] += abs(g1)
-            s[_L2 + q] += abs(g2)
-            s[_SL + q] += abs(slope)
+        k_middle = record[FORMS + 5 * stride]
+        k_radius = record[FORMS + 5 * stride + m]
+        for k in range(1, m):
+            k_spread += abs(record[FORMS + 5 * stride + k])
     k_low = max(0.0, k_middle - k_spread - k_radius)
     k_high = abs(k_middle) + k_spread + k_radius
-    for q in range(n):
-        ax = abs(s[_AX + q])
-        ay = abs(s[_AY + q])
-        c1 = abs(s[_C1 + q])
-        c2 = abs(s[_C2 + q])
-        l1 = s[_L1 + q]
-        l2 = s[_L2 + q]
-        r1 = rp * ax + rc * ay + rw1 + _ROUND * l1
-        r2 = rs * ay + rw2 + _ROUND * l2
+    for q in range(0, n, 8):
+        ax = load8(offset_x, q)
+        ay = load8(offset_y, q)
+        c1 = fma(p, ax, -fma(c, ay, w1))
+        c2 = fma(g, ay, -w2)
+        l1 = 0.0 * ax
+        l2 = 0.0 * ax
+        sl = 0.0 * ax
+        for k in range(1, m):
+            g1 = fma(record[FORMS + k], ax, -fma(record[FORMS + stride + k], ay, record[FORMS + 3 * stride + k]))
+            g2 = fma(record[FORMS + 2 * stride + k], ay, -record[FORMS + 4 * stride + k])
+            slope = fma(c1, g1, c2 * g2)
+            if antialiased:
+                slope = slope + record[FORMS + 5 * stride + k]
+            store(rows, (_FORM + k) * PIXELS + q, slope)
+            l1 = l1 + abs(g1)
+            l2 = l2 + abs(g2)
+            sl = sl + abs(slope)
+        c1 = abs(c1)
+        c2 = abs(c2)
+        r1 = rp * abs(ax) + rc * abs(ay) + rw1 + _ROUND * l1
+        r2 = rs * abs(ay) + rw2 + _ROUND * l2
         s0 = 0.5 * (c1 * c1 + c2 * c2)
         # (g.p)^2 / 2 lies in [0, l^2 / 2]: half centre, half radius
         curve = 0.25 * (l1 * l1 + l2 * l2)
         e1 = l1 + r1
         e2 = l2 + r2
         center = s0 + curve + k_middle
-        radius = (
-            c1 * r1
-            + c2 * r2
-            + r1 * (l1 + 0.5 * r1)
-            + r2 * (l2 + 0.5 * r2)
-            + curve
-            + k_radius
-            + _ROUND * (s0 + c1 * e1 + c2 * e2 + k_high)
-        ) * _UP
+        first = fma(c1, r1, r1 * (l1 + 0.5 * r1))
+        second = fma(c2, r2, r2 * (l2 + 0.5 * r2))
+        size = fma(c1, e1, fma(c2, e2, s0)) + k_high
+        radius = (first + second + (curve + fma(_ROUND, size, k_radius))) * _UP
         low, high = _square_sum_range(c1, c2, e1, e2, k_low, k_high)
-        spread = (s[_SL + q] + radius + _ROUND * center) * _UP
-        s[_S0 + q] = center
-        s[_SR + q] = radius
-        s[_SLO + q] = max(low, center - spread)
-        s[_SHI + q] = min(high, center + spread)
+        spread = (sl + radius + _ROUND * center) * _UP
+        store(s, _S0 + q, center)
+        store(s, _SR + q, radius)
+        store(s, _SL + q, sl)
+        store(s, _SB + q, 0.0 * sl)
+        store(s, _SLO + q, maximum(low, center - spread))
+        store(s, _SHI + q, minimum(high, center + spread))
 
 
 @njit(cache=True, error_model="numpy", forceinline=True)
-def _exponent_line(record, i, n, s, antialiased):
-    """`_exponent` for one parameter and order 2 in a single loop; coefficients into rows _LINEAR, _QUADRATIC."""
-    p0, p1, p2, pr = record[i, FORMS], record[i, FORMS + 1], record[i, FORMS + 2], record[i, FORMS + 3]
-    c0, c1, c2, cr = record[i, FORMS + 4], record[i, FORMS + 5], record[i, FORMS + 6], record[i, FORMS + 7]
-    g0, g1, g2, gr = record[i, FORMS + 8], record[i, FORMS + 9], record[i, FORMS + 10], record[i, FORMS + 11]
-    v0, v1, v2, vr = record[i, FORMS + 12], record[i, FORMS + 13], record[i, FORMS + 14], record[i, FORMS + 15]
-    w0, w1, w2, wr = record[i, FORMS + 16], record[i, FORMS + 17], record[i, FORMS + 18], record[i, FORMS + 19]
+def _alpha_line(
+    record, n, offset_x, offset_y, layers, given, sigma_max, opacity_low, opacity_high, alpha_min, alpha_min_high,
+    alpha_max, sure, unit, antialiased,
+):  # fmt: skip
+    """`_exponent` and `_fit_exponential` for one parameter and order 2, eight pixels at a time."""
+    p0, p1, p2, pr = record[FORMS], record[FORMS + 1], record[FORMS + 2], record[FORMS + 3]
+    c0, c1, c2, cr = record[FORMS + 4], record[FORMS + 5], record[FORMS + 6], record[FORMS + 7]
+    g0, g1, g2, gr = record[FORMS + 8], record[FORMS + 9], record[FORMS + 10], record[FORMS + 11]
+    v0, v1, v2, vr = record[FORMS + 12], record[FORMS + 13], record[FORMS + 14], record[FORMS + 15]
+    w0, w1, w2, wr = record[FORMS + 16], record[FORMS + 17], record[FORMS + 18], record[FORMS + 19]
     pr += _ROUND * abs(p0)
     cr += _ROUND * abs(c0)
     gr += _ROUND * abs(g0)
@@ -334,50 +344,58 @@ def _exponent_line(record, i, n, s, antialiased):
     wr += _ROUND * abs(w0)
     k0, k1, k2, kr = 0.0, 0.0, 0.0, 0.0
     if antialiased:
-        k0, k1, k2, kr = record[i, FORMS + 20], record[i, FORMS + 21], record[i, FORMS + 22], record[i, FORMS + 23]
+        k0, k1, k2, kr = record[FORMS + 20], record[FORMS + 21], record[FORMS + 22], record[FORMS + 23]
     k_low = max(0.0, k0 - abs(k1) - abs(k2) - kr)
     k_high = abs(k0) + abs(k1) + abs(k2) + kr
-    for q in range(n):
-        ax = s[_AX + q]
-        ay = s[_AY + q]
-        y1 = p0 * ax - c0 * ay - v0
-        l1 = p1 * ax - c1 * ay - v1
-        b1 = p2 * ax - c2 * ay - v2
-        y2 = g0 * ay - w0
-        l2 = g1 * ay - w1
-        b2 = g2 * ay - w2
-        linear = y1 * l1 + y2 * l2 + k1
-        quadratic = y1 * b1 + y2 * b2 + 0.5 * (l1 * l1 + l2 * l2) + k2
-        s0 = 0.5 * (y1 * y1 + y2 * y2)
+    kappa = record[KAPPA]
+    found = 0
+    for q in range(0, n, 8):
+        ax = load8(offset_x, q)
+        ay = load8(offset_y, q)
+        y1 = fma(p0, ax, -fma(c0, ay, v0))
+        l1 = fma(p1, ax, -fma(c1, ay, v1))
+        b1 = fma(p2, ax, -fma(c2, ay, v2))
+        y2 = fma(g0, ay, -w0)
+        l2 = fma(g1, ay, -w1)
+        b2 = fma(g2, ay, -w2)
+        linear = fma(y1, l1, fma(y2, l2, k1))
+        quadratic = fma(y1, b1, fma(y2, b2, fma(0.5, fma(l1, l1, l2 * l2), k2)))
+        s0 = 0.5 * fma(y1, y1, y2 * y2)
         l1 = abs(l1)
         l2 = abs(l2)
         b1 = abs(b1)
         b2 = abs(b2)
         y1 = abs(y1)
         y2 = abs(y2)
-        r1 = pr * abs(ax) + cr * abs(ay) + vr + _ROUND * (l1 + b1)
-        r2 = gr * abs(ay) + wr + _ROUND * (l2 + b2)
+        r1 = fma(pr, abs(ax), fma(cr, abs(ay), fma(_ROUND, l1 + b1, vr)))
+        r2 = fma(gr, abs(ay), fma(_ROUND, l2 + b2, wr))
         e1 = l1 + b1 + r1
         e2 = l2 + b2 + r2
         radius = _curved_radius(y1, y2, l1, l2, b1, b2, r1, r2, s0, kr, k_high)
         low, high = _square_sum_range(y1, y2, e1, e2, k_low, k_high)
-        s0 += k0
+        s0 = s0 + k0
         slope = abs(linear)
         bend = abs(quadratic)
         rounding = _ROUND * (slope + bend + abs(s0))
         # the vertex of linear p + quadratic p^2 counts where it lies inside [-1, 1]
-        vertex = -0.25 * (slope * slope) / (quadratic if quadratic != 0.0 else 1.0)
+        vertex = -0.25 * (slope * slope) / where(quadratic != 0.0, quadratic, 1.0)
         inside = slope < 2.0 * bend
-        top = max(quadratic + slope, vertex) if inside else quadratic + slope
-        bottom = min(quadratic - slope, vertex) if inside else quadratic - slope
-        s[_S0 + q] = s0
-        s[_SR + q] = radius
-        s[_SL + q] = slope
-        s[_SB + q] = bend
-        s[_LINEAR + q] = linear
-        s[_QUADRATIC + q] = quadratic
-        s[_SLO + q] = max(low, s0 + bottom - radius - rounding)
-        s[_SHI + q] = min(high, s0 + top + radius + rounding)
+        top = where(inside, maximum(quadratic + slope, vertex), quadratic + slope)
+        bottom = where(inside, minimum(quadratic - slope, vertex), quadratic - slope)
+        low = maximum(low, s0 + bottom - radius - rounding)
+        if bits(low > sigma_max) == _ALL:
+            # alpha stays below the threshold
+            continue
+        center, spread, low, high, weight, curve = _fitted_exponential(
+            low, minimum(high, s0 + top + radius + rounding), s0, radius, slope, bend, opacity_low, opacity_high,
+            kappa, sigma_max, alpha_min, alpha_min_high, alpha_max, sure, unit, 1.0,
+        )  # fmt: skip
+        store_columns(
+            layers, given + 8 * q, 8, low, high, low, high, center, weight * linear,
+            fma(weight, quadratic, curve * (linear * linear)), spread,
+        )  # fmt: skip
+        found |= (_ALL - bits(high < alpha_min)) << q
+    return found
 
 
 @njit(cache=True, error_model="numpy")
@@ -406,79 +424,95 @@ def _add_range(poly, d, n, s):
 
 
 @njit(cache=True, error_model="numpy", forceinline=True)
-def _fit_exponential(
-    n, s, opacity_low, opacity_high, kappa, sigma_max, alpha_min, alpha_min_high, alpha_max, sure, unit, order
-):
-    """Form alpha = opacity exp(-sigma) with its thresholds.
+def _fitted_exponential(
+    s_low, s_high, s0, s_radius, l, b, opacity_low, opacity_high, kappa, sigma_max, alpha_min, alpha_min_high,
+    alpha_max, sure, unit, quadratic,
+):  # fmt: skip
+    """Form alpha = opacity exp(-sigma) with its thresholds (design.md, B3-B4), of lanes.
 
-    Leaves centre _A0, radius _AR, bounds _LO, _HI, and the
-    factors _WEIGHT, _CURVE that turn sigma's coefficients into alpha's (design.md, B3-B4).
+    Takes bounds, centre and radius of sigma and the sums of its absolute coefficients of first and second order;
+    ``quadratic`` is 1 for forms of order 2. Returns alpha's centre, radius and bounds, and the factors that turn
+    sigma's coefficients into alpha's.
     """
     opacity = 0.5 * (opacity_low + opacity_high)
     opacity_spread = 0.5 * (opacity_high - opacity_low) * _UP + _ROUND * opacity
+    low = minimum(maximum(0.0, s_low * (1.0 - kappa)), _EXPONENT_LIMIT)
+    high = maximum(low, s_high * (1.0 + kappa))
+    # float evaluation moves the exponent by kappa
+    sr = s_radius + kappa * minimum(high, 4.0 * _EXPONENT_LIMIT)
+    width = 0.5 * (high - low) * _UP
+    half = minimum(width, _FIT_LIMIT)
+    fits = where(width < _FIT_LIMIT, 1.0, 0.0)
+    e_low = exp_kernel(-low)
+    e_half = exp_kernel(-half)
+    slack = (30.0 + 3.0 * low + 6.0 * half) * unit + 4.0 * EXP_RELATIVE_ERROR
+    a_high = opacity_high * e_low * (1.0 + slack)
+    a_low = fits * (opacity_low * e_low * (e_half * e_half) * (1.0 - slack))
+    # exp(-t) = k0 - k1 t + k2 t^2 +- fit over |t| <= half (design.md, B3)
+    h = 0.5 * half
+    x = h * h
+    x2 = x * x
+    i0 = fma(x, fma(x, fma(x, fma(x, 1.0 / 576.0, 1.0 / 36.0), 0.25), 1.0), 1.0)
+    k1 = fma(x, fma(x, fma(x, fma(x, 1.0 / 2880.0, 1.0 / 144.0), 1.0 / 12.0), 0.5), 1.0)
+    j2 = fma(x, fma(x, fma(x, fma(x, 1.0 / 17280.0, 1.0 / 720.0), 1.0 / 48.0), 1.0 / 6.0), 0.5)
+    fit = (h * x) * (1.0 / 3.0) * fma(x, fma(x, 1.0 / 24.0, 0.25), 1.0) * fma(x, 1.0 / 15.0, fma(h, 0.25, 1.0))
+    fit = fma(1.2e-4 * x, x2 * x2, fma(1.0 - quadratic, 2.0 * x * j2, fit))
+    k0 = i0 - quadratic * (2.0 * x * j2)
+    k2 = quadratic * j2
+    t0 = s0 - (low + half)
+    scale = opacity * (e_low * e_half)
+    weight = fma(2.0 * k2, t0, -k1)
+    spread = sr + l + b
+    size = fma(abs(t0), 4.0 + abs(t0), fma(spread, 1.0 + spread, 4.0))
+    bent = fma(b, fma(2.0, l, b), sr * fma(2.0, l + b, sr))
+    error = fma(abs(weight), sr, fma(k2, bent, fma(_ROUND + 2.0 * EXP_RELATIVE_ERROR, size, fit)))
+    radius = fma(scale, error, 1.01 * e_low * fma(opacity_high, slack, opacity_spread))
+    center = scale * fma(t0, fma(k2, t0, -k1), k0)
+    # alpha_max
+    excess = maximum(0.0, a_high - alpha_max)
+    a_high = minimum(a_high, alpha_max * (1.0 + 2.0 * unit))
+    a_low = minimum(a_low, alpha_max * (1.0 - 2.0 * unit))
+    # alpha_min: below it the layer is skipped
+    skips = a_low < alpha_min_high
+    jump = where(skips, minimum(alpha_min_high, a_high), 0.0)
+    center = center - 0.5 * (excess + jump)
+    radius = fma(0.5, excess + jump, radius) * _UP
+    a_low = where(skips, 0.0, sure * a_low)
+    # gone where it cannot reach the threshold
+    gone = (a_high < alpha_min) | (low > sigma_max)
+    a_high = where(gone, 0.0, a_high)
+    a_low = where(gone, 0.0, a_low)
+    flat = 0.5 * (a_high - a_low)
+    keep = where(radius < flat, fits * sure, 0.0)
+    center = where(keep == 1.0, center, 0.5 * (a_high + a_low))
+    radius = where(keep == 1.0, radius, flat * _UP)
+    return center, radius, a_low, a_high, keep * (scale * weight), keep * (scale * k2)
+
+
+@njit(cache=True, error_model="numpy", forceinline=True)
+def _fit_exponential(
+    n, s, rows, opacity_low, opacity_high, kappa, sigma_max, alpha_min, alpha_min_high, alpha_max, sure, unit, order, m
+):
+    """`_fitted_exponential` from rows of ``s`` to those of a layer's columns.
+
+    Factors go to rows _WEIGHT, _CURVE. Returns the set of lanes on which alpha may reach the threshold.
+    """
     quadratic = 1.0 if order == 2 else 0.0
-    for q in range(n):
-        low = min(max(0.0, s[_SLO + q] * (1.0 - kappa)), _EXPONENT_LIMIT)
-        high = max(low, s[_SHI + q] * (1.0 + kappa))
-        # float evaluation moves the exponent by kappa
-        sr = s[_SR + q] + kappa * min(high, 4.0 * _EXPONENT_LIMIT)
-        width = 0.5 * (high - low) * _UP
-        half = min(width, _FIT_LIMIT)
-        fits = 1.0 if width < _FIT_LIMIT else 0.0
-        e_low = exp_kernel(-low)
-        e_half = exp_kernel(-half)
-        slack = (30.0 + 3.0 * low + 6.0 * half) * unit + 4.0 * EXP_RELATIVE_ERROR
-        a_high = opacity_high * e_low * (1.0 + slack)
-        a_low = fits * (opacity_low * e_low * (e_half * e_half) * (1.0 - slack))
-        # exp(-t) = k0 - k1 t + k2 t^2 +- fit over |t| <= half (design.md, B3)
-        h = 0.5 * half
-        x = h * h
-        x2 = x * x
-        i0 = 1.0 + x * (1.0 + x * (0.25 + x * (1.0 / 36.0 + x * (1.0 / 576.0))))
-        k1 = 1.0 + x * (0.5 + x * (1.0 / 12.0 + x * (1.0 / 144.0 + x * (1.0 / 2880.0))))
-        j2 = 0.5 + x * (1.0 / 6.0 + x * (1.0 / 48.0 + x * (1.0 / 720.0 + x * (1.0 / 17280.0))))
-        fit = (h * x) * (1.0 / 3.0) * (1.0 + 0.25 * x + x2 * (1.0 / 24.0)) * (1.0 + 0.25 * h + x * (1.0 / 15.0))
-        fit += 1.2e-4 * x * x2 * x2 + (1.0 - quadratic) * (2.0 * x * j2)
-        k0 = i0 - quadratic * (2.0 * x * j2)
-        k2 = quadratic * j2
-        t0 = s[_S0 + q] - (low + half)
-        l = s[_SL + q]
-        b = s[_SB + q]
-        scale = opacity * (e_low * e_half)
-        weight = 2.0 * k2 * t0 - k1
-        spread = sr + l + b
-        size = 4.0 + abs(t0) * (4.0 + abs(t0)) + spread * (1.0 + spread)
-        radius = scale * (
-            fit
-            + abs(weight) * sr
-            + k2 * (2.0 * l * b + b * b + sr * (2.0 * (l + b) + sr))
-            + (_ROUND + 2.0 * EXP_RELATIVE_ERROR) * size
-        )
-        radius += (opacity_spread * e_low + opacity_high * e_low * slack) * 1.01
-        center = scale * (k0 - k1 * t0 + k2 * t0 * t0)
-        # alpha_max
-        excess = max(0.0, a_high - alpha_max)
-        a_high = min(a_high, alpha_max * (1.0 + 2.0 * unit))
-        a_low = min(a_low, alpha_max * (1.0 - 2.0 * unit))
-        # alpha_min: below it the layer is skipped
-        skips = a_low < alpha_min_high
-        jump = min(alpha_min_high, a_high) if skips else 0.0
-        center -= 0.5 * (excess + jump)
-        radius = (radius + 0.5 * (excess + jump)) * _UP
-        a_low = 0.0 if skips else sure * a_low
-        # gone where it cannot reach the threshold
-        gone = a_high < alpha_min or low > sigma_max
-        a_high = 0.0 if gone else a_high
-        a_low = 0.0 if gone else a_low
-        flat = 0.5 * (a_high - a_low)
-        keep = fits * sure
-        keep = keep if radius < flat else 0.0
-        s[_A0 + q] = center if keep == 1.0 else 0.5 * (a_high + a_low)
-        s[_AR + q] = radius if keep == 1.0 else flat * _UP
-        s[_LO + q] = a_low
-        s[_HI + q] = a_high
-        s[_WEIGHT + q] = keep * (scale * weight)
-        s[_CURVE + q] = keep * (scale * k2)
+    found = 0
+    for q in range(0, n, 8):
+        center, radius, low, high, weight, curve = _fitted_exponential(
+            load8(s, _SLO + q), load8(s, _SHI + q), load8(s, _S0 + q), load8(s, _SR + q), load8(s, _SL + q),
+            load8(s, _SB + q), opacity_low, opacity_high, kappa, sigma_max, alpha_min, alpha_min_high, alpha_max,
+            sure, unit, quadratic,
+        )  # fmt: skip
+        store(rows, _ALPHA_LOW * PIXELS + q, low)
+        store(rows, _ALPHA_HIGH * PIXELS + q, high)
+        store(rows, _FORM * PIXELS + q, center)
+        store(rows, (_FORM + m) * PIXELS + q, radius)
+        store(s, _WEIGHT + q, weight)
+        store(s, _CURVE + q, curve)
+        found |= (_ALL - bits(high < alpha_min)) << q
+    return found
 
 
 # what a block may answer in place of a number of pairs
@@ -490,20 +524,19 @@ _GROW = -2
 def _uncertain(i, j, delta, depth_error, slope, m):
     """Whether the depth order of Gaussians i and j is not the same over the whole cell (design.md, O1).
 
-    ``slope`` [rows, 3] is the third row of the rotation: depths differ by ``slope . (delta_i - delta_j)``.
+    ``slope`` [rows, 3], flat, is the third row of the rotation: depths differ by ``slope . (delta_i - delta_j)``.
     """
-    x = delta[i, 0] - delta[j, 0]
-    y = delta[i, 1] - delta[j, 1]
-    z = delta[i, 2] - delta[j, 2]
-    center = slope[0, 0] * x + slope[0, 1] * y + slope[0, 2] * z
+    x = delta[3 * i] - delta[3 * j]
+    y = delta[3 * i + 1] - delta[3 * j + 1]
+    z = delta[3 * i + 2] - delta[3 * j + 2]
+    center = slope[0] * x + slope[1] * y + slope[2] * z
     spread = 0.0
     for k in range(1, m):
-        spread += abs(slope[k, 0] * x + slope[k, 1] * y + slope[k, 2] * z)
-    size = (
-        abs(delta[i, 0]) + abs(delta[j, 0]) + abs(delta[i, 1]) + abs(delta[j, 1]) + abs(delta[i, 2]) + abs(delta[j, 2])
-    )
+        spread += abs(slope[3 * k] * x + slope[3 * k + 1] * y + slope[3 * k + 2] * z)
+    size = abs(delta[3 * i]) + abs(delta[3 * j]) + abs(delta[3 * i + 1]) + abs(delta[3 * j + 1])
+    size += abs(delta[3 * i + 2]) + abs(delta[3 * j + 2])
     rounding = _ROUND * size * 2.0
-    radius = slope[m, 0] * abs(x) + slope[m, 1] * abs(y) + slope[m, 2] * abs(z)
+    radius = slope[3 * m] * abs(x) + slope[3 * m + 1] * abs(y) + slope[3 * m + 2] * abs(z)
     return not (abs(center) > (spread + radius) * _UP + rounding + depth_error[i] + depth_error[j])
 
 
@@ -552,8 +585,8 @@ def _depth_reach(entries, depth, delta, depth_error, slope, ray, m, reach, deep)
 
 @njit(cache=True, error_model="numpy", forceinline=True)
 def _find_pairs(
-    k, entries, deep, delta, depth_error, slope, m, reach, room, largest, farthest, far, far_count, first, last,
-    pairs, count,
+    k, entries, length, deep, delta, depth_error, slope, m, reach, room, largest, farthest, far, far_count, first,
+    last, pairs, pair_limit, count,
 ):  # fmt: skip
     """Append the pairs (k, later entry) of uncertain order to ``pairs`` and widen ``first``, ``last``.
 
@@ -561,8 +594,8 @@ def _find_pairs(
     """
     i = entries[k]
     window = reach[k] + largest
-    beyond = entries.size
-    for other in range(k + 1, entries.size):
+    beyond = length
+    for other in range(k + 1, length):
         gap = (deep[other] - deep[k]) * room
         if gap > window:
             beyond = other
@@ -570,10 +603,10 @@ def _find_pairs(
         if gap <= reach[k] + reach[other] and _uncertain(
             i, entries[other], delta, depth_error, slope, m
         ):
-            if count >= pairs.shape[0]:
+            if count >= pair_limit:
                 return -1
-            pairs[count, 0] = k
-            pairs[count, 1] = other
+            pairs[2 * count] = k
+            pairs[2 * count + 1] = other
             last[k] = max(last[k], other)
             first[other] = min(first[other], k)
             count += 1
@@ -587,10 +620,10 @@ def _find_pairs(
         if gap <= reach[k] + reach[other] and _uncertain(
             i, entries[other], delta, depth_error, slope, m
         ):
-            if count >= pairs.shape[0]:
+            if count >= pair_limit:
                 return -1
-            pairs[count, 0] = k
-            pairs[count, 1] = other
+            pairs[2 * count] = k
+            pairs[2 * count + 1] = other
             last[k] = max(last[k], other)
             first[other] = min(first[other], k)
             count += 1
@@ -598,111 +631,121 @@ def _find_pairs(
 
 
 @njit(cache=True, error_model="numpy", forceinline=True)
-def _list_lanes(record, i, ox, oy, left, right, top, bottom, sigma_max, m, live, s, pixels):
-    """List the pixels of a range that take light and where the exponent may stay below ``sigma_max``.
+def _reached(record, ox, oy, left, right, top, bottom, m, s):
+    """The set of pixels of a range where the exponent may stay low enough for the threshold.
 
-    ``live`` holds the pixels that take light. Row by row, sigma >= (near1^2 + near2^2)/2 bounds the
-    columns, where near1 and near2 are what the forms' spread leaves of |y1| and |y2| (design.md, B2).
-    Writes the offsets from the mean into rows _AX and _AY and the pixel numbers into ``pixels``; returns
-    their number. (ox, oy) is the offset of the block's first pixel.
+    Row by row, sigma >= (near1^2 + near2^2)/2 bounds the columns, where near1 and near2 are what the forms' spread
+    leaves of |y1| and |y2| (design.md, B2). (ox, oy) is the offset of the block's first pixel from the mean.
     """
-    wild = record[i, WILD] != 0.0
+    inside = ((2 << (bottom * BLOCK + BLOCK - 1)) - 1) & ~((1 << (top * BLOCK)) - 1)
+    wild = record[WILD] != 0.0
     p, c, g, w1, w2 = 0.0, 0.0, 0.0, 0.0, 0.0
     spread1, spread2 = np.inf, np.inf
     if not wild:
         stride = m + 1
-        p = record[i, FORMS]
-        c = record[i, FORMS + stride]
-        g = record[i, FORMS + 2 * stride]
-        w1 = record[i, FORMS + 3 * stride]
-        w2 = record[i, FORMS + 4 * stride]
+        p = record[FORMS]
+        c = record[FORMS + stride]
+        g = record[FORMS + 2 * stride]
+        w1 = record[FORMS + 3 * stride]
+        w2 = record[FORMS + 4 * stride]
         x = max(abs(ox + left), abs(ox + right))
         y = max(abs(oy + top), abs(oy + bottom))
         spread1 = _ROUND * (abs(p) * x + abs(c) * y + abs(w1))
         spread2 = _ROUND * (abs(g) * y + abs(w2))
         for k in range(1, m + 1):
             spread1 += (
-                abs(record[i, FORMS + k]) * x
-                + abs(record[i, FORMS + stride + k]) * y
-                + abs(record[i, FORMS + 3 * stride + k])
+                abs(record[FORMS + k]) * x
+                + abs(record[FORMS + stride + k]) * y
+                + abs(record[FORMS + 3 * stride + k])
             )
-            spread2 += abs(record[i, FORMS + 2 * stride + k]) * y + abs(record[i, FORMS + 4 * stride + k])
+            spread2 += abs(record[FORMS + 2 * stride + k]) * y + abs(record[FORMS + 4 * stride + k])
         spread1 *= _ROOM
         spread2 *= _ROOM
     # without a bound on the columns the whole rows are taken
-    bounded = p > 0.0 and spread1 < np.inf and spread2 < np.inf
-    mask = 0
-    if bounded:
+    numbers = load8(s, _NUMBERS)
+    start = float(left) + 0.0 * numbers
+    stop = float(right) + 0.0 * numbers
+    if p > 0.0 and spread1 < np.inf and spread2 < np.inf:
         inverse = 1.0 / p
-        reach = 2.0 * sigma_max * _ROOM
-        first, past = float(left), float(right)
-        # all rows, in number one that the compiler does not know: vector code
-        for row in range(s.size // (_ROWS * BLOCK)):
-            ay = oy + row
-            near = max(0.0, abs(g * ay - w2) - spread2)
-            rest = reach - near * near * (2.0 - _ROOM)
-            half = (math.sqrt(max(rest, 0.0)) + spread1) * inverse * _ROOM
-            center = (c * ay + w1) * inverse - ox
-            slack = (_ROOM - 1.0) * (abs(center) + abs(ox) + half)
-            s[_C1 + row] = np.ceil(min(max(center - half - slack, first), past + 1.0))
-            s[_C2 + row] = np.floor(max(min(center + half + slack, past), first - 1.0)) if rest >= 0.0 else -1.0
-        for row in range(top, bottom + 1):
-            start, stop = int(s[_C1 + row]), int(s[_C2 + row])
-            if start <= stop:
-                mask |= ((2 << stop) - (1 << start)) << (row * BLOCK)
-    else:
-        for row in range(top, bottom + 1):
-            mask |= ((2 << right) - (1 << left)) << (row * BLOCK)
-    mask &= live
-    n = 0
-    while mask != 0:
-        pixels[n] = lowest_bit(mask)
-        mask &= mask - 1
-        n += 1
-    for lane in range(n):
-        s[_AX + lane] = ox + (pixels[lane] & (BLOCK - 1))
-        s[_AY + lane] = oy + (pixels[lane] >> _ROW_SHIFT)
-    return n
+        ay = oy + numbers
+        near = maximum(0.0, abs(g * ay - w2) - spread2)
+        rest = 2.0 * record[FAINT] * _ROOM - near * near * (2.0 - _ROOM)
+        half = (root(maximum(rest, 0.0)) + spread1) * inverse * _ROOM
+        center = (c * ay + w1) * inverse - ox
+        slack = (_ROOM - 1.0) * (abs(center) + abs(ox) + half)
+        start = maximum(start, center - half - slack)
+        stop = where(rest >= 0.0, minimum(stop, center + half + slack), -1.0)
+    store(s, _C1, start)
+    store(s, _C2, stop)
+    mask = 0
+    for row in range(BLOCK):
+        columns = bits((numbers >= s[_C1 + row]) & (numbers <= s[_C2 + row]))
+        mask |= columns << (row * BLOCK)
+    return mask & inside
+
+
+@njit(cache=True, error_model="numpy")
+def _still_live(found, pixels, live):
+    """Those lanes of ``found`` whose pixel is in ``live``."""
+    left = 0
+    while found != 0:
+        lane = lowest_bit(found)
+        found &= found - 1
+        if live & (1 << int(pixels[lane])) != 0:
+            left |= 1 << lane
+    return left
 
 
 @njit(cache=True, error_model="numpy")
 def _forward(
-    entries, record, box, tiles, tile_x, tile_y, colors, depth, delta, depth_error, slope, ray,
-    s, y1, y2, poly, pixels, layers, sources, lengths, reach, deep, far, first, last, slots, heights, places, pairs,
-    x0, y0, d, order, m, antialiased, rules, errors, marks,
+    entries_, record_, box_, tiles_, tile_x, tile_y, colors_, palette_, depth_, delta_, depth_error_, slope_, ray,
+    s_, y1, y2, poly, rows_, layers_, width, offset_x, offset_y, pixels_, batch_, lists_, lengths_, reach_, deep_, far_,
+    first_, last_, slots_, heights_, places_, pairs_, x0, y0, d, order, m, antialiased, rules, errors, marks_,
 ):  # fmt: skip
-    """Collect the layers of every lane, nearest first (design.md, B5-B6).
+    """Collect the layers of every pixel, nearest first (design.md, B5-B6).
 
-    ``first[k] <= k <= last[k]`` become the list positions whose depth order against entry k is
-    uncertain, ``pairs`` [., 2] all such pairs, ``slots[k]`` the row of ``heights`` that holds the
+    ``layers`` receives layer after layer, ``width`` numbers each; ``lists[q, e]`` the number of pixel q's layer e
+    there and its list position. ``first[k] <= k <= last[k]`` become the list positions whose depth order against
+    entry k is uncertain, ``pairs`` [., 2] all such pairs, ``slots[k]`` the row of ``heights`` that holds the
     upper alphas of an entry that takes part in one (-1: none), and of ``places`` that holds its place in
-    the lanes' lists (-1: not in it). Returns the number of pairs and of
+    the pixels' lists (-1: not in it). Returns the number of pairs and of
     slots; or _GIVE_UP where more pairs are uncertain than ``pairs`` may hold, or _GROW where another
     buffer is too small.
 
     Row _RHO of ``s`` receives how much transmittance may be lost to a stop that the kept layers ignore;
-    ``marks`` is set for the entries that some lane that takes light may draw, or stop at.
+    ``marks`` is set for the entries that some pixel that takes light may draw, or stop at; ``palette`` receives
+    their colours. ``batch`` [3, entries] is scratch, and so are ``offset_x``, ``offset_y`` and ``pixels``, by pixel
+    of a batch.
     """
+    entries, record, box, tiles = pointer(entries_), pointer(record_), pointer(box_), pointer(tiles_)
+    colors, palette, delta = pointer(colors_), pointer(palette_), pointer(delta_)
+    depth_error, slope, s, rows = pointer(depth_error_), pointer(slope_), pointer(s_), pointer(rows_)
+    layers, ax, ay, pixels = pointer(layers_), pointer(offset_x), pointer(offset_y), pointer(pixels_)
+    masks, begins, hits = pointer(batch_[0]), pointer(batch_[1]), pointer(batch_[2])
+    lists, lengths, reach, deep = pointer(lists_), pointer(lengths_), pointer(reach_), pointer(deep_)
+    far, first, last, slots = pointer(far_), pointer(first_), pointer(last_), pointer(slots_)
+    heights, places, pairs, marks = pointer(heights_), pointer(places_), pointer(pairs_), pointer(marks_)
+    length, columns, color_columns = entries_.size, record_.shape[1], colors_.shape[1]
+    deepest, slot_limit, pair_limit = lists_.shape[1], heights_.shape[0], pairs_.shape[0]
     unit = errors[0]
-    alpha_min = rules[7] * (1.0 - 2.0 * unit)
     stop = rules[9]
     stop_low = stop * (1.0 - 8.0 * unit)
     stop_high = stop * (1.0 + 8.0 * unit)
-    line = d == 1 and order == 2
-    vector = _VECTOR_LINE if line else _VECTOR
+    capacity = layers_.size // width
+    color_rows = color_columns // 3
     for q in range(PIXELS):
         s[_TLO + q] = 1.0
         s[_THI + q] = 1.0
         s[_REACH + q] = -1.0
         s[_RHO + q] = 0.0
-        s[_TMP + q] = 0.0
+        s[_LOST + q] = 0.0
         lengths[q] = 0
-    room, largest = _depth_reach(entries, depth, delta, depth_error, slope, ray, m, reach, deep)
+    room, largest = _depth_reach(entries_, depth_, delta_, depth_error_, slope_, ray, m, reach_, deep_)
     if not room > 0.0:
         return _GIVE_UP, 0
     far_count = 0
     farthest = 0.0
-    for k in range(entries.size):
+    for k in range(length):
         first[k] = k
         last[k] = k
         slots[k] = -1
@@ -713,142 +756,144 @@ def _forward(
     pair_count = 0
     slot_count = 0
     live = -1
-    live_first = 0
-    live_last = BLOCK - 1
-    record_bytes = 8 * record.shape[1]
-    color_bytes = 8 * colors.shape[1]
-    for k in range(entries.size):
-        if k + AHEAD < entries.size:
-            ahead = entries[k + AHEAD]
-            prefetch(box, ahead, 0)
-            prefetch(tiles, ahead, 0)
-            for byte in range(0, record_bytes, 64):
-                prefetch(record, ahead, byte)
-            prefetch(record, ahead, record_bytes - 8)
-            for byte in range(0, color_bytes, 64):
-                prefetch(colors, ahead, byte)
-        i = entries[k]
-        # only the pixels that the Gaussian may reach, in rows that still take light
-        left = int(math.ceil(min(max(box[i, 0] - 0.5 - x0, 0.0), float(BLOCK))))
-        right = int(math.floor(min(max(box[i, 1] - 0.5 - x0, -1.0), BLOCK - 1.0)))
-        top = max(live_first, int(math.ceil(min(max(box[i, 2] - 0.5 - y0, 0.0), float(BLOCK)))))
-        bottom = min(live_last, int(math.floor(min(max(box[i, 3] - 0.5 - y0, -1.0), BLOCK - 1.0))))
-        if top > bottom or left > right:
-            continue
-        sigma_max = record[i, FAINT]
-        n = _list_lanes(
-            record, i, x0 + 0.5 - record[i, MEAN_X], y0 + 0.5 - record[i, MEAN_Y], left, right, top, bottom,
-            sigma_max, m, live, s, pixels,
-        )  # fmt: skip
-        if n == 0:
-            continue
-        # vector code works on whole multiples; the lanes in excess repeat the last one
-        padded = -(-n // vector) * vector
-        for lane in range(n, padded):
-            s[_AX + lane] = s[_AX + n - 1]
-            s[_AY + lane] = s[_AY + n - 1]
-        sure = tiles[i, 4] <= tile_x and tile_x < tiles[i, 5] and tiles[i, 6] <= tile_y and tile_y < tiles[i, 7]
-        if not _alpha_forms(
-            record, i, padded, s, y1, y2, poly, sigma_max, d, order, m, antialiased, sure, rules, errors
-        ):
-            continue
-        pair_count = _find_pairs(
-            k, entries, deep, delta, depth_error, slope, m, reach, room, largest, farthest, far, far_count,
-            first, last, pairs, pair_count,
-        )  # fmt: skip
-        if pair_count < 0:
-            return _GIVE_UP, 0
-        alone = first[k] == k and last[k] == k
-        if not alone:
-            if slot_count >= heights.shape[0]:
-                return _GROW, 0
-            slots[k] = slot_count
-            heights[slot_count] = 0.0
-            places[slot_count] = -1
-            slot_count += 1
-        ended = False
-        seen = False
-        for lane in range(n):
-            high = s[_HI + lane]
-            q = int(pixels[lane])
-            if high < alpha_min:
+    used = 0
+    for start in range(0, length, _BATCH):
+        some = min(_BATCH, length - start)
+        begun = live
+        # which pixels: only those that the Gaussian may reach and that still take light
+        for b in range(some):
+            ahead = entries[min(start + b + _BATCH, length - 1)]
+            prefetch(box_, ahead, 0)
+            prefetch(tiles_, ahead, 0)
+            for byte in range(0, 8 * columns, 64):
+                prefetch(record_, ahead, byte)
+            prefetch(record_, ahead, 8 * columns - 8)
+            for byte in range(0, 8 * color_columns, 64):
+                prefetch(colors_, ahead, byte)
+            i = entries[start + b]
+            left = int(math.ceil(min(max(box[4 * i] - 0.5 - x0, 0.0), float(BLOCK))))
+            right = int(math.floor(min(max(box[4 * i + 1] - 0.5 - x0, -1.0), BLOCK - 1.0)))
+            top = int(math.ceil(min(max(box[4 * i + 2] - 0.5 - y0, 0.0), float(BLOCK))))
+            bottom = int(math.floor(min(max(box[4 * i + 3] - 0.5 - y0, -1.0), BLOCK - 1.0)))
+            masks[b] = 0
+            if top <= bottom and left <= right:
+                row = advanced(record, i * columns)
+                ox, oy = x0 + 0.5 - row[MEAN_X], y0 + 0.5 - row[MEAN_Y]
+                masks[b] = signed(live & _reached(row, ox, oy, left, right, top, bottom, m, s))
+        end = 0
+        for b in range(some):
+            i = entries[start + b]
+            row = advanced(record, i * columns)
+            ox, oy = x0 + 0.5 - row[MEAN_X], y0 + 0.5 - row[MEAN_Y]
+            mask = masks[b]
+            begins[b] = end
+            while mask != 0:
+                q = lowest_bit(mask)
+                mask &= mask - 1
+                pixels[end] = q
+                ax[end] = ox + (q & (BLOCK - 1))
+                ay[end] = oy + (q >> _ROW_SHIFT)
+                end += 1
+        begins[some] = end
+        # eight at a time, some in excess
+        if used + end + 8 > capacity:
+            return _GROW, 0
+        for b in range(some):
+            i = entries[start + b]
+            begin = begins[b]
+            n = begins[b + 1] - begin
+            hits[b] = 0
+            if n > 0:
+                core = advanced(tiles, 8 * i + 4)
+                sure = core[0] <= tile_x and tile_x < core[1] and core[2] <= tile_y and tile_y < core[3]
+                hits[b] = _alphas(
+                    advanced(record, i * columns), n, advanced(ax, begin), advanced(ay, begin), s, y1, y2, poly, rows,
+                    layers, (used + begin) * width, width, d, order, m, antialiased, sure, rules, errors,
+                )  # fmt: skip
+        for b in range(some):
+            found = hits[b]
+            begin = begins[b]
+            if live != begun:
+                found = _still_live(found, advanced(pixels, begin), live)
+            if found == 0:
                 continue
-            seen = True
-            low = s[_LO + lane]
-            before = s[_THI + q]
-            # two roundings of the running transmittance
-            t_low = s[_TLO + q] * (1.0 - high) * (1.0 - 8.0 * unit)
-            t_high = before * (1.0 - low) * (1.0 + 8.0 * unit)
-            if alone and t_high <= stop_low:
-                # surely the stop: neither this layer nor any behind it is drawn
-                live &= ~(1 << q)
-                ended = True
-                continue
-            count = lengths[q]
-            if count >= layers.shape[0]:
-                return _GROW, 0
-            dropped = False
-            if alone and t_low <= stop_high:
-                # s[_TMP] is the most that any stop so far may leave of the light
-                s[_TMP + q] = max(s[_TMP + q], min(before, stop_high / (1.0 - high)))
-                dropped = s[_TMP + q] >= before
-                if not dropped:
-                    s[_RHO + q] = s[_TMP + q]
-            row = layers[count, q]
-            if dropped:
-                row[0] = 0.5 * high
-                for r in range(1, m):
-                    row[r] = 0.0
-                row[m] = 0.5 * high * _UP
-                low = 0.0
-            elif line:
-                row[0] = s[_A0 + lane]
-                row[1] = s[_LINEAR + lane]
-                row[2] = s[_QUADRATIC + lane]
-                row[3] = s[_AR + lane]
-            else:
-                for r in range(m):
-                    row[r] = poly[r, lane]
-                row[m] = s[_AR + lane]
-            row[m + 1] = low
-            row[m + 2] = high
-            # transmittance after this layer at its least, before it at its most
-            row[m + 3] = t_low
-            row[m + 4] = before
-            sources[count, q] = k
-            lengths[q] = count + 1
-            s[_TLO + q] = t_low
-            s[_THI + q] = t_high
+            k = start + b
+            i = entries[k]
+            pair_count = _find_pairs(
+                k, entries, length, deep, delta, depth_error, slope, m, reach, room, largest, farthest, far, far_count,
+                first, last, pairs, pair_limit, pair_count,
+            )  # fmt: skip
+            if pair_count < 0:
+                return _GIVE_UP, 0
+            alone = first[k] == k and last[k] == k
             if not alone:
-                heights[slots[k], q] = high
-                places[slots[k], q] = count
-                # layers up to the last one whose order is uncertain may still come first
-                s[_REACH + q] = max(s[_REACH + q], float(last[k]))
-        # threads share these bytes: written no more than once each
-        if seen and marks[i] == 0:
-            marks[i] = 1
-        if slot_count > 0:
-            for lane in range(n):
+                if slot_count >= slot_limit:
+                    return _GROW, 0
+                slots[k] = slot_count
+                for q in range(slot_count * PIXELS, (slot_count + 1) * PIXELS):
+                    heights[q] = 0.0
+                    places[q] = -1
+                slot_count += 1
+            # threads share these bytes: written no more than once each
+            if marks[i] == 0:
+                marks[i] = 1
+            _set_colors(palette, k, advanced(colors, i * color_columns), color_rows)
+            while found != 0:
+                lane = begin + lowest_bit(found)
+                found &= found - 1
                 q = int(pixels[lane])
-                if s[_THI + q] <= stop_low and s[_REACH + q] <= k:
+                at = (used + lane) * width
+                low = layers[at + _ALPHA_LOW]
+                high = layers[at + _ALPHA_HIGH]
+                before = s[_THI + q]
+                # two roundings of the running transmittance
+                t_low = s[_TLO + q] * (1.0 - high) * (1.0 - 8.0 * unit)
+                t_high = before * (1.0 - low) * (1.0 + 8.0 * unit)
+                if alone and t_high <= stop_low:
+                    # surely the stop: neither this layer nor any behind it is drawn
                     live &= ~(1 << q)
-                    ended = True
-        if ended:
-            if live == 0:
-                break
-            live_first = lowest_bit(live) // BLOCK
-            while live & (255 << (live_last * BLOCK)) == 0:
-                live_last -= 1
+                    continue
+                count = lengths[q]
+                if count >= deepest:
+                    return _GROW, 0
+                if alone and t_low <= stop_high:
+                    # s[_LOST] is the most that any stop so far may leave of the light
+                    s[_LOST + q] = max(s[_LOST + q], min(before, stop_high / (1.0 - high)))
+                    if s[_LOST + q] >= before:
+                        _set_unknown(layers, at, high, m)
+                    else:
+                        s[_RHO + q] = s[_LOST + q]
+                layers[at + _LEFT] = t_low
+                layers[at + _LIGHT] = before
+                entry = 2 * (q * deepest + count)
+                lists[entry] = used + lane
+                lists[entry + 1] = k
+                lengths[q] = count + 1
+                s[_TLO + q] = t_low
+                s[_THI + q] = t_high
+                if not alone:
+                    heights[slots[k] * PIXELS + q] = high
+                    places[slots[k] * PIXELS + q] = count
+                    # layers up to the last one whose order is uncertain may still come first
+                    s[_REACH + q] = max(s[_REACH + q], float(last[k]))
+            if slot_count > 0:
+                for lane in range(begin, begins[b + 1]):
+                    q = int(pixels[lane])
+                    if s[_THI + q] <= stop_low and s[_REACH + q] <= k:
+                        live &= ~(1 << q)
+        if live == 0:
+            break
+        used += end
     return pair_count, slot_count
 
 
 @njit(cache=True, error_model="numpy")
-def _settle_stops(layers, sources, lengths, first, last, slots, places, s, m, stop, unit):
+def _settle_stops(layers, width, lists, lengths, first, last, slots, places, s, m, stop, unit):
     """Drop or weaken the layers of uncertain depth order that the stop may hide (design.md, B6)."""
     stop_low = stop * (1.0 - 8.0 * unit)
     stop_high = stop * (1.0 + 8.0 * unit)
     for q in range(PIXELS):
-        s[_CC + q] = 0.0
+        s[_C1 + q] = 0.0
     for k in range(slots.size):
         if slots[k] < 0:
             continue
@@ -859,37 +904,33 @@ def _settle_stops(layers, sources, lengths, first, last, slots, places, s, m, st
             if e < 0 or s[_TLO + q] > stop_high:
                 continue
             behind = e
-            while behind + 1 < lengths[q] and sources[behind + 1, q] <= last[k]:
+            while behind + 1 < lengths[q] and lists[q, behind + 1, 1] <= last[k]:
                 behind += 1
-            t_low = layers[behind, q, m + 3]
+            t_low = layers[lists[q, behind, 0] * width + _LEFT]
             if t_low > stop_high:
                 continue
             before = e
-            while before > 0 and sources[before - 1, q] >= first[k]:
+            while before > 0 and lists[q, before - 1, 1] >= first[k]:
                 before -= 1
-            light = layers[before, q, m + 4]
-            t_high = light * (1.0 - layers[e, q, m + 1]) * (1.0 + 8.0 * unit)
+            light = layers[lists[q, before, 0] * width + _LIGHT]
+            at = lists[q, e, 0] * width
+            t_high = light * (1.0 - layers[at + _ALPHA_LOW]) * (1.0 + 8.0 * unit)
             # the most light that a stop at this layer may leave
-            high = layers[e, q, m + 2]
+            high = layers[at + _ALPHA_HIGH]
             lost = min(light, stop_high / (1.0 - high))
             if t_high <= stop_low:
-                s[_CC + q] = max(s[_CC + q], lost)
-                for r in range(m + 3):
-                    layers[e, q, r] = 0.0
+                s[_C1 + q] = max(s[_C1 + q], lost)
+                _set_unknown(pointer(layers), at, 0.0, m)
             elif lost < light:
                 # kept; what the stop may leave of the light is added at the end
-                s[_RHO + q] = max(s[_RHO + q], lost, s[_TMP + q])
+                s[_RHO + q] = max(s[_RHO + q], lost, s[_LOST + q])
             else:
-                s[_CC + q] = max(s[_CC + q], lost)
-                layers[e, q, 0] = 0.5 * high
-                for r in range(1, m):
-                    layers[e, q, r] = 0.0
-                layers[e, q, m] = 0.5 * high * _UP
-                layers[e, q, m + 1] = 0.0
+                s[_C1 + q] = max(s[_C1 + q], lost)
+                _set_unknown(pointer(layers), at, high, m)
     # a stop at a dropped or weakened layer also hides the kept layers behind it
     for q in range(PIXELS):
         if s[_RHO + q] > 0.0:
-            s[_RHO + q] = max(s[_RHO + q], s[_CC + q])
+            s[_RHO + q] = max(s[_RHO + q], s[_C1 + q])
 
 
 @njit(cache=True, error_model="numpy")
@@ -907,7 +948,7 @@ def _color_range(colors, i, channel, color_rows):
 def _swap_bounds(pairs, pair_count, slots, slot_count, heights, entries, colors, color_rows, moves, most):
     """Bound what reordering may change when a slot's layer joins the layers behind it (design.md, O2).
 
-    ``moves[slot, 2 c]`` and ``moves[slot, 2 c + 1]`` (rows of lanes) are how much it may lower or raise channel c.
+    ``moves[slot, c]`` and ``moves[slot, 3 + c]`` (rows of lanes) are how much it may lower or raise channel c.
     """
     moves[:slot_count] = 0.0
     most[:slot_count] = 0.0
@@ -924,8 +965,8 @@ def _swap_bounds(pairs, pair_count, slots, slot_count, heights, entries, colors,
                 change = max(0.0, high_e - low_f) if side == 0 else max(0.0, high_f - low_e)
                 if change == 0.0:
                     continue
-                total = moves[front, 2 * channel + side]
-                single = most[front, 2 * channel + side]
+                total = moves[front, 3 * side + channel]
+                single = most[front, 3 * side + channel]
                 alpha = heights[back]
                 for q in range(n):
                     total[q] += alpha[q] * change
@@ -943,7 +984,10 @@ def _swap_bounds(pairs, pair_count, slots, slot_count, heights, entries, colors,
 
 @njit(cache=True, error_model="numpy")
 def _collect_moves(moves, slot_count, places, extra, moved):
-    """Move the swap bounds from slots to the lanes' layers; ``moved[e]`` tells whether row e has any."""
+    """Move the swap bounds from slots to the pixels' layers; ``moved[e]`` tells whether layer e of any has some.
+
+    ``extra[e]``, flat by pixel: how much three channels, and one of none, may fall, then rise.
+    """
     for slot in range(slot_count):
         for q in range(PIXELS):
             e = places[slot, q]
@@ -952,14 +996,15 @@ def _collect_moves(moves, slot_count, places, extra, moved):
             if not moved[e]:
                 moved[e] = True
                 extra[e] = 0.0
-            for r in range(6):
-                extra[e, r, q] = moves[slot, r, q]
+            for channel in range(3):
+                extra[e, 8 * q + channel] = moves[slot, channel, q]
+                extra[e, 8 * q + 4 + channel] = moves[slot, 3 + channel, q]
 
 
 @njit(cache=True, error_model="numpy")
 def _interval_chain(
-    layers, sources, entries, colors, extra, moved, low, high, start, stop, q, channel, m, color_rows,
-    suffix_low, suffix_high,
+    layers, width, lists, entries, colors, extra, moved, low, high, start, stop, q, channel, color_rows, suffix_low,
+    suffix_high,
 ):  # fmt: skip
     """One step of the interval blend for layers [start, stop) whose order is uncertain (design.md, O2-O4).
 
@@ -967,16 +1012,16 @@ def _interval_chain(
     """
     behind_low, behind_high = low, high
     for e in range(stop - 1, start - 1, -1):
-        layer = layers[e, q]
-        c_low, c_high = _color_range(colors, entries[sources[e, q]], channel, color_rows)
-        a_low = layer[m + 1]
-        a_high = layer[m + 2]
+        at = lists[q, e, 0] * width
+        c_low, c_high = _color_range(colors, entries[lists[q, e, 1]], channel, color_rows)
+        a_low = layers[at + _ALPHA_LOW]
+        a_high = layers[at + _ALPHA_HIGH]
         v = c_high - high
         front_high = high + (a_high if v > 0.0 else a_low) * v
         v = c_low - low
         front_low = low + (a_high if v < 0.0 else a_low) * v
-        lower = extra[e, 2 * channel, q] if moved[e] else 0.0
-        lift = extra[e, 2 * channel + 1, q] if moved[e] else 0.0
+        lower = extra[e, 8 * q + channel] if moved[e] else 0.0
+        lift = extra[e, 8 * q + 4 + channel] if moved[e] else 0.0
         # wherever it goes among the layers behind, it moves the colour by at most its alpha times
         # the distance to the darkest or brightest of what lies behind
         hull_high = max(front_high, high + a_high * max(0.0, c_high - suffix_low))
@@ -989,17 +1034,17 @@ def _interval_chain(
     keys = np.empty(count)
     for side in range(2):
         for e in range(count):
-            c_low, c_high = _color_range(colors, entries[sources[start + e, q]], channel, color_rows)
+            c_low, c_high = _color_range(colors, entries[lists[q, start + e, 1]], channel, color_rows)
             keys[e] = c_low if side == 0 else -c_high
         order = np.argsort(keys)
         value = behind_low if side == 0 else behind_high
         # nearest first: darkest for the lower bound, brightest for the upper one
         for position in range(count - 1, -1, -1):
-            layer = layers[start + order[position], q]
+            at = lists[q, start + order[position], 0] * width
             color = keys[order[position]] if side == 0 else -keys[order[position]]
             v = color - value
             grows = v < 0.0 if side == 0 else v > 0.0
-            value += layer[m + 2 if grows else m + 1] * v
+            value += layers[at + (_ALPHA_HIGH if grows else _ALPHA_LOW)] * v
         if side == 0:
             low = max(low, value)
         else:
@@ -1009,7 +1054,7 @@ def _interval_chain(
 
 @njit(cache=True, error_model="numpy")
 def _interval_blend(
-    layers, sources, entries, colors, lengths, extra, moved, chain, background, m, color_rows, low, high
+    layers, width, lists, entries, colors, lengths, extra, moved, chain, background, color_rows, low, high
 ):
     """Sharpen the interval blend where depth orders are uncertain; ``chain[k]`` numbers the groups."""
     size = np.zeros(chain.size + 2, np.int64)
@@ -1020,11 +1065,11 @@ def _interval_blend(
         weight = 0.0
         for e in range(lengths[q]):
             # of two layers alone the swap bound is exact
-            if moved[e] and size[chain[sources[e, q]]] > 2:
+            if moved[e] and size[chain[lists[q, e, 1]]] > 2:
                 most = 0.0
-                for r in range(6):
-                    most = max(most, extra[e, r, q])
-                weight += most * layers[e, q, m + 4]
+                for r in range(8):
+                    most = max(most, extra[e, 8 * q + r])
+                weight += most * layers[lists[q, e, 0] * width + _LIGHT]
         if not weight > _REORDERING_MATTERS:
             continue
         for channel in range(3):
@@ -1035,11 +1080,11 @@ def _interval_blend(
             stop = int(lengths[q])
             while stop > 0:
                 start = stop - 1
-                while start > 0 and chain[sources[start - 1, q]] == chain[sources[stop - 1, q]]:
+                while start > 0 and chain[lists[q, start - 1, 1]] == chain[lists[q, stop - 1, 1]]:
                     start -= 1
                 value_low, value_high, suffix_low, suffix_high = _interval_chain(
-                    layers, sources, entries, colors, extra, moved, value_low, value_high, start, stop, q, channel, m,
-                    color_rows, suffix_low, suffix_high,
+                    layers, width, lists, entries, colors, extra, moved, value_low, value_high, start, stop, q,
+                    channel, color_rows, suffix_low, suffix_high,
                 )  # fmt: skip
                 stop = start
             low[channel, q] = max(low[channel, q], value_low)
@@ -1047,358 +1092,234 @@ def _interval_blend(
 
 
 @njit(cache=True, error_model="numpy", forceinline=True)
-def _step_affine(n, s, layer, start, p, m, color_rows):
-    """One layer over one channel's polynomials ``p`` [m, lanes] of order 1 (design.md, B7): one loop by parameter.
+def _set_colors(palette, k, color, color_rows):
+    """Write the colour of list position k: centre, slopes, radius, then its lower and upper bound.
 
-    Leaves the colour's middle, spread and radius in rows _C1, _CC, _C2, the sizes of colour - P and of its slopes in
-    _SR and _SB, one more than those of alpha in _SL, what is left of the products in _TMP, and |P| in _S0.
+    Each is four numbers: three channels and one of none.
     """
-    moving = color_rows > 2
-    color, middle = layer[start], p[0]
-    for q in range(n):
-        # value = colour - P, a form without radius
-        value = color[q] - middle[q]
-        s[_C1 + q] = color[q]
-        s[_WEIGHT + q] = value
-        s[_SR + q] = abs(value)
-        s[_S0 + q] = middle[q] + s[_A0 + q] * value
-        s[_CC + q] = 0.0
-        s[_SB + q] = 0.0
-        s[_TMP + q] = 0.0
-    for k in range(1, m):
-        alpha, slope = layer[k], p[k]
-        if moving:
-            color = layer[start + k]
-            for q in range(n):
-                change = color[q] - slope[q]
-                curve = 0.5 * (alpha[q] * change)
-                slope[q] += s[_A0 + q] * change + s[_WEIGHT + q] * alpha[q]
-                s[_S0 + q] += curve
-                s[_TMP + q] -= abs(curve)
-                s[_SB + q] += abs(change)
-                s[_CC + q] += abs(color[q])
-        else:
-            for q in range(n):
-                change = -slope[q]
-                curve = 0.5 * (alpha[q] * change)
-                slope[q] += s[_A0 + q] * change + s[_WEIGHT + q] * alpha[q]
-                s[_S0 + q] += curve
-                s[_TMP + q] -= abs(curve)
-                s[_SB + q] += abs(change)
-    # the last row of a colour is its radius
-    color = layer[start + color_rows - 1]
-    has_radius = 1.0 if color_rows > 1 else 0.0
-    for q in range(n):
-        spread = has_radius * abs(color[q])
-        s[_C2 + q] = spread
-        s[_CC + q] += spread
-        s[_TMP + q] += s[_L1 + q] * s[_SB + q]
-        s[_SL + q] = 1.0 + s[_L1 + q]
-        middle[q] = s[_S0 + q]
-        s[_S0 + q] = abs(s[_S0 + q])
-
-
-@njit(cache=True, error_model="numpy")
-def _step_curved(n, s, layer, start, p, value, d, m, color_rows):
-    """`_step_affine` for order 2; ``value`` [m, lanes] is scratch."""
-    moving = color_rows > 2
-    for q in range(n):
-        s[_C1 + q] = layer[start, q]
-        s[_CC + q] = 0.0
-    for k in range(1, color_rows):
-        for q in range(n):
-            s[_CC + q] += abs(layer[start + k, q])
-    if color_rows > 1:
-        for q in range(n):
-            s[_C2 + q] = layer[start + color_rows - 1, q]
-    else:
-        for q in range(n):
-            s[_C2 + q] = 0.0
-    # value = colour - P, a form without radius
-    for q in range(n):
-        value[0, q] = s[_C1 + q] - p[0, q]
-    for k in range(1, m):
-        if moving:
-            for q in range(n):
-                value[k, q] = layer[start + k, q] - p[k, q]
-        else:
-            for q in range(n):
-                value[k, q] = -p[k, q]
-    _spread(value, 1, 1 + d, n, s, _L2)
-    for q in range(n):
-        p[0, q] += s[_A0 + q] * value[0, q]
-    for k in range(1, m):
-        for q in range(n):
-            p[k, q] += s[_A0 + q] * value[k, q] + value[0, q] * layer[k, q]
-    _spread(value, 1 + d, m, n, s, _B2)
-    row = 1 + d
-    for k in range(1, d + 1):
-        for q in range(n):
-            p[row, q] += layer[k, q] * value[k, q]
-        row += 1
-        for l in range(k + 1, d + 1):
-            for q in range(n):
-                p[row, q] += layer[k, q] * value[l, q] + layer[l, q] * value[k, q]
-            row += 1
-    for q in range(n):
-        s[_TMP + q] = s[_L1 + q] * s[_B2 + q] + s[_B1 + q] * (s[_L2 + q] + s[_B2 + q])
-    for q in range(n):
-        s[_SL + q] = 1.0 + s[_L1 + q] + s[_B1 + q]
-        s[_SB + q] = s[_L2 + q] + s[_B2 + q]
-    for q in range(n):
-        s[_SR + q] = abs(value[0, q])
-    for q in range(n):
-        s[_S0 + q] = abs(p[0, q])
-
-
-@njit(cache=True, error_model="numpy")
-def _blend_group(
-    ranked, layers, sources, entries, colors, lengths, layer, extra, moved, background, d, order, m, color_rows,
-    state, radius, low, high, value, s,
-):  # fmt: skip
-    """Blend the layers of the pixels ``ranked`` back to front, as forms and as intervals (design.md, B7).
-
-    ``state`` [3, m, lanes] and ``radius`` [3, lanes] receive the polynomial forms, ``low`` and
-    ``high`` [3, lanes] the intervals; rows _MIN and _MAX of ``s`` the range of all colours.
-    """
-    n = value.shape[1]
-    count = 0
-    for q in range(n):
-        s[_MIN + q] = min(background[0], background[1], background[2])
-        s[_MAX + q] = max(background[0], background[1], background[2])
-        count = max(count, int(lengths[ranked[q]]))
-    state[:] = 0.0
-    radius[:] = 0.0
+    forms = max(color_rows - 1, 1)
+    at = 4 * k * (forms + 3)
     for channel in range(3):
-        for q in range(n):
-            state[channel, 0, q] = background[channel]
-            low[channel, q] = background[channel]
-            high[channel, q] = background[channel]
-    for e in range(count - 1, -1, -1):
-        # lane by lane in memory, row by row for the arithmetic
-        for q in range(n):
-            lane = ranked[q]
-            if e < lengths[lane]:
-                for r in range(m + 3):
-                    layer[r, q] = layers[e, lane, r]
-                i = entries[sources[e, lane]]
-                for r in range(3 * color_rows):
-                    layer[m + 3 + r, q] = colors[i, r]
-            else:
-                for r in range(layer.shape[0]):
-                    layer[r, q] = 0.0
-        _spread(layer, 1, 1 + d, n, s, _L1)
-        if order == 2:
-            _spread(layer, 1 + d, m, n, s, _B1)
-        # rows that the loops below use often
-        for q in range(n):
-            s[_A0 + q] = layer[0, q]
-        for q in range(n):
-            s[_AR + q] = layer[m, q]
-        for q in range(n):
-            s[_LO + q] = layer[m + 1, q]
-        for q in range(n):
-            s[_HI + q] = layer[m + 2, q]
-        for channel in range(3):
-            start = m + 3 + channel * color_rows
-            p, r, top, bottom = state[channel], radius[channel], high[channel], low[channel]
-            if order == 1:
-                _step_affine(n, s, layer, start, p, m, color_rows)
-            else:
-                _step_curved(n, s, layer, start, p, value, d, m, color_rows)
-            for q in range(n):
-                size = s[_SR + q] + s[_SB + q]
-                r[q] = (
-                    (1.0 - s[_LO + q]) * r[q]
-                    + s[_HI + q] * s[_C2 + q]
-                    + s[_AR + q] * size
-                    + s[_TMP + q]
-                    + _ROUND * (s[_S0 + q] + size * s[_SL + q])
-                ) * _UP
-            for q in range(n):
-                c_high = s[_C1 + q] + s[_CC + q] * _UP
-                v = c_high - top[q]
-                top[q] += (s[_HI + q] if v > 0.0 else s[_LO + q]) * v
-                s[_MAX + q] = max(s[_MAX + q], c_high)
-            for q in range(n):
-                c_low = s[_C1 + q] - s[_CC + q] * _UP
-                v = c_low - bottom[q]
-                bottom[q] += (s[_HI + q] if v < 0.0 else s[_LO + q]) * v
-                s[_MIN + q] = min(s[_MIN + q], c_low)
-            if moved[e]:
-                lower = 2 * channel
-                lift = 2 * channel + 1
-                for q in range(n):
-                    falls, rises = extra[e, lower, ranked[q]], extra[e, lift, ranked[q]]
-                    p[0, q] += 0.5 * (rises - falls)
-                    r[q] += 0.5 * (rises + falls) * _UP
-                    top[q] += rises
-                    bottom[q] -= falls
-
-
-@njit(cache=True, error_model="numpy")
-def _blend(
-    ranked, layers, sources, entries, colors, lengths, layer, extra, moved, background, d, order, m, color_rows,
-    group, group_ends, state, radius, low, high, value, s,
-):  # fmt: skip
-    """`_blend_group` of all pixels, in the order ``ranked``.
-
-    Rows _DARKEST and _BRIGHTEST of ``s`` receive the range of all colours; ``group`` [3, m, lanes] and
-    ``group_ends`` [3, 3, lanes] are scratch for a group.
-    """
-    n = value.shape[1]
-    for first in range(0, PIXELS, n):
-        some = ranked[first : first + n]
-        _blend_group(
-            some, layers, sources, entries, colors, lengths, layer, extra, moved, background, d, order, m, color_rows,
-            group, group_ends[0], group_ends[1], group_ends[2], value, s,
-        )  # fmt: skip
-        for q in range(n):
-            s[_DARKEST + int(some[q])] = s[_MIN + q]
-            s[_BRIGHTEST + int(some[q])] = s[_MAX + q]
-        for channel in range(3):
-            for k in range(m):
-                for q in range(n):
-                    state[channel, k, some[q]] = group[channel, k, q]
-            for q in range(n):
-                radius[channel, some[q]] = group_ends[0, channel, q]
-                low[channel, some[q]] = group_ends[1, channel, q]
-                high[channel, some[q]] = group_ends[2, channel, q]
-
-
-# rows of one channel of the one-parameter blend: coefficients, radius, interval, then the layer's colour
-_P0, _P1, _P2, _PR, _PLO, _PHI, _K0, _K1, _K2, _KR = range(0, 10 * _GROUP, _GROUP)
-_CHANNEL_ROWS = 10
+        start = channel * color_rows
+        spread = 0.0
+        for r in range(1, color_rows):
+            spread += abs(color[start + r])
+        spread *= _UP
+        for r in range(forms):
+            palette[at + 4 * r + channel] = color[start + r]
+        palette[at + 4 * forms + channel] = color[start + forms] if color_rows > 1 else 0.0
+        palette[at + 4 * forms + 4 + channel] = color[start] - spread
+        palette[at + 4 * forms + 8 + channel] = color[start] + spread
 
 
 @njit(cache=True, error_model="numpy", forceinline=True)
-def _blend_channel_line(n, s, t):
-    """Blend one layer (rows _A0, _LINEAR, _QUADRATIC, _AR, _LO, _HI of ``s``) into one channel's rows ``t``."""
-    for q in range(n):
-        a0 = s[_A0 + q]
-        a1 = s[_LINEAR + q]
-        a2 = s[_QUADRATIC + q]
-        low = s[_LO + q]
-        high = s[_HI + q]
-        p0 = t[_P0 + q]
-        p1 = t[_P1 + q]
-        p2 = t[_P2 + q]
-        # colour - P, a form without radius
-        v0 = t[_K0 + q] - p0
-        v1 = t[_K1 + q] - p1
-        v2 = t[_K2 + q] - p2
-        p0 += a0 * v0
-        t[_P0 + q] = p0
-        t[_P1 + q] = p1 + a0 * v1 + v0 * a1
-        t[_P2 + q] = p2 + a0 * v2 + v0 * a2 + a1 * v1
-        a1 = abs(a1)
-        a2 = abs(a2)
-        v1 = abs(v1)
-        v2 = abs(v2)
-        size = abs(v0) + v1 + v2
-        t[_PR + q] = (
-            (1.0 - low) * t[_PR + q]
-            + high * t[_KR + q]
-            + s[_AR + q] * size
-            + a1 * v2
-            + a2 * (v1 + v2)
-            + _ROUND * (abs(p0) + size * (1.0 + a1 + a2))
-        ) * _UP
-        spread = (abs(t[_K1 + q]) + abs(t[_K2 + q]) + t[_KR + q]) * _UP
-        c_high = t[_K0 + q] + spread
-        c_low = t[_K0 + q] - spread
-        v = c_high - t[_PHI + q]
-        t[_PHI + q] += (high if v > 0.0 else low) * v
-        v = c_low - t[_PLO + q]
-        t[_PLO + q] += (high if v < 0.0 else low) * v
-        s[_MAX + q] = max(s[_MAX + q], c_high)
-        s[_MIN + q] = min(s[_MIN + q], c_low)
+def _blend_interval(low, high, layers, at, palette, ends):
+    """One layer over the interval [low, high] (design.md, B7)."""
+    a_low, a_high = layers[at + _ALPHA_LOW], layers[at + _ALPHA_HIGH]
+    v = load4(palette, ends) - low
+    low = fma(where(v < 0.0, a_high, a_low), v, low)
+    v = load4(palette, ends + 4) - high
+    return low, fma(where(v > 0.0, a_high, a_low), v, high)
 
 
 @njit(cache=True, error_model="numpy")
 def _blend_line(
-    ranked, layers, sources, entries, colors, lengths, extra, moved, background, color_rows, state, radius, low, high,
-    red, green, blue, s,
-):  # fmt: skip
-    """`_blend` for one parameter and order 2; ``red``, ``green``, ``blue`` [rows * lanes] are scratch for a group."""
-    n = red.size // _CHANNEL_ROWS
-    darkest = min(background[0], background[1], background[2])
-    brightest = max(background[0], background[1], background[2])
-    for first in range(0, PIXELS, n):
-        for channel in range(3):
-            t = red if channel == 0 else (green if channel == 1 else blue)
-            t[:] = 0.0
-            for q in range(n):
-                t[_P0 + q] = background[channel]
-                t[_PLO + q] = background[channel]
-                t[_PHI + q] = background[channel]
-        deepest = 0
-        for q in range(n):
-            s[_MIN + q] = darkest
-            s[_MAX + q] = brightest
-            deepest = max(deepest, lengths[ranked[first + q]])
-        for e in range(deepest - 1, -1, -1):
-            # lane by lane in memory, row by row for the arithmetic
-            for q in range(n):
-                lane = ranked[first + q]
-                if e < lengths[lane]:
-                    row = layers[e, lane]
-                    s[_A0 + q] = row[0]
-                    s[_LINEAR + q] = row[1]
-                    s[_QUADRATIC + q] = row[2]
-                    s[_AR + q] = row[3]
-                    s[_LO + q] = row[4]
-                    s[_HI + q] = row[5]
-                    # a list that has ended keeps the colour of its last layer, with alpha 0
-                    color = colors[entries[sources[e, lane]]]
-                    red[_K0 + q] = color[0]
-                    green[_K0 + q] = color[color_rows]
-                    blue[_K0 + q] = color[2 * color_rows]
-                    if color_rows > 1:
-                        # the last row of a colour is its radius, those between are its slopes
-                        red[_KR + q] = color[color_rows - 1]
-                        green[_KR + q] = color[2 * color_rows - 1]
-                        blue[_KR + q] = color[3 * color_rows - 1]
-                    if color_rows > 2:
-                        red[_K1 + q] = color[1]
-                        red[_K2 + q] = color[2]
-                        green[_K1 + q] = color[color_rows + 1]
-                        green[_K2 + q] = color[color_rows + 2]
-                        blue[_K1 + q] = color[2 * color_rows + 1]
-                        blue[_K2 + q] = color[2 * color_rows + 2]
-                else:
-                    s[_A0 + q] = 0.0
-                    s[_LINEAR + q] = 0.0
-                    s[_QUADRATIC + q] = 0.0
-                    s[_AR + q] = 0.0
-                    s[_LO + q] = 0.0
-                    s[_HI + q] = 0.0
-            _blend_channel_line(n, s, red)
-            _blend_channel_line(n, s, green)
-            _blend_channel_line(n, s, blue)
+    layers_, width, lists_, palette_, forms, lengths, extra_, moved, background_, state, radius, low, high, s, t_
+):
+    """Blend every pixel's layers back to front, as forms and as intervals (design.md, B7): one parameter, order 2.
+
+    Lanes are the channels. ``background`` [4] and ``palette`` (`_set_colors`, ``forms`` rows before the radius) have
+    a fourth one of zeros. ``state`` [3, m, pixels] and ``radius`` [3, pixels] receive the polynomial forms, ``low``
+    and ``high`` [3, pixels] the intervals; rows _DARKEST and _BRIGHTEST of ``s`` the range of all colours. ``t`` is
+    scratch.
+    """
+    moving = forms > 1
+    layers, lists, palette, extra = pointer(layers_), pointer(lists_), pointer(palette_), pointer(extra_)
+    background, t = pointer(background_), pointer(t_)
+    deepest = lists_.shape[1]
+    for q in range(PIXELS):
+        p0 = load4(background, 0)
+        p1 = 0.0 * p0
+        p2 = 0.0 * p0
+        r = 0.0 * p0
+        bottom = p0
+        top = p0
+        darkest = p0
+        brightest = p0
+        for e in range(int(lengths[q]) - 1, -1, -1):
+            entry = 2 * (q * deepest + e)
+            at = int(lists[entry]) * width
+            key = 4 * int(lists[entry + 1]) * (forms + 3)
+            ends = key + 4 * forms + 4
+            a0, a1, a2 = layers[at + _FORM], layers[at + _FORM + 1], layers[at + _FORM + 2]
+            # colour - P, a form without radius
+            v0 = load4(palette, key) - p0
+            if moving:
+                v1 = load4(palette, key + 4) - p1
+                v2 = load4(palette, key + 8) - p2
+            else:
+                v1 = -p1
+                v2 = -p2
+            # sums in the order that leaves short chains from layer to layer
+            p0 = fma(a0, v0, p0)
+            p1 = fma(a0, v1, fma(a1, v0, p1))
+            p2 = fma(a0, v2, fma(a2, v0, fma(a1, v1, p2)))
+            a1 = abs(a1)
+            a2 = abs(a2)
+            v1 = abs(v1)
+            v2 = abs(v2)
+            v1 = v1 + v2
+            size = abs(v0) + v1
+            added = fma(layers[at + _ALPHA_HIGH], load4(palette, key + 4 * forms), fma(a1, v2, a2 * v1))
+            added = fma(layers[at + _FORM + 3], size, fma(_ROUND, fma(1.0 + a1 + a2, size, abs(p0)), added))
+            r = fma(1.0 - layers[at + _ALPHA_LOW], r, added) * _UP
+            bottom, top = _blend_interval(bottom, top, layers, at, palette, ends)
+            darkest = minimum(darkest, load4(palette, ends))
+            brightest = maximum(brightest, load4(palette, ends + 4))
             if moved[e]:
-                for channel in range(3):
-                    t = red if channel == 0 else (green if channel == 1 else blue)
-                    for q in range(n):
-                        lower = extra[e, 2 * channel, ranked[first + q]]
-                        lift = extra[e, 2 * channel + 1, ranked[first + q]]
-                        t[_P0 + q] += 0.5 * (lift - lower)
-                        t[_PR + q] += 0.5 * (lift + lower) * _UP
-                        t[_PHI + q] += lift
-                        t[_PLO + q] -= lower
-        for q in range(n):
-            s[_DARKEST + int(ranked[first + q])] = s[_MIN + q]
-            s[_BRIGHTEST + int(ranked[first + q])] = s[_MAX + q]
-        for channel in range(3):
-            t = red if channel == 0 else (green if channel == 1 else blue)
-            for q in range(n):
-                lane = ranked[first + q]
-                state[channel, 0, lane] = t[_P0 + q]
-                state[channel, 1, lane] = t[_P1 + q]
-                state[channel, 2, lane] = t[_P2 + q]
-                radius[channel, lane] = t[_PR + q]
-                low[channel, lane] = t[_PLO + q]
-                high[channel, lane] = t[_PHI + q]
+                move = 8 * (e * PIXELS + q)
+                falls, rises = load4(extra, move), load4(extra, move + 4)
+                p0 = p0 + 0.5 * (rises - falls)
+                r = r + 0.5 * (rises + falls) * _UP
+                bottom = bottom - falls
+                top = top + rises
+        store(t, 0, p0)
+        store(t, 4, p1)
+        store(t, 8, p2)
+        _keep_pixel(q, 3, t, r, bottom, top, darkest, brightest, state, radius, low, high, s)
+
+
+@njit(cache=True, error_model="numpy", forceinline=True)
+def _keep_pixel(q, m, t, r, bottom, top, darkest, brightest, state, radius, low, high, s):
+    """Write what was blended for pixel q; ``t`` starts with the coefficients' rows, and is scratch behind them."""
+    end = 4 * m
+    store(t, end, r)
+    store(t, end + 4, bottom)
+    store(t, end + 8, top)
+    store(t, end + 12, darkest)
+    store(t, end + 16, brightest)
+    for channel in range(3):
+        for k in range(m):
+            state[channel, k, q] = t[4 * k + channel]
+        radius[channel, q] = t[end + channel]
+        low[channel, q] = t[end + 4 + channel]
+        high[channel, q] = t[end + 8 + channel]
+    s[_DARKEST + q] = min(t[end + 12], t[end + 13], t[end + 14])
+    s[_BRIGHTEST + q] = max(t[end + 16], t[end + 17], t[end + 18])
+
+
+@njit(cache=True, error_model="numpy", forceinline=True)
+def _step_affine(r, layers, at, palette, key, forms, t, m):
+    """One layer over the polynomials ``t`` [m, 4], flat, of order 1 and radius ``r`` (design.md, B7); the new radius.
+
+    Lanes are the channels.
+    """
+    moving = forms > 1
+    a0 = layers[at + _FORM]
+    p0 = load4(t, 0)
+    value = load4(palette, key) - p0
+    middle = fma(a0, value, p0)
+    steep = 0.0
+    change_size = 0.0 * p0
+    curves = 0.0 * p0
+    for k in range(1, m):
+        slope = load4(t, 4 * k)
+        alpha = layers[at + _FORM + k]
+        change = -slope
+        if moving:
+            change = load4(palette, key + 4 * k) - slope
+        # half of a product of two slopes goes to the centre, half to the radius
+        curve = 0.5 * (alpha * change)
+        store(t, 4 * k, fma(a0, change, fma(alpha, value, slope)))
+        middle = middle + curve
+        curves = curves + abs(curve)
+        steep += abs(alpha)
+        change_size = change_size + abs(change)
+    store(t, 0, middle)
+    size = abs(value) + change_size
+    added = fma(layers[at + _ALPHA_HIGH], load4(palette, key + 4 * forms), fma(steep, change_size, -curves))
+    added = fma(layers[at + _FORM + m], size, fma(_ROUND, fma(1.0 + steep, size, abs(middle)), added))
+    return fma(1.0 - layers[at + _ALPHA_LOW], r, added) * _UP
+
+
+@njit(cache=True, error_model="numpy", forceinline=True)
+def _step_curved(r, layers, at, palette, key, forms, t, value, d, m):
+    """`_step_affine` for order 2; ``value`` [m, 4], flat, is scratch."""
+    moving = forms > 1
+    a0 = layers[at + _FORM]
+    # value = colour - P, a form without radius
+    v0 = load4(palette, key) - load4(t, 0)
+    slopes = 0.0 * v0
+    bends = 0.0 * v0
+    steep, bent = 0.0, 0.0
+    for k in range(1, m):
+        v = -load4(t, 4 * k)
+        if moving:
+            v = load4(palette, key + 4 * k) + v
+        store(value, 4 * k, v)
+        alpha = layers[at + _FORM + k]
+        store(t, 4 * k, load4(t, 4 * k) + (a0 * v + alpha * v0))
+        if k <= d:
+            slopes = slopes + abs(v)
+            steep += abs(alpha)
+        else:
+            bends = bends + abs(v)
+            bent += abs(alpha)
+    p0 = load4(t, 0) + a0 * v0
+    store(t, 0, p0)
+    row = 1 + d
+    for k in range(1, d + 1):
+        alpha, v = layers[at + _FORM + k], load4(value, 4 * k)
+        store(t, 4 * row, load4(t, 4 * row) + alpha * v)
+        row += 1
+        for l in range(k + 1, d + 1):
+            product = alpha * load4(value, 4 * l) + layers[at + _FORM + l] * v
+            store(t, 4 * row, load4(t, 4 * row) + product)
+            row += 1
+    size = abs(v0) + (slopes + bends)
+    added = fma(layers[at + _ALPHA_HIGH], load4(palette, key + 4 * forms), fma(steep, bends, bent * (slopes + bends)))
+    added = fma(layers[at + _FORM + m], size, fma(_ROUND, fma(1.0 + steep + bent, size, abs(p0)), added))
+    return fma(1.0 - layers[at + _ALPHA_LOW], r, added) * _UP
+
+
+@njit(cache=True, error_model="numpy")
+def _blend(
+    layers_, width, lists_, palette_, forms, lengths, extra_, moved, background_, d, order, m, state, radius, low, high,
+    s, t_, value_,
+):  # fmt: skip
+    """`_blend_line` for any number of parameters and order; ``value`` is scratch."""
+    layers, lists, palette, extra = pointer(layers_), pointer(lists_), pointer(palette_), pointer(extra_)
+    background, t, value = pointer(background_), pointer(t_), pointer(value_)
+    deepest = lists_.shape[1]
+    for q in range(PIXELS):
+        r = 0.0 * load4(background, 0)
+        for k in range(m):
+            store(t, 4 * k, r)
+        bottom = load4(background, 0)
+        store(t, 0, bottom)
+        top = bottom
+        darkest = bottom
+        brightest = bottom
+        for e in range(int(lengths[q]) - 1, -1, -1):
+            entry = 2 * (q * deepest + e)
+            at = int(lists[entry]) * width
+            key = 4 * int(lists[entry + 1]) * (forms + 3)
+            ends = key + 4 * forms + 4
+            if order == 1:
+                r = _step_affine(r, layers, at, palette, key, forms, t, m)
+            else:
+                r = _step_curved(r, layers, at, palette, key, forms, t, value, d, m)
+            bottom, top = _blend_interval(bottom, top, layers, at, palette, ends)
+            darkest = minimum(darkest, load4(palette, ends))
+            brightest = maximum(brightest, load4(palette, ends + 4))
+            if moved[e]:
+                move = 8 * (e * PIXELS + q)
+                falls, rises = load4(extra, move), load4(extra, move + 4)
+                store(t, 0, load4(t, 0) + 0.5 * (rises - falls))
+                r = r + 0.5 * (rises + falls) * _UP
+                bottom = bottom - falls
+                top = top + rises
+        _keep_pixel(q, m, t, r, bottom, top, darkest, brightest, state, radius, low, high, s)
 
 
 @njit(cache=True, error_model="numpy")
@@ -1436,28 +1357,12 @@ def _chains(last):
 
 
 @njit(cache=True, error_model="numpy")
-def _rank(lengths, deepest, counts, ranked):
-    """Sort the pixels by their ``lengths``, at most ``deepest``, into ``ranked``; ``counts`` is scratch."""
-    counts[: deepest + 1] = 0
-    for q in range(PIXELS):
-        counts[lengths[q]] += 1
-    position = 0
-    for length in range(deepest + 1):
-        count = counts[length]
-        counts[length] = position
-        position += count
-    for q in range(PIXELS):
-        ranked[counts[lengths[q]]] = q
-        counts[lengths[q]] += 1
-
-
-@njit(cache=True, error_model="numpy")
 def _block(
     listed, x0, y0, tile_x, tile_y, record, box, tiles, depth, delta, depth_error, colors, color_radius,
     slope, direction, camera, rules, errors, background, negligible, d, order, m, antialiased,
-    s, y1, y2, poly, value, layer, pixels, layers, sources, lengths, reach, deep, far, first, last, slots, heights,
-    places, pairs, moves, most, extra, moved, line, group, group_ends, state, radius, low, high, ray, lower, upper,
-    linear, statistics, marks,
+    s, t, y1, y2, poly, rows, value, palette, layers, offset_x, offset_y, pixels, batch, lists, lengths, reach, deep,
+    far, first, last, slots, heights, places, pairs, moves, most, extra, moved, state, radius, low, high, ray, lower,
+    upper, linear, statistics, marks,
 ):  # fmt: skip
     """Bounds of one block of pixels whose first pixel is (x0, y0). Returns whether the buffers sufficed.
 
@@ -1466,15 +1371,16 @@ def _block(
     """
     unit = errors[0]
     side = lower.shape[0]
+    width = rows.size // PIXELS
     color_rows = colors.shape[1] // 3
     u = (x0 + 0.5 * BLOCK - camera[2]) / camera[0]
     v = (y0 + 0.5 * BLOCK - camera[3]) / camera[1]
     for k in range(3):
         ray[k] = direction[k] * u + direction[3 + k] * v + direction[6 + k]
     pair_count, slot_count = _forward(
-        listed, record, box, tiles, tile_x, tile_y, colors, depth, delta, depth_error, slope, ray,
-        s, y1, y2, poly, pixels, layers, sources, lengths, reach, deep, far, first, last, slots, heights, places, pairs,
-        x0, y0, d, order, m, antialiased, rules, errors, marks,
+        listed, record, box, tiles, tile_x, tile_y, colors, palette, depth, delta, depth_error, slope, ray,
+        s, y1, y2, poly, rows, layers, width, offset_x, offset_y, pixels, batch, lists, lengths, reach, deep, far,
+        first, last, slots, heights, places, pairs, x0, y0, d, order, m, antialiased, rules, errors, marks,
     )  # fmt: skip
     if pair_count == _GROW:
         return False
@@ -1500,26 +1406,23 @@ def _block(
     moved[:deepest] = False
     if slot_count > 0:
         _settle_stops(
-            layers, sources, lengths, first, last, slots[: listed.size], places, s, m, rules[9], unit
+            layers, width, lists, lengths, first, last, slots[: listed.size], places, s, m, rules[9], unit
         )
         _swap_bounds(pairs, pair_count, slots, slot_count, heights, listed, colors, color_rows, moves, most)
         _collect_moves(moves, slot_count, places, extra, moved)
-    # pixels of like depth are blended together; the pixels' numbers are of no more use
-    ranked = pixels
-    _rank(lengths, deepest, far, ranked)
+    forms = max(color_rows - 1, 1)
     if d == 1 and order == 2:
         _blend_line(
-            ranked, layers, sources, listed, colors, lengths, extra, moved, background, color_rows, state, radius,
-            low, high, line[0], line[1], line[2], s,
-        )  # fmt: skip
+            layers, width, lists, palette, forms, lengths, extra, moved, background, state, radius, low, high, s, t
+        )
     else:
         _blend(
-            ranked, layers, sources, listed, colors, lengths, layer, extra, moved, background, d, order, m, color_rows,
-            group, group_ends, state, radius, low, high, value, s,
+            layers, width, lists, palette, forms, lengths, extra, moved, background, d, order, m, state, radius, low,
+            high, s, t, value,
         )  # fmt: skip
     if slot_count > 0:
         _interval_blend(
-            layers, sources, listed, colors, lengths, extra, moved, _chains(last[: listed.size]), background, m,
+            layers, width, lists, listed, colors, lengths, extra, moved, _chains(last[: listed.size]), background,
             color_rows, low, high,
         )
     statistics[1] += deepest
@@ -1555,48 +1458,63 @@ def _block(
 
 
 @njit(cache=True, error_model="numpy")
+def _aligned(size):
+    """Uninitialised doubles that begin with a cache line."""
+    memory = np.empty(size + 7)
+    start = -(memory.ctypes.data // 8) % 8
+    return memory[start : start + size]
+
+
+@njit(cache=True, error_model="numpy")
 def _pixel_worker(
     thread, wanted, offsets, entries, record_, box_, tiles_, depth_, delta_, depth_error_, colors_, color_radius,
-    slope_, direction_, camera_, rules_, errors_, background_, negligible, pair_limit, d, order, m, antialiased,
+    slope_, direction_, camera_, rules_, errors_, background_colors, negligible, pair_limit, d, order, m, antialiased,
     threads, lower_, upper_, linear_, statistics_, marks_,
 ):  # fmt: skip
     """Every ``threads``-th tile, from number ``thread``; see `pixel_stage`."""
     record, box, tiles, depth = borrowed(record_), borrowed(box_), borrowed(tiles_), borrowed(depth_)
     delta, depth_error, colors, slope = borrowed(delta_), borrowed(depth_error_), borrowed(colors_), borrowed(slope_)
     direction, camera, rules, errors = borrowed(direction_), borrowed(camera_), borrowed(rules_), borrowed(errors_)
-    background, lower, upper = borrowed(background_), borrowed(lower_), borrowed(upper_)
+    lower, upper = borrowed(lower_), borrowed(upper_)
     linear, statistics, marks = borrowed(linear_), borrowed(statistics_), borrowed(marks_)
     image_width, image_height = camera[4], camera[5]
     side = lower.shape[1]
     tiles_x = int(math.ceil(image_width / side))
     blocks = side // BLOCK
-    rows = m + 5
+    # columns of a layer, and numbers of a colour of the palette
+    width = -(-(_FORM + m + 1) // 8) * 8
+    color_size = 4 * (max(colors.shape[1] // 3 - 1, 1) + 3)
     scratch = np.zeros(_ROWS * PIXELS)
-    planes = np.empty((3 * m, PIXELS))
-    group_planes = np.empty((2 * m + 3 + colors.shape[1], _GROUP))
-    pixels_ = np.empty(PIXELS, np.uint8)
+    scratch[_NUMBERS : _NUMBERS + BLOCK] = np.arange(BLOCK)
+    background_ = np.zeros(4)
+    background_[:3] = background_colors
+    channels_ = np.zeros(4 * (m + 5))
+    value_ = np.zeros(4 * m)
+    planes = np.empty((2 * m, PIXELS))
+    rows_ = np.zeros((width, PIXELS))
+    offsets_ = np.zeros((2, _BATCH * PIXELS + 8))
+    pixels_ = np.empty(_BATCH * PIXELS, np.uint8)
+    batch_ = np.empty((3, _BATCH + 1), np.int64)
     lengths_ = np.empty(PIXELS, np.uint32)
     ray_ = np.empty(3)
-    s = borrowed(scratch)
-    y1, y2, poly = borrowed(planes[:m]), borrowed(planes[m : 2 * m]), borrowed(planes[2 * m : 3 * m])
-    value, layer = borrowed(group_planes[:m]), borrowed(group_planes[m:])
+    s, t, value, background = borrowed(scratch), borrowed(channels_), borrowed(value_), borrowed(background_)
+    y1, y2, poly = borrowed(planes[:m]), borrowed(planes[m:]), borrowed(rows_[_FORM : _FORM + m])
+    rows, batch = borrowed(rows_.reshape(width * PIXELS)), borrowed(batch_)
+    offset_x, offset_y = borrowed(offsets_[0]), borrowed(offsets_[1])
     pixels, lengths, ray = borrowed(pixels_), borrowed(lengths_), borrowed(ray_)
     state_ = np.empty((3, m, PIXELS))
-    line_ = np.empty((3, _CHANNEL_ROWS * _GROUP))
-    line = borrowed(line_)
     ends = np.empty((3, 3, PIXELS))
-    group_, group_ends_ = np.empty((3, m, _GROUP)), np.empty((3, 3, _GROUP))
-    group, group_ends = borrowed(group_), borrowed(group_ends_)
     state, radius, low, high = borrowed(state_), borrowed(ends[0]), borrowed(ends[1]), borrowed(ends[2])
-    layers_ = np.empty((256, PIXELS, rows))
-    sources_ = np.empty((256, PIXELS), np.uint32)
-    extra_ = np.empty((256, 6, PIXELS))
+    layers_ = _aligned(256 * PIXELS * width)
+    lists_ = np.empty((PIXELS, 256, 2), np.uint32)
+    extra_ = np.empty((256, 8 * PIXELS))
     moved_ = np.empty(256, np.bool_)
     heights_ = np.empty((64, PIXELS))
     places_ = np.empty((64, PIXELS), np.int64)
     moves_ = np.empty((2, 64, 6, PIXELS))
     reach_ = np.empty((2, 1024))
     order_ = np.empty((4, 1024), np.int64)
+    palette_ = np.zeros(1024 * color_size)
     pairs_ = np.empty((pair_limit, 2), np.int64)
     block_offsets = np.empty(blocks * blocks + 1, np.int64)
     block_entries = np.empty(4096, np.uint32)
@@ -1617,21 +1535,22 @@ def _pixel_worker(
             if listed.size >= reach_.shape[1]:
                 reach_ = np.empty((2, 2 * listed.size))
                 order_ = np.empty((4, 2 * listed.size), np.int64)
+                palette_ = np.zeros(2 * listed.size * color_size)
             while not _block(
                 borrowed(listed), x0, y0, tile_x, tile_y, record, box, tiles, depth, delta, depth_error, colors,
                 color_radius, slope, direction, camera, rules, errors, background, negligible, d, order, m,
-                antialiased, s, y1, y2, poly, value, layer, pixels, borrowed(layers_), borrowed(sources_), lengths,
-                borrowed(reach_[0]), borrowed(reach_[1]), borrowed(order_[0]), borrowed(order_[1]),
-                borrowed(order_[2]), borrowed(order_[3]),
+                antialiased, s, t, y1, y2, poly, rows, value, borrowed(palette_), borrowed(layers_), offset_x,
+                offset_y, pixels, batch, borrowed(lists_), lengths, borrowed(reach_[0]), borrowed(reach_[1]),
+                borrowed(order_[0]), borrowed(order_[1]), borrowed(order_[2]), borrowed(order_[3]),
                 borrowed(heights_), borrowed(places_), borrowed(pairs_), borrowed(moves_[0]), borrowed(moves_[1]),
-                borrowed(extra_), borrowed(moved_), line, group, group_ends, state, radius, low, high, ray,
+                borrowed(extra_), borrowed(moved_), state, radius, low, high, ray,
                 lower[number], upper[number], linear[min(number, linear.shape[0]) :],
                 statistics[thread], marks,
             ):  # fmt: skip
-                capacity = 2 * layers_.shape[0]
-                layers_ = np.empty((capacity, PIXELS, rows))
-                sources_ = np.empty((capacity, PIXELS), np.uint32)
-                extra_ = np.empty((capacity, 6, PIXELS))
+                capacity = 2 * moved_.size
+                layers_ = _aligned(capacity * PIXELS * width)
+                lists_ = np.empty((PIXELS, capacity, 2), np.uint32)
+                extra_ = np.empty((capacity, 8 * PIXELS))
                 moved_ = np.empty(capacity, np.bool_)
                 slot_capacity = 2 * heights_.shape[0]
                 heights_ = np.empty((slot_capacity, PIXELS))
@@ -1639,10 +1558,10 @@ def _pixel_worker(
                 moves_ = np.empty((2, slot_capacity, 6, PIXELS))
     # the owners of the borrowed arrays live to here
     return (
-        scratch.size + planes.size + group_planes.size + group_.size + group_ends_.size + pixels_.size + lengths_.size
-        + ray_.size + line_.size + state_.size + ends.size + layers_.size + sources_.size
+        scratch.size + background_.size + channels_.size + value_.size + planes.size + rows_.size + offsets_.size
+        + pixels_.size + batch_.size + lengths_.size + ray_.size + state_.size + ends.size + layers_.size + lists_.size
         + extra_.size + moved_.size + heights_.size + places_.size + moves_.size
-        + reach_.size + order_.size + pairs_.size
+        + reach_.size + order_.size + palette_.size + pairs_.size
     )  # fmt: skip
 
 

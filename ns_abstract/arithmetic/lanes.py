@@ -1,0 +1,312 @@
+"""Several doubles side by side: explicit vectors for compiled kernels.
+
+`load8` and `load4` take 8 or 4 neighbours in memory as one value. ``+ - * /``, comparisons, ``abs``, and the
+functions below work lane by lane on such values and on floats, which stand for all lanes; every lane is rounded as
+float64 arithmetic is. Loops that a compiler turns into vector code work on at most half as wide vectors, and lose more
+than they gain where they are short.
+
+Interpreted (without compilation), lanes are arrays.
+"""
+
+from __future__ import annotations
+
+import operator
+from collections.abc import Callable
+
+import numpy as np
+from llvmlite import ir
+from numba import config, types
+from numba.core import cgutils
+from numba.core.typing.templates import ConcreteTemplate, infer_global, signature
+from numba.extending import intrinsic, lower_builtin, models, register_model
+
+_DOUBLE = ir.DoubleType()
+_INT32 = ir.IntType(32)
+
+
+class LanesType(types.Type):
+    """``width`` doubles."""
+
+    def __init__(self, width: int) -> None:
+        self.width = width
+        super().__init__(name=f"Lanes({width})")
+
+
+class MaskType(types.Type):
+    """``width`` truth values."""
+
+    def __init__(self, width: int) -> None:
+        self.width = width
+        super().__init__(name=f"Mask({width})")
+
+
+@register_model(LanesType)
+class _LanesModel(models.PrimitiveModel):
+    def __init__(self, manager, kind):
+        super().__init__(manager, kind, ir.VectorType(_DOUBLE, kind.width))
+
+
+@register_model(MaskType)
+class _MaskModel(models.PrimitiveModel):
+    def __init__(self, manager, kind):
+        super().__init__(manager, kind, ir.VectorType(ir.IntType(1), kind.width))
+
+
+_KINDS = {width: (LanesType(width), MaskType(width)) for width in (4, 8)}
+
+
+def _width(*kinds: types.Type) -> int:
+    """Number of lanes of an operation on ``kinds``; 0: on floats alone."""
+    widths = {kind.width for kind in kinds if isinstance(kind, LanesType | MaskType)}
+    if len(widths) > 1:
+        raise TypeError(f"lanes of different widths: {kinds}")
+    return widths.pop() if widths else 0
+
+
+def _wide(builder, value, kind: types.Type, width: int):
+    """``value`` in all ``width`` lanes where it is a single one."""
+    if width == 0 or isinstance(kind, LanesType | MaskType):
+        return value
+    vector = ir.VectorType(value.type, width)
+    nothing, first = ir.Constant(vector, ir.Undefined), ir.Constant(ir.VectorType(_INT32, width), None)
+    return builder.shuffle_vector(builder.insert_element(nothing, value, _INT32(0)), nothing, first)
+
+
+def operands(builder, sig, args):
+    """The arguments of a call as values of one type, floats in all lanes."""
+    width = _width(*sig.args)
+    return [_wide(builder, value, kind, width) for value, kind in zip(args, sig.args, strict=True)]
+
+
+def _typed(function: Callable, cases: list) -> None:
+    """Tell numba the signatures ``cases`` of ``function``."""
+    template = type(f"_Of{function.__name__}", (ConcreteTemplate,), {"cases": cases})
+    infer_global(function)(template)  # pyright: ignore[reportOptionalCall]
+
+
+def _register(function: Callable, arguments: int, masks: bool, build: Callable) -> None:
+    """Let ``function`` take lanes, or lanes and floats; ``build(builder, *values)`` makes the result."""
+    cases = []
+    for lanes, mask in _KINDS.values():
+        result = mask if masks else lanes
+        cases.append(signature(result, *[lanes] * arguments))
+        if arguments == 2:
+            cases += [signature(result, lanes, types.float64), signature(result, types.float64, lanes)]
+
+    _typed(function, cases)
+
+    def lower(context, builder, sig, args):
+        return build(builder, *operands(builder, sig, args))
+
+    for case in cases:
+        lower_builtin(function, *case.args)(lower)
+
+
+_register(operator.add, 2, False, lambda builder, a, b: builder.fadd(a, b))
+_register(operator.sub, 2, False, lambda builder, a, b: builder.fsub(a, b))
+_register(operator.mul, 2, False, lambda builder, a, b: builder.fmul(a, b))
+_register(operator.truediv, 2, False, lambda builder, a, b: builder.fdiv(a, b))
+_register(operator.neg, 1, False, lambda builder, a: builder.fneg(a))
+for _function, _sign in (
+    (operator.lt, "<"), (operator.le, "<="), (operator.gt, ">"), (operator.ge, ">="), (operator.eq, "=="),
+):  # fmt: skip
+    _register(_function, 2, True, lambda builder, a, b, sign=_sign: builder.fcmp_ordered(sign, a, b))
+_register(operator.ne, 2, True, lambda builder, a, b: builder.fcmp_unordered("!=", a, b))
+
+
+def _by_intrinsic(name: str, builder, a):
+    """LLVM's function ``name`` of floats or lanes."""
+    suffix = f"v{a.type.count}f64" if isinstance(a.type, ir.VectorType) else "f64"
+    function = ir.FunctionType(a.type, [a.type])
+    return builder.call(cgutils.get_or_insert_function(builder.module, function, f"llvm.{name}.{suffix}"), [a])
+
+
+_register(abs, 1, False, lambda builder, a: _by_intrinsic("fabs", builder, a))
+for _lanes, _mask in _KINDS.values():
+    for _function in (operator.and_, operator.or_):
+        _typed(_function, [signature(_mask, _mask, _mask)])
+
+
+@lower_builtin(operator.and_, MaskType, MaskType)
+def _both(context, builder, sig, args):
+    return builder.and_(*args)
+
+
+@lower_builtin(operator.or_, MaskType, MaskType)
+def _either(context, builder, sig, args):
+    return builder.or_(*args)
+
+
+def common_type(*kinds: types.Type) -> types.Type:
+    """Lanes where one of ``kinds`` is, else float64."""
+    width = _width(*kinds)
+    return _KINDS[width][0] if width else types.float64
+
+
+def _choice(sign: str):
+    """``b if b sign a else a``, as the built-in ``max`` and ``min`` decide (also on values that are not numbers)."""
+
+    def codegen(context, builder, sig, args):
+        a, b = operands(builder, sig, args)
+        return builder.select(builder.fcmp_ordered(sign, b, a), b, a)
+
+    return codegen
+
+
+@intrinsic
+def maximum(typingctx, a, b):  # pyright: ignore[reportRedeclaration]
+    """``max(a, b)``."""
+    return common_type(a, b)(a, b), _choice(">")
+
+
+@intrinsic
+def minimum(typingctx, a, b):  # pyright: ignore[reportRedeclaration]
+    """``min(a, b)``."""
+    return common_type(a, b)(a, b), _choice("<")
+
+
+@intrinsic
+def root(typingctx, a):  # pyright: ignore[reportRedeclaration]
+    """Square root, rounded to nearest."""
+    return a(a), lambda context, builder, sig, args: _by_intrinsic("sqrt", builder, args[0])
+
+
+@intrinsic
+def where(typingctx, mask, a, b):  # pyright: ignore[reportRedeclaration]
+    """``a`` where ``mask`` holds, else ``b``."""
+
+    def codegen(context, builder, sig, args):
+        condition, a, b = args
+        width = _width(*sig.args)
+        a, b = _wide(builder, a, sig.args[1], width), _wide(builder, b, sig.args[2], width)
+        return builder.select(condition, a, b)
+
+    return common_type(mask, a, b)(mask, a, b), codegen
+
+
+@intrinsic
+def bits(typingctx, mask):  # pyright: ignore[reportRedeclaration]
+    """Bit k of an int64 tells whether lane k of ``mask`` holds."""
+
+    def codegen(context, builder, sig, args):
+        packed = builder.bitcast(args[0], ir.IntType(sig.args[0].width))
+        return builder.zext(packed, ir.IntType(64))
+
+    return types.int64(mask), codegen
+
+
+def _address(builder, elements, at, width: int):
+    address = builder.gep(elements, [at], source_etype=_DOUBLE)
+    return builder.bitcast(address, ir.VectorType(_DOUBLE, width).as_pointer())
+
+
+def _check(elements) -> None:
+    if elements != types.CPointer(types.float64):
+        raise TypeError(f"lanes are read and written through pointer(float64 array), not {elements}")
+
+
+def _loader(elements, width: int):
+    _check(elements)
+
+    def codegen(context, builder, sig, args):
+        address = _address(builder, args[0], args[1], width)
+        return builder.load(address, align=8, typ=ir.VectorType(_DOUBLE, width))
+
+    return _KINDS[width][0](elements, types.intp), codegen
+
+
+@intrinsic
+def load8(typingctx, elements, at):  # pyright: ignore[reportRedeclaration]
+    """``elements[at : at + 8]`` of a `compiled.pointer` as lanes."""
+    return _loader(elements, 8)
+
+
+@intrinsic
+def load4(typingctx, elements, at):  # pyright: ignore[reportRedeclaration]
+    """``elements[at : at + 4]`` of a `compiled.pointer` as lanes."""
+    return _loader(elements, 4)
+
+
+@intrinsic
+def store(typingctx, elements, at, lanes):  # pyright: ignore[reportRedeclaration]
+    """Write the lanes to ``elements[at : ...]`` of a `compiled.pointer`."""
+    _check(elements)
+
+    def codegen(context, builder, sig, args):
+        builder.store(args[2], _address(builder, args[0], args[1], sig.args[2].width), align=8)
+        return context.get_dummy_value()
+
+    return types.void(elements, types.intp, lanes), codegen
+
+
+def _transposed(builder, rows):
+    """The columns of 8 rows of 8 lanes."""
+
+    def mixed(a, b, picks):
+        return builder.shuffle_vector(a, b, ir.Constant(ir.VectorType(_INT32, 8), [_INT32(p) for p in picks]))
+
+    # pairs of rows, then of pairs, then of fours
+    for reach in (1, 2, 4):
+        done = list(rows)
+        for low in range(8):
+            if low & reach:
+                continue
+            a, b = rows[low], rows[low + reach]
+            done[low] = mixed(a, b, [p if not p & reach else 8 + (p ^ reach) for p in range(8)])
+            done[low + reach] = mixed(a, b, [p | reach if not p & reach else 8 + p for p in range(8)])
+        rows = done
+    return rows
+
+
+@intrinsic
+def store_columns(typingctx, elements, at, stride, a, b, c, d, e, f, g, h):  # pyright: ignore[reportRedeclaration]
+    """Write lane k of the eight values side by side to ``elements[at + stride k : ...]`` of a `compiled.pointer`."""
+    _check(elements)
+
+    def codegen(context, builder, sig, args):
+        for k, row in enumerate(_transposed(builder, args[3:])):
+            at = builder.add(args[1], builder.mul(args[2], args[2].type(k)))
+            builder.store(row, _address(builder, args[0], at, 8), align=8)
+        return context.get_dummy_value()
+
+    return types.void(elements, types.intp, types.intp, a, b, c, d, e, f, g, h), codegen
+
+
+if config.DISABLE_JIT:  # pyright: ignore[reportAttributeAccessIssue]
+
+    def maximum(a, b):
+        """``max(a, b)``."""
+        return where(b > a, b, a)
+
+    def minimum(a, b):
+        """``min(a, b)``."""
+        return where(b < a, b, a)
+
+    def root(a):
+        """Square root, rounded to nearest."""
+        return np.sqrt(a)
+
+    def where(mask, a, b):
+        """``a`` where ``mask`` holds, else ``b``."""
+        return np.where(mask, a, b) if np.ndim(mask) else (a if mask else b)
+
+    def bits(mask):
+        """Bit k of the result tells whether lane k of ``mask`` holds."""
+        return sum(1 << k for k, holds in enumerate(mask) if holds)
+
+    def load8(elements, at):
+        """``elements[at : at + 8]``."""
+        return elements[at : at + 8].copy()
+
+    def load4(elements, at):
+        """``elements[at : at + 4]``."""
+        return elements[at : at + 4].copy()
+
+    def store(elements, at, lanes):
+        """Write the lanes to ``elements[at : ...]``."""
+        elements[at : at + len(lanes)] = lanes
+
+    def store_columns(elements, at, stride, *values):
+        """Write lane k of the eight values side by side to ``elements[at + stride k : ...]``."""
+        for k, row in enumerate(np.stack(values, axis=1)):
+            elements[at + stride * k : at + stride * k + 8] = row
