@@ -486,7 +486,7 @@ class FormArray:
         values = np.asarray(values, dtype=np.float64)
         data = np.zeros((basis.rows, values.size))
         data[0] = values.ravel()
-        data[basis.monomials] = np.broadcast_to(radius, values.shape).ravel()
+        data[basis.monomials].reshape(values.shape)[...] = radius
         return cls(basis, data, values.shape)
 
     @classmethod
@@ -532,11 +532,14 @@ class FormArray:
             return self
         rows = self.basis.rows
         padded = (rows, *(1,) * (len(shape) - len(self.shape)), *self.shape)
-        data = np.broadcast_to(self.data.reshape(padded), (rows, *shape)).reshape(rows, -1)
-        return FormArray(self.basis, np.ascontiguousarray(data), shape)
+        data = np.empty((rows, *shape))
+        data[...] = self.data.reshape(padded)
+        return FormArray(self.basis, data.reshape(rows, -1), shape)
 
     def _pair(self, other: FormArray | Float64Array | float) -> tuple[FormArray, FormArray]:
         other = self._lift(other)
+        if other.shape == self.shape:
+            return self, other
         shape = np.broadcast_shapes(self.shape, other.shape)
         return self.broadcast_to(shape), other.broadcast_to(shape)
 

@@ -36,6 +36,7 @@ class CellBounds:
         visible: [n] scene indices of the Gaussians that some pose of the cell may show in these tiles.
         reach: [n, 4] their ranges of tiles: columns first and past, rows first and past.
         linear: [t, side, side, 3, m + 1] polynomial coefficients and radius, or None.
+        slopes: [d] mean absolute linear coefficients.
         statistics: Blocks, layers, uncertain pairs, blocks that gave up on order, results that were
             not numbers.
     """
@@ -46,6 +47,7 @@ class CellBounds:
     visible: np.ndarray
     reach: np.ndarray
     linear: np.ndarray | None
+    slopes: np.ndarray
     statistics: np.ndarray
 
 
@@ -143,6 +145,7 @@ class SplatBounds:
         lower = np.zeros((wanted.size, self.side, self.side, 3))
         upper = np.zeros((wanted.size, self.side, self.side, 3))
         linear = np.zeros((wanted.size if keep_linear else 0, self.side, self.side, 3, m + 1))
+        slopes = np.zeros((wanted.size, d))
         threads = get_num_threads()
         statistics = np.zeros((threads, 5), np.int64)
         marks = np.zeros(n, np.uint8)
@@ -151,12 +154,13 @@ class SplatBounds:
             wanted, offsets, entries, record, box, tiles, depth, delta, depth_error, colors, self._color_radius,
             slope, np.ascontiguousarray(rotation[0]), view, self.rules, self._errors,
             splats.background, negligible, PAIR_LIMIT, d, order, m, splats.antialiased, threads,
-            lower, upper, linear, statistics, marks,
+            lower, upper, linear, slopes, statistics, marks,
         )  # fmt: skip
         used = np.flatnonzero(marks)
         return CellBounds(
             wanted, lower, upper, candidates[used], np.ascontiguousarray(tiles[used, :4]),
-            linear if keep_linear else None, statistics.sum(axis=0),
+            linear if keep_linear else None, slopes.sum(axis=0) / (max(wanted.size, 1) * self.side**2 * 3),
+            statistics.sum(axis=0),
         )  # fmt: skip
 
     def _colors(self, forms: PoseForms, candidates: np.ndarray, alive: np.ndarray, n: int) -> np.ndarray:

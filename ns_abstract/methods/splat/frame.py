@@ -8,7 +8,6 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numba import njit
 
 from ns_abstract.arithmetic.outward import outward
 from ns_abstract.arithmetic.units import Arithmetic
@@ -71,19 +70,6 @@ class TileBounds:
     context: Context
     linear: tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray] | None
     trivial: int
-
-
-@njit(cache=True, error_model="numpy")
-def _mean_slopes(linear, d):
-    """Mean absolute linear coefficients [d] of forms [t, side, side, 3, ...]."""
-    total = np.zeros(d)
-    for tile in range(linear.shape[0]):
-        for row in range(linear.shape[1]):
-            for column in range(linear.shape[2]):
-                for channel in range(3):
-                    for k in range(d):
-                        total[k] += abs(linear[tile, row, column, channel, 1 + k])
-    return total / max(linear.shape[0] * linear.shape[1] * linear.shape[2] * 3, 1)
 
 
 class SplatFrame:
@@ -167,20 +153,16 @@ class SplatFrame:
             return TileBounds(picture, picture, np.zeros(box.dimensions), _NOTHING, None, 0)
         box = inside
         candidates = self._candidates(tiles, within)
-        cell = self.bounds.cell(
-            self.camera, self.pose_set.enclosure(box, self.order), tiles, candidates, keep_linear or box.dimensions > 1
-        )
+        cell = self.bounds.cell(self.camera, self.pose_set.enclosure(box, self.order), tiles, candidates, keep_linear)
         lower, upper = outward(cell.lower, cell.upper)
-        d = box.dimensions
-        slopes = np.zeros(d) if cell.linear is None else _mean_slopes(cell.linear, d)
         # hardly smaller: not worth its memory
         kept = within is not None and cell.visible.size > _WORTH_KEEPING * within.visible.size
         context = within if within is not None and kept else Context(cell.visible, cell.reach)
         linear = None
         if keep_linear:
             assert cell.linear is not None
-            linear = linear_sets(cell.linear, cell.lower, cell.upper, d)
-        return TileBounds(lower, upper, slopes, context, linear, int(cell.statistics[3]))
+            linear = linear_sets(cell.linear, cell.lower, cell.upper, box.dimensions)
+        return TileBounds(lower, upper, cell.slopes, context, linear, int(cell.statistics[3]))
 
     def _candidates(self, tiles: np.ndarray, within: Context | None) -> np.ndarray | None:
         if within is None:

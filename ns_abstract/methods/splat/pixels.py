@@ -1362,12 +1362,12 @@ def _block(
     slope, direction, camera, rules, errors, background, negligible, d, order, m, antialiased,
     s, t, y1, y2, poly, rows, value, palette, layers, offset_x, offset_y, pixels, batch, lists, lengths, reach, deep,
     far, first, last, slots, heights, places, pairs, moves, most, extra, moved, state, radius, low, high, ray, lower,
-    upper, linear, statistics, marks,
+    upper, linear, slopes, statistics, marks,
 ):  # fmt: skip
     """Bounds of one block of pixels whose first pixel is (x0, y0). Returns whether the buffers sufficed.
 
     ``lower``, ``upper`` [side, side, 3] are the tile's, ``linear`` starts with the tile's or is empty;
-    ``statistics`` is the thread's row.
+    ``slopes`` [d] are the tile's sums of absolute linear coefficients, ``statistics`` is the thread's row.
     """
     unit = errors[0]
     side = lower.shape[0]
@@ -1428,6 +1428,11 @@ def _block(
     statistics[1] += deepest
     statistics[2] += pair_count
     for channel in range(3):
+        for k in range(d):
+            total = 0.0
+            for q in range(PIXELS):
+                total += abs(state[channel, 1 + k, q])
+            slopes[k] += total
         _form_range(state[channel], d, order, m, s)
         for q in range(PIXELS):
             row = y0 % side + q // BLOCK
@@ -1469,13 +1474,13 @@ def _aligned(size):
 def _pixel_worker(
     thread, wanted, offsets, entries, record_, box_, tiles_, depth_, delta_, depth_error_, colors_, color_radius,
     slope_, direction_, camera_, rules_, errors_, background_colors, negligible, pair_limit, d, order, m, antialiased,
-    threads, lower_, upper_, linear_, statistics_, marks_,
+    threads, lower_, upper_, linear_, slopes_, statistics_, marks_,
 ):  # fmt: skip
     """Every ``threads``-th tile, from number ``thread``; see `pixel_stage`."""
     record, box, tiles, depth = borrowed(record_), borrowed(box_), borrowed(tiles_), borrowed(depth_)
     delta, depth_error, colors, slope = borrowed(delta_), borrowed(depth_error_), borrowed(colors_), borrowed(slope_)
     direction, camera, rules, errors = borrowed(direction_), borrowed(camera_), borrowed(rules_), borrowed(errors_)
-    lower, upper = borrowed(lower_), borrowed(upper_)
+    lower, upper, slopes = borrowed(lower_), borrowed(upper_), borrowed(slopes_)
     linear, statistics, marks = borrowed(linear_), borrowed(statistics_), borrowed(marks_)
     image_width, image_height = camera[4], camera[5]
     side = lower.shape[1]
@@ -1545,7 +1550,7 @@ def _pixel_worker(
                 borrowed(heights_), borrowed(places_), borrowed(pairs_), borrowed(moves_[0]), borrowed(moves_[1]),
                 borrowed(extra_), borrowed(moved_), state, radius, low, high, ray,
                 lower[number], upper[number], linear[min(number, linear.shape[0]) :],
-                statistics[thread], marks,
+                slopes[number], statistics[thread], marks,
             ):  # fmt: skip
                 capacity = 2 * moved_.size
                 layers_ = _aligned(capacity * PIXELS * width)
@@ -1569,7 +1574,7 @@ def _pixel_worker(
 def pixel_stage(
     wanted, offsets, entries, record, box, tiles, depth, delta, depth_error, colors, color_radius,
     slope, direction, camera, rules, errors, background, negligible, pair_limit, d, order, m, antialiased,
-    threads, lower, upper, linear, statistics, marks,
+    threads, lower, upper, linear, slopes, statistics, marks,
 ):  # fmt: skip
     """Bounds of the pixels of the tiles ``wanted`` [t] (tile numbers, row-major).
 
@@ -1585,6 +1590,7 @@ def pixel_stage(
         pair_limit: Most depth-order pairs looked at in one block.
         lower, upper: [t, side, side, 3] outputs.
         linear: [t, side, side, 3, m + 1] forms before the clamp, or empty.
+        slopes: [t, d] sums of absolute linear coefficients, added to.
         marks: [n] uint8; set to 1 for every Gaussian that some pixel of these tiles may draw or stop at.
             Those that stay 0 are hidden or too faint for every pose: leaving them out changes nothing.
         statistics: [threads, 5] blocks, layers, uncertain pairs, blocks where too many pairs were
@@ -1594,5 +1600,5 @@ def pixel_stage(
         _pixel_worker(
             thread, wanted, offsets, entries, record, box, tiles, depth, delta, depth_error, colors, color_radius,
             slope, direction, camera, rules, errors, background, negligible, pair_limit, d, order, m, antialiased,
-            threads, lower, upper, linear, statistics, marks,
+            threads, lower, upper, linear, slopes, statistics, marks,
         )  # fmt: skip
