@@ -1,9 +1,8 @@
 """Per-pixel stage of the bounds: alphas as polynomial forms, blended back to front.
 
-One pass handles a block of `PIXELS` pixels (lanes) of one tile (design.md, B1-B9). Each lane keeps
-a list of the layers that may contribute to it, nearest first; a layer holds
-
-    alpha's m coefficients and radius, its lower and upper bound, and its colour.
+One pass handles a block of `PIXELS` pixels of one tile (design.md, B1-B9). Alphas are found Gaussian by Gaussian,
+nearest first, eight pixels at a time, and kept as layers one after the other; each pixel lists those that may
+contribute to it. Then each pixel's list is blended from its end, the three channels side by side.
 """
 
 from __future__ import annotations
@@ -55,9 +54,7 @@ _BATCH = 8
 _ROW_SHIFT = BLOCK.bit_length() - 1
 assert PIXELS == 64 and BLOCK == 8
 
-# Scratch is flat: row r holds its lanes at r * PIXELS .. r * PIXELS + PIXELS - 1. With constant
-# offsets the compiler sees that rows do not overlap. Lane loops run to a length taken from an array:
-# with a constant length they would be unrolled into scalar code, as it is they become vector code.
+# Scratch is flat: row r holds its lanes at r * PIXELS .. r * PIXELS + PIXELS - 1, one by pixel.
 (
     _C1, _C2, _L1, _L2, _B1, _B2, _S0, _SR, _SL, _SB, _SLO, _SHI, _WEIGHT, _CURVE,
     _TLO, _THI, _REACH, _RHO, _LOST, _MIN, _MAX, _DARKEST, _BRIGHTEST, _NUMBERS,
@@ -900,7 +897,7 @@ def _settle_stops(layers, width, lists, lengths, first, last, slots, places, s, 
         place = places[slots[k]]
         for q in range(PIXELS):
             e = place[q]
-            # the stop is out of reach of most lanes
+            # the stop is out of reach of most pixels
             if e < 0 or s[_TLO + q] > stop_high:
                 continue
             behind = e
