@@ -13,10 +13,9 @@ from fractions import Fraction
 import numpy as np
 from llvmlite import ir
 from numba import config, njit
-from numba.core import cgutils
 from numba.extending import intrinsic
 
-from ns_abstract.arithmetic.lanes import LanesType, common_type, operands
+from ns_abstract.arithmetic.lanes import LanesType, by_intrinsic, common_type, operands
 
 #: Proven bound of ``|exp_kernel(x) - exp(x)| / exp(x)`` for ``EXP_LOWEST <= x <= EXP_HIGHEST``
 #: (design.md, E1): truncation 2.4e-16, reduction and Horner rounding 3 units, scaling exact.
@@ -39,14 +38,7 @@ def fma(typingctx, x, y, z):  # pyright: ignore[reportRedeclaration]
     """``x * y + z`` with one rounding, of floats or lanes."""
 
     def codegen(context, builder, sig, args):
-        values = operands(builder, sig, args)
-        if not isinstance(sig.return_type, LanesType):
-            return builder.fma(*values)
-        kind = values[0].type
-        function = ir.FunctionType(kind, [kind] * 3)
-        return builder.call(
-            cgutils.get_or_insert_function(builder.module, function, f"llvm.fma.v{kind.count}f64"), values
-        )
+        return by_intrinsic("fma", builder, *operands(builder, sig, args))
 
     return common_type(x, y, z)(x, y, z), codegen
 

@@ -114,14 +114,15 @@ for _function, _sign in (
 _register(operator.ne, 2, True, lambda builder, a, b: builder.fcmp_unordered("!=", a, b))
 
 
-def _by_intrinsic(name: str, builder, a):
-    """LLVM's function ``name`` of floats or lanes."""
-    suffix = f"v{a.type.count}f64" if isinstance(a.type, ir.VectorType) else "f64"
-    function = ir.FunctionType(a.type, [a.type])
-    return builder.call(cgutils.get_or_insert_function(builder.module, function, f"llvm.{name}.{suffix}"), [a])
+def by_intrinsic(name: str, builder, *values):
+    """LLVM's function ``name`` of floats or lanes, all of one type."""
+    kind = values[0].type
+    suffix = f"v{kind.count}f64" if isinstance(kind, ir.VectorType) else "f64"
+    function = ir.FunctionType(kind, [kind] * len(values))
+    return builder.call(cgutils.get_or_insert_function(builder.module, function, f"llvm.{name}.{suffix}"), values)
 
 
-_register(abs, 1, False, lambda builder, a: _by_intrinsic("fabs", builder, a))
+_register(abs, 1, False, lambda builder, a: by_intrinsic("fabs", builder, a))
 for _lanes, _mask in _KINDS.values():
     for _function in (operator.and_, operator.or_):
         _typed(_function, [signature(_mask, _mask, _mask)])
@@ -168,7 +169,7 @@ def minimum(typingctx, a, b):  # pyright: ignore[reportRedeclaration]
 @intrinsic
 def root(typingctx, a):  # pyright: ignore[reportRedeclaration]
     """Square root, rounded to nearest."""
-    return a(a), lambda context, builder, sig, args: _by_intrinsic("sqrt", builder, args[0])
+    return a(a), lambda context, builder, sig, args: by_intrinsic("sqrt", builder, args[0])
 
 
 @intrinsic

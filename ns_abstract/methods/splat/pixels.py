@@ -885,8 +885,9 @@ def _forward(
 
 
 @njit(cache=True, error_model="numpy")
-def _settle_stops(layers, width, lists, lengths, first, last, slots, places, s, m, stop, unit):
+def _settle_stops(layers_, width, lists, lengths, first, last, slots, places, s, m, stop, unit):
     """Drop or weaken the layers of uncertain depth order that the stop may hide (design.md, B6)."""
+    layers = pointer(layers_)
     stop_low = stop * (1.0 - 8.0 * unit)
     stop_high = stop * (1.0 + 8.0 * unit)
     for q in range(PIXELS):
@@ -917,32 +918,55 @@ def _settle_stops(layers, width, lists, lengths, first, last, slots, places, s, 
             lost = min(light, stop_high / (1.0 - high))
             if t_high <= stop_low:
                 s[_C1 + q] = max(s[_C1 + q], lost)
-                _set_unknown(pointer(layers), at, 0.0, m)
+                _set_unknown(layers, at, 0.0, m)
             elif lost < light:
                 # kept; what the stop may leave of the light is added at the end
                 s[_RHO + q] = max(s[_RHO + q], lost, s[_LOST + q])
             else:
                 s[_C1 + q] = max(s[_C1 + q], lost)
-                _set_unknown(pointer(layers), at, high, m)
+                _set_unknown(layers, at, high, m)
     # a stop at a dropped or weakened layer also hides the kept layers behind it
     for q in range(PIXELS):
         if s[_RHO + q] > 0.0:
             s[_RHO + q] = max(s[_RHO + q], s[_C1 + q])
 
 
-@njit(cache=True, error_model="numpy")
-def _color_range(colors, i, channel, color_rows):
-    """Bounds of one Gaussian's colour over the cell."""
-    start = channel * color_rows
-    spread = 0.0
-    for r in range(1, color_rows):
-        spread += abs(colors[i, start + r])
-    spread *= _UP
-    return colors[i, start] - spread, colors[i, start] + spread
+@njit(cache=True, error_model="numpy", inline="always")
+def _color_size(forms):
+    """Numbers of one colour of the palette."""
+    return 4 * (forms + 3)
+
+
+@njit(cache=True, error_model="numpy", forceinline=True)
+def _set_colors(palette, k, color, color_rows):
+    """Write the colour of list position k: centre, slopes, radius, then its lower and upper bound over the cell.
+
+    Each is four numbers: three channels and one of none.
+    """
+    forms = max(color_rows - 1, 1)
+    at = k * _color_size(forms)
+    for channel in range(3):
+        start = channel * color_rows
+        spread = 0.0
+        for r in range(1, color_rows):
+            spread += abs(color[start + r])
+        spread *= _UP
+        for r in range(forms):
+            palette[at + 4 * r + channel] = color[start + r]
+        palette[at + 4 * forms + channel] = color[start + forms] if color_rows > 1 else 0.0
+        palette[at + 4 * forms + 4 + channel] = color[start] - spread
+        palette[at + 4 * forms + 8 + channel] = color[start] + spread
+
+
+@njit(cache=True, error_model="numpy", inline="always")
+def _color_range(palette, k, channel, forms):
+    """Bounds of the colour of list position k over the cell."""
+    at = k * _color_size(forms) + 4 * forms + 4 + channel
+    return palette[at], palette[at + 4]
 
 
 @njit(cache=True, error_model="numpy")
-def _swap_bounds(pairs, pair_count, slots, slot_count, heights, entries, colors, color_rows, moves, most):
+def _swap_bounds(pairs, pair_count, slots, slot_count, heights, palette, forms, moves, most):
     """Bound what reordering may change when a slot's layer joins the layers behind it (design.md, O2).
 
     ``moves[slot, c]`` and ``moves[slot, 3 + c]`` (rows of lanes) are how much it may lower or raise channel c.
@@ -956,8 +980,8 @@ def _swap_bounds(pairs, pair_count, slots, slot_count, heights, entries, colors,
         if front < 0 or back < 0:
             continue
         for channel in range(3):
-            low_e, high_e = _color_range(colors, entries[pairs[p, 0]], channel, color_rows)
-            low_f, high_f = _color_range(colors, entries[pairs[p, 1]], channel, color_rows)
+            low_e, high_e = _color_range(palette, pairs[p, 0], channel, forms)
+            low_f, high_f = _color_range(palette, pairs[p, 1], channel, forms)
             for side in range(2):
                 change = max(0.0, high_e - low_f) if side == 0 else max(0.0, high_f - low_e)
                 if change == 0.0:
@@ -1000,8 +1024,7 @@ def _collect_moves(moves, slot_count, places, extra, moved):
 
 @njit(cache=True, error_model="numpy")
 def _interval_chain(
-    layers, width, lists, entries, colors, extra, moved, low, high, start, stop, q, channel, color_rows, suffix_low,
-    suffix_high,
+    layers, width, lists, palette, forms, extra, moved, low, high, start, stop, q, channel, suffix_low, suffix_high
 ):  # fmt: skip
     """One step of the interval blend for layers [start, stop) whose order is uncertain (design.md, O2-O4).
 
@@ -1010,7 +1033,7 @@ def _interval_chain(
     behind_low, behind_high = low, high
     for e in range(stop - 1, start - 1, -1):
         at = lists[q, e, 0] * width
-        c_low, c_high = _color_range(colors, entries[lists[q, e, 1]], channel, color_rows)
+        c_low, c_high = _color_range(palette, int(lists[q, e, 1]), channel, forms)
         a_low = layers[at + _ALPHA_LOW]
         a_high = layers[at + _ALPHA_HIGH]
         v = c_high - high
@@ -1031,7 +1054,7 @@ def _interval_chain(
     keys = np.empty(count)
     for side in range(2):
         for e in range(count):
-            c_low, c_high = _color_range(colors, entries[lists[q, start + e, 1]], channel, color_rows)
+            c_low, c_high = _color_range(palette, int(lists[q, start + e, 1]), channel, forms)
             keys[e] = c_low if side == 0 else -c_high
         order = np.argsort(keys)
         value = behind_low if side == 0 else behind_high
@@ -1051,7 +1074,7 @@ def _interval_chain(
 
 @njit(cache=True, error_model="numpy")
 def _interval_blend(
-    layers, width, lists, entries, colors, lengths, extra, moved, chain, background, color_rows, low, high
+    layers, width, lists, palette, forms, lengths, extra, moved, chain, background, low, high
 ):
     """Sharpen the interval blend where depth orders are uncertain; ``chain[k]`` numbers the groups."""
     size = np.zeros(chain.size + 2, np.int64)
@@ -1080,8 +1103,8 @@ def _interval_blend(
                 while start > 0 and chain[lists[q, start - 1, 1]] == chain[lists[q, stop - 1, 1]]:
                     start -= 1
                 value_low, value_high, suffix_low, suffix_high = _interval_chain(
-                    layers, width, lists, entries, colors, extra, moved, value_low, value_high, start, stop, q,
-                    channel, color_rows, suffix_low, suffix_high,
+                    layers, width, lists, palette, forms, extra, moved, value_low, value_high, start, stop, q, channel,
+                    suffix_low, suffix_high,
                 )  # fmt: skip
                 stop = start
             low[channel, q] = max(low[channel, q], value_low)
@@ -1089,34 +1112,21 @@ def _interval_blend(
 
 
 @njit(cache=True, error_model="numpy", forceinline=True)
-def _set_colors(palette, k, color, color_rows):
-    """Write the colour of list position k: centre, slopes, radius, then its lower and upper bound.
-
-    Each is four numbers: three channels and one of none.
-    """
-    forms = max(color_rows - 1, 1)
-    at = 4 * k * (forms + 3)
-    for channel in range(3):
-        start = channel * color_rows
-        spread = 0.0
-        for r in range(1, color_rows):
-            spread += abs(color[start + r])
-        spread *= _UP
-        for r in range(forms):
-            palette[at + 4 * r + channel] = color[start + r]
-        palette[at + 4 * forms + channel] = color[start + forms] if color_rows > 1 else 0.0
-        palette[at + 4 * forms + 4 + channel] = color[start] - spread
-        palette[at + 4 * forms + 8 + channel] = color[start] + spread
+def _listed_layer(lists, entry, width, forms):
+    """Where a pixel's layer stands, and its colour in the palette."""
+    return int(lists[2 * entry]) * width, int(lists[2 * entry + 1]) * _color_size(forms)
 
 
 @njit(cache=True, error_model="numpy", forceinline=True)
-def _blend_interval(low, high, layers, at, palette, ends):
-    """One layer over the interval [low, high] (design.md, B7)."""
+def _blend_interval(low, high, darkest, brightest, layers, at, palette, ends):
+    """One layer over the interval [low, high] (design.md, B7); also the range of the colours so far."""
     a_low, a_high = layers[at + _ALPHA_LOW], layers[at + _ALPHA_HIGH]
-    v = load4(palette, ends) - low
+    c_low, c_high = load4(palette, ends), load4(palette, ends + 4)
+    v = c_low - low
     low = fma(where(v < 0.0, a_high, a_low), v, low)
-    v = load4(palette, ends + 4) - high
-    return low, fma(where(v > 0.0, a_high, a_low), v, high)
+    v = c_high - high
+    high = fma(where(v > 0.0, a_high, a_low), v, high)
+    return low, high, minimum(darkest, c_low), maximum(brightest, c_high)
 
 
 @njit(cache=True, error_model="numpy")
@@ -1144,10 +1154,7 @@ def _blend_line(
         darkest = p0
         brightest = p0
         for e in range(int(lengths[q]) - 1, -1, -1):
-            entry = 2 * (q * deepest + e)
-            at = int(lists[entry]) * width
-            key = 4 * int(lists[entry + 1]) * (forms + 3)
-            ends = key + 4 * forms + 4
+            at, key = _listed_layer(lists, q * deepest + e, width, forms)
             a0, a1, a2 = layers[at + _FORM], layers[at + _FORM + 1], layers[at + _FORM + 2]
             # colour - P, a form without radius
             v0 = load4(palette, key) - p0
@@ -1170,9 +1177,9 @@ def _blend_line(
             added = fma(layers[at + _ALPHA_HIGH], load4(palette, key + 4 * forms), fma(a1, v2, a2 * v1))
             added = fma(layers[at + _FORM + 3], size, fma(_ROUND, fma(1.0 + a1 + a2, size, abs(p0)), added))
             r = fma(1.0 - layers[at + _ALPHA_LOW], r, added) * _UP
-            bottom, top = _blend_interval(bottom, top, layers, at, palette, ends)
-            darkest = minimum(darkest, load4(palette, ends))
-            brightest = maximum(brightest, load4(palette, ends + 4))
+            bottom, top, darkest, brightest = _blend_interval(
+                bottom, top, darkest, brightest, layers, at, palette, key + 4 * forms + 4
+            )
             if moved[e]:
                 move = 8 * (e * PIXELS + q)
                 falls, rises = load4(extra, move), load4(extra, move + 4)
@@ -1298,17 +1305,14 @@ def _blend(
         darkest = bottom
         brightest = bottom
         for e in range(int(lengths[q]) - 1, -1, -1):
-            entry = 2 * (q * deepest + e)
-            at = int(lists[entry]) * width
-            key = 4 * int(lists[entry + 1]) * (forms + 3)
-            ends = key + 4 * forms + 4
+            at, key = _listed_layer(lists, q * deepest + e, width, forms)
             if order == 1:
                 r = _step_affine(r, layers, at, palette, key, forms, t, m)
             else:
                 r = _step_curved(r, layers, at, palette, key, forms, t, value, d, m)
-            bottom, top = _blend_interval(bottom, top, layers, at, palette, ends)
-            darkest = minimum(darkest, load4(palette, ends))
-            brightest = maximum(brightest, load4(palette, ends + 4))
+            bottom, top, darkest, brightest = _blend_interval(
+                bottom, top, darkest, brightest, layers, at, palette, key + 4 * forms + 4
+            )
             if moved[e]:
                 move = 8 * (e * PIXELS + q)
                 falls, rises = load4(extra, move), load4(extra, move + 4)
@@ -1369,7 +1373,7 @@ def _block(
     unit = errors[0]
     side = lower.shape[0]
     width = rows.size // PIXELS
-    color_rows = colors.shape[1] // 3
+    forms = max(colors.shape[1] // 3 - 1, 1)
     u = (x0 + 0.5 * BLOCK - camera[2]) / camera[0]
     v = (y0 + 0.5 * BLOCK - camera[3]) / camera[1]
     for k in range(3):
@@ -1405,9 +1409,8 @@ def _block(
         _settle_stops(
             layers, width, lists, lengths, first, last, slots[: listed.size], places, s, m, rules[9], unit
         )
-        _swap_bounds(pairs, pair_count, slots, slot_count, heights, listed, colors, color_rows, moves, most)
+        _swap_bounds(pairs, pair_count, slots, slot_count, heights, palette, forms, moves, most)
         _collect_moves(moves, slot_count, places, extra, moved)
-    forms = max(color_rows - 1, 1)
     if d == 1 and order == 2:
         _blend_line(
             layers, width, lists, palette, forms, lengths, extra, moved, background, state, radius, low, high, s, t
@@ -1419,8 +1422,8 @@ def _block(
         )  # fmt: skip
     if slot_count > 0:
         _interval_blend(
-            layers, width, lists, listed, colors, lengths, extra, moved, _chains(last[: listed.size]), background,
-            color_rows, low, high,
+            layers, width, lists, palette, forms, lengths, extra, moved, _chains(last[: listed.size]), background, low,
+            high,
         )
     statistics[1] += deepest
     statistics[2] += pair_count
@@ -1485,7 +1488,7 @@ def _pixel_worker(
     blocks = side // BLOCK
     # columns of a layer, and numbers of a colour of the palette
     width = -(-(_FORM + m + 1) // 8) * 8
-    color_size = 4 * (max(colors.shape[1] // 3 - 1, 1) + 3)
+    color_size = _color_size(max(colors.shape[1] // 3 - 1, 1))
     scratch = np.zeros(_ROWS * PIXELS)
     scratch[_NUMBERS : _NUMBERS + BLOCK] = np.arange(BLOCK)
     background_ = np.zeros(4)
