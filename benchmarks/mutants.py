@@ -360,8 +360,19 @@ MUTANTS = (
     ),
     Mutant(
         "antichain sorted the wrong way", PIXELS,
-        "keys[e] = c_low if side == 0 else -c_high", "keys[e] = -c_low if side == 0 else c_high",
+        "keys[e] = palette[ends] if side == 0 else -palette[ends + 4]",
+        "keys[e] = -palette[ends] if side == 0 else palette[ends + 4]",
         "test_bounds.py::test_three_layers_swap[1]",
+    ),
+    Mutant(
+        "layers that share a pixel are taken for apart", PIXELS,
+        "shown & int(masks[other]) == 0", "shown & int(masks[other]) & 1 == 0",
+        "test_bounds.py::test_depth_swap[2]",
+    ),
+    Mutant(
+        "order swap counts at the first pixel only", PIXELS,
+        "both = drawn[front] & drawn[back]", "both = drawn[front] & drawn[back] & 1",
+        "test_bounds.py::test_depth_swap[2]",
     ),
     Mutant(
         "1/255 is not a jump", PIXELS,

@@ -65,6 +65,10 @@ _ALL = 255
 #: Columns of a layer: bounds of alpha, transmittance behind it at its least and before it at its most, alpha's
 #: coefficients and then its radius.
 _ALPHA_LOW, _ALPHA_HIGH, _LEFT, _LIGHT, _FORM = range(5)
+#: Columns of an entry of a pixel's list: the layer's number, its list position, its row of moves; one is spare.
+_LISTED = 4
+#: Columns of a row of moves: by how much reordering may lower and raise the pixel, found from sums and from maxima.
+_MOVES = 16
 
 
 @njit(cache=True, error_model="numpy", inline="always")
@@ -580,54 +584,7 @@ def _depth_reach(entries, depth, delta, depth_error, slope, ray, m, reach, deep)
     return room, largest
 
 
-@njit(cache=True, error_model="numpy", forceinline=True)
-def _find_pairs(
-    k, entries, length, deep, delta, depth_error, slope, m, reach, room, largest, farthest, far, far_count, first,
-    last, pairs, pair_limit, count,
-):  # fmt: skip
-    """Append the pairs (k, later entry) of uncertain order to ``pairs`` and widen ``first``, ``last``.
-
-    Returns their number, or -1 where ``pairs`` is full.
-    """
-    i = entries[k]
-    window = reach[k] + largest
-    beyond = length
-    for other in range(k + 1, length):
-        gap = (deep[other] - deep[k]) * room
-        if gap > window:
-            beyond = other
-            break
-        if gap <= reach[k] + reach[other] and _uncertain(
-            i, entries[other], delta, depth_error, slope, m
-        ):
-            if count >= pair_limit:
-                return -1
-            pairs[2 * count] = k
-            pairs[2 * count + 1] = other
-            last[k] = max(last[k], other)
-            first[other] = min(first[other], k)
-            count += 1
-    for f in range(far_count):
-        other = far[f]
-        if other < beyond:
-            continue
-        gap = (deep[other] - deep[k]) * room
-        if gap > reach[k] + farthest:
-            break
-        if gap <= reach[k] + reach[other] and _uncertain(
-            i, entries[other], delta, depth_error, slope, m
-        ):
-            if count >= pair_limit:
-                return -1
-            pairs[2 * count] = k
-            pairs[2 * count + 1] = other
-            last[k] = max(last[k], other)
-            first[other] = min(first[other], k)
-            count += 1
-    return count
-
-
-@njit(cache=True, error_model="numpy", forceinline=True)
+@njit(cache=True, error_model="numpy")
 def _reached(record, ox, oy, left, right, top, bottom, m, s):
     """The set of pixels of a range where the exponent may stay low enough for the threshold.
 
@@ -682,6 +639,83 @@ def _reached(record, ox, oy, left, right, top, bottom, m, s):
 
 
 @njit(cache=True, error_model="numpy")
+def _pixels_of(record, box, x0, y0, m, s):
+    """The set of a block's pixels on which a Gaussian may reach the threshold."""
+    left = int(math.ceil(min(max(box[0] - 0.5 - x0, 0.0), float(BLOCK))))
+    right = int(math.floor(min(max(box[1] - 0.5 - x0, -1.0), BLOCK - 1.0)))
+    top = int(math.ceil(min(max(box[2] - 0.5 - y0, 0.0), float(BLOCK))))
+    bottom = int(math.floor(min(max(box[3] - 0.5 - y0, -1.0), BLOCK - 1.0)))
+    if top > bottom or left > right:
+        return 0
+    ox, oy = x0 + 0.5 - record[MEAN_X], y0 + 0.5 - record[MEAN_Y]
+    return signed(_reached(record, ox, oy, left, right, top, bottom, m, s))
+
+
+@njit(cache=True, error_model="numpy")
+def _pixels_at(lanes, pixels):
+    """The set of the pixels in ``lanes``."""
+    found = 0
+    while lanes != 0:
+        found |= 1 << int(pixels[lowest_bit(lanes)])
+        lanes &= lanes - 1
+    return signed(found)
+
+
+@njit(cache=True, error_model="numpy", forceinline=True)
+def _find_pairs(
+    k, found, pixels, entries, length, record, columns, box, x0, y0, s, masks, asked, deep, delta, depth_error, slope,
+    m, reach, room, largest, farthest, far, far_count, first, last, pairs, pair_limit, count,
+):  # fmt: skip
+    """Append the pairs (k, later entry) that share a pixel and are of uncertain order; widen ``first``, ``last``.
+
+    ``pixels`` in the lanes ``found`` are k's; ``masks`` receives the others' where they are needed, ``asked`` then a 1.
+    Returns the number of pairs, or -1 where ``pairs`` is full.
+    """
+    i = entries[k]
+    shown = 0
+    beyond = length
+    window = reach[k] + largest
+    # those within the window, then those that reach far
+    other = k
+    f = 0
+    within = True
+    while True:
+        if within:
+            other += 1
+            if other >= length or (deep[other] - deep[k]) * room > window:
+                within = False
+                beyond = other
+                continue
+        else:
+            while f < far_count and far[f] < beyond:
+                f += 1
+            if f >= far_count:
+                break
+            other = far[f]
+            f += 1
+            if (deep[other] - deep[k]) * room > reach[k] + farthest:
+                break
+        if (deep[other] - deep[k]) * room > reach[k] + reach[other]:
+            continue
+        if shown == 0:
+            shown = _pixels_at(found, pixels)
+        j = entries[other]
+        if asked[other] == 0:
+            asked[other] = 1
+            masks[other] = _pixels_of(advanced(record, j * columns), advanced(box, 4 * j), x0, y0, m, s)
+        if shown & int(masks[other]) == 0 or not _uncertain(i, j, delta, depth_error, slope, m):
+            continue
+        if count >= pair_limit:
+            return -1
+        pairs[2 * count] = k
+        pairs[2 * count + 1] = other
+        last[k] = max(last[k], other)
+        first[other] = min(first[other], k)
+        count += 1
+    return count
+
+
+@njit(cache=True, error_model="numpy")
 def _still_live(found, pixels, live):
     """Those lanes of ``found`` whose pixel is in ``live``."""
     left = 0
@@ -696,39 +730,42 @@ def _still_live(found, pixels, live):
 @njit(cache=True, error_model="numpy")
 def _forward(
     entries_, record_, box_, tiles_, tile_x, tile_y, colors_, palette_, depth_, delta_, depth_error_, slope_, ray,
-    s_, y1, y2, poly, rows_, layers_, width, offset_x, offset_y, pixels_, batch_, lists_, lengths_, reach_, deep_, far_,
-    first_, last_, slots_, heights_, places_, pairs_, x0, y0, d, order, m, antialiased, rules, errors, marks_,
+    s_, y1, y2, poly, rows_, layers_, width, offset_x, offset_y, pixels_, batch_, masks_, asked_, lists_, lengths_,
+    reach_, deep_, far_, first_, last_, slots_, owners_, drawn_, places_, moves_, pairs_, x0, y0, d, order, m,
+    antialiased, rules, errors, marks_,
 ):  # fmt: skip
     """Collect the layers of every pixel, nearest first (design.md, B5-B6).
 
     ``layers`` receives layer after layer, ``width`` numbers each; ``lists[q, e]`` the number of pixel q's layer e
-    there and its list position. ``first[k] <= k <= last[k]`` become the list positions whose depth order against
-    entry k is uncertain, ``pairs`` [., 2] all such pairs, ``slots[k]`` the row of ``heights`` that holds the
-    upper alphas of an entry that takes part in one (-1: none), and of ``places`` that holds its place in
-    the pixels' lists (-1: not in it). Returns the number of pairs and of
-    slots; or _GIVE_UP where more pairs are uncertain than ``pairs`` may hold, or _GROW where another
+    there, its list position and its row of ``moves`` (0: its order is certain; the others are set to 0).
+    ``first[k] <= k <= last[k]`` become the list positions whose depth order against entry k is uncertain, ``pairs``
+    [., 2] all such pairs, ``slots[k]`` numbers the entries that take part in one (-1: it does not) and ``owners``
+    leads back; the set ``drawn`` holds a slot's pixels and ``places`` its place in their lists. Returns the number of
+    pairs and of slots; or _GIVE_UP where more pairs are uncertain than ``pairs`` may hold, or _GROW where another
     buffer is too small.
 
     Row _RHO of ``s`` receives how much transmittance may be lost to a stop that the kept layers ignore;
     ``marks`` is set for the entries that some pixel that takes light may draw, or stop at; ``palette`` receives
-    their colours. ``batch`` [3, entries] is scratch, and so are ``offset_x``, ``offset_y`` and ``pixels``, by pixel
-    of a batch.
+    their colours. ``batch`` [2, entries], ``masks`` and ``asked`` are scratch, and so are ``offset_x``, ``offset_y``
+    and ``pixels``, by pixel of a batch.
     """
     entries, record, box, tiles = pointer(entries_), pointer(record_), pointer(box_), pointer(tiles_)
     colors, palette, delta = pointer(colors_), pointer(palette_), pointer(delta_)
     depth_error, slope, s, rows = pointer(depth_error_), pointer(slope_), pointer(s_), pointer(rows_)
     layers, ax, ay, pixels = pointer(layers_), pointer(offset_x), pointer(offset_y), pointer(pixels_)
-    masks, begins, hits = pointer(batch_[0]), pointer(batch_[1]), pointer(batch_[2])
+    begins, hits, masks, asked = pointer(batch_[0]), pointer(batch_[1]), pointer(masks_), pointer(asked_)
     lists, lengths, reach, deep = pointer(lists_), pointer(lengths_), pointer(reach_), pointer(deep_)
     far, first, last, slots = pointer(far_), pointer(first_), pointer(last_), pointer(slots_)
-    heights, places, pairs, marks = pointer(heights_), pointer(places_), pointer(pairs_), pointer(marks_)
+    owners, drawn, places, moves = pointer(owners_), pointer(drawn_), pointer(places_), pointer(moves_)
+    pairs, marks = pointer(pairs_), pointer(marks_)
     length, columns, color_columns = entries_.size, record_.shape[1], colors_.shape[1]
-    deepest, slot_limit, pair_limit = lists_.shape[1], heights_.shape[0], pairs_.shape[0]
+    deepest, slot_limit, pair_limit = lists_.shape[1], drawn_.size, pairs_.shape[0]
     unit = errors[0]
     stop = rules[9]
     stop_low = stop * (1.0 - 8.0 * unit)
     stop_high = stop * (1.0 + 8.0 * unit)
     capacity = layers_.size // width
+    move_limit = moves_.shape[0]
     color_rows = color_columns // 3
     for q in range(PIXELS):
         s[_TLO + q] = 1.0
@@ -746,12 +783,15 @@ def _forward(
         first[k] = k
         last[k] = k
         slots[k] = -1
+        asked[k] = 0
         if reach[k] > largest:
             far[far_count] = k
             far_count += 1
             farthest = max(farthest, reach[k])
     pair_count = 0
     slot_count = 0
+    # row 0 stays 0
+    move_count = 1
     live = -1
     used = 0
     for start in range(0, length, _BATCH):
@@ -768,21 +808,14 @@ def _forward(
             for byte in range(0, 8 * color_columns, 64):
                 prefetch(colors_, ahead, byte)
             i = entries[start + b]
-            left = int(math.ceil(min(max(box[4 * i] - 0.5 - x0, 0.0), float(BLOCK))))
-            right = int(math.floor(min(max(box[4 * i + 1] - 0.5 - x0, -1.0), BLOCK - 1.0)))
-            top = int(math.ceil(min(max(box[4 * i + 2] - 0.5 - y0, 0.0), float(BLOCK))))
-            bottom = int(math.floor(min(max(box[4 * i + 3] - 0.5 - y0, -1.0), BLOCK - 1.0)))
-            masks[b] = 0
-            if top <= bottom and left <= right:
-                row = advanced(record, i * columns)
-                ox, oy = x0 + 0.5 - row[MEAN_X], y0 + 0.5 - row[MEAN_Y]
-                masks[b] = signed(live & _reached(row, ox, oy, left, right, top, bottom, m, s))
+            if asked[start + b] == 0:
+                masks[start + b] = _pixels_of(advanced(record, i * columns), advanced(box, 4 * i), x0, y0, m, s)
         end = 0
         for b in range(some):
             i = entries[start + b]
             row = advanced(record, i * columns)
             ox, oy = x0 + 0.5 - row[MEAN_X], y0 + 0.5 - row[MEAN_Y]
-            mask = masks[b]
+            mask = live & masks[start + b]
             begins[b] = end
             while mask != 0:
                 q = lowest_bit(mask)
@@ -817,8 +850,9 @@ def _forward(
             k = start + b
             i = entries[k]
             pair_count = _find_pairs(
-                k, entries, length, deep, delta, depth_error, slope, m, reach, room, largest, farthest, far, far_count,
-                first, last, pairs, pair_limit, pair_count,
+                k, found, advanced(pixels, begin), entries, length, record, columns, box, x0, y0, s, masks, asked, deep,
+                delta, depth_error, slope, m, reach, room, largest, farthest, far, far_count, first, last, pairs,
+                pair_limit, pair_count,
             )  # fmt: skip
             if pair_count < 0:
                 return _GIVE_UP, 0
@@ -827,9 +861,8 @@ def _forward(
                 if slot_count >= slot_limit:
                     return _GROW, 0
                 slots[k] = slot_count
-                for q in range(slot_count * PIXELS, (slot_count + 1) * PIXELS):
-                    heights[q] = 0.0
-                    places[q] = -1
+                owners[slot_count] = k
+                drawn[slot_count] = 0
                 slot_count += 1
             # threads share these bytes: written no more than once each
             if marks[i] == 0:
@@ -848,7 +881,7 @@ def _forward(
                 t_high = before * (1.0 - low) * (1.0 + 8.0 * unit)
                 if alone and t_high <= stop_low:
                     # surely the stop: neither this layer nor any behind it is drawn
-                    live &= ~(1 << q)
+                    live = signed(live & ~(1 << q))
                     continue
                 count = lengths[q]
                 if count >= deepest:
@@ -862,14 +895,21 @@ def _forward(
                         s[_RHO + q] = s[_LOST + q]
                 layers[at + _LEFT] = t_low
                 layers[at + _LIGHT] = before
-                entry = 2 * (q * deepest + count)
+                entry = _LISTED * (q * deepest + count)
                 lists[entry] = used + lane
                 lists[entry + 1] = k
+                lists[entry + 2] = 0
                 lengths[q] = count + 1
                 s[_TLO + q] = t_low
                 s[_THI + q] = t_high
                 if not alone:
-                    heights[slots[k] * PIXELS + q] = high
+                    if move_count >= move_limit:
+                        return _GROW, 0
+                    lists[entry + 2] = move_count
+                    for r in range(_MOVES * move_count, _MOVES * (move_count + 1), 8):
+                        store(moves, r, 0.0 * load8(s, _NUMBERS))
+                    move_count += 1
+                    drawn[slots[k]] = signed(int(drawn[slots[k]]) | (1 << q))
                     places[slots[k] * PIXELS + q] = count
                     # layers up to the last one whose order is uncertain may still come first
                     s[_REACH + q] = max(s[_REACH + q], float(last[k]))
@@ -877,7 +917,7 @@ def _forward(
                 for lane in range(begin, begins[b + 1]):
                     q = int(pixels[lane])
                     if s[_THI + q] <= stop_low and s[_REACH + q] <= k:
-                        live &= ~(1 << q)
+                        live = signed(live & ~(1 << q))
         if live == 0:
             break
         used += end
@@ -885,33 +925,42 @@ def _forward(
 
 
 @njit(cache=True, error_model="numpy")
-def _settle_stops(layers_, width, lists, lengths, first, last, slots, places, s, m, stop, unit):
+def _settle_stops(
+    layers_, width, lists_, lengths, first_, last_, owners_, drawn_, places_, slot_count, s_, m, stop, unit
+):
     """Drop or weaken the layers of uncertain depth order that the stop may hide (design.md, B6)."""
-    layers = pointer(layers_)
+    layers, lists, first, last = pointer(layers_), pointer(lists_), pointer(first_), pointer(last_)
+    owners, drawn, places, s = pointer(owners_), pointer(drawn_), pointer(places_), pointer(s_)
+    deepest = lists_.shape[1]
     stop_low = stop * (1.0 - 8.0 * unit)
     stop_high = stop * (1.0 + 8.0 * unit)
+    # the stop is out of reach of most pixels
+    dark = 0
     for q in range(PIXELS):
         s[_C1 + q] = 0.0
-    for k in range(slots.size):
-        if slots[k] < 0:
-            continue
-        place = places[slots[k]]
-        for q in range(PIXELS):
-            e = place[q]
-            # the stop is out of reach of most pixels
-            if e < 0 or s[_TLO + q] > stop_high:
+        if not s[_TLO + q] > stop_high:
+            dark |= 1 << q
+    for slot in range(slot_count if dark != 0 else 0):
+        k = owners[slot]
+        some = drawn[slot]
+        while some != 0:
+            q = lowest_bit(some)
+            some &= some - 1
+            if dark & (1 << q) == 0:
                 continue
+            start = q * deepest
+            e = start + int(places[slot * PIXELS + q])
             behind = e
-            while behind + 1 < lengths[q] and lists[q, behind + 1, 1] <= last[k]:
+            while behind + 1 < start + int(lengths[q]) and int(lists[_LISTED * (behind + 1) + 1]) <= last[k]:
                 behind += 1
-            t_low = layers[lists[q, behind, 0] * width + _LEFT]
+            t_low = layers[int(lists[_LISTED * behind]) * width + _LEFT]
             if t_low > stop_high:
                 continue
             before = e
-            while before > 0 and lists[q, before - 1, 1] >= first[k]:
+            while before > start and int(lists[_LISTED * (before - 1) + 1]) >= first[k]:
                 before -= 1
-            light = layers[lists[q, before, 0] * width + _LIGHT]
-            at = lists[q, e, 0] * width
+            light = layers[int(lists[_LISTED * before]) * width + _LIGHT]
+            at = int(lists[_LISTED * e]) * width
             t_high = light * (1.0 - layers[at + _ALPHA_LOW]) * (1.0 + 8.0 * unit)
             # the most light that a stop at this layer may leave
             high = layers[at + _ALPHA_HIGH]
@@ -958,163 +1007,58 @@ def _set_colors(palette, k, color, color_rows):
         palette[at + 4 * forms + 8 + channel] = color[start] + spread
 
 
-@njit(cache=True, error_model="numpy", inline="always")
-def _color_range(palette, k, channel, forms):
-    """Bounds of the colour of list position k over the cell."""
-    at = k * _color_size(forms) + 4 * forms + 4 + channel
-    return palette[at], palette[at + 4]
-
-
 @njit(cache=True, error_model="numpy")
-def _swap_bounds(pairs, pair_count, slots, slot_count, heights, palette, forms, moves, most):
-    """Bound what reordering may change when a slot's layer joins the layers behind it (design.md, O2).
+def _swap_bounds(
+    pairs_, pair_count, slots_, slot_count, drawn_, places_, layers_, width, lists_, palette_, forms, moves_
+):  # fmt: skip
+    """Bound what reordering may change when a layer joins the layers behind it (design.md, O2).
 
-    ``moves[slot, c]`` and ``moves[slot, 3 + c]`` (rows of lanes) are how much it may lower or raise channel c.
+    The first half of its row of ``moves`` becomes how much three channels, and one of none, may fall, then rise.
     """
-    moves[:slot_count] = 0.0
-    most[:slot_count] = 0.0
-    n = heights.shape[1]
+    pairs, slots, drawn, places = pointer(pairs_), pointer(slots_), pointer(drawn_), pointer(places_)
+    layers, lists, palette, moves = pointer(layers_), pointer(lists_), pointer(palette_), pointer(moves_)
+    deepest = lists_.shape[1]
     for p in range(pair_count):
-        front = slots[pairs[p, 0]]
-        back = slots[pairs[p, 1]]
+        k, other = pairs[2 * p], pairs[2 * p + 1]
+        front, back = slots[k], slots[other]
         if front < 0 or back < 0:
             continue
-        for channel in range(3):
-            low_e, high_e = _color_range(palette, pairs[p, 0], channel, forms)
-            low_f, high_f = _color_range(palette, pairs[p, 1], channel, forms)
-            for side in range(2):
-                change = max(0.0, high_e - low_f) if side == 0 else max(0.0, high_f - low_e)
-                if change == 0.0:
-                    continue
-                total = moves[front, 3 * side + channel]
-                single = most[front, 3 * side + channel]
-                alpha = heights[back]
-                for q in range(n):
-                    total[q] += alpha[q] * change
-                for q in range(n):
-                    single[q] = max(single[q], change if alpha[q] > 0.0 else 0.0)
-    for slot in range(slot_count):
-        alpha = heights[slot]
-        for r in range(6):
-            total = moves[slot, r]
-            single = most[slot, r]
-            # the weights of the layers it may move behind add up to at most one
-            for q in range(n):
-                total[q] = alpha[q] * min(total[q], single[q]) * _UP
-
-
-@njit(cache=True, error_model="numpy")
-def _collect_moves(moves, slot_count, places, extra, moved):
-    """Move the swap bounds from slots to the pixels' layers; ``moved[e]`` tells whether layer e of any has some.
-
-    ``extra[e]``, flat by pixel: how much three channels, and one of none, may fall, then rise.
-    """
-    for slot in range(slot_count):
-        for q in range(PIXELS):
-            e = places[slot, q]
-            if e < 0:
-                continue
-            if not moved[e]:
-                moved[e] = True
-                extra[e] = 0.0
-            for channel in range(3):
-                extra[e, 8 * q + channel] = moves[slot, channel, q]
-                extra[e, 8 * q + 4 + channel] = moves[slot, 3 + channel, q]
-
-
-@njit(cache=True, error_model="numpy")
-def _interval_chain(
-    layers, width, lists, palette, forms, extra, moved, low, high, start, stop, q, channel, suffix_low, suffix_high
-):  # fmt: skip
-    """One step of the interval blend for layers [start, stop) whose order is uncertain (design.md, O2-O4).
-
-    Returns the tighter of the swap, hull and antichain bounds, and the range of the colours so far.
-    """
-    behind_low, behind_high = low, high
-    for e in range(stop - 1, start - 1, -1):
-        at = lists[q, e, 0] * width
-        c_low, c_high = _color_range(palette, int(lists[q, e, 1]), channel, forms)
-        a_low = layers[at + _ALPHA_LOW]
-        a_high = layers[at + _ALPHA_HIGH]
-        v = c_high - high
-        front_high = high + (a_high if v > 0.0 else a_low) * v
-        v = c_low - low
-        front_low = low + (a_high if v < 0.0 else a_low) * v
-        lower = extra[e, 8 * q + channel] if moved[e] else 0.0
-        lift = extra[e, 8 * q + 4 + channel] if moved[e] else 0.0
-        # wherever it goes among the layers behind, it moves the colour by at most its alpha times
-        # the distance to the darkest or brightest of what lies behind
-        hull_high = max(front_high, high + a_high * max(0.0, c_high - suffix_low))
-        hull_low = min(front_low, low + a_high * min(0.0, c_low - suffix_high))
-        high = min(front_high + lift, hull_high) if lift > 0.0 else front_high
-        low = max(front_low - lower, hull_low) if lower > 0.0 else front_low
-        suffix_low = min(suffix_low, c_low)
-        suffix_high = max(suffix_high, c_high)
-    count = stop - start
-    keys = np.empty(count)
-    for side in range(2):
-        for e in range(count):
-            c_low, c_high = _color_range(palette, int(lists[q, start + e, 1]), channel, forms)
-            keys[e] = c_low if side == 0 else -c_high
-        order = np.argsort(keys)
-        value = behind_low if side == 0 else behind_high
-        # nearest first: darkest for the lower bound, brightest for the upper one
-        for position in range(count - 1, -1, -1):
-            at = lists[q, start + order[position], 0] * width
-            color = keys[order[position]] if side == 0 else -keys[order[position]]
-            v = color - value
-            grows = v < 0.0 if side == 0 else v > 0.0
-            value += layers[at + (_ALPHA_HIGH if grows else _ALPHA_LOW)] * v
-        if side == 0:
-            low = max(low, value)
-        else:
-            high = min(high, value)
-    return low, high, suffix_low, suffix_high
-
-
-@njit(cache=True, error_model="numpy")
-def _interval_blend(
-    layers, width, lists, palette, forms, lengths, extra, moved, chain, background, low, high
-):
-    """Sharpen the interval blend where depth orders are uncertain; ``chain[k]`` numbers the groups."""
-    size = np.zeros(chain.size + 2, np.int64)
-    for k in range(chain.size):
-        size[chain[k]] += 1
-    for q in range(PIXELS):
-        # reordering that cannot move the colour by a ten-thousandth is left to the swap bound
-        weight = 0.0
-        for e in range(lengths[q]):
-            # of two layers alone the swap bound is exact
-            if moved[e] and size[chain[lists[q, e, 1]]] > 2:
-                most = 0.0
-                for r in range(8):
-                    most = max(most, extra[e, 8 * q + r])
-                weight += most * layers[lists[q, e, 0] * width + _LIGHT]
-        if not weight > _REORDERING_MATTERS:
+        both = drawn[front] & drawn[back]
+        if both == 0:
             continue
-        for channel in range(3):
-            value_low = background[channel]
-            value_high = background[channel]
-            suffix_low = value_low
-            suffix_high = value_high
-            stop = int(lengths[q])
-            while stop > 0:
-                start = stop - 1
-                while start > 0 and chain[lists[q, start - 1, 1]] == chain[lists[q, stop - 1, 1]]:
-                    start -= 1
-                value_low, value_high, suffix_low, suffix_high = _interval_chain(
-                    layers, width, lists, palette, forms, extra, moved, value_low, value_high, start, stop, q, channel,
-                    suffix_low, suffix_high,
-                )  # fmt: skip
-                stop = start
-            low[channel, q] = max(low[channel, q], value_low)
-            high[channel, q] = min(high[channel, q], value_high)
+        # bounds of the colours
+        e, f = k * _color_size(forms) + 4 * forms + 4, other * _color_size(forms) + 4 * forms + 4
+        falls = maximum(0.0, load4(palette, e + 4) - load4(palette, f))
+        rises = maximum(0.0, load4(palette, f + 4) - load4(palette, e))
+        while both != 0:
+            q = lowest_bit(both)
+            both &= both - 1
+            behind = _LISTED * (q * deepest + int(places[back * PIXELS + q]))
+            move = _MOVES * int(lists[_LISTED * (q * deepest + int(places[front * PIXELS + q])) + 2])
+            alpha = layers[int(lists[behind]) * width + _ALPHA_HIGH]
+            store(moves, move, fma(alpha, falls, load4(moves, move)))
+            store(moves, move + 4, fma(alpha, rises, load4(moves, move + 4)))
+            store(moves, move + 8, maximum(load4(moves, move + 8), falls))
+            store(moves, move + 12, maximum(load4(moves, move + 12), rises))
+    # one rounding by pair
+    up = _UP + 2.0 * UNIT64 * pair_count
+    for slot in range(slot_count):
+        some = drawn[slot]
+        while some != 0:
+            q = lowest_bit(some)
+            some &= some - 1
+            entry = _LISTED * (q * deepest + int(places[slot * PIXELS + q]))
+            alpha = layers[int(lists[entry]) * width + _ALPHA_HIGH]
+            move = _MOVES * int(lists[entry + 2])
+            # the weights of the layers it may move behind add up to at most one
+            store(moves, move, alpha * minimum(load8(moves, move), load8(moves, move + 8)) * up)
 
 
 @njit(cache=True, error_model="numpy", forceinline=True)
 def _listed_layer(lists, entry, width, forms):
-    """Where a pixel's layer stands, and its colour in the palette."""
-    return int(lists[2 * entry]) * width, int(lists[2 * entry + 1]) * _color_size(forms)
+    """Where a pixel's layer stands, its colour in the palette and its row of moves (0: none)."""
+    at = _LISTED * entry
+    return int(lists[at]) * width, int(lists[at + 1]) * _color_size(forms), _MOVES * int(lists[at + 2])
 
 
 @njit(cache=True, error_model="numpy", forceinline=True)
@@ -1130,8 +1074,112 @@ def _blend_interval(low, high, darkest, brightest, layers, at, palette, ends):
 
 
 @njit(cache=True, error_model="numpy")
+def _interval_chain(layers, width, lists, palette, forms, moves, low, high, darkest, brightest, start, stop, t):
+    """One step of the interval blend for list entries [start, stop) whose order is uncertain (design.md, O2-O4).
+
+    Returns the tighter of the swap, hull and antichain bounds, and the range of the colours so far; ``t`` is scratch.
+    """
+    store(t, 8, low)
+    store(t, 12, high)
+    for entry in range(stop - 1, start - 1, -1):
+        at, key, move = _listed_layer(lists, entry, width, forms)
+        ends = key + 4 * forms + 4
+        a_high = layers[at + _ALPHA_HIGH]
+        # wherever it goes among the layers behind, it moves the colour by at most its alpha times
+        # the distance to the darkest or brightest of what lies behind
+        hull_low = fma(a_high, minimum(0.0, load4(palette, ends) - brightest), low)
+        hull_high = fma(a_high, maximum(0.0, load4(palette, ends + 4) - darkest), high)
+        low, high, darkest, brightest = _blend_interval(low, high, darkest, brightest, layers, at, palette, ends)
+        hull_low, hull_high = minimum(low, hull_low), maximum(high, hull_high)
+        low = maximum(low - load4(moves, move), hull_low)
+        high = minimum(high + load4(moves, move + 4), hull_high)
+    store(t, 0, low)
+    store(t, 4, high)
+    count = stop - start
+    keys = np.empty(count)
+    for channel in range(3):
+        for side in range(2):
+            for e in range(count):
+                _, key, _ = _listed_layer(lists, start + e, width, forms)
+                ends = key + 4 * forms + 4 + channel
+                keys[e] = palette[ends] if side == 0 else -palette[ends + 4]
+            order = np.argsort(keys)
+            value = t[8 + 4 * side + channel]
+            # nearest first: darkest for the lower bound, brightest for the upper one
+            for position in range(count - 1, -1, -1):
+                at, _, _ = _listed_layer(lists, start + order[position], width, forms)
+                color = keys[order[position]] if side == 0 else -keys[order[position]]
+                v = color - value
+                grows = v < 0.0 if side == 0 else v > 0.0
+                value += layers[at + (_ALPHA_HIGH if grows else _ALPHA_LOW)] * v
+            if side == 0:
+                t[channel] = max(t[channel], value)
+            else:
+                t[4 + channel] = min(t[4 + channel], value)
+    return load4(t, 0), load4(t, 4), darkest, brightest
+
+
+@njit(cache=True, error_model="numpy")
+def _interval_blend(
+    layers_, width, lists_, palette_, forms, lengths, moves_, chain, background_, low, high, form_low, form_high,
+    t_,
+):  # fmt: skip
+    """Sharpen the interval blend where depth orders are uncertain; ``chain[k]`` numbers the groups."""
+    layers, lists, palette, moves = pointer(layers_), pointer(lists_), pointer(palette_), pointer(moves_)
+    background, t = pointer(background_), pointer(t_)
+    deepest = lists_.shape[1]
+    for q in range(PIXELS):
+        begin = q * deepest
+        end = begin + int(lengths[q])
+        falls = 0.0 * load4(background, 0)
+        rises = falls
+        for entry in range(begin, end):
+            at, _, move = _listed_layer(lists, entry, width, forms)
+            if move != 0:
+                light = layers[at + _LIGHT]
+                falls = fma(light, load4(moves, move), falls)
+                rises = fma(light, load4(moves, move + 4), rises)
+        store(t, 0, falls)
+        store(t, 4, rises)
+        # how much of what reordering moves may be won back, where the forms are not tighter anyhow
+        gain = 0.0
+        for channel in range(3):
+            fall, rise = t[channel], t[4 + channel]
+            gain = max(gain, min(fall, low[channel, q] + fall - form_low[channel, q]))
+            gain = max(gain, min(rise, form_high[channel, q] - (high[channel, q] - rise)))
+        if not gain > _REORDERING_MATTERS:
+            continue
+        value_low = load4(background, 0)
+        value_high = value_low
+        darkest = value_low
+        brightest = value_low
+        stop = end
+        while stop > begin:
+            start = stop - 1
+            group = chain[int(lists[_LISTED * start + 1])]
+            while start > begin and chain[int(lists[_LISTED * (start - 1) + 1])] == group:
+                start -= 1
+            if stop - start == 1:
+                at, key, _ = _listed_layer(lists, start, width, forms)
+                value_low, value_high, darkest, brightest = _blend_interval(
+                    value_low, value_high, darkest, brightest, layers, at, palette, key + 4 * forms + 4
+                )
+            else:
+                value_low, value_high, darkest, brightest = _interval_chain(
+                    layers, width, lists, palette, forms, moves, value_low, value_high, darkest, brightest, start,
+                    stop, t,
+                )  # fmt: skip
+            stop = start
+        store(t, 0, value_low)
+        store(t, 4, value_high)
+        for channel in range(3):
+            low[channel, q] = max(low[channel, q], t[channel])
+            high[channel, q] = min(high[channel, q], t[4 + channel])
+
+
+@njit(cache=True, error_model="numpy")
 def _blend_line(
-    layers_, width, lists_, palette_, forms, lengths, extra_, moved, background_, state, radius, low, high, s, t_
+    layers_, width, lists_, palette_, forms, lengths, moves_, background_, state, radius, low, high, s, t_
 ):
     """Blend every pixel's layers back to front, as forms and as intervals (design.md, B7): one parameter, order 2.
 
@@ -1141,7 +1189,7 @@ def _blend_line(
     scratch.
     """
     moving = forms > 1
-    layers, lists, palette, extra = pointer(layers_), pointer(lists_), pointer(palette_), pointer(extra_)
+    layers, lists, palette, moves = pointer(layers_), pointer(lists_), pointer(palette_), pointer(moves_)
     background, t = pointer(background_), pointer(t_)
     deepest = lists_.shape[1]
     for q in range(PIXELS):
@@ -1154,7 +1202,7 @@ def _blend_line(
         darkest = p0
         brightest = p0
         for e in range(int(lengths[q]) - 1, -1, -1):
-            at, key = _listed_layer(lists, q * deepest + e, width, forms)
+            at, key, move = _listed_layer(lists, q * deepest + e, width, forms)
             a0, a1, a2 = layers[at + _FORM], layers[at + _FORM + 1], layers[at + _FORM + 2]
             # colour - P, a form without radius
             v0 = load4(palette, key) - p0
@@ -1180,9 +1228,8 @@ def _blend_line(
             bottom, top, darkest, brightest = _blend_interval(
                 bottom, top, darkest, brightest, layers, at, palette, key + 4 * forms + 4
             )
-            if moved[e]:
-                move = 8 * (e * PIXELS + q)
-                falls, rises = load4(extra, move), load4(extra, move + 4)
+            if move != 0:
+                falls, rises = load4(moves, move), load4(moves, move + 4)
                 p0 = p0 + 0.5 * (rises - falls)
                 r = r + 0.5 * (rises + falls) * _UP
                 bottom = bottom - falls
@@ -1288,11 +1335,11 @@ def _step_curved(r, layers, at, palette, key, forms, t, value, d, m):
 
 @njit(cache=True, error_model="numpy")
 def _blend(
-    layers_, width, lists_, palette_, forms, lengths, extra_, moved, background_, d, order, m, state, radius, low, high,
-    s, t_, value_,
+    layers_, width, lists_, palette_, forms, lengths, moves_, background_, d, order, m, state, radius, low, high, s, t_,
+    value_,
 ):  # fmt: skip
     """`_blend_line` for any number of parameters and order; ``value`` is scratch."""
-    layers, lists, palette, extra = pointer(layers_), pointer(lists_), pointer(palette_), pointer(extra_)
+    layers, lists, palette, moves = pointer(layers_), pointer(lists_), pointer(palette_), pointer(moves_)
     background, t, value = pointer(background_), pointer(t_), pointer(value_)
     deepest = lists_.shape[1]
     for q in range(PIXELS):
@@ -1305,7 +1352,7 @@ def _blend(
         darkest = bottom
         brightest = bottom
         for e in range(int(lengths[q]) - 1, -1, -1):
-            at, key = _listed_layer(lists, q * deepest + e, width, forms)
+            at, key, move = _listed_layer(lists, q * deepest + e, width, forms)
             if order == 1:
                 r = _step_affine(r, layers, at, palette, key, forms, t, m)
             else:
@@ -1313,9 +1360,8 @@ def _blend(
             bottom, top, darkest, brightest = _blend_interval(
                 bottom, top, darkest, brightest, layers, at, palette, key + 4 * forms + 4
             )
-            if moved[e]:
-                move = 8 * (e * PIXELS + q)
-                falls, rises = load4(extra, move), load4(extra, move + 4)
+            if move != 0:
+                falls, rises = load4(moves, move), load4(moves, move + 4)
                 store(t, 0, load4(t, 0) + 0.5 * (rises - falls))
                 r = r + 0.5 * (rises + falls) * _UP
                 bottom = bottom - falls
@@ -1344,9 +1390,8 @@ def _form_range(p, d, order, m, s):
 
 
 @njit(cache=True, error_model="numpy")
-def _chains(last):
-    """Number of the group of each list position: no uncertain pair spans two groups."""
-    chain = np.empty(last.size, np.int64)
+def _chains(last, chain):
+    """Number the groups of list positions: no uncertain pair spans two groups."""
     group = 0
     reach = -1
     for k in range(last.size):
@@ -1354,16 +1399,15 @@ def _chains(last):
             group += 1
         chain[k] = group
         reach = max(reach, last[k])
-    return chain
 
 
 @njit(cache=True, error_model="numpy")
 def _block(
     listed, x0, y0, tile_x, tile_y, record, box, tiles, depth, delta, depth_error, colors, color_radius,
     slope, direction, camera, rules, errors, background, negligible, d, order, m, antialiased,
-    s, t, y1, y2, poly, rows, value, palette, layers, offset_x, offset_y, pixels, batch, lists, lengths, reach, deep,
-    far, first, last, slots, heights, places, pairs, moves, most, extra, moved, state, radius, low, high, ray, lower,
-    upper, linear, slopes, statistics, marks,
+    s, t, y1, y2, poly, rows, value, palette, layers, offset_x, offset_y, pixels, batch, masks, asked, lists, lengths,
+    reach, deep, far, first, last, slots, owners, drawn, places, pairs, moves, state, radius, low, high, form_low,
+    form_high, ray, lower, upper, linear, slopes, statistics, marks,
 ):  # fmt: skip
     """Bounds of one block of pixels whose first pixel is (x0, y0). Returns whether the buffers sufficed.
 
@@ -1380,8 +1424,9 @@ def _block(
         ray[k] = direction[k] * u + direction[3 + k] * v + direction[6 + k]
     pair_count, slot_count = _forward(
         listed, record, box, tiles, tile_x, tile_y, colors, palette, depth, delta, depth_error, slope, ray,
-        s, y1, y2, poly, rows, layers, width, offset_x, offset_y, pixels, batch, lists, lengths, reach, deep, far,
-        first, last, slots, heights, places, pairs, x0, y0, d, order, m, antialiased, rules, errors, marks,
+        s, y1, y2, poly, rows, layers, width, offset_x, offset_y, pixels, batch, masks, asked, lists, lengths, reach,
+        deep, far, first, last, slots, owners, drawn, places, moves, pairs, x0, y0, d, order, m, antialiased, rules,
+        errors, marks,
     )  # fmt: skip
     if pair_count == _GROW:
         return False
@@ -1404,27 +1449,31 @@ def _block(
     deepest = 0
     for q in range(PIXELS):
         deepest = max(deepest, int(lengths[q]))
-    moved[:deepest] = False
     if slot_count > 0:
+        _swap_bounds(
+            pairs, pair_count, slots, slot_count, drawn, places, layers, width, lists, palette, forms, moves
+        )
         _settle_stops(
-            layers, width, lists, lengths, first, last, slots[: listed.size], places, s, m, rules[9], unit
+            layers, width, lists, lengths, first, last, owners, drawn, places, slot_count, s, m, rules[9], unit
         )
-        _swap_bounds(pairs, pair_count, slots, slot_count, heights, palette, forms, moves, most)
-        _collect_moves(moves, slot_count, places, extra, moved)
     if d == 1 and order == 2:
-        _blend_line(
-            layers, width, lists, palette, forms, lengths, extra, moved, background, state, radius, low, high, s, t
-        )
+        _blend_line(layers, width, lists, palette, forms, lengths, moves, background, state, radius, low, high, s, t)
     else:
         _blend(
-            layers, width, lists, palette, forms, lengths, extra, moved, background, d, order, m, state, radius, low,
-            high, s, t, value,
+            layers, width, lists, palette, forms, lengths, moves, background, d, order, m, state, radius, low, high, s,
+            t, value,
         )  # fmt: skip
+    for channel in range(3):
+        _form_range(state[channel], d, order, m, s)
+        for q in range(PIXELS):
+            form_low[channel, q] = s[_SLO + q] - radius[channel, q] * _UP
+            form_high[channel, q] = s[_SHI + q] + radius[channel, q] * _UP
     if slot_count > 0:
+        _chains(last[: listed.size], far)
         _interval_blend(
-            layers, width, lists, palette, forms, lengths, extra, moved, _chains(last[: listed.size]), background, low,
-            high,
-        )
+            layers, width, lists, palette, forms, lengths, moves, far, background, low, high, form_low,
+            form_high, t,
+        )  # fmt: skip
     statistics[1] += deepest
     statistics[2] += pair_count
     for channel in range(3):
@@ -1433,7 +1482,6 @@ def _block(
             for q in range(PIXELS):
                 total += abs(state[channel, 1 + k, q])
             slopes[k] += total
-        _form_range(state[channel], d, order, m, s)
         for q in range(PIXELS):
             row = y0 % side + q // BLOCK
             column = x0 % side + q % BLOCK
@@ -1446,8 +1494,8 @@ def _block(
             rho = s[_RHO + q] * (1.0 + 16.0 * unit)
             fall = slack + rho * max(0.0, s[_BRIGHTEST + q] - background[channel])
             rise = slack + rho * max(0.0, background[channel] - s[_DARKEST + q])
-            bottom = max(low[channel, q], s[_SLO + q] - radius[channel, q] * _UP) - fall
-            top = min(high[channel, q], s[_SHI + q] + radius[channel, q] * _UP) + rise
+            bottom = max(low[channel, q], form_low[channel, q]) - fall
+            top = min(high[channel, q], form_high[channel, q]) + rise
             if not bottom <= top:
                 # crossed or not a number: nothing is known
                 bottom = 0.0
@@ -1499,7 +1547,7 @@ def _pixel_worker(
     rows_ = np.zeros((width, PIXELS))
     offsets_ = np.zeros((2, _BATCH * PIXELS + 8))
     pixels_ = np.empty(_BATCH * PIXELS, np.uint8)
-    batch_ = np.empty((3, _BATCH + 1), np.int64)
+    batch_ = np.empty((2, _BATCH + 1), np.int64)
     lengths_ = np.empty(PIXELS, np.uint32)
     ray_ = np.empty(3)
     s, t, value, background = borrowed(scratch), borrowed(channels_), borrowed(value_), borrowed(background_)
@@ -1508,17 +1556,16 @@ def _pixel_worker(
     offset_x, offset_y = borrowed(offsets_[0]), borrowed(offsets_[1])
     pixels, lengths, ray = borrowed(pixels_), borrowed(lengths_), borrowed(ray_)
     state_ = np.empty((3, m, PIXELS))
-    ends = np.empty((3, 3, PIXELS))
+    ends = np.empty((5, 3, PIXELS))
     state, radius, low, high = borrowed(state_), borrowed(ends[0]), borrowed(ends[1]), borrowed(ends[2])
+    form_low, form_high = borrowed(ends[3]), borrowed(ends[4])
     layers_ = _aligned(256 * PIXELS * width)
-    lists_ = np.empty((PIXELS, 256, 2), np.uint32)
-    extra_ = np.empty((256, 8 * PIXELS))
-    moved_ = np.empty(256, np.bool_)
-    heights_ = np.empty((64, PIXELS))
-    places_ = np.empty((64, PIXELS), np.int64)
-    moves_ = np.empty((2, 64, 6, PIXELS))
+    lists_ = np.empty((PIXELS, 256, _LISTED), np.uint32)
+    drawn_ = np.empty(512, np.int64)
+    places_ = np.empty((512, PIXELS), np.uint32)
+    moves_ = np.zeros((8192, _MOVES))
     reach_ = np.empty((2, 1024))
-    order_ = np.empty((4, 1024), np.int64)
+    order_ = np.empty((7, 1024), np.int64)
     palette_ = np.zeros(1024 * color_size)
     pairs_ = np.empty((pair_limit, 2), np.int64)
     block_offsets = np.empty(blocks * blocks + 1, np.int64)
@@ -1539,33 +1586,30 @@ def _pixel_worker(
             listed = block_entries[block_offsets[b] : block_offsets[b + 1]]
             if listed.size >= reach_.shape[1]:
                 reach_ = np.empty((2, 2 * listed.size))
-                order_ = np.empty((4, 2 * listed.size), np.int64)
+                order_ = np.empty((7, 2 * listed.size), np.int64)
                 palette_ = np.zeros(2 * listed.size * color_size)
             while not _block(
                 borrowed(listed), x0, y0, tile_x, tile_y, record, box, tiles, depth, delta, depth_error, colors,
                 color_radius, slope, direction, camera, rules, errors, background, negligible, d, order, m,
                 antialiased, s, t, y1, y2, poly, rows, value, borrowed(palette_), borrowed(layers_), offset_x,
-                offset_y, pixels, batch, borrowed(lists_), lengths, borrowed(reach_[0]), borrowed(reach_[1]),
-                borrowed(order_[0]), borrowed(order_[1]), borrowed(order_[2]), borrowed(order_[3]),
-                borrowed(heights_), borrowed(places_), borrowed(pairs_), borrowed(moves_[0]), borrowed(moves_[1]),
-                borrowed(extra_), borrowed(moved_), state, radius, low, high, ray,
+                offset_y, pixels, batch, borrowed(order_[0]), borrowed(order_[1]), borrowed(lists_), lengths,
+                borrowed(reach_[0]), borrowed(reach_[1]), borrowed(order_[2]), borrowed(order_[3]),
+                borrowed(order_[4]), borrowed(order_[5]), borrowed(order_[6]), borrowed(drawn_), borrowed(places_),
+                borrowed(pairs_), borrowed(moves_), state, radius, low, high, form_low, form_high, ray,
                 lower[number], upper[number], linear[min(number, linear.shape[0]) :],
                 slopes[number], statistics[thread], marks,
             ):  # fmt: skip
-                capacity = 2 * moved_.size
+                capacity = 2 * lists_.shape[1]
                 layers_ = _aligned(capacity * PIXELS * width)
-                lists_ = np.empty((PIXELS, capacity, 2), np.uint32)
-                extra_ = np.empty((capacity, 8 * PIXELS))
-                moved_ = np.empty(capacity, np.bool_)
-                slot_capacity = 2 * heights_.shape[0]
-                heights_ = np.empty((slot_capacity, PIXELS))
-                places_ = np.empty((slot_capacity, PIXELS), np.int64)
-                moves_ = np.empty((2, slot_capacity, 6, PIXELS))
+                lists_ = np.empty((PIXELS, capacity, _LISTED), np.uint32)
+                drawn_ = np.empty(2 * capacity, np.int64)
+                places_ = np.empty((2 * capacity, PIXELS), np.uint32)
+                moves_ = np.zeros((32 * capacity, _MOVES))
     # the owners of the borrowed arrays live to here
     return (
         scratch.size + background_.size + channels_.size + value_.size + planes.size + rows_.size + offsets_.size
         + pixels_.size + batch_.size + lengths_.size + ray_.size + state_.size + ends.size + layers_.size + lists_.size
-        + extra_.size + moved_.size + heights_.size + places_.size + moves_.size
+        + drawn_.size + places_.size + moves_.size
         + reach_.size + order_.size + palette_.size + pairs_.size
     )  # fmt: skip
 
