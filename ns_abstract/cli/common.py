@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import os
 import re
 import signal
 import sys
@@ -14,6 +15,9 @@ from typing import Any, NoReturn
 from ns_abstract.errors import InputError
 
 DONE, BAD_INPUT, INTERRUPTED = 0, 2, 3
+
+# threads that wait, awake, for milliseconds slow down those that work; OpenMP reads this when it is first loaded
+os.environ.setdefault("GOMP_SPINCOUNT", "3000")
 
 
 class Stop:

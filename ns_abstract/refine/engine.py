@@ -310,6 +310,16 @@ class Refinement:
             slopes = np.nan_to_num(self.frame.motion(box), nan=0.0)
         return int(np.argmax(np.where(_narrow_axes(box, self.frame.box), -1.0, slopes)))
 
+    def _outlying(self, box: ParameterBox) -> np.ndarray:
+        """A point [d] of ``box`` as far out in the set as it reaches, where pixels are likely to be extreme.
+
+        Which end is taken by chance where the box spans the set.
+        """
+        whole = self.frame.box
+        first, last = np.equal(box.lower, whole.lower), np.equal(box.upper, whole.upper)
+        last &= ~first | (self.random.random(box.dimensions) < 0.5)
+        return np.where(last, box.upper, np.where(first, box.lower, box.middle))
+
     def _settle(self, tiles: np.ndarray, changes: dict[int, _Change] | None = None) -> None:
         """Update the outer bound of ``tiles``, given what has changed since the round began."""
         for t in tiles:
@@ -546,9 +556,10 @@ class Refinement:
         """Bound the parts of ``cell`` in the tiles of ``rows``; returns the bytes of the new leaves."""
         tiles = np.array(list(rows), np.int64)
         children = [self._cell(part) for part in self._halved(cell, parts)]
-        for child in children if cell.box.dimensions > 1 else ():
-            self._witness(child.box.middle, tiles)
-        if cell.box.dimensions == 1:
+        if cell.box.dimensions > 1:
+            # one of them: the first corners have shown most of what there is to see
+            self._witness(self._outlying(children[self.random.integers(len(children))].box), tiles)
+        else:
             steps = self.frame.witnesses
             for number in range(1, steps * len(children)):
                 child, step = children[(number - 1) // steps], (number - 1) % steps + 1

@@ -23,7 +23,7 @@ from ns_abstract.sets.poses import PoseForms
 from ns_abstract.sets.tiles import tile_grid
 
 #: Most pairs of layers whose depth order is examined in one block of pixels.
-PAIR_LIMIT = 60_000
+PAIR_LIMIT = 30_000
 
 
 @dataclass

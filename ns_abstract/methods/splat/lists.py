@@ -42,6 +42,7 @@ def tile_lists(order, tiles, wanted, tiles_x):
     count = wanted.size
     offsets = np.zeros(count + 1, np.int64)
     for k in range(order.size):
+        prefetch(tiles, order[min(k + AHEAD, order.size - 1)], 0)
         i = order[k]
         for ty in range(tiles[i, 2], tiles[i, 3]):
             for tx in range(tiles[i, 0], tiles[i, 1]):
@@ -53,6 +54,7 @@ def tile_lists(order, tiles, wanted, tiles_x):
     entries = np.empty(offsets[count], np.uint32)
     position = offsets[:-1].copy()
     for k in range(order.size):
+        prefetch(tiles, order[min(k + AHEAD, order.size - 1)], 0)
         i = order[k]
         for ty in range(tiles[i, 2], tiles[i, 3]):
             for tx in range(tiles[i, 0], tiles[i, 1]):

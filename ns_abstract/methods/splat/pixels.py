@@ -790,7 +790,9 @@ def _forward(
             farthest = max(farthest, reach[k])
     pair_count = 0
     slot_count = 0
-    # row 0 stays 0
+    # row 0 is for layers that do not move
+    for r in range(_MOVES):
+        moves[r] = 0.0
     move_count = 1
     live = -1
     used = 0
@@ -1074,10 +1076,33 @@ def _blend_interval(low, high, darkest, brightest, layers, at, palette, ends):
 
 
 @njit(cache=True, error_model="numpy")
-def _interval_chain(layers, width, lists, palette, forms, moves, low, high, darkest, brightest, start, stop, t):
+def _sort(keys, order, count):
+    """Sort the first ``count`` of ``keys``, least first; ``order`` receives where each stood."""
+    for e in range(count):
+        order[e] = e
+    # by insertion, after sorting what lies far apart: most groups are small
+    step = 1
+    while step < count // 3:
+        step = 3 * step + 1
+    while step > 0:
+        for e in range(step, count):
+            key, place = keys[e], order[e]
+            other = e
+            while other >= step and keys[other - step] > key:
+                keys[other], order[other] = keys[other - step], order[other - step]
+                other -= step
+            keys[other], order[other] = key, place
+        step //= 3
+
+
+@njit(cache=True, error_model="numpy")
+def _interval_chain(
+    layers, width, lists, palette, forms, moves, low, high, darkest, brightest, start, stop, t, keys, order
+):
     """One step of the interval blend for list entries [start, stop) whose order is uncertain (design.md, O2-O4).
 
-    Returns the tighter of the swap, hull and antichain bounds, and the range of the colours so far; ``t`` is scratch.
+    Returns the tighter of the swap, hull and antichain bounds, and the range of the colours so far; ``t``, ``keys`` and
+    ``order`` are scratch.
     """
     store(t, 8, low)
     store(t, 12, high)
@@ -1096,19 +1121,18 @@ def _interval_chain(layers, width, lists, palette, forms, moves, low, high, dark
     store(t, 0, low)
     store(t, 4, high)
     count = stop - start
-    keys = np.empty(count)
     for channel in range(3):
         for side in range(2):
             for e in range(count):
                 _, key, _ = _listed_layer(lists, start + e, width, forms)
                 ends = key + 4 * forms + 4 + channel
                 keys[e] = palette[ends] if side == 0 else -palette[ends + 4]
-            order = np.argsort(keys)
+            _sort(keys, order, count)
             value = t[8 + 4 * side + channel]
             # nearest first: darkest for the lower bound, brightest for the upper one
             for position in range(count - 1, -1, -1):
                 at, _, _ = _listed_layer(lists, start + order[position], width, forms)
-                color = keys[order[position]] if side == 0 else -keys[order[position]]
+                color = keys[position] if side == 0 else -keys[position]
                 v = color - value
                 grows = v < 0.0 if side == 0 else v > 0.0
                 value += layers[at + (_ALPHA_HIGH if grows else _ALPHA_LOW)] * v
@@ -1122,11 +1146,14 @@ def _interval_chain(layers, width, lists, palette, forms, moves, low, high, dark
 @njit(cache=True, error_model="numpy")
 def _interval_blend(
     layers_, width, lists_, palette_, forms, lengths, moves_, chain, background_, low, high, form_low, form_high,
-    t_,
+    t_, keys_, order_,
 ):  # fmt: skip
-    """Sharpen the interval blend where depth orders are uncertain; ``chain[k]`` numbers the groups."""
+    """Sharpen the interval blend where depth orders are uncertain; ``chain[k]`` numbers the groups.
+
+    ``t``, ``keys`` and ``order`` are scratch.
+    """
     layers, lists, palette, moves = pointer(layers_), pointer(lists_), pointer(palette_), pointer(moves_)
-    background, t = pointer(background_), pointer(t_)
+    background, t, keys, order = pointer(background_), pointer(t_), pointer(keys_), pointer(order_)
     deepest = lists_.shape[1]
     for q in range(PIXELS):
         begin = q * deepest
@@ -1167,7 +1194,7 @@ def _interval_blend(
             else:
                 value_low, value_high, darkest, brightest = _interval_chain(
                     layers, width, lists, palette, forms, moves, value_low, value_high, darkest, brightest, start,
-                    stop, t,
+                    stop, t, keys, order,
                 )  # fmt: skip
             stop = start
         store(t, 0, value_low)
@@ -1472,7 +1499,7 @@ def _block(
         _chains(last[: listed.size], far)
         _interval_blend(
             layers, width, lists, palette, forms, lengths, moves, far, background, low, high, form_low,
-            form_high, t,
+            form_high, t, reach, first,
         )  # fmt: skip
     statistics[1] += deepest
     statistics[2] += pair_count
@@ -1563,7 +1590,7 @@ def _pixel_worker(
     lists_ = np.empty((PIXELS, 256, _LISTED), np.uint32)
     drawn_ = np.empty(512, np.int64)
     places_ = np.empty((512, PIXELS), np.uint32)
-    moves_ = np.zeros((8192, _MOVES))
+    moves_ = np.empty((8192, _MOVES))
     reach_ = np.empty((2, 1024))
     order_ = np.empty((7, 1024), np.int64)
     palette_ = np.zeros(1024 * color_size)
@@ -1604,7 +1631,7 @@ def _pixel_worker(
                 lists_ = np.empty((PIXELS, capacity, _LISTED), np.uint32)
                 drawn_ = np.empty(2 * capacity, np.int64)
                 places_ = np.empty((2 * capacity, PIXELS), np.uint32)
-                moves_ = np.zeros((32 * capacity, _MOVES))
+                moves_ = np.empty((32 * capacity, _MOVES))
     # the owners of the borrowed arrays live to here
     return (
         scratch.size + background_.size + channels_.size + value_.size + planes.size + rows_.size + offsets_.size
