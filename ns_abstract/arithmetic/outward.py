@@ -8,23 +8,26 @@ from numba import njit
 
 def outward(lower: np.ndarray, upper: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Float32 neighbours of ``lower`` from below and ``upper`` from above."""
-    return _below(lower), -_below(-upper)
+    return _beside(lower, 1.0), _beside(upper, -1.0)
 
 
-def _below(values: np.ndarray) -> np.ndarray:
-    """The largest float32 numbers that are not above ``values``."""
+def _beside(values: np.ndarray, sign: float) -> np.ndarray:
+    """The nearest float32 numbers that are not above ``values``; not below for ``sign`` -1."""
     values = np.ascontiguousarray(values, np.float64)
-    nearest = values.astype(np.float32)
-    flat = nearest.reshape(-1)
-    _step_down(values.reshape(-1), flat, flat.view(np.int32))
-    return nearest
+    found = np.empty(values.shape, np.float32)
+    _round_down(values.reshape(-1), sign, found.reshape(-1))
+    return found
 
 
 @njit(cache=True, error_model="numpy")
-def _step_down(values, nearest, bits):
-    """Replace each of ``nearest`` that is above its value by the number below; ``bits`` is the same memory."""
+def _round_down(values, sign, out):
+    """``sign * out <= sign * values`` [n], as large as float32 allows; ``sign`` is 1 or -1."""
     for q in range(values.size):
+        value = sign * values[q]
+        nearest = np.float32(value)
+        bits = nearest.view(np.int32)
         # numbers of one sign are ordered as their bits are; below 0 comes the first negative number
-        down = np.int32(-1) if bits[q] > 0 else np.int32(1)
-        start = bits[q] if bits[q] != 0 else np.int32(-2147483648)
-        bits[q] = start + down if nearest[q] > values[q] else bits[q]
+        down = np.int32(-1) if bits > 0 else np.int32(1)
+        start = bits if bits != 0 else np.int32(-2147483648)
+        below = np.int32(start + down) if nearest > value else bits
+        out[q] = np.float32(sign) * np.int32(below).view(np.float32)
