@@ -16,6 +16,7 @@ from ns_abstract.arithmetic.units import FLOAT32, REAL
 from ns_abstract.methods.splat.activate import Splats, rotation_matrices
 from ns_abstract.methods.splat.bounds import SplatBounds
 from ns_abstract.methods.splat.constants import GSPLAT_1_4_0
+from ns_abstract.methods.splat.pixels import _sort as sort_group
 from ns_abstract.methods.splat.render import Renderer
 from ns_abstract.sets.box import ParameterBox
 from ns_abstract.sets.path import Camera
@@ -408,6 +409,29 @@ def test_ties(order):
             assert (lower <= image).all() and (image <= upper).all(), worst(lower, image, upper)
         images.append(image)
     assert np.abs(images[0] - images[1]).max() > 0.1
+
+
+@both_orders
+def test_layers_apart_have_no_order(order):
+    """Gaussians of one block and one depth count as a pair where they share a pixel, and only there."""
+    dot = {"scale": 0.05, "opacity": 0.9, "color": (1.0, 0.5, 0.0)}
+    for column, pairs in ((6.5, 0), (2.5, 1)):
+        # pixel = 8 + 16 x / 5
+        places = [((1.5 - 8.0) * 5.0 / 16.0, 2.0, -5.0), ((column - 8.0) * 5.0 / 16.0, 2.0, -5.0)]
+        case = Case(scene(*(dot | {"mean": place} for place in places)), moves(yaw=0.01))
+        assert case.bounds(case.poses.box, order).statistics[2] == pairs
+        case.check(order, parts=1)
+
+
+def test_sorting_of_a_group():
+    """Keys end in order, each beside the place where it stood."""
+    rng = np.random.default_rng(0)
+    for count in (0, 1, 2, 3, 7, 50, 400):
+        for values in (rng.random(count), np.round(4.0 * rng.random(count)), np.arange(count, 0.0, -1.0)):
+            keys, order = np.append(values, -1.0), np.full(count + 1, -7)
+            sort_group(keys, order, count)
+            assert np.array_equal(keys[:count], np.sort(values)) and np.array_equal(values[order[:count]], keys[:count])
+            assert sorted(order[:count].tolist()) == list(range(count)) and (keys[count], order[count]) == (-1.0, -7)
 
 
 POINTS = {

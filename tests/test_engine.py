@@ -519,3 +519,14 @@ def test_children_that_contradict_their_parent_are_not_believed() -> None:
     assert forbidden.any() and not forbidden.all()
     result = refine(frame, Goal(1.0, FOREVER, 3))
     assert (result.lower[forbidden] == 0.0).all() and (result.upper[forbidden] == 1.0).all()
+
+
+def test_poses_are_rendered_far_out() -> None:
+    """A part that touches an end of the set is looked at there, one that touches both at either."""
+    refinement = Refinement(Waves(3), 0, Goal())
+    whole = refinement.frame.box
+    part = whole.split(0, 2)[0].split(1, 4)[1]
+    seen = np.array([refinement._outlying(part) for _ in range(50)])
+    assert (seen[:, 0] == whole.lower[0]).all() and (seen[:, 1] == part.middle[1]).all()
+    assert set(seen[:, 2]) == {whole.lower[2], whole.upper[2]}
+    assert (refinement._outlying(whole.split(0, 2)[1].split(2, 3)[2])[[0, 2]] == np.array(whole.upper)[[0, 2]]).all()
