@@ -12,7 +12,18 @@ from numba.core.errors import TypingError
 
 from ns_abstract.arithmetic.compiled import advanced, pointer, signed
 from ns_abstract.arithmetic.elementary import exp_kernel, fma
-from ns_abstract.arithmetic.lanes import bits, load4, load8, maximum, minimum, root, store, store_columns, where
+from ns_abstract.arithmetic.lanes import (
+    bits,
+    load4,
+    load8,
+    maximum,
+    minimum,
+    root,
+    spans,
+    store,
+    store_columns,
+    where,
+)
 from ns_abstract.arithmetic.outward import outward
 
 SPECIAL = [0.0, -0.0, 1.0, -1.0, 1e-310, -1e308, np.inf, -np.inf, np.nan, 3.0, np.nextafter(1.0, 2.0), 1e-16]
@@ -159,6 +170,28 @@ def pointed(x):
 def test_refused(function: object, argument: np.ndarray) -> None:
     with pytest.raises((TypingError, TypeError)):
         function(argument)  # pyright: ignore[reportCallIssue]
+
+
+@njit(error_model="numpy")
+def spans_of(first_, last_, out):
+    first, last = pointer(first_), pointer(last_)
+    for k in range(out.size):
+        out[k] = spans(load8(first, 8 * k), load8(last, 8 * k))
+
+
+def test_spans() -> None:
+    ends = np.concatenate(
+        [np.arange(-1.0, 8.5, 0.5), np.nextafter(np.arange(8.0), 9.0), np.nextafter(np.arange(8.0), -9)]
+    )
+    pairs = np.array([(a, b) for a, b in itertools.product(ends, ends) if 0.0 <= a <= 8.0 and -1.0 <= b < 8.0])
+    pairs = pairs[: len(pairs) // 8 * 8]
+    found = np.empty(len(pairs) // 8, np.int64)
+    spans_of(pairs[:, 0].copy(), pairs[:, 1].copy(), found)
+    columns = np.arange(8.0)
+    inside = (columns >= pairs[:, :1]) & (columns <= pairs[:, 1:])
+    assert np.array_equal(
+        found.view(np.uint8).reshape(-1, 8), np.packbits(inside, axis=1, bitorder="little").reshape(-1, 8)
+    )
 
 
 def test_outward_rounding_is_to_neighbours() -> None:

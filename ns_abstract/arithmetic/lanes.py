@@ -10,6 +10,7 @@ Interpreted (without compilation), lanes are arrays.
 
 from __future__ import annotations
 
+import math
 import operator
 from collections.abc import Callable
 
@@ -196,6 +197,22 @@ def bits(typingctx, mask):  # pyright: ignore[reportRedeclaration]
     return types.int64(mask), codegen
 
 
+@intrinsic
+def spans(typingctx, first, last):  # pyright: ignore[reportRedeclaration]
+    """Byte k of an int64 has the bits from ``ceil(first)`` to ``floor(last)`` of lane k; 8 lanes of -1 to 8."""
+
+    def codegen(context, builder, sig, args):
+        wide = ir.VectorType(ir.IntType(64), 8)
+        one, none = ir.Constant(wide, [1] * 8), ir.Constant(wide, [0] * 8)
+        start = builder.fptosi(by_intrinsic("ceil", builder, args[0]), wide)
+        past = builder.add(builder.fptosi(by_intrinsic("floor", builder, args[1]), wide), one)
+        run = builder.sub(builder.shl(one, past), builder.shl(one, start))
+        run = builder.select(builder.icmp_signed(">", past, start), run, none)
+        return builder.bitcast(builder.trunc(run, ir.VectorType(ir.IntType(8), 8)), ir.IntType(64))
+
+    return types.int64(_KINDS[8][0], _KINDS[8][0]), codegen
+
+
 def _address(builder, elements, at, width: int):
     address = builder.gep(elements, [at], source_etype=_DOUBLE)
     return builder.bitcast(address, ir.VectorType(_DOUBLE, width).as_pointer())
@@ -294,6 +311,11 @@ if config.DISABLE_JIT:  # pyright: ignore[reportAttributeAccessIssue]
     def bits(mask):
         """Bit k of the result tells whether lane k of ``mask`` holds."""
         return sum(1 << k for k, holds in enumerate(mask) if holds)
+
+    def spans(first, last):
+        """Byte k of the result has the bits from ``ceil(first)`` to ``floor(last)`` of lane k."""
+        runs = [max(0, (1 << math.floor(b) + 1) - (1 << math.ceil(a))) for a, b in zip(first, last, strict=True)]
+        return sum(run << 8 * k for k, run in enumerate(runs))
 
     def load8(elements, at):
         """``elements[at : at + 8]``."""

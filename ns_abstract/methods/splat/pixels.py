@@ -21,6 +21,7 @@ from ns_abstract.arithmetic.lanes import (
     maximum,
     minimum,
     root,
+    spans,
     store,
     store_columns,
     where,
@@ -629,13 +630,7 @@ def _reached(record, ox, oy, left, right, top, bottom, m, s):
         slack = (_ROOM - 1.0) * (abs(center) + abs(ox) + half)
         start = maximum(start, center - half - slack)
         stop = where(rest >= 0.0, minimum(stop, center + half + slack), -1.0)
-    store(s, _C1, start)
-    store(s, _C2, stop)
-    mask = 0
-    for row in range(BLOCK):
-        columns = bits((numbers >= s[_C1 + row]) & (numbers <= s[_C2 + row]))
-        mask |= columns << (row * BLOCK)
-    return mask & inside
+    return spans(minimum(float(BLOCK), start), maximum(-1.0, stop)) & inside
 
 
 @njit(cache=True, error_model="numpy")
