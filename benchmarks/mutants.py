@@ -366,7 +366,7 @@ MUTANTS = (
     ),
     Mutant(
         "layers that share a pixel are taken for apart", PIXELS,
-        "shown & int(masks[other]) == 0", "shown & int(masks[other]) & 1 == 0",
+        "shown & int(theirs) == 0", "shown & int(theirs) & 1 == 0",
         "test_bounds.py::test_depth_swap[2]",
     ),
     Mutant(

@@ -30,4 +30,5 @@ def _round_down(values, sign, out):
         down = np.int32(-1) if bits > 0 else np.int32(1)
         start = bits if bits != 0 else np.int32(-2147483648)
         below = np.int32(start + down) if nearest > value else bits
+        # the cast gives the two branches one name, which `view` needs to compile
         out[q] = np.float32(sign) * np.int32(below).view(np.float32)

@@ -646,6 +646,16 @@ def _pixels_of(record, box, x0, y0, m, s):
     return signed(_reached(record, ox, oy, left, right, top, bottom, m, s))
 
 
+@njit(cache=True, error_model="numpy", forceinline=True)
+def _pixels_once(k, entries, record, columns, box, x0, y0, m, s, masks, asked):
+    """`_pixels_of` list position k, found when first asked for; ``asked`` [entries] starts as 0."""
+    if asked[k] == 0:
+        asked[k] = 1
+        i = entries[k]
+        masks[k] = _pixels_of(advanced(record, i * columns), advanced(box, 4 * i), x0, y0, m, s)
+    return masks[k]
+
+
 @njit(cache=True, error_model="numpy")
 def _pixels_at(lanes, pixels):
     """The set of the pixels in ``lanes``."""
@@ -663,8 +673,8 @@ def _find_pairs(
 ):  # fmt: skip
     """Append the pairs (k, later entry) that share a pixel and are of uncertain order; widen ``first``, ``last``.
 
-    ``pixels`` in the lanes ``found`` are k's; ``masks`` receives the others' where they are needed, ``asked`` then a 1.
-    Returns the number of pairs, or -1 where ``pairs`` is full.
+    ``pixels`` in the lanes ``found`` are k's; ``masks`` and ``asked`` are those of `_pixels_once`. Returns the number
+    of pairs, or -1 where ``pairs`` is full.
     """
     i = entries[k]
     shown = 0
@@ -694,11 +704,8 @@ def _find_pairs(
             continue
         if shown == 0:
             shown = _pixels_at(found, pixels)
-        j = entries[other]
-        if asked[other] == 0:
-            asked[other] = 1
-            masks[other] = _pixels_of(advanced(record, j * columns), advanced(box, 4 * j), x0, y0, m, s)
-        if shown & int(masks[other]) == 0 or not _uncertain(i, j, delta, depth_error, slope, m):
+        theirs = _pixels_once(other, entries, record, columns, box, x0, y0, m, s, masks, asked)
+        if shown & int(theirs) == 0 or not _uncertain(i, entries[other], delta, depth_error, slope, m):
             continue
         if count >= pair_limit:
             return -1
@@ -804,9 +811,7 @@ def _forward(
             prefetch(record_, ahead, 8 * columns - 8)
             for byte in range(0, 8 * color_columns, 64):
                 prefetch(colors_, ahead, byte)
-            i = entries[start + b]
-            if asked[start + b] == 0:
-                masks[start + b] = _pixels_of(advanced(record, i * columns), advanced(box, 4 * i), x0, y0, m, s)
+            _pixels_once(start + b, entries, record, columns, box, x0, y0, m, s, masks, asked)
         end = 0
         for b in range(some):
             i = entries[start + b]
@@ -937,7 +942,9 @@ def _settle_stops(
         s[_C1 + q] = 0.0
         if not s[_TLO + q] > stop_high:
             dark |= 1 << q
-    for slot in range(slot_count if dark != 0 else 0):
+    if dark == 0:
+        return
+    for slot in range(slot_count):
         k = owners[slot]
         some = drawn[slot]
         while some != 0:
@@ -983,6 +990,12 @@ def _color_size(forms):
     return 4 * (forms + 3)
 
 
+@njit(cache=True, error_model="numpy", inline="always")
+def _ends(forms):
+    """Where in a colour of the palette its lower bound stands, before its upper one."""
+    return 4 * (forms + 1)
+
+
 @njit(cache=True, error_model="numpy", forceinline=True)
 def _set_colors(palette, k, color, color_rows):
     """Write the colour of list position k: centre, slopes, radius, then its lower and upper bound over the cell.
@@ -1000,8 +1013,15 @@ def _set_colors(palette, k, color, color_rows):
         for r in range(forms):
             palette[at + 4 * r + channel] = color[start + r]
         palette[at + 4 * forms + channel] = color[start + forms] if color_rows > 1 else 0.0
-        palette[at + 4 * forms + 4 + channel] = color[start] - spread
-        palette[at + 4 * forms + 8 + channel] = color[start] + spread
+        palette[at + _ends(forms) + channel] = color[start] - spread
+        palette[at + _ends(forms) + 4 + channel] = color[start] + spread
+
+
+@njit(cache=True, error_model="numpy", forceinline=True)
+def _listed_layer(lists, entry, width, forms):
+    """Where a pixel's layer stands, its colour in the palette and its row of moves (0: none)."""
+    at = _LISTED * entry
+    return int(lists[at]) * width, int(lists[at + 1]) * _color_size(forms), _MOVES * int(lists[at + 2])
 
 
 @njit(cache=True, error_model="numpy")
@@ -1024,15 +1044,15 @@ def _swap_bounds(
         if both == 0:
             continue
         # bounds of the colours
-        e, f = k * _color_size(forms) + 4 * forms + 4, other * _color_size(forms) + 4 * forms + 4
+        e, f = k * _color_size(forms) + _ends(forms), other * _color_size(forms) + _ends(forms)
         falls = maximum(0.0, load4(palette, e + 4) - load4(palette, f))
         rises = maximum(0.0, load4(palette, f + 4) - load4(palette, e))
         while both != 0:
             q = lowest_bit(both)
             both &= both - 1
-            behind = _LISTED * (q * deepest + int(places[back * PIXELS + q]))
-            move = _MOVES * int(lists[_LISTED * (q * deepest + int(places[front * PIXELS + q])) + 2])
-            alpha = layers[int(lists[behind]) * width + _ALPHA_HIGH]
+            at, _, _ = _listed_layer(lists, q * deepest + int(places[back * PIXELS + q]), width, forms)
+            _, _, move = _listed_layer(lists, q * deepest + int(places[front * PIXELS + q]), width, forms)
+            alpha = layers[at + _ALPHA_HIGH]
             store(moves, move, fma(alpha, falls, load4(moves, move)))
             store(moves, move + 4, fma(alpha, rises, load4(moves, move + 4)))
             store(moves, move + 8, maximum(load4(moves, move + 8), falls))
@@ -1044,18 +1064,9 @@ def _swap_bounds(
         while some != 0:
             q = lowest_bit(some)
             some &= some - 1
-            entry = _LISTED * (q * deepest + int(places[slot * PIXELS + q]))
-            alpha = layers[int(lists[entry]) * width + _ALPHA_HIGH]
-            move = _MOVES * int(lists[entry + 2])
+            at, _, move = _listed_layer(lists, q * deepest + int(places[slot * PIXELS + q]), width, forms)
             # the weights of the layers it may move behind add up to at most one
-            store(moves, move, alpha * minimum(load8(moves, move), load8(moves, move + 8)) * up)
-
-
-@njit(cache=True, error_model="numpy", forceinline=True)
-def _listed_layer(lists, entry, width, forms):
-    """Where a pixel's layer stands, its colour in the palette and its row of moves (0: none)."""
-    at = _LISTED * entry
-    return int(lists[at]) * width, int(lists[at + 1]) * _color_size(forms), _MOVES * int(lists[at + 2])
+            store(moves, move, layers[at + _ALPHA_HIGH] * minimum(load8(moves, move), load8(moves, move + 8)) * up)
 
 
 @njit(cache=True, error_model="numpy", forceinline=True)
@@ -1103,7 +1114,7 @@ def _interval_chain(
     store(t, 12, high)
     for entry in range(stop - 1, start - 1, -1):
         at, key, move = _listed_layer(lists, entry, width, forms)
-        ends = key + 4 * forms + 4
+        ends = key + _ends(forms)
         a_high = layers[at + _ALPHA_HIGH]
         # wherever it goes among the layers behind, it moves the colour by at most its alpha times
         # the distance to the darkest or brightest of what lies behind
@@ -1120,7 +1131,7 @@ def _interval_chain(
         for side in range(2):
             for e in range(count):
                 _, key, _ = _listed_layer(lists, start + e, width, forms)
-                ends = key + 4 * forms + 4 + channel
+                ends = key + _ends(forms) + channel
                 keys[e] = palette[ends] if side == 0 else -palette[ends + 4]
             _sort(keys, order, count)
             value = t[8 + 4 * side + channel]
@@ -1184,7 +1195,7 @@ def _interval_blend(
             if stop - start == 1:
                 at, key, _ = _listed_layer(lists, start, width, forms)
                 value_low, value_high, darkest, brightest = _blend_interval(
-                    value_low, value_high, darkest, brightest, layers, at, palette, key + 4 * forms + 4
+                    value_low, value_high, darkest, brightest, layers, at, palette, key + _ends(forms)
                 )
             else:
                 value_low, value_high, darkest, brightest = _interval_chain(
@@ -1248,7 +1259,7 @@ def _blend_line(
             added = fma(layers[at + _FORM + 3], size, fma(_ROUND, fma(1.0 + a1 + a2, size, abs(p0)), added))
             r = fma(1.0 - layers[at + _ALPHA_LOW], r, added) * _UP
             bottom, top, darkest, brightest = _blend_interval(
-                bottom, top, darkest, brightest, layers, at, palette, key + 4 * forms + 4
+                bottom, top, darkest, brightest, layers, at, palette, key + _ends(forms)
             )
             if move != 0:
                 falls, rises = load4(moves, move), load4(moves, move + 4)
@@ -1380,7 +1391,7 @@ def _blend(
             else:
                 r = _step_curved(r, layers, at, palette, key, forms, t, value, d, m)
             bottom, top, darkest, brightest = _blend_interval(
-                bottom, top, darkest, brightest, layers, at, palette, key + 4 * forms + 4
+                bottom, top, darkest, brightest, layers, at, palette, key + _ends(forms)
             )
             if move != 0:
                 falls, rises = load4(moves, move), load4(moves, move + 4)
