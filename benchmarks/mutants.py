@@ -327,8 +327,8 @@ MUTANTS = (
     ),
     Mutant(
         "pixels are blended as others", PIXELS,
-        "            state[channel, k, q] = t[4 * k + channel]",
-        "            state[channel, k, PIXELS - 1 - q] = t[4 * k + channel]",
+        "        row, column = top_row + q // BLOCK, left + q % BLOCK",
+        "        row, column = top_row + q // BLOCK, left + BLOCK - 1 - q % BLOCK",
         "test_bounds.py::test_one_layer[2]",
     ),
     Mutant(
@@ -345,11 +345,11 @@ MUTANTS = (
     ),
     Mutant(
         "order swap raises but does not lower", PIXELS,
-        "                p0 = p0 + 0.5 * (rises - falls)\n"
-        "                r = r + 0.5 * (rises + falls) * _UP\n"
-        "                bottom = bottom - falls\n",
-        "                p0 = p0 + 0.5 * (rises - falls)\n"
-        "                r = r + 0.5 * (rises + falls) * _UP\n",
+        "            p0 = p0 + 0.5 * (rises - falls)\n"
+        "            r = r + 0.5 * (rises + falls)\n"
+        "            bottom = bottom - falls\n",
+        "            p0 = p0 + 0.5 * (rises - falls)\n"
+        "            r = r + 0.5 * (rises + falls)\n",
         "test_bounds.py::test_depth_swap[2]",
     ),
     Mutant(
@@ -417,8 +417,7 @@ MUTANTS = (
     ),
     Mutant(
         "exponent's vertex counted for the wrong end", PIXELS,
-        "bottom = where(inside, minimum(quadratic - slope, vertex), quadratic - slope)",
-        "bottom = quadratic + slope",
+        "bottom = where(inside, minimum(bottom, vertex), bottom)", "bottom = top",
         "test_bounds.py::test_one_layer[2]",
     ),
     Mutant(

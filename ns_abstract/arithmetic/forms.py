@@ -486,7 +486,8 @@ class FormArray:
         values = np.asarray(values, dtype=np.float64)
         data = np.zeros((basis.rows, values.size))
         data[0] = values.ravel()
-        data[basis.monomials].reshape(values.shape)[...] = radius
+        if np.ndim(radius) or radius != 0.0:
+            data[basis.monomials].reshape(values.shape)[...] = radius
         return cls(basis, data, values.shape)
 
     @classmethod
@@ -586,6 +587,12 @@ class FormArray:
             total = total + part
         return total
 
+    def flipped(self, signs: Float64Array) -> FormArray:
+        """The forms times ``signs`` (1 or -1, broadcast against ``shape``), without rounding."""
+        data = self.data.copy()
+        data[: self.basis.monomials].reshape(-1, *self.shape)[...] *= signs
+        return FormArray(self.basis, data, self.shape)
+
     def transpose(self) -> FormArray:
         """Matrix transpose of a two-dimensional array."""
         rows = self.basis.rows
@@ -629,9 +636,10 @@ class FormArray:
 
     def compose(self, f0, f1, f2_low, f2_high, f3) -> FormArray:
         """See the kernel `compose`; arguments broadcast against ``shape``."""
-        values = (f0, f1, f2_low, f2_high, f3)
-        flat = [np.broadcast_to(np.asarray(v, np.float64), self.shape).ravel().copy() for v in values]
+        values = np.empty((5, *self.shape))
+        for row, value in enumerate((f0, f1, f2_low, f2_high, f3)):
+            values[row] = value
         out = np.empty_like(self.data)
         # one array per value
-        compose(self.data, *flat, out, *self._layout)  # pyright: ignore[reportCallIssue]
+        compose(self.data, *values.reshape(5, -1), out, *self._layout)  # pyright: ignore[reportCallIssue]
         return FormArray(self.basis, out, self.shape)

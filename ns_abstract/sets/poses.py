@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -206,6 +207,7 @@ class PoseSet:
                 box = box.replace(i, first, last)
         return box
 
+    @cached_property
     def _base(self) -> tuple[Float64Array, Float64Array, Float64Array, float, Float64Array]:
         """Start rotation, start position, segment axis, segment angle, segment displacement."""
         start = self.camera.camera_to_world
@@ -222,7 +224,7 @@ class PoseSet:
         for name, factors in self.shear.items():
             low, high = self.perturbation.rotation[name]
             p[name] = min(max(p[name] + sum(factor * p[other] for other, factor in factors.items()), low), high)
-        rotation, position, axis, angle, displacement = self._base()
+        rotation, position, axis, angle, displacement = self._base
         if self.target_camera is not None:
             rotation = rotation @ rotation_about(axis, p["segment"] * angle)
             position = position + p["segment"] * displacement
@@ -245,7 +247,7 @@ class PoseSet:
         rounding, shift = self._rounding
         rotation.data[m] += rounding
         position.data[m] += shift
-        world_to_camera = rotation.transpose() * _FLIP[:, None]
+        world_to_camera = rotation.transpose().flipped(_FLIP[:, None])
         origin = position.center.copy()
         offset = world_to_camera @ (origin - position)
         return PoseForms(world_to_camera, offset, position, origin)
@@ -257,10 +259,10 @@ class PoseSet:
         rounding, shift = self._rounding
         return rotation.widened(rounding), position.widened(shift)
 
-    @property
+    @cached_property
     def _rounding(self) -> tuple[float, float]:
         """What the concrete pose's float64 evaluation may add to a rotation's and a position's entry."""
-        start, displacement = self._base()[1], self._base()[4]
+        start, displacement = self._base[1], self._base[4]
         reach = sum(max(map(abs, limits)) for limits in self.perturbation.translation.values())
         shift = _POSE_ROUNDING * (1.0 + reach + np.abs(start).max() + np.abs(displacement).max())
         if self.perturbation.orbit is not None:
@@ -290,7 +292,7 @@ class PoseSet:
             cosine, sine = trigonometry(angle)
             return sine * k + (1.0 - cosine) * (k @ k) + np.eye(3)
 
-        first, start, axis, angle, displacement = self._base()
+        first, start, axis, angle, displacement = self._base
         rotation = kind.constant(basis, first)
         position = kind.constant(basis, start)
         if self.target_camera is not None:

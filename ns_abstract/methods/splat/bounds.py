@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -37,8 +38,8 @@ class CellBounds:
         reach: [n, 4] their ranges of tiles: columns first and past, rows first and past.
         linear: [t, side, side, 3, m + 1] polynomial coefficients and radius, or None.
         slopes: [d] mean absolute linear coefficients.
-        statistics: Blocks, layers, uncertain pairs, blocks that gave up on order, results that were
-            not numbers.
+        statistics: Blocks, layers, uncertain pairs, blocks that gave up on order, pixels with results that were not
+            numbers.
     """
 
     wanted: np.ndarray
@@ -81,7 +82,7 @@ class SplatBounds:
 
     def _buffer(self, name: str, shape: tuple[int, ...], dtype: type = np.float64) -> np.ndarray:
         """Uninitialised memory that is kept from call to call."""
-        size = int(np.prod(shape))
+        size = math.prod(shape)
         kept = self._buffers.get(name)
         if kept is None or kept.size < size:
             kept = self._buffers[name] = np.empty(size, dtype)
@@ -135,7 +136,7 @@ class SplatBounds:
             d, order, m, splats.antialiased, record, box, tiles, depth, delta, depth_error, state,
         )  # fmt: skip
         alive = np.flatnonzero(state)
-        colors = self._colors(forms, candidates, alive, n)
+        colors = self._colors(forms, camera_reach, candidates, alive, n)
         mask = np.zeros(across * down, np.uint8)
         mask[wanted] = 1
         offsets, entries = tile_lists(depth_order(alive, depth), tiles, mask, across)
@@ -163,7 +164,9 @@ class SplatBounds:
             statistics.sum(axis=0),
         )  # fmt: skip
 
-    def _colors(self, forms: PoseForms, candidates: np.ndarray, alive: np.ndarray, n: int) -> np.ndarray:
+    def _colors(
+        self, forms: PoseForms, camera_reach: np.ndarray, candidates: np.ndarray, alive: np.ndarray, n: int
+    ) -> np.ndarray:
         """Colours of the visible Gaussians: [n, 3], [n, 6] (centre, radius) or forms."""
         splats, varied = self.splats, self.varied
         basis = forms.position.basis
@@ -173,11 +176,11 @@ class SplatBounds:
             if n == splats.count:
                 return np.ascontiguousarray(splats.sh[:, 0])
             return splats.sh[candidates, 0]
-        indices = np.stack([alive, candidates[alive]], axis=1).astype(np.int64)
+        indices = np.empty((alive.size, 2), np.int64)
+        indices[:, 0], indices[:, 1] = alive, candidates[alive]
         unit = self.arithmetic.unit
-        low, high = forms.position.bounds()
         # torch.inverse of the view matrix: 80 units of 1 + |T| (design.md, C3)
-        position_error = 80.0 * unit * (1.0 + float(np.maximum(np.abs(low), np.abs(high)).sum()))
+        position_error = 80.0 * unit * (1.0 + float(camera_reach.sum()))
         if not np.any(forms.position.linear) and float(forms.position.radius.max()) < 1e-9:
             colors = self._buffer("colors", (n, 6))
             position_error += 2.0 * float(forms.position.radius.max())

@@ -39,6 +39,7 @@ from ns_abstract.methods.splat.records import (
     OPACITY_HIGH,
     OPACITY_LOW,
     REGION,
+    SPREAD,
     WILD,
     coordinate_errors,
     float_errors,
@@ -382,11 +383,17 @@ def _project_block(
                 form = work[_K if f == 5 else _FORMS + f]
                 for k in range(stride):
                     record[index, start + k] = form[k, q]
-            for k in range(stride):
-                total += abs(record[index, start + k])
+            # with 16 units for the rounding of what the pixel stage adds up
+            spread = _COEFFICIENT * 2.0 * abs(record[index, start])
+            for k in range(1, stride):
+                spread += abs(record[index, start + k])
+            if f < 5:
+                record[index, SPREAD + f] = spread
+            total += abs(record[index, start]) + spread
         # float error of the mean, in units of y
-        record[index, FORMS + 4 * stride - 1] += s[row.EW + q]
-        record[index, FORMS + 5 * stride - 1] += s[row.EW + q]
+        for f in (3, 4):
+            record[index, FORMS + f * stride + m] += s[row.EW + q]
+            record[index, SPREAD + f] += s[row.EW + q]
         if not math.isfinite(total + s[row.EW + q]):
             record[index, WILD] = 1.0
             record[index, FAINT] = -1.0

@@ -36,6 +36,7 @@ from ns_abstract.methods.splat.records import (
     MEAN_Y,
     OPACITY_HIGH,
     OPACITY_LOW,
+    SPREAD,
     WILD,
 )
 
@@ -58,9 +59,9 @@ assert PIXELS == 64 and BLOCK == 8
 # Scratch is flat: row r holds its lanes at r * PIXELS .. r * PIXELS + PIXELS - 1, one by pixel.
 (
     _C1, _C2, _L1, _L2, _B1, _B2, _S0, _SR, _SL, _SB, _SLO, _SHI, _WEIGHT, _CURVE,
-    _TLO, _THI, _REACH, _RHO, _LOST, _MIN, _MAX, _DARKEST, _BRIGHTEST, _NUMBERS,
-) = range(0, 24 * PIXELS, PIXELS)  # fmt: skip
-_ROWS = 24
+    _TLO, _THI, _REACH, _RHO, _LOST, _MIN, _MAX, _NUMBERS,
+) = range(0, 22 * PIXELS, PIXELS)  # fmt: skip
+_ROWS = 22
 #: The set of all of 8 lanes.
 _ALL = 255
 #: Columns of a layer: bounds of alpha, transmittance behind it at its least and before it at its most, alpha's
@@ -158,6 +159,19 @@ def _set_unknown(layers, at, high, m):
     for k in range(1, m):
         layers[at + _FORM + k] = 0.0
     layers[at + _FORM + m] = 0.5 * high * _UP
+
+
+@njit(cache=True, error_model="numpy", forceinline=True)
+def _parabola(slope, bend):
+    """Range of +-slope p + bend p^2 over p in [-1, 1], up to rounding, of lanes (design.md, A4)."""
+    bottom, top = bend - slope, bend + slope
+    # the vertex counts where it lies inside [-1, 1]
+    inside = slope < 2.0 * abs(bend)
+    if bits(inside) != 0:
+        vertex = -0.25 * (slope * slope) / where(bend != 0.0, bend, 1.0)
+        bottom = where(inside, minimum(bottom, vertex), bottom)
+        top = where(inside, maximum(top, vertex), top)
+    return bottom, top
 
 
 @njit(cache=True, error_model="numpy", inline="always")
@@ -261,7 +275,7 @@ def _exponent(record, n, offset_x, offset_y, s, y1, y2, poly, d, m, antialiased)
         rounding = _ROUND * (s[_SL + q] + s[_SB + q] + s[_S0 + q])
         s[_MIN + q] = s[_S0 + q] - s[_SR + q] - rounding
         s[_MAX + q] = s[_S0 + q] + s[_SR + q] + rounding
-    _add_range(poly, d, n, s)
+    _add_range(pointer(poly), d, n, s)
     for q in range(n):
         s[_SHI + q] = min(s[_SHI + q], s[_MAX + q])
         s[_SLO + q] = max(s[_SLO + q], s[_MIN + q])
@@ -379,11 +393,7 @@ def _alpha_line(
         slope = abs(linear)
         bend = abs(quadratic)
         rounding = _ROUND * (slope + bend + abs(s0))
-        # the vertex of linear p + quadratic p^2 counts where it lies inside [-1, 1]
-        vertex = -0.25 * (slope * slope) / where(quadratic != 0.0, quadratic, 1.0)
-        inside = slope < 2.0 * bend
-        top = where(inside, maximum(quadratic + slope, vertex), quadratic + slope)
-        bottom = where(inside, minimum(quadratic - slope, vertex), quadratic - slope)
+        bottom, top = _parabola(slope, quadratic)
         low = maximum(low, s0 + bottom - radius - rounding)
         if bits(low > sigma_max) == _ALL:
             # alpha stays below the threshold
@@ -400,29 +410,22 @@ def _alpha_line(
     return found
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", forceinline=True)
 def _add_range(poly, d, n, s):
     """Add the range of the order-2 polynomial's non-constant part to rows _MIN and _MAX (design.md, A4)."""
-    row = 1 + d
-    for k in range(1, d + 1):
-        for q in range(n):
-            g = abs(poly[k, q])
-            c = poly[row, q]
-            # the vertex of g p + c p^2 counts where it lies inside [-1, 1]
-            divisor = c if c != 0.0 else 1.0
-            vertex = -0.25 * (g * g) / divisor
-            inside = g < 2.0 * abs(c)
-            top = c + g
-            bottom = c - g
-            s[_MAX + q] += max(top, vertex) if inside else top
-            s[_MIN + q] += min(bottom, vertex) if inside else bottom
-        row += 1
-        for _ in range(k + 1, d + 1):
-            for q in range(n):
-                c = abs(poly[row, q])
-                s[_MAX + q] += c
-                s[_MIN + q] -= c
+    for q in range(0, n, 8):
+        bottom, top = load8(s, _MIN + q), load8(s, _MAX + q)
+        row = 1 + d
+        for k in range(1, d + 1):
+            low, high = _parabola(abs(load8(poly, k * PIXELS + q)), load8(poly, row * PIXELS + q))
+            bottom, top = bottom + low, top + high
             row += 1
+            for _ in range(k + 1, d + 1):
+                mixed = abs(load8(poly, row * PIXELS + q))
+                bottom, top = bottom - mixed, top + mixed
+                row += 1
+        store(s, _MIN + q, bottom)
+        store(s, _MAX + q, top)
 
 
 @njit(cache=True, error_model="numpy", forceinline=True)
@@ -605,17 +608,8 @@ def _reached(record, ox, oy, left, right, top, bottom, m, s):
         w2 = record[FORMS + 4 * stride]
         x = max(abs(ox + left), abs(ox + right))
         y = max(abs(oy + top), abs(oy + bottom))
-        spread1 = _ROUND * (abs(p) * x + abs(c) * y + abs(w1))
-        spread2 = _ROUND * (abs(g) * y + abs(w2))
-        for k in range(1, m + 1):
-            spread1 += (
-                abs(record[FORMS + k]) * x
-                + abs(record[FORMS + stride + k]) * y
-                + abs(record[FORMS + 3 * stride + k])
-            )
-            spread2 += abs(record[FORMS + 2 * stride + k]) * y + abs(record[FORMS + 4 * stride + k])
-        spread1 *= _ROOM
-        spread2 *= _ROOM
+        spread1 = (record[SPREAD] * x + record[SPREAD + 1] * y + record[SPREAD + 3]) * _ROOM
+        spread2 = (record[SPREAD + 2] * y + record[SPREAD + 4]) * _ROOM
     # without a bound on the columns the whole rows are taken
     numbers = load8(s, _NUMBERS)
     start = float(left) + 0.0 * numbers
@@ -730,6 +724,39 @@ def _still_live(found, pixels, live):
 
 
 @njit(cache=True, error_model="numpy")
+def _keep_drawn(
+    found, pixels, first_layer, k, layers, width, s, lengths, lists, deepest, stop_high, shrink, grow
+):  # fmt: skip
+    """Keep the layers of a Gaussian whose place is certain in those lanes of ``found`` that no stop can hide.
+
+    Lane b is layer number ``first_layer + b`` on the pixel ``pixels[b]``. Returns the other lanes.
+    """
+    rest = 0
+    while found != 0:
+        lane = lowest_bit(found)
+        found &= found - 1
+        q = int(pixels[lane])
+        number = first_layer + lane
+        at = number * width
+        t_low = s[_TLO + q] * (1.0 - layers[at + _ALPHA_HIGH]) * shrink
+        if not t_low > stop_high:
+            rest |= 1 << lane
+            continue
+        before = s[_THI + q]
+        count = lengths[q]
+        layers[at + _LEFT] = t_low
+        layers[at + _LIGHT] = before
+        s[_TLO + q] = t_low
+        s[_THI + q] = before * (1.0 - layers[at + _ALPHA_LOW]) * grow
+        entry = _LISTED * (q * deepest + count)
+        lists[entry] = number
+        lists[entry + 1] = k
+        lists[entry + 2] = 0
+        lengths[q] = count + 1
+    return rest
+
+
+@njit(cache=True, error_model="numpy")
 def _forward(
     entries_, record_, box_, tiles_, tile_x, tile_y, colors_, palette_, depth_, delta_, depth_error_, slope_, ray,
     s_, y1, y2, poly, rows_, layers_, width, offset_x, offset_y, pixels_, batch_, masks_, asked_, lists_, lengths_,
@@ -766,6 +793,8 @@ def _forward(
     stop = rules[9]
     stop_low = stop * (1.0 - 8.0 * unit)
     stop_high = stop * (1.0 + 8.0 * unit)
+    # two roundings of the running transmittance
+    shrink, grow = 1.0 - 8.0 * unit, 1.0 + 8.0 * unit
     capacity = layers_.size // width
     move_limit = moves_.shape[0]
     color_rows = color_columns // 3
@@ -797,6 +826,8 @@ def _forward(
         moves[r] = 0.0
     move_count = 1
     live = -1
+    # pixels that take no light behind the layers whose place is still open
+    dim = 0
     used = 0
     for start in range(0, length, _BATCH):
         some = min(_BATCH, length - start)
@@ -829,6 +860,11 @@ def _forward(
         begins[some] = end
         # eight at a time, some in excess
         if used + end + 8 > capacity:
+            return _GROW, 0
+        longest = 0
+        for q in range(PIXELS):
+            longest = max(longest, int(lengths[q]))
+        if longest + some > deepest:
             return _GROW, 0
         for b in range(some):
             i = entries[start + b]
@@ -870,6 +906,11 @@ def _forward(
             if marks[i] == 0:
                 marks[i] = 1
             _set_colors(palette, k, advanced(colors, i * color_columns), color_rows)
+            if alone:
+                found = _keep_drawn(
+                    found, advanced(pixels, begin), used + begin, k, layers, width, s, lengths, lists, deepest,
+                    stop_high, shrink, grow,
+                )  # fmt: skip
             while found != 0:
                 lane = begin + lowest_bit(found)
                 found &= found - 1
@@ -878,16 +919,13 @@ def _forward(
                 low = layers[at + _ALPHA_LOW]
                 high = layers[at + _ALPHA_HIGH]
                 before = s[_THI + q]
-                # two roundings of the running transmittance
-                t_low = s[_TLO + q] * (1.0 - high) * (1.0 - 8.0 * unit)
-                t_high = before * (1.0 - low) * (1.0 + 8.0 * unit)
+                t_low = s[_TLO + q] * (1.0 - high) * shrink
+                t_high = before * (1.0 - low) * grow
                 if alone and t_high <= stop_low:
                     # surely the stop: neither this layer nor any behind it is drawn
                     live = signed(live & ~(1 << q))
                     continue
                 count = lengths[q]
-                if count >= deepest:
-                    return _GROW, 0
                 if alone and t_low <= stop_high:
                     # s[_LOST] is the most that any stop so far may leave of the light
                     s[_LOST + q] = max(s[_LOST + q], min(before, stop_high / (1.0 - high)))
@@ -904,6 +942,8 @@ def _forward(
                 lengths[q] = count + 1
                 s[_TLO + q] = t_low
                 s[_THI + q] = t_high
+                if t_high <= stop_low:
+                    dim = signed(dim | (1 << q))
                 if not alone:
                     if move_count >= move_limit:
                         return _GROW, 0
@@ -915,11 +955,12 @@ def _forward(
                     places[slots[k] * PIXELS + q] = count
                     # layers up to the last one whose order is uncertain may still come first
                     s[_REACH + q] = max(s[_REACH + q], float(last[k]))
-            if slot_count > 0:
-                for lane in range(begin, begins[b + 1]):
-                    q = int(pixels[lane])
-                    if s[_THI + q] <= stop_low and s[_REACH + q] <= k:
-                        live = signed(live & ~(1 << q))
+            some_dim = dim & live
+            while some_dim != 0:
+                q = lowest_bit(some_dim)
+                some_dim &= some_dim - 1
+                if s[_REACH + q] <= k:
+                    live = signed(live & ~(1 << q))
         if live == 0:
             break
         used += end
@@ -1150,146 +1191,105 @@ def _interval_chain(
 
 
 @njit(cache=True, error_model="numpy")
-def _interval_blend(
-    layers_, width, lists_, palette_, forms, lengths, moves_, chain, background_, low, high, form_low, form_high,
-    t_, keys_, order_,
+def _sharpened(
+    low, high, form_low, form_high, layers, width, lists, palette, forms, begin, end, moves, chain, background, t, keys,
+    order,
 ):  # fmt: skip
-    """Sharpen the interval blend where depth orders are uncertain; ``chain[k]`` numbers the groups.
+    """Interval [low, high] of a pixel whose layers' depth orders are uncertain, sharpened where that may pay (O4).
 
-    ``t``, ``keys`` and ``order`` are scratch.
+    The list entries of the pixel are [begin, end); ``form_low`` and ``form_high`` are its bounds by the forms;
+    ``chain[k]`` numbers the groups; ``t``, ``keys`` and ``order`` are scratch.
     """
-    layers, lists, palette, moves = pointer(layers_), pointer(lists_), pointer(palette_), pointer(moves_)
-    background, t, keys, order = pointer(background_), pointer(t_), pointer(keys_), pointer(order_)
-    deepest = lists_.shape[1]
-    for q in range(PIXELS):
-        begin = q * deepest
-        end = begin + int(lengths[q])
-        falls = 0.0 * load4(background, 0)
-        rises = falls
-        for entry in range(begin, end):
-            at, _, move = _listed_layer(lists, entry, width, forms)
-            if move != 0:
-                light = layers[at + _LIGHT]
-                falls = fma(light, load4(moves, move), falls)
-                rises = fma(light, load4(moves, move + 4), rises)
-        store(t, 0, falls)
-        store(t, 4, rises)
-        # how much of what reordering moves may be won back, where the forms are not tighter anyhow
-        gain = 0.0
-        for channel in range(3):
-            fall, rise = t[channel], t[4 + channel]
-            gain = max(gain, min(fall, low[channel, q] + fall - form_low[channel, q]))
-            gain = max(gain, min(rise, form_high[channel, q] - (high[channel, q] - rise)))
-        if not gain > _REORDERING_MATTERS:
-            continue
-        value_low = load4(background, 0)
-        value_high = value_low
-        darkest = value_low
-        brightest = value_low
-        stop = end
-        while stop > begin:
-            start = stop - 1
-            group = chain[int(lists[_LISTED * start + 1])]
-            while start > begin and chain[int(lists[_LISTED * (start - 1) + 1])] == group:
-                start -= 1
-            if stop - start == 1:
-                at, key, _ = _listed_layer(lists, start, width, forms)
-                value_low, value_high, darkest, brightest = _blend_interval(
-                    value_low, value_high, darkest, brightest, layers, at, palette, key + _ends(forms)
-                )
-            else:
-                value_low, value_high, darkest, brightest = _interval_chain(
-                    layers, width, lists, palette, forms, moves, value_low, value_high, darkest, brightest, start,
-                    stop, t, keys, order,
-                )  # fmt: skip
-            stop = start
-        store(t, 0, value_low)
-        store(t, 4, value_high)
-        for channel in range(3):
-            low[channel, q] = max(low[channel, q], t[channel])
-            high[channel, q] = min(high[channel, q], t[4 + channel])
-
-
-@njit(cache=True, error_model="numpy")
-def _blend_line(
-    layers_, width, lists_, palette_, forms, lengths, moves_, background_, state, radius, low, high, s, t_
-):
-    """Blend every pixel's layers back to front, as forms and as intervals (design.md, B7): one parameter, order 2.
-
-    Lanes are the channels. ``background`` [4] and ``palette`` (`_set_colors`, ``forms`` rows before the radius) have
-    a fourth one of zeros. ``state`` [3, m, pixels] and ``radius`` [3, pixels] receive the polynomial forms, ``low``
-    and ``high`` [3, pixels] the intervals; rows _DARKEST and _BRIGHTEST of ``s`` the range of all colours. ``t`` is
-    scratch.
-    """
-    moving = forms > 1
-    layers, lists, palette, moves = pointer(layers_), pointer(lists_), pointer(palette_), pointer(moves_)
-    background, t = pointer(background_), pointer(t_)
-    deepest = lists_.shape[1]
-    for q in range(PIXELS):
-        p0 = load4(background, 0)
-        p1 = 0.0 * p0
-        p2 = 0.0 * p0
-        r = 0.0 * p0
-        bottom = p0
-        top = p0
-        darkest = p0
-        brightest = p0
-        for e in range(int(lengths[q]) - 1, -1, -1):
-            at, key, move = _listed_layer(lists, q * deepest + e, width, forms)
-            a0, a1, a2 = layers[at + _FORM], layers[at + _FORM + 1], layers[at + _FORM + 2]
-            # colour - P, a form without radius
-            v0 = load4(palette, key) - p0
-            if moving:
-                v1 = load4(palette, key + 4) - p1
-                v2 = load4(palette, key + 8) - p2
-            else:
-                v1 = -p1
-                v2 = -p2
-            # sums in the order that leaves short chains from layer to layer
-            p0 = fma(a0, v0, p0)
-            p1 = fma(a0, v1, fma(a1, v0, p1))
-            p2 = fma(a0, v2, fma(a2, v0, fma(a1, v1, p2)))
-            a1 = abs(a1)
-            a2 = abs(a2)
-            v1 = abs(v1)
-            v2 = abs(v2)
-            v1 = v1 + v2
-            size = abs(v0) + v1
-            added = fma(layers[at + _ALPHA_HIGH], load4(palette, key + 4 * forms), fma(a1, v2, a2 * v1))
-            added = fma(layers[at + _FORM + 3], size, fma(_ROUND, fma(1.0 + a1 + a2, size, abs(p0)), added))
-            r = fma(1.0 - layers[at + _ALPHA_LOW], r, added) * _UP
-            bottom, top, darkest, brightest = _blend_interval(
-                bottom, top, darkest, brightest, layers, at, palette, key + _ends(forms)
+    falls = 0.0 * low
+    rises = falls
+    for entry in range(begin, end):
+        at, _, move = _listed_layer(lists, entry, width, forms)
+        if move != 0:
+            light = layers[at + _LIGHT]
+            falls = fma(light, load4(moves, move), falls)
+            rises = fma(light, load4(moves, move + 4), rises)
+    # how much of what reordering moves may be won back, where the forms are not tighter anyhow
+    gain = maximum(minimum(falls, low + falls - form_low), minimum(rises, form_high - (high - rises)))
+    if bits(gain > _REORDERING_MATTERS) == 0:
+        return low, high
+    value_low = load4(background, 0)
+    value_high = value_low
+    darkest = value_low
+    brightest = value_low
+    stop = end
+    while stop > begin:
+        start = stop - 1
+        group = chain[int(lists[_LISTED * start + 1])]
+        while start > begin and chain[int(lists[_LISTED * (start - 1) + 1])] == group:
+            start -= 1
+        if stop - start == 1:
+            at, key, _ = _listed_layer(lists, start, width, forms)
+            value_low, value_high, darkest, brightest = _blend_interval(
+                value_low, value_high, darkest, brightest, layers, at, palette, key + _ends(forms)
             )
-            if move != 0:
-                falls, rises = load4(moves, move), load4(moves, move + 4)
-                p0 = p0 + 0.5 * (rises - falls)
-                r = r + 0.5 * (rises + falls) * _UP
-                bottom = bottom - falls
-                top = top + rises
-        store(t, 0, p0)
-        store(t, 4, p1)
-        store(t, 8, p2)
-        _keep_pixel(q, 3, t, r, bottom, top, darkest, brightest, state, radius, low, high, s)
+        else:
+            value_low, value_high, darkest, brightest = _interval_chain(
+                layers, width, lists, palette, forms, moves, value_low, value_high, darkest, brightest, start, stop, t,
+                keys, order,
+            )  # fmt: skip
+        stop = start
+    return maximum(low, value_low), minimum(high, value_high)
 
 
 @njit(cache=True, error_model="numpy", forceinline=True)
-def _keep_pixel(q, m, t, r, bottom, top, darkest, brightest, state, radius, low, high, s):
-    """Write what was blended for pixel q; ``t`` starts with the coefficients' rows, and is scratch behind them."""
-    end = 4 * m
-    store(t, end, r)
-    store(t, end + 4, bottom)
-    store(t, end + 8, top)
-    store(t, end + 12, darkest)
-    store(t, end + 16, brightest)
-    for channel in range(3):
-        for k in range(m):
-            state[channel, k, q] = t[4 * k + channel]
-        radius[channel, q] = t[end + channel]
-        low[channel, q] = t[end + 4 + channel]
-        high[channel, q] = t[end + 8 + channel]
-    s[_DARKEST + q] = min(t[end + 12], t[end + 13], t[end + 14])
-    s[_BRIGHTEST + q] = max(t[end + 16], t[end + 17], t[end + 18])
+def _blend_line(layers, width, lists, palette, forms, begin, end, moves, background, t):
+    """Blend the list entries [begin, end) of a pixel back to front, as forms and as intervals (design.md, B7).
+
+    For one parameter and order 2. Lanes are the channels; ``background`` [4] and ``palette`` (`_set_colors`, ``forms``
+    rows before the radius) have a fourth one of zeros. ``t`` [m, 4] receives the polynomials; returns their radii, not
+    yet rounded up, the intervals' ends, and the range of all colours.
+    """
+    moving = forms > 1
+    p0 = load4(background, 0)
+    p1 = 0.0 * p0
+    p2 = 0.0 * p0
+    r = 0.0 * p0
+    bottom = p0
+    top = p0
+    darkest = p0
+    brightest = p0
+    for entry in range(end - 1, begin - 1, -1):
+        at, key, move = _listed_layer(lists, entry, width, forms)
+        a0, a1, a2 = layers[at + _FORM], layers[at + _FORM + 1], layers[at + _FORM + 2]
+        # colour - P, a form without radius
+        v0 = load4(palette, key) - p0
+        if moving:
+            v1 = load4(palette, key + 4) - p1
+            v2 = load4(palette, key + 8) - p2
+        else:
+            v1 = -p1
+            v2 = -p2
+        # sums in the order that leaves short chains from layer to layer
+        p0 = fma(a0, v0, p0)
+        p1 = fma(a0, v1, fma(a1, v0, p1))
+        p2 = fma(a0, v2, fma(a2, v0, fma(a1, v1, p2)))
+        a1 = abs(a1)
+        a2 = abs(a2)
+        v1 = abs(v1)
+        v2 = abs(v2)
+        v1 = v1 + v2
+        size = abs(v0) + v1
+        added = fma(layers[at + _ALPHA_HIGH], load4(palette, key + 4 * forms), fma(a1, v2, a2 * v1))
+        added = fma(layers[at + _FORM + 3], size, fma(_ROUND, fma(1.0 + a1 + a2, size, abs(p0)), added))
+        r = fma(1.0 - layers[at + _ALPHA_LOW], r, added)
+        bottom, top, darkest, brightest = _blend_interval(
+            bottom, top, darkest, brightest, layers, at, palette, key + _ends(forms)
+        )
+        if move != 0:
+            falls, rises = load4(moves, move), load4(moves, move + 4)
+            p0 = p0 + 0.5 * (rises - falls)
+            r = r + 0.5 * (rises + falls)
+            bottom = bottom - falls
+            top = top + rises
+    store(t, 0, p0)
+    store(t, 4, p1)
+    store(t, 8, p2)
+    return r, bottom, top, darkest, brightest
 
 
 @njit(cache=True, error_model="numpy", forceinline=True)
@@ -1323,7 +1323,7 @@ def _step_affine(r, layers, at, palette, key, forms, t, m):
     size = abs(value) + change_size
     added = fma(layers[at + _ALPHA_HIGH], load4(palette, key + 4 * forms), fma(steep, change_size, -curves))
     added = fma(layers[at + _FORM + m], size, fma(_ROUND, fma(1.0 + steep, size, abs(middle)), added))
-    return fma(1.0 - layers[at + _ALPHA_LOW], r, added) * _UP
+    return fma(1.0 - layers[at + _ALPHA_LOW], r, added)
 
 
 @njit(cache=True, error_model="numpy", forceinline=True)
@@ -1363,63 +1363,60 @@ def _step_curved(r, layers, at, palette, key, forms, t, value, d, m):
     size = abs(v0) + (slopes + bends)
     added = fma(layers[at + _ALPHA_HIGH], load4(palette, key + 4 * forms), fma(steep, bends, bent * (slopes + bends)))
     added = fma(layers[at + _FORM + m], size, fma(_ROUND, fma(1.0 + steep + bent, size, abs(p0)), added))
-    return fma(1.0 - layers[at + _ALPHA_LOW], r, added) * _UP
+    return fma(1.0 - layers[at + _ALPHA_LOW], r, added)
 
 
-@njit(cache=True, error_model="numpy")
-def _blend(
-    layers_, width, lists_, palette_, forms, lengths, moves_, background_, d, order, m, state, radius, low, high, s, t_,
-    value_,
-):  # fmt: skip
+@njit(cache=True, error_model="numpy", forceinline=True)
+def _blend(layers, width, lists, palette, forms, begin, end, moves, background, d, order, m, t, value):
     """`_blend_line` for any number of parameters and order; ``value`` is scratch."""
-    layers, lists, palette, moves = pointer(layers_), pointer(lists_), pointer(palette_), pointer(moves_)
-    background, t, value = pointer(background_), pointer(t_), pointer(value_)
-    deepest = lists_.shape[1]
-    for q in range(PIXELS):
-        r = 0.0 * load4(background, 0)
-        for k in range(m):
-            store(t, 4 * k, r)
-        bottom = load4(background, 0)
-        store(t, 0, bottom)
-        top = bottom
-        darkest = bottom
-        brightest = bottom
-        for e in range(int(lengths[q]) - 1, -1, -1):
-            at, key, move = _listed_layer(lists, q * deepest + e, width, forms)
-            if order == 1:
-                r = _step_affine(r, layers, at, palette, key, forms, t, m)
-            else:
-                r = _step_curved(r, layers, at, palette, key, forms, t, value, d, m)
-            bottom, top, darkest, brightest = _blend_interval(
-                bottom, top, darkest, brightest, layers, at, palette, key + _ends(forms)
-            )
-            if move != 0:
-                falls, rises = load4(moves, move), load4(moves, move + 4)
-                store(t, 0, load4(t, 0) + 0.5 * (rises - falls))
-                r = r + 0.5 * (rises + falls) * _UP
-                bottom = bottom - falls
-                top = top + rises
-        _keep_pixel(q, m, t, r, bottom, top, darkest, brightest, state, radius, low, high, s)
+    bottom = load4(background, 0)
+    r = 0.0 * bottom
+    store(t, 0, bottom)
+    for k in range(1, m):
+        store(t, 4 * k, r)
+    top = bottom
+    darkest = bottom
+    brightest = bottom
+    for entry in range(end - 1, begin - 1, -1):
+        at, key, move = _listed_layer(lists, entry, width, forms)
+        if order == 1:
+            r = _step_affine(r, layers, at, palette, key, forms, t, m)
+        else:
+            r = _step_curved(r, layers, at, palette, key, forms, t, value, d, m)
+        bottom, top, darkest, brightest = _blend_interval(
+            bottom, top, darkest, brightest, layers, at, palette, key + _ends(forms)
+        )
+        if move != 0:
+            falls, rises = load4(moves, move), load4(moves, move + 4)
+            store(t, 0, load4(t, 0) + 0.5 * (rises - falls))
+            r = r + 0.5 * (rises + falls)
+            bottom = bottom - falls
+            top = top + rises
+    return r, bottom, top, darkest, brightest
 
 
-@njit(cache=True, error_model="numpy")
-def _form_range(p, d, order, m, s):
-    """Range over the box of one channel's polynomial into rows _SLO, _SHI, rounded outward."""
-    n = p.shape[1]
-    _spread(p, 1, m, n, s, _SL)
-    for q in range(n):
-        s[_MIN + q] = p[0, q]
-        s[_MAX + q] = p[0, q]
+@njit(cache=True, error_model="numpy", forceinline=True)
+def _form_range(t, r, d, order, m):
+    """Range over the box of the polynomials ``t`` [m, 4] of radii ``r``, rounded outward (design.md, A4)."""
+    middle = load4(t, 0)
+    bottom, top = middle, middle
+    size = 0.0 * middle
+    for k in range(1, m):
+        size = size + abs(load4(t, 4 * k))
     if order == 1:
-        for q in range(n):
-            s[_MIN + q] -= s[_SL + q]
-            s[_MAX + q] += s[_SL + q]
+        bottom, top = middle - size, middle + size
     else:
-        _add_range(p, d, n, s)
-    for q in range(n):
-        rounding = 8.0 * _ROUND * (abs(p[0, q]) + s[_SL + q])
-        s[_SLO + q] = s[_MIN + q] - rounding
-        s[_SHI + q] = s[_MAX + q] + rounding
+        row = 1 + d
+        for k in range(1, d + 1):
+            low, high = _parabola(abs(load4(t, 4 * k)), load4(t, 4 * row))
+            bottom, top = bottom + low, top + high
+            row += 1
+            for _ in range(k + 1, d + 1):
+                mixed = abs(load4(t, 4 * row))
+                bottom, top = bottom - mixed, top + mixed
+                row += 1
+    room = 8.0 * _ROUND * (abs(middle) + size) + r * _UP
+    return bottom - room, top + room
 
 
 @njit(cache=True, error_model="numpy")
@@ -1439,8 +1436,8 @@ def _block(
     listed, x0, y0, tile_x, tile_y, record, box, tiles, depth, delta, depth_error, colors, color_radius,
     slope, direction, camera, rules, errors, background, negligible, d, order, m, antialiased,
     s, t, y1, y2, poly, rows, value, palette, layers, offset_x, offset_y, pixels, batch, masks, asked, lists, lengths,
-    reach, deep, far, first, last, slots, owners, drawn, places, pairs, moves, state, radius, low, high, form_low,
-    form_high, ray, lower, upper, linear, slopes, statistics, marks,
+    reach, deep, far, first, last, slots, owners, drawn, places, pairs, moves, ray, lower, upper, linear, slopes,
+    statistics, marks,
 ):  # fmt: skip
     """Bounds of one block of pixels whose first pixel is (x0, y0). Returns whether the buffers sufficed.
 
@@ -1489,58 +1486,88 @@ def _block(
         _settle_stops(
             layers, width, lists, lengths, first, last, owners, drawn, places, slot_count, s, m, rules[9], unit
         )
-    if d == 1 and order == 2:
-        _blend_line(layers, width, lists, palette, forms, lengths, moves, background, state, radius, low, high, s, t)
-    else:
-        _blend(
-            layers, width, lists, palette, forms, lengths, moves, background, d, order, m, state, radius, low, high, s,
-            t, value,
-        )  # fmt: skip
-    for channel in range(3):
-        _form_range(state[channel], d, order, m, s)
-        for q in range(PIXELS):
-            form_low[channel, q] = s[_SLO + q] - radius[channel, q] * _UP
-            form_high[channel, q] = s[_SHI + q] + radius[channel, q] * _UP
-    if slot_count > 0:
         _chains(last[: listed.size], far)
-        _interval_blend(
-            layers, width, lists, palette, forms, lengths, moves, far, background, low, high, form_low,
-            form_high, t, reach, first,
-        )  # fmt: skip
     statistics[1] += deepest
     statistics[2] += pair_count
-    for channel in range(3):
-        for k in range(d):
-            total = 0.0
-            for q in range(PIXELS):
-                total += abs(state[channel, 1 + k, q])
-            slopes[k] += total
-        for q in range(PIXELS):
-            row = y0 % side + q // BLOCK
-            column = x0 % side + q % BLOCK
-            # rounding of the program's own sums and products (design.md, B8)
-            bright = max(1.0, s[_BRIGHTEST + q], -s[_DARKEST + q])
-            slack = (
-                (3.0 * lengths[q] + 16.0) * (unit + 8.0 * UNIT64) * bright * 1.01 + color_radius + negligible * bright
-            )
-            # a stop that was ignored shows the background in place of what lies behind (B6)
-            rho = s[_RHO + q] * (1.0 + 16.0 * unit)
-            fall = slack + rho * max(0.0, s[_BRIGHTEST + q] - background[channel])
-            rise = slack + rho * max(0.0, background[channel] - s[_DARKEST + q])
-            bottom = max(low[channel, q], form_low[channel, q]) - fall
-            top = min(high[channel, q], form_high[channel, q]) + rise
-            if not bottom <= top:
-                # crossed or not a number: nothing is known
-                bottom = 0.0
-                top = 1.0
-                statistics[4] += 1
-            lower[row, column, channel] = min(1.0, max(0.0, bottom))
-            upper[row, column, channel] = max(0.0, min(1.0, top))
-            if linear.shape[0] > 0:
-                for k in range(m):
-                    linear[0, row, column, channel, k] = state[channel, k, q]
-                linear[0, row, column, channel, m] = radius[channel, q] + max(fall, rise)
+    _shade(
+        layers, width, lists, palette, forms, lengths, moves, far, slot_count > 0, background, color_radius, negligible,
+        unit, x0 % side, y0 % side, d, order, m, s, t, value, reach, first, lower, upper, linear, slopes, statistics,
+    )  # fmt: skip
     return True
+
+
+@njit(cache=True, error_model="numpy")
+def _shade(
+    layers_, width, lists_, palette_, forms, lengths, moves_, chain, reordered, background_, color_radius, negligible,
+    unit, left, top_row, d, order, m, s_, t_, value_, keys_, order_, lower, upper, linear, slopes, statistics,
+):  # fmt: skip
+    """Blend every pixel's layers and write its bounds; lanes are the channels, a fourth one holds nothing.
+
+    The block begins at column ``left`` and row ``top_row`` of its tile; ``reordered`` tells whether layers may move.
+    """
+    layers, lists, palette, moves = pointer(layers_), pointer(lists_), pointer(palette_), pointer(moves_)
+    background, s, t, value = pointer(background_), pointer(s_), pointer(t_), pointer(value_)
+    keys, order_of = pointer(keys_), pointer(order_)
+    deepest = lists_.shape[1]
+    # behind the polynomials: scratch, then sums of absolute linear coefficients
+    u = advanced(t, 4 * m)
+    sums = advanced(t, 4 * m + 16)
+    behind = load4(background, 0)
+    for k in range(d):
+        store(sums, 4 * k, 0.0 * behind)
+    for q in range(PIXELS):
+        begin = q * deepest
+        end = begin + int(lengths[q])
+        if d == 1 and order == 2:
+            r, low, high, darkest, brightest = _blend_line(
+                layers, width, lists, palette, forms, begin, end, moves, background, t
+            )
+        else:
+            r, low, high, darkest, brightest = _blend(
+                layers, width, lists, palette, forms, begin, end, moves, background, d, order, m, t, value
+            )
+        # the radius' own rounding: three for every layer
+        r = r * (_UP + 4.0 * UNIT64 * lengths[q])
+        form_low, form_high = _form_range(t, r, d, order, m)
+        if reordered:
+            low, high = _sharpened(
+                low, high, form_low, form_high, layers, width, lists, palette, forms, begin, end, moves, chain,
+                background, u, keys, order_of,
+            )  # fmt: skip
+        for k in range(d):
+            store(sums, 4 * k, load4(sums, 4 * k) + abs(load4(t, 4 + 4 * k)))
+        store(u, 0, darkest)
+        store(u, 4, brightest)
+        dark, light = min(u[0], u[1], u[2]), max(u[4], u[5], u[6])
+        # rounding of the program's own sums and products (design.md, B8)
+        bright = max(1.0, light, -dark)
+        slack = (
+            (3.0 * lengths[q] + 16.0) * (unit + 8.0 * UNIT64) * bright * 1.01 + color_radius + negligible * bright
+        )
+        # a stop that was ignored shows the background in place of what lies behind (B6)
+        rho = s[_RHO + q] * (1.0 + 16.0 * unit)
+        fall = slack + rho * maximum(0.0, light - behind)
+        rise = slack + rho * maximum(0.0, behind - dark)
+        bottom = maximum(low, form_low) - fall
+        top = minimum(high, form_high) + rise
+        # crossed or not a number: nothing is known
+        known = bottom <= top
+        store(u, 0, minimum(1.0, maximum(0.0, where(known, bottom, 0.0))))
+        store(u, 4, maximum(0.0, minimum(1.0, where(known, top, 1.0))))
+        if bits(known) != 15:
+            statistics[4] += 1
+        row, column = top_row + q // BLOCK, left + q % BLOCK
+        for channel in range(3):
+            lower[row, column, channel] = u[channel]
+            upper[row, column, channel] = u[4 + channel]
+        if linear.shape[0] > 0:
+            store(u, 0, r + maximum(fall, rise))
+            for channel in range(3):
+                for k in range(m):
+                    linear[0, row, column, channel, k] = t[4 * k + channel]
+                linear[0, row, column, channel, m] = u[channel]
+    for k in range(d):
+        slopes[k] += sums[4 * k] + sums[4 * k + 1] + sums[4 * k + 2]
 
 
 @njit(cache=True, error_model="numpy")
@@ -1574,7 +1601,7 @@ def _pixel_worker(
     scratch[_NUMBERS : _NUMBERS + BLOCK] = np.arange(BLOCK)
     background_ = np.zeros(4)
     background_[:3] = background_colors
-    channels_ = np.zeros(4 * (m + 5))
+    channels_ = np.zeros(4 * (2 * m + 4))
     value_ = np.zeros(4 * m)
     planes = np.empty((2 * m, PIXELS))
     rows_ = np.zeros((width, PIXELS))
@@ -1588,10 +1615,6 @@ def _pixel_worker(
     rows, batch = borrowed(rows_.reshape(width * PIXELS)), borrowed(batch_)
     offset_x, offset_y = borrowed(offsets_[0]), borrowed(offsets_[1])
     pixels, lengths, ray = borrowed(pixels_), borrowed(lengths_), borrowed(ray_)
-    state_ = np.empty((3, m, PIXELS))
-    ends = np.empty((5, 3, PIXELS))
-    state, radius, low, high = borrowed(state_), borrowed(ends[0]), borrowed(ends[1]), borrowed(ends[2])
-    form_low, form_high = borrowed(ends[3]), borrowed(ends[4])
     layers_ = _aligned(256 * PIXELS * width)
     lists_ = np.empty((PIXELS, 256, _LISTED), np.uint32)
     drawn_ = np.empty(512, np.int64)
@@ -1628,7 +1651,7 @@ def _pixel_worker(
                 offset_y, pixels, batch, borrowed(order_[0]), borrowed(order_[1]), borrowed(lists_), lengths,
                 borrowed(reach_[0]), borrowed(reach_[1]), borrowed(order_[2]), borrowed(order_[3]),
                 borrowed(order_[4]), borrowed(order_[5]), borrowed(order_[6]), borrowed(drawn_), borrowed(places_),
-                borrowed(pairs_), borrowed(moves_), state, radius, low, high, form_low, form_high, ray,
+                borrowed(pairs_), borrowed(moves_), ray,
                 lower[number], upper[number], linear[min(number, linear.shape[0]) :],
                 slopes[number], statistics[thread], marks,
             ):  # fmt: skip
@@ -1641,9 +1664,8 @@ def _pixel_worker(
     # the owners of the borrowed arrays live to here
     return (
         scratch.size + background_.size + channels_.size + value_.size + planes.size + rows_.size + offsets_.size
-        + pixels_.size + batch_.size + lengths_.size + ray_.size + state_.size + ends.size + layers_.size + lists_.size
-        + drawn_.size + places_.size + moves_.size
-        + reach_.size + order_.size + palette_.size + pairs_.size
+        + pixels_.size + batch_.size + lengths_.size + ray_.size + layers_.size + lists_.size + drawn_.size
+        + places_.size + moves_.size + reach_.size + order_.size + palette_.size + pairs_.size
     )  # fmt: skip
 
 
@@ -1671,7 +1693,7 @@ def pixel_stage(
         marks: [n] uint8; set to 1 for every Gaussian that some pixel of these tiles may draw or stop at.
             Those that stay 0 are hidden or too faint for every pose: leaving them out changes nothing.
         statistics: [threads, 5] blocks, layers, uncertain pairs, blocks where too many pairs were
-            uncertain, results that were not numbers.
+            uncertain, pixels with results that were not numbers.
     """
     for thread in prange(threads):
         _pixel_worker(

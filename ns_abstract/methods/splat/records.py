@@ -7,7 +7,8 @@ For every Gaussian that some pose of the cell may show, one record is written:
     4      kappa: relative error of the exponent that float evaluation may add
     5      1 where nothing but the opacity is known ("wild"), else 0
     6      exponent from which on alpha is below the threshold, however it is evaluated (B4); -1 if wild
-    7 ..   forms P, Q, S, W1, W2 (and K if antialiased), each m coefficients and a radius
+    7 ..   of the forms P, Q, S, W1, W2: how far each may be from its centre, for pixels that surely see nothing
+    12 ..  forms P, Q, S, W1, W2 (and K if antialiased), each m coefficients and a radius
 
 so that for a pixel at offset (ax, ay) from the mean
 
@@ -30,7 +31,8 @@ _SIGMOID = 12.0
 REGION = 1.0 + 2.0**-30
 
 # columns of a record before its forms
-MEAN_X, MEAN_Y, OPACITY_LOW, OPACITY_HIGH, KAPPA, WILD, FAINT, FORMS = range(8)
+MEAN_X, MEAN_Y, OPACITY_LOW, OPACITY_HIGH, KAPPA, WILD, FAINT, SPREAD = range(8)
+FORMS = SPREAD + 5
 
 # Scratch of a block is flat: row r holds its lanes at r * LANES .. r * LANES + LANES - 1. With constant offsets the
 # compiler sees that rows do not overlap, so that long loops over lanes become vector code.
