@@ -36,6 +36,8 @@ UNITS = "arithmetic/units.py"
 POSES = "sets/poses.py"
 BOX = "sets/box.py"
 GAUSSIANS = "methods/splat/gaussians.py"
+FORM_PROJECTION = "methods/splat/form_projection.py"
+WIDE = "arithmetic/wide_forms.py"
 LINE = "methods/splat/line_projection.py"
 RECORDS = "methods/splat/records.py"
 PIXELS = "methods/splat/pixels.py"
@@ -250,11 +252,7 @@ MUTANTS = (
     ),
     Mutant(
         "near plane culls what crosses it", GAUSSIANS,
-        "        if not (farthest[q] + spread_z >= near and nearest[q] - spread_z <= far):\n"
-        "            # a bound that is not a number keeps the Gaussian\n"
-        "            if farthest[q] + spread_z < near or",
-        "        if not (nearest[q] + spread_z >= near and nearest[q] - spread_z <= far):\n"
-        "            if nearest[q] + spread_z < near or",
+        "gone = (farthest + spread_z < near)", "gone = (nearest + spread_z < near)",
         "test_bounds.py::test_near_plane[2]",
     ),
     Mutant(
@@ -270,8 +268,8 @@ MUTANTS = (
         "test_bounds.py::test_tile_cut[1]",
     ),
     Mutant(
-        "Jacobian without its clamp", GAUSSIANS,
-        "    # the Jacobian's clamped ratios\n    if margin >= 0.0:", "    if False:",
+        "Jacobian without its clamp", FORM_PROJECTION,
+        "        # the Jacobian's clamped ratios\n        if margin >= 0.0:", "        if False:",
         "test_bounds.py::test_jacobian_clamp[1]",
     ),
     Mutant(
@@ -287,13 +285,14 @@ MUTANTS = (
         "test_bounds.py::test_jacobian_clamp_all_sides[2]",
     ),
     Mutant(
-        "clamped on one side only", GAUSSIANS,
-        "    clamp_below(a, -limit_high, other[0], other[1], d, order, m)\n", "",
+        "clamped on one side only", WIDE,
+        "    if bits(high > limit_high) != 0:", "    if False:",
         "test_bounds.py::test_jacobian_clamp_all_sides[1]",
     ),
     Mutant(
-        "no compensation when antialiased", GAUSSIANS,
-        "form = work[_K if f == 5 else _FORMS + f]", "form = work[_FORMS + 2 if f == 5 else _FORMS + f]",
+        "no compensation when antialiased", FORM_PROJECTION,
+        "scale_add(w, _LOG * one, -0.5, _LOG * one, 0.0, k, d, order, m)",
+        "scale_add(w, _LOG * one, 0.0, _LOG * one, 0.0, k, d, order, m)",
         "test_bounds.py::test_antialiased[1]",
     ),
     Mutant(
@@ -303,8 +302,8 @@ MUTANTS = (
         "test_bounds.py::test_antialiased[2]",
     ),
     Mutant(
-        "blur left out of the determinant", GAUSSIANS,
-        "    add_product(work[_T1], work[_T2], 1.0, work[_DET], d, order, m)\n", "",
+        "blur left out of the determinant", FORM_PROJECTION,
+        "        add_product(w, t1, z2, 1.0, det, d, order, m)\n", "",
         "test_bounds.py::test_depth_swap[1]",
     ),
     Mutant(
@@ -324,6 +323,16 @@ MUTANTS = (
         "n10 = _lowered(_rotated(r1, b0, b1, b2, still, 0.0, 0.0), (v[0], -v[1], v[2], v[3]), deep)\n"
         "        b0, b1, b2 = s[row.B01",
         "test_bounds.py::test_needle[2]",
+    ),
+    Mutant(
+        "a product of eight forms drops what linear terms make", WIDE,
+        "        radius = radius + la * lb\n", "",
+        "test_wide_forms.py::test_pairs",
+    ),
+    Mutant(
+        "a Gaussian's reach without its mean's error", GAUSSIANS,
+        "                spread = spread + mean_error\n", "",
+        "test_bounds.py::test_reach_counts_every_error",
     ),
     Mutant(
         "pixels are blended as others", PIXELS,

@@ -17,6 +17,7 @@ from ns_abstract.methods.splat.activate import Splats, rotation_matrices
 from ns_abstract.methods.splat.bounds import SplatBounds
 from ns_abstract.methods.splat.constants import GSPLAT_1_4_0
 from ns_abstract.methods.splat.pixels import _sort as sort_group
+from ns_abstract.methods.splat.records import FORMS, SPREAD, WILD, columns
 from ns_abstract.methods.splat.render import Renderer
 from ns_abstract.sets.box import ParameterBox
 from ns_abstract.sets.path import Camera
@@ -206,6 +207,31 @@ def test_alpha_threshold_of_all(order):
     splats = scene({"mean": (0.0, -0.15625, -5.0), "scale": 0.01, "opacity": 0.00396}, background=(0.3, 0.3, 0.3))
     _, sampled = Case(splats, moves(x=0.3)).check(order, parts=1, count=61)
     assert np.argwhere(sampled[..., 0]).tolist() == [[8, 7], [8, 8]]
+
+
+@both_orders
+@pytest.mark.parametrize("antialiased", [False, True])
+@pytest.mark.parametrize("names", [("x",), ("x", "yaw", "roll")])
+def test_reach_counts_every_error(order, antialiased, names):
+    """What a record says of how far its forms may be from their centres covers all terms, the float error too."""
+    places = np.random.default_rng(5).uniform(-1.0, 1.0, (70, 2))
+    splats = scene(
+        *({"mean": (*place, -6.0), "scale": 0.3, "opacity": 0.9, "quat": TURN} for place in places),
+        antialiased=antialiased,
+    )
+    case = Case(splats, moves(**dict.fromkeys(names, 0.01)))
+    bounds = SplatBounds(splats, GSPLAT_1_4_0, FLOAT32)
+    forms = case.poses.enclosure(case.poses.box, order)
+    bounds.cell(case.camera, forms)
+    m = forms.rotation.basis.monomials
+    width = columns(6 if antialiased else 5, m)
+    record = bounds._buffer("record", (70, width))
+    assert (record[:, WILD] == 0.0).all() and width % 8 == 0
+    for f in range(5):
+        form = record[:, FORMS + f * (m + 1) : FORMS + (f + 1) * (m + 1)]
+        spread = np.abs(form[:, 1:]).sum(axis=1)
+        assert (record[:, SPREAD + f] >= spread * (1.0 - 1e-14)).all()
+        assert (record[:, SPREAD + f] <= spread * (1.0 + 1e-14) + 1e-14 * np.abs(form[:, 0])).all()
 
 
 @both_orders

@@ -290,6 +290,27 @@ def store_columns(typingctx, elements, at, stride, a, b, c, d, e, f, g, h):  # p
     return types.void(elements, types.intp, types.intp, a, b, c, d, e, f, g, h), codegen
 
 
+@intrinsic
+def scatter_columns(typingctx, elements, places, first, stride, shift, a, b, c, d, e, f, g, h):  # pyright: ignore[reportRedeclaration]
+    """Write lane k of the eight values side by side to ``elements[stride * places[first + k] + shift : ...]``.
+
+    ``elements`` and ``places`` (int64) are `compiled.pointer`.
+    """
+    _check(elements)
+    if places != types.CPointer(types.int64):
+        raise TypeError(f"places are read through pointer(int64 array), not {places}")
+
+    def codegen(context, builder, sig, args):
+        int64 = ir.IntType(64)
+        for k, row in enumerate(_transposed(builder, args[5:])):
+            address = builder.gep(args[1], [builder.add(args[2], int64(k))], source_etype=int64)
+            at = builder.add(builder.mul(builder.load(address, typ=int64), args[3]), args[4])
+            builder.store(row, _address(builder, args[0], at, 8), align=8)
+        return context.get_dummy_value()
+
+    return types.void(elements, places, types.intp, types.intp, types.intp, a, b, c, d, e, f, g, h), codegen
+
+
 if config.DISABLE_JIT:  # pyright: ignore[reportAttributeAccessIssue]
 
     def maximum(a, b):
@@ -333,3 +354,9 @@ if config.DISABLE_JIT:  # pyright: ignore[reportAttributeAccessIssue]
         """Write lane k of the eight values side by side to ``elements[at + stride k : ...]``."""
         for k, row in enumerate(np.stack(values, axis=1)):
             elements[at + stride * k : at + stride * k + 8] = row
+
+    def scatter_columns(elements, places, first, stride, shift, *values):
+        """Write lane k of the eight values side by side to ``elements[stride * places[first + k] + shift : ...]``."""
+        for k, row in enumerate(np.stack(values, axis=1)):
+            at = stride * int(places[first + k]) + shift
+            elements[at : at + 8] = row

@@ -16,7 +16,7 @@ from ns_abstract.methods.splat.constants import Rasteriser, rules_array
 from ns_abstract.methods.splat.gaussians import covariance_noise, gaussian_stage
 from ns_abstract.methods.splat.lists import depth_order, tile_lists
 from ns_abstract.methods.splat.pixels import pixel_stage
-from ns_abstract.methods.splat.records import FORMS, faint_exponents
+from ns_abstract.methods.splat.records import columns, faint_exponents
 from ns_abstract.methods.splat.render import camera_array
 from ns_abstract.methods.splat.variations import VariedSplats
 from ns_abstract.sets.path import Camera
@@ -75,17 +75,20 @@ class SplatBounds:
         self._errors = np.array([a.unit, a.flush, a.division, a.sqrt, a.rsqrt, a.exp, a.overflow])
         self._buffers: dict[str, np.ndarray] = {}
         self._faint = faint_exponents(self.varied.opacity_high, self.rules[7], a.unit)
+        self._extents = np.sqrt(np.square(splats.axes).sum(axis=1).max(axis=1, initial=0.0))
         self._noise = covariance_noise(splats.axes, a.unit, a.flush)
         self._color_radius = 8.0 * a.unit * float(np.abs(splats.sh).max(initial=1.0)) if splats.degree == 0 else 0.0
         self._color_reach = color_reach(splats.sh, splats.degree) if splats.degree > 0 else None
         self._plain_colors = _shifted_colors(self.varied, a.unit) if splats.degree == 0 else None
 
     def _buffer(self, name: str, shape: tuple[int, ...], dtype: type = np.float64) -> np.ndarray:
-        """Uninitialised memory that is kept from call to call."""
+        """Uninitialised memory that begins with a cache line and is kept from call to call."""
         size = math.prod(shape)
         kept = self._buffers.get(name)
         if kept is None or kept.size < size:
-            kept = self._buffers[name] = np.empty(size, dtype)
+            room = np.empty(size * np.dtype(dtype).itemsize + 64, np.uint8)
+            start = -room.ctypes.data % 64
+            kept = self._buffers[name] = room[start : start + room.size - 64].view(dtype)
         return kept[:size].reshape(shape)
 
     def cell(
@@ -121,8 +124,7 @@ class SplatBounds:
         rotation_reach = np.maximum(np.abs(low), np.abs(high)).ravel()
         low, high = forms.position.bounds()
         camera_reach = np.maximum(np.abs(low), np.abs(high))
-        count = 6 if splats.antialiased else 5
-        record = self._buffer("record", (n, FORMS + count * (m + 1)))
+        record = self._buffer("record", (n, columns(6 if splats.antialiased else 5, m)))
         box = self._buffer("box", (n, 4))
         tiles = self._buffer("tiles", (n, 8), np.int32)
         depth = self._buffer("depth", (n,))
@@ -130,7 +132,7 @@ class SplatBounds:
         depth_error = self._buffer("depth_error", (n,))
         state = self._buffer("state", (n,), np.uint8)
         gaussian_stage(
-            candidates, self.varied.mean_middle, splats.axes, self._noise,
+            candidates, self.varied.mean_middle, splats.axes, self._extents, self._noise,
             self.varied.opacity_low, self.varied.opacity_high, self._faint, self.varied.mean_radius,
             rotation, offset, forms.origin, camera_reach, rotation_reach, view, self.rules, self._errors,
             d, order, m, splats.antialiased, record, box, tiles, depth, delta, depth_error, state,

@@ -43,7 +43,7 @@ def _rotation_row(rotation, k):
 
 @njit(cache=True, error_model="numpy", inline="always")
 def _rotated(r, x, y, z, shift, shift_size, spread):
-    """``r . (x, y, z) + shift`` for exact x, y, z and a form ``shift`` (`gaussians._rotate`), widened by ``spread``."""
+    """``r . (x, y, z) + shift`` for exact x, y, z and a form ``shift``, widened (`form_projection.rotate`)."""
     a, b, c = abs(x), abs(y), abs(z)
     radius = r[9] * a + r[10] * b + r[11] * c + shift[3]
     radius += _COEFFICIENT * (r[12] * a + r[13] * b + r[14] * c + shift_size)
@@ -57,7 +57,7 @@ def _rotated(r, x, y, z, shift, shift_size, spread):
 
 @njit(cache=True, error_model="numpy", inline="always")
 def _clamped(a, low, high, limit_low, limit_high):
-    """``min(limit_high, max(-limit_low, a))`` given bounds of ``a`` (`gaussians._clamp_ratio`)."""
+    """``min(limit_high, max(-limit_low, a))`` given bounds of ``a`` (`wide_forms.clamp`)."""
     a = raised(a, -limit_low, low, high)
     low, high = max(low, -limit_low), max(high, -limit_low)
     a = raised((-a[0], -a[1], -a[2], a[3]), -limit_high, -high, -low)

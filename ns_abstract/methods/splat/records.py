@@ -34,9 +34,16 @@ REGION = 1.0 + 2.0**-30
 MEAN_X, MEAN_Y, OPACITY_LOW, OPACITY_HIGH, KAPPA, WILD, FAINT, SPREAD = range(8)
 FORMS = SPREAD + 5
 
+
+
+@njit(cache=True, error_model="numpy")
+def columns(count, m):
+    """Columns of a record of ``count`` forms of ``m`` monomials: whole cache lines."""
+    return -(-(FORMS + count * (m + 1)) // 8) * 8
+
+
 # Scratch of a block is flat: row r holds its lanes at r * LANES .. r * LANES + LANES - 1. With constant offsets the
 # compiler sees that rows do not overlap, so that long loops over lanes become vector code.
-ROWS = 124
 (
     # means minus origin; principal axes by column; float error of their covariance; |mean|, half-width of its range
     V0, V1, V2,
@@ -45,6 +52,8 @@ ROWS = 124
     M0, M1, M2, R0, R1, R2,
     # ends of the opacity's range, exponent at which it reaches the threshold
     OPLOW, OPHIGH, OPFAINT,
+    # largest standard deviation
+    EXTENT,
     # bounds that the projection leaves: depth, ratios, scaled covariance entries, determinant, half difference,
     # squared compensation, reach of the third row of rotation times axes
     ZLO, ZHI, ULO, UHI, VLO, VHI, ALO, AHI, CLO, CHI, BLO, BHI, DLO, DHI, LO, HI, DISC, DEEP0, DEEP1, DEEP2,
@@ -56,9 +65,18 @@ ROWS = 124
     ZLOW, ZHIGH, MXLO, MXHI, MYLO, MYHI, A, C, DET, EDET, SHARP, RHIGH, RLOW, ETA, EW, TAME,
     # what `regions` leaves: state, columns of the record, box and tiles
     GONE, KNOWN, LOWER, UPPER, BEND, LAST, BOX0, BOX1, BOX2, BOX3, T0, T1, T2, T3, T4, T5, T6, T7,
-    # forms of one parameter, four rows each: those of a record and the determinant
+    # a record, column by column; its forms are FP .. FK, four rows each where there is one parameter, and behind them
+    # the determinant
+    R_MEAN_X, R_MEAN_Y, R_OPACITY_LOW, R_OPACITY_HIGH, R_KAPPA, R_WILD, R_FAINT, R_SPREAD,
     FP, FQ, FS, FW1, FW2, FK, FD,
-) = (*range(0, 96 * LANES, LANES), *range(96 * LANES, 124 * LANES, 4 * LANES))  # fmt: skip
+) = (*range(0, 105 * LANES, LANES), *range(109 * LANES, 137 * LANES, 4 * LANES))  # fmt: skip
+RECORD = R_MEAN_X
+
+
+@njit(cache=True, error_model="numpy")
+def table_rows(width):
+    """Rows of the scratch for records of ``width`` columns."""
+    return RECORD // LANES + max(width, (FD - RECORD) // LANES + 4)
 
 
 @njit(cache=True, error_model="numpy")

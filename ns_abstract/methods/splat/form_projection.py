@@ -1,0 +1,221 @@
+"""Projection of Gaussians over cells of any number of parameters (design.md, G4-G9): forms of eight at a time."""
+
+from __future__ import annotations
+
+from numba import njit
+
+from ns_abstract.arithmetic.lanes import load8, store
+from ns_abstract.arithmetic.units import UNIT64
+from ns_abstract.arithmetic.wide_forms import (
+    add_product,
+    add_square,
+    bounds,
+    clamp,
+    clear,
+    logarithm,
+    multiply,
+    reach,
+    reciprocal,
+    reciprocal_square_root,
+    scale_add,
+    settle,
+    size,
+    square,
+)
+from ns_abstract.methods.splat import records as row
+from ns_abstract.methods.splat.records import LANES
+
+_COEFFICIENT = 8.0 * UNIT64
+_UP = 1.0 + 128.0 * UNIT64
+
+# numbers of the forms in the workspace; behind _LOG stands the logarithm's scratch
+(
+    _X, _Y, _Z, _RZ, _U, _V, _DX, _DY, _W0, _W1, _W2, _N0, _N1, _N2, _N3, _N4, _N5,
+    _A, _B, _C, _DET, _K, _T0, _T1, _T2, _P, _Q, _S, _LOG,
+) = range(29)  # fmt: skip
+WORKSPACE = 30
+
+
+@njit(cache=True, error_model="numpy")
+def rotate(w, rotation, r, x, y, z, offset, shifted, spread, out, d, order, m):
+    """Row ``r`` of the rotation times exact (x, y, z), plus the offset's if ``shifted``, widened by ``spread``.
+
+    ``rotation`` [rows, 9] and ``offset`` [rows, 3], both flat, are the pose's forms.
+    """
+    a, b, c = 3 * r, 3 * r + 1, 3 * r + 2
+    for k in range(m):
+        total = rotation[9 * k + a] * x + rotation[9 * k + b] * y + rotation[9 * k + c] * z
+        if shifted:
+            total = total + offset[3 * k + r]
+        store(w, out + 8 * k, total)
+    x, y, z = abs(x), abs(y), abs(z)
+    linear, curved = 9 * (m + 1), 9 * (m + 2)
+    size_a = abs(rotation[a]) + rotation[linear + a] + rotation[curved + a]
+    size_b = abs(rotation[b]) + rotation[linear + b] + rotation[curved + b]
+    size_c = abs(rotation[c]) + rotation[linear + c] + rotation[curved + c]
+    radius = rotation[9 * m + a] * x + rotation[9 * m + b] * y + rotation[9 * m + c] * z
+    rounding = size_a * x + size_b * y + size_c * z
+    if shifted:
+        radius = radius + offset[3 * m + r]
+        rounding = rounding + (abs(offset[r]) + offset[3 * (m + 1) + r] + offset[3 * (m + 2) + r])
+    store(w, out + 8 * m, (radius + _COEFFICIENT * rounding) * _UP + spread)
+    settle(w, out, d, order, m)
+
+
+@njit(cache=True, error_model="numpy", forceinline=True)
+def _keep_bounds(w, a, s, low, high, q, d, order, m):
+    """Write the bounds of a form to two rows; returns them."""
+    bottom, top = bounds(w, a, d, order, m)
+    store(s, low + q, bottom)
+    store(s, high + q, top)
+    return bottom, top
+
+
+@njit(cache=True, error_model="numpy", forceinline=True)
+def _pixels(w, a, z, ratio, focal, out, d, order, m):
+    """``focal a - (focal ratio) z``, which vanishes at the middle of the cell: a pixel offset times depth.
+
+    ``ratio`` is a form; returns the focal length times its centre.
+    """
+    # the pixel offset used later is exactly focal * ratio in float64
+    shift = focal * load8(w, ratio)
+    for k in range(m):
+        store(w, out + 8 * k, focal * load8(w, a + 8 * k) - shift * load8(w, z + 8 * k))
+    rounding = focal * reach(w, a, order, m) + abs(shift) * reach(w, z, order, m)
+    radius = focal * load8(w, a + 8 * m) + abs(shift) * load8(w, z + 8 * m) + _COEFFICIENT * rounding
+    store(w, out + 8 * m, radius * _UP)
+    settle(w, out, d, order, m)
+    return shift
+
+
+@njit(cache=True, error_model="numpy")
+def _lower(w, a, b, out, d, order, m):
+    """``out -= a b``."""
+    # the subtraction's own rounding, for what it starts from
+    store(w, out + 8 * m, load8(w, out + 8 * m) + _COEFFICIENT * reach(w, out, order, m))
+    add_product(w, a, b, -1.0, out, d, order, m)
+    settle(w, out, d, order, m)
+
+
+@njit(cache=True, error_model="numpy", forceinline=True)
+def _keep(w, a, s, f, q, m):
+    """Write form number ``f`` of a record."""
+    for k in range(m + 1):
+        store(s, row.FP + (f * (m + 1) + k) * LANES + q, load8(w, a + 8 * k))
+
+
+@njit(cache=True, error_model="numpy")
+def project_forms(w, s, rotation, offset, camera, rules, d, order, m, antialiased):
+    """`line_projection.project_line` for any number of parameters and order, and its `compensate_line`.
+
+    ``w`` is scratch for `WORKSPACE` forms; the forms of a record go to the rows from FP, m + 1 each.
+    """
+    one = size(m)
+    x, y, z, inverse, u, v = _X * one, _Y * one, _Z * one, _RZ * one, _U * one, _V * one
+    dx, dy, deep = _DX * one, _DY * one, _W2 * one
+    a, b, c, det, k, z2 = _A * one, _B * one, _C * one, _DET * one, _K * one, _T2 * one
+    t0, t1, p, across, root = _T0 * one, _T1 * one, _P * one, _Q * one, _S * one
+    eps2d, margin = rules[2], rules[6]
+    fx, fy, cx, cy, width, height = camera[0], camera[1], camera[2], camera[3], camera[4], camera[5]
+    for q in range(0, LANES, 8):
+        v0, v1, v2 = load8(s, row.V0 + q), load8(s, row.V1 + q), load8(s, row.V2 + q)
+        rotate(w, rotation, 0, v0, v1, v2, offset, True, load8(s, row.SX + q), x, d, order, m)
+        rotate(w, rotation, 1, v0, v1, v2, offset, True, load8(s, row.SY + q), y, d, order, m)
+        rotate(w, rotation, 2, v0, v1, v2, offset, True, load8(s, row.SZ + q), z, d, order, m)
+        _keep_bounds(w, z, s, row.ZLO, row.ZHI, q, d, order, m)
+        store(s, row.Z0 + q, load8(w, z))
+        # u = x / z, v = y / z
+        reciprocal(w, z, inverse, d, order, m)
+        multiply(w, x, inverse, u, d, order, m)
+        multiply(w, y, inverse, v, d, order, m)
+        u_low, u_high = _keep_bounds(w, u, s, row.ULO, row.UHI, q, d, order, m)
+        v_low, v_high = _keep_bounds(w, v, s, row.VLO, row.VHI, q, d, order, m)
+        store(s, row.X0 + q, _pixels(w, x, z, u, fx, dx, d, order, m))
+        store(s, row.Y0 + q, _pixels(w, y, z, v, fy, dy, d, order, m))
+        # the Jacobian's clamped ratios
+        if margin >= 0.0:
+            extra = margin * 0.5 * width / fx
+            clamp(w, u, -(cx / fx + extra), (width - cx) / fx + extra, u_low, u_high, d, order, m)
+            extra = margin * 0.5 * height / fy
+            clamp(w, v, -(cy / fy + extra), (height - cy) / fy + extra, v_low, v_high, d, order, m)
+        # w = R B, then n0 = w0 - u w2, n1 = w1 - v w2
+        none = 0.0 * v0
+        for column in range(3):
+            at = row.B00 + 3 * column * LANES + q
+            b0, b1, b2 = load8(s, at), load8(s, at + LANES), load8(s, at + 2 * LANES)
+            n0, n1 = (_N0 + column) * one, (_N3 + column) * one
+            rotate(w, rotation, 0, b0, b1, b2, offset, False, none, n0, d, order, m)
+            rotate(w, rotation, 1, b0, b1, b2, offset, False, none, n1, d, order, m)
+            rotate(w, rotation, 2, b0, b1, b2, offset, False, none, deep, d, order, m)
+            store(s, row.DEEP0 + column * LANES + q, reach(w, deep, order, m) + load8(w, deep + 8 * m))
+            _lower(w, u, deep, n0, d, order, m)
+            _lower(w, v, deep, n1, d, order, m)
+        # a' = fx^2 |n0|^2 + eps z^2, c' = fy^2 |n1|^2 + eps z^2, b' = fx fy n0.n1 (covariance times z^2)
+        square(w, z, z2, d, order, m)
+        clear(w, a, m)
+        clear(w, b, m)
+        clear(w, c, m)
+        for column in range(3):
+            n0, n1 = (_N0 + column) * one, (_N3 + column) * one
+            add_square(w, n0, a, d, order, m)
+            add_square(w, n1, c, d, order, m)
+            add_product(w, n0, n1, 1.0, b, d, order, m)
+        settle(w, a, d, order, m)
+        settle(w, b, d, order, m)
+        settle(w, c, d, order, m)
+        scale_add(w, b, fx * fy, b, 0.0, b, d, order, m)
+        # det' = fx^2 fy^2 |n0 x n1|^2 + eps z^2 (fx^2 |n0|^2 + fy^2 |n1|^2) + eps^2 z^4, sums of squares only
+        clear(w, k, m)
+        for column in range(3):
+            i, j = (column + 1) % 3, (column + 2) % 3
+            clear(w, t0, m)
+            add_product(w, (_N0 + i) * one, (_N3 + j) * one, 1.0, t0, d, order, m)
+            add_product(w, (_N0 + j) * one, (_N3 + i) * one, -1.0, t0, d, order, m)
+            settle(w, t0, d, order, m)
+            add_square(w, t0, k, d, order, m)
+        settle(w, k, d, order, m)
+        scale_add(w, k, (fx * fy) * (fx * fy), k, 0.0, k, d, order, m)
+        scale_add(w, a, fx * fx, c, fy * fy, t0, d, order, m)
+        scale_add(w, t0, eps2d, z2, eps2d * eps2d, t1, d, order, m)
+        scale_add(w, k, 1.0, k, 0.0, det, d, order, m)
+        add_product(w, t1, z2, 1.0, det, d, order, m)
+        settle(w, det, d, order, m)
+        scale_add(w, a, fx * fx, z2, eps2d, a, d, order, m)
+        scale_add(w, c, fy * fy, z2, eps2d, c, d, order, m)
+        _keep_bounds(w, a, s, row.ALO, row.AHI, q, d, order, m)
+        _keep_bounds(w, c, s, row.CLO, row.CHI, q, d, order, m)
+        _keep_bounds(w, b, s, row.BLO, row.BHI, q, d, order, m)
+        _keep_bounds(w, det, s, row.DLO, row.DHI, q, d, order, m)
+        # (a' - c')/2, for the radius
+        scale_add(w, a, 0.5, c, -0.5, t1, d, order, m)
+        _keep_bounds(w, t1, s, row.LO, row.HI, q, d, order, m)
+        # S' = 1/sqrt(c'), P' = sqrt(c'/det'), Q' = P' b'/c'
+        reciprocal_square_root(w, c, root, d, order, m)
+        reciprocal_square_root(w, det, t0, d, order, m)
+        multiply(w, c, root, t1, d, order, m)
+        multiply(w, t1, t0, p, d, order, m)
+        multiply(w, b, root, t0, d, order, m)
+        multiply(w, t0, root, t1, d, order, m)
+        multiply(w, p, t1, across, d, order, m)
+        if antialiased:
+            # K = -log(compensation), compensation^2 = |n0 x n1|^2 / det'
+            reciprocal(w, det, t0, d, order, m)
+            multiply(w, k, t0, t1, d, order, m)
+            low, _ = bounds(w, t1, d, order, m)
+            store(s, row.DISC + q, low)
+            logarithm(w, t1, _LOG * one, d, order, m)
+            scale_add(w, _LOG * one, -0.5, _LOG * one, 0.0, k, d, order, m)
+            _keep(w, k, s, 5, q, m)
+        # P = P' z, Q = Q' z, S = S' z, W1 = P' X^ - Q' Y^, W2 = S' Y^
+        multiply(w, p, z, t0, d, order, m)
+        _keep(w, t0, s, 0, q, m)
+        multiply(w, across, z, t0, d, order, m)
+        _keep(w, t0, s, 1, q, m)
+        multiply(w, root, z, t0, d, order, m)
+        _keep(w, t0, s, 2, q, m)
+        clear(w, t0, m)
+        add_product(w, p, dx, 1.0, t0, d, order, m)
+        add_product(w, across, dy, -1.0, t0, d, order, m)
+        _keep(w, t0, s, 3, q, m)
+        multiply(w, root, dy, t0, d, order, m)
+        _keep(w, t0, s, 4, q, m)
