@@ -86,6 +86,18 @@ def advanced(typingctx, elements, count):  # pyright: ignore[reportRedeclaration
 
 
 @intrinsic
+def taken(typingctx, counter):  # pyright: ignore[reportRedeclaration]
+    """What the int64 that the `pointer` leads to was before it grew by 1; no two threads get the same."""
+    if counter != types.CPointer(types.int64):
+        raise TypeError(f"taken() takes the pointer to an int64 array, not {counter}")
+
+    def codegen(context, builder, signature, args):
+        return builder.atomic_rmw("add", args[0], ir.IntType(64)(1), "monotonic")
+
+    return types.int64(counter), codegen
+
+
+@intrinsic
 def lowest_bit(typingctx, mask):  # pyright: ignore[reportRedeclaration]
     """Number of the lowest bit that is set in an int64 that is not 0."""
 
@@ -117,6 +129,11 @@ if config.DISABLE_JIT:  # pyright: ignore[reportAttributeAccessIssue]
     def advanced(elements, count):
         """The elements without the first ``count``."""
         return elements[count:]
+
+    def taken(counter):
+        """What the first element was before it grew by 1."""
+        counter[0] += 1
+        return int(counter[0]) - 1
 
     def lowest_bit(mask):
         """Number of the lowest bit that is set."""

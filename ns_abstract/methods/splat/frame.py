@@ -14,6 +14,7 @@ from ns_abstract.arithmetic.units import Arithmetic
 from ns_abstract.methods.splat.activate import Splats
 from ns_abstract.methods.splat.bounds import SplatBounds
 from ns_abstract.methods.splat.constants import Rasteriser
+from ns_abstract.methods.splat.lists import touching
 from ns_abstract.methods.splat.render import Renderer
 from ns_abstract.methods.splat.variations import VariedSplats
 from ns_abstract.sets.box import ParameterBox
@@ -169,13 +170,9 @@ class SplatFrame:
             return None
         if tiles.size == self.tile_count:
             return within.visible
-        mask = np.zeros((self.down + 1, self.across + 1), np.int32)
-        rows, columns = tiles // self.across, tiles % self.across
-        mask[rows + 1, columns + 1] = 1
-        sums = mask.cumsum(0).cumsum(1)
-        x0, x1, y0, y1 = within.reach.T
-        hits = sums[y1, x1] - sums[y0, x1] - sums[y1, x0] + sums[y0, x0]
-        return within.visible[hits > 0]
+        mask = np.zeros(self.tile_count, np.uint8)
+        mask[tiles] = 1
+        return within.visible[touching(np.arange(within.visible.size), within.reach, mask, self.across)]
 
     @cached_property
     def _middle_picture(self) -> np.ndarray:

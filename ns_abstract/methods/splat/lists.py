@@ -34,6 +34,33 @@ def _sort_ties(order, keys):
 
 
 @njit(cache=True, error_model="numpy")
+def touching(indices, tiles, wanted, tiles_x):
+    """Those of ``indices`` whose range of ``tiles`` holds one of which ``wanted`` is not 0; see `tile_lists`."""
+    out = np.empty_like(indices)
+    count = 0
+    for i in indices:
+        hit = False
+        for ty in range(tiles[i, 2], tiles[i, 3]):
+            for tx in range(tiles[i, 0], tiles[i, 1]):
+                hit = hit or wanted[ty * tiles_x + tx] != 0
+            if hit:
+                break
+        if hit:
+            out[count] = i
+            count += 1
+    return out[:count]
+
+
+@njit(cache=True, error_model="numpy")
+def longest_first(wanted, offsets):
+    """Positions in ``wanted`` (tile numbers), those with the longest lists first: threads end together."""
+    lengths = np.empty(wanted.size, np.int64)
+    for k in range(wanted.size):
+        lengths[k] = offsets[wanted[k]] - offsets[wanted[k] + 1]
+    return np.argsort(lengths, kind="mergesort")
+
+
+@njit(cache=True, error_model="numpy")
 def tile_lists(order, tiles, wanted, tiles_x):
     """Offsets [T + 1] and entries of the lists of the T tiles whose ``wanted`` is not 0.
 

@@ -12,7 +12,7 @@ import math
 import numpy as np
 from numba import njit, prange
 
-from ns_abstract.arithmetic.compiled import advanced, borrowed, lowest_bit, pointer, prefetch, signed
+from ns_abstract.arithmetic.compiled import advanced, borrowed, lowest_bit, pointer, prefetch, signed, taken
 from ns_abstract.arithmetic.elementary import EXP_RELATIVE_ERROR, exp_kernel, fma
 from ns_abstract.arithmetic.lanes import (
     bits,
@@ -27,7 +27,7 @@ from ns_abstract.arithmetic.lanes import (
     where,
 )
 from ns_abstract.arithmetic.units import UNIT64
-from ns_abstract.methods.splat.lists import AHEAD, BLOCK, PIXELS, block_lists
+from ns_abstract.methods.splat.lists import AHEAD, BLOCK, PIXELS, block_lists, longest_first
 from ns_abstract.methods.splat.records import (
     FAINT,
     FORMS,
@@ -1580,11 +1580,12 @@ def _aligned(size):
 
 @njit(cache=True, error_model="numpy")
 def _pixel_worker(
-    thread, wanted, offsets, entries, record_, box_, tiles_, depth_, delta_, depth_error_, colors_, color_radius,
-    slope_, direction_, camera_, rules_, errors_, background_colors, negligible, pair_limit, d, order, m, antialiased,
-    threads, lower_, upper_, linear_, slopes_, statistics_, marks_,
+    thread, sequence_, counter_, wanted, offsets, entries, record_, box_, tiles_, depth_, delta_, depth_error_, colors_,
+    color_radius, slope_, direction_, camera_, rules_, errors_, background_colors, negligible, pair_limit, d, order, m,
+    antialiased, lower_, upper_, linear_, slopes_, statistics_, marks_,
 ):  # fmt: skip
-    """Every ``threads``-th tile, from number ``thread``; see `pixel_stage`."""
+    """One thread's tiles: the next of ``sequence`` that none has taken yet; see `pixel_stage`."""
+    sequence, counter = borrowed(sequence_), pointer(counter_)
     record, box, tiles, depth = borrowed(record_), borrowed(box_), borrowed(tiles_), borrowed(depth_)
     delta, depth_error, colors, slope = borrowed(delta_), borrowed(depth_error_), borrowed(colors_), borrowed(slope_)
     direction, camera, rules, errors = borrowed(direction_), borrowed(camera_), borrowed(rules_), borrowed(errors_)
@@ -1626,7 +1627,11 @@ def _pixel_worker(
     pairs_ = np.empty((pair_limit, 2), np.int64)
     block_offsets = np.empty(blocks * blocks + 1, np.int64)
     block_entries = np.empty(4096, np.uint32)
-    for number in range(thread, wanted.size, threads):
+    while True:
+        turn = taken(counter)
+        if turn >= sequence.size:
+            break
+        number = sequence[turn]
         tile = wanted[number]
         tile_x = tile % tiles_x
         tile_y = tile // tiles_x
@@ -1695,9 +1700,11 @@ def pixel_stage(
         statistics: [threads, 5] blocks, layers, uncertain pairs, blocks where too many pairs were
             uncertain, pixels with results that were not numbers.
     """
+    sequence = longest_first(wanted, offsets)
+    counter = np.zeros(1, np.int64)
     for thread in prange(threads):
         _pixel_worker(
-            thread, wanted, offsets, entries, record, box, tiles, depth, delta, depth_error, colors, color_radius,
-            slope, direction, camera, rules, errors, background, negligible, pair_limit, d, order, m, antialiased,
-            threads, lower, upper, linear, slopes, statistics, marks,
+            thread, sequence, counter, wanted, offsets, entries, record, box, tiles, depth, delta, depth_error, colors,
+            color_radius, slope, direction, camera, rules, errors, background, negligible, pair_limit, d, order, m,
+            antialiased, lower, upper, linear, slopes, statistics, marks,
         )  # fmt: skip

@@ -11,12 +11,20 @@ import math
 import numpy as np
 from numba import get_num_threads, njit, prange
 
-from ns_abstract.arithmetic.compiled import borrowed
+from ns_abstract.arithmetic.compiled import borrowed, pointer, taken
 from ns_abstract.arithmetic.elementary import exp_kernel
 from ns_abstract.methods.splat.activate import Splats
 from ns_abstract.methods.splat.colors import sh_color
 from ns_abstract.methods.splat.constants import Rasteriser, rules_array
-from ns_abstract.methods.splat.lists import BLOCK, PIXELS, block_lists, depth_order, tile_lists
+from ns_abstract.methods.splat.lists import (
+    BLOCK,
+    PIXELS,
+    block_lists,
+    depth_order,
+    longest_first,
+    tile_lists,
+    touching,
+)
 from ns_abstract.sets.path import Camera
 from ns_abstract.sets.tiles import assemble, tile_grid
 
@@ -194,9 +202,10 @@ def _add_gaussian(record, i, ox, oy, n, state, alpha_min, alpha_max, stop):
 
 @njit(cache=True, error_model="numpy")
 def _rasterise_worker(
-    thread, wanted, offsets, entries, record_, box_, camera, rules, background, tile, threads, image_
+    sequence_, counter_, wanted, offsets, entries, record_, box_, camera, rules, background, tile, image_
 ):  # fmt: skip
-    """Every ``threads``-th tile, from number ``thread``; see `_rasterise`."""
+    """One thread's tiles: the next of ``sequence`` that none has taken yet; see `_rasterise`."""
+    sequence, counter = borrowed(sequence_), pointer(counter_)
     record, box, image = borrowed(record_), borrowed(box_), borrowed(image_)
     width, height = camera[4], camera[5]
     alpha_min, alpha_max, stop = rules[7], rules[8], rules[9]
@@ -206,7 +215,11 @@ def _rasterise_worker(
     state = borrowed(state_)
     block_offsets = np.empty(blocks * blocks + 1, np.int64)
     block_entries = np.empty(4096, np.uint32)
-    for number in range(thread, wanted.size, threads):
+    while True:
+        turn = taken(counter)
+        if turn >= sequence.size:
+            break
+        number = sequence[turn]
         t = wanted[number]
         left = (t % tiles_x) * tile
         above = (t // tiles_x) * tile
@@ -257,9 +270,11 @@ def _rasterise_worker(
 @njit(cache=True, parallel=True, error_model="numpy")
 def _rasterise(wanted, offsets, entries, record, box, camera, rules, background, tile, threads, image):
     """Blend the tiles ``wanted`` into ``image`` [t, tile, tile, 3]."""
-    for thread in prange(threads):
+    sequence = longest_first(wanted, offsets)
+    counter = np.zeros(1, np.int64)
+    for _ in prange(threads):
         _rasterise_worker(
-            thread, wanted, offsets, entries, record, box, camera, rules, background, tile, threads, image
+            sequence, counter, wanted, offsets, entries, record, box, camera, rules, background, tile, image
         )
 
 
@@ -321,10 +336,12 @@ class Renderer:
             self._depth, self._visible,
         )  # fmt: skip
         across, down = tile_grid(camera, self.side)
-        order = depth_order(np.flatnonzero(self._visible), self._depth)
         mask = np.zeros(across * down, np.uint8)
         mask[wanted] = 1
-        return tile_lists(order, self._tiles, mask, across)
+        seen = np.flatnonzero(self._visible)
+        if not mask.all():
+            seen = touching(seen, self._tiles, mask, across)
+        return tile_lists(depth_order(seen, self._depth), self._tiles, mask, across)
 
     def _blend(
         self,
