@@ -19,6 +19,7 @@ from ns_abstract.arithmetic.lanes import (
     maximum,
     minimum,
     root,
+    scatter_columns,
     spans,
     store,
     store_columns,
@@ -140,6 +141,26 @@ def test_memory() -> None:
     np.testing.assert_array_equal(four, [7.0, *x[7:11], 7.0])
     assert eight == sum(1 << k for k in range(8) if x[k] < x[8 + k])
     assert few == sum(1 << k for k in range(4) if x[k] >= 0.0)
+
+
+@njit(error_model="numpy")
+def scattered(x_, places_, out_):
+    x, places, out = pointer(x_), pointer(places_), pointer(out_)
+    scatter_columns(
+        out, places, 2, 10, 1, load8(x, 0), load8(x, 8), load8(x, 16), load8(x, 24), load8(x, 32), load8(x, 40),
+        load8(x, 48), load8(x, 56),
+    )  # fmt: skip
+
+
+def test_scattered_columns() -> None:
+    x = np.random.default_rng(4).standard_normal(64)
+    places = np.array([-9, -9, 7, 0, 3, 9, 1, 8, 4, 4])
+    x.reshape(8, 8)[:, 7] = x.reshape(8, 8)[:, 6]
+    out = np.full((10, 10), 7.0)
+    scattered(x, places, out.reshape(-1))
+    expected = np.full((10, 10), 7.0)
+    expected[places[2:], 1:9] = x.reshape(8, 8).T
+    np.testing.assert_array_equal(out, expected)
 
 
 def test_signed() -> None:

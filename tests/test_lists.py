@@ -1,0 +1,99 @@
+"""Lists of tiles: which Gaussians, in which order, and which thread works on which tile."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from numba import get_num_threads, njit, prange
+from test_bounds import TURN, camera, moves, scene
+
+from ns_abstract.arithmetic.compiled import pointer, taken
+from ns_abstract.arithmetic.units import REAL
+from ns_abstract.methods.splat.constants import GSPLAT_1_4_0
+from ns_abstract.methods.splat.frame import SplatFrame
+from ns_abstract.methods.splat.lists import depth_order, longest_first, tile_lists, touching
+from ns_abstract.sets.poses import PoseSet
+
+ACROSS, DOWN = 5, 4
+
+
+def ranges(count: int, seed: int) -> np.ndarray:
+    """Ranges of tiles [count, 4], some of them empty."""
+    generator = np.random.default_rng(seed)
+    columns = np.sort(generator.integers(0, ACROSS + 1, (count, 2)), axis=1)
+    rows = np.sort(generator.integers(0, DOWN + 1, (count, 2)), axis=1)
+    return np.concatenate([columns, rows], axis=1).astype(np.int32)
+
+
+def held(tiles: np.ndarray, wanted: np.ndarray) -> set[int]:
+    """The wanted tiles in one range."""
+    x0, x1, y0, y1 = tiles
+    return {t for y in range(y0, y1) for x in range(x0, x1) if wanted[t := y * ACROSS + x]}
+
+
+@pytest.mark.parametrize("share", [0.0, 0.15, 1.0])
+def test_touching_is_what_the_lists_hold(share):
+    tiles = ranges(300, 1)
+    wanted = (np.random.default_rng(2).uniform(size=ACROSS * DOWN) < share).astype(np.uint8)
+    indices = np.random.default_rng(3).permutation(300)[:200]
+    found = touching(indices, tiles, wanted, ACROSS)
+    assert found.tolist() == [i for i in indices if held(tiles[i], wanted)]
+    _, entries = tile_lists(indices, tiles, wanted, ACROSS)
+    assert set(entries.tolist()) == set(found.tolist())
+
+
+def test_lists_are_by_depth_and_equal_depths_by_index():
+    tiles, generator = ranges(300, 4), np.random.default_rng(5)
+    depth = generator.integers(0, 40, 300).astype(np.float64)
+    visible = np.flatnonzero(generator.uniform(size=300) < 0.7)
+    wanted = np.ones(ACROSS * DOWN, np.uint8)
+    offsets, entries = tile_lists(depth_order(visible, depth), tiles, wanted, ACROSS)
+    for t in range(ACROSS * DOWN):
+        mine = [i for i in visible.tolist() if t in held(tiles[i], wanted)]
+        assert entries[offsets[t] : offsets[t + 1]].tolist() == sorted(mine, key=lambda i: (depth[i], i))
+
+
+def test_longest_lists_first():
+    offsets = np.array([0, 3, 3, 10, 11, 18])
+    wanted = np.array([0, 1, 2, 4])
+    assert longest_first(wanted, offsets).tolist() == [2, 3, 0, 1]
+
+
+@njit(parallel=True)
+def _take(counter, owners, threads):
+    for thread in prange(threads):
+        while True:
+            number = taken(pointer(counter))
+            if number >= owners.size:
+                break
+            owners[number] += 1 + 1000 * thread
+
+
+def test_every_number_is_taken_once():
+    owners = np.zeros(20_000, np.int64)
+    _take(np.zeros(1, np.int64), owners, get_num_threads())
+    assert (owners % 1000 == 1).all()
+
+
+def test_partial_pictures_are_parts_of_the_whole():
+    """Renders and bounds of some tiles are those of the whole picture, bit for bit."""
+    generator = np.random.default_rng(6)
+    splats = scene(
+        *(
+            {"mean": (*place, depth), "scale": 0.2, "opacity": 0.8, "quat": TURN, "color": color}
+            for place, depth, color in zip(
+                generator.uniform(-3.0, 3.0, (400, 2)), generator.uniform(-9.0, -4.0, 400),
+                generator.uniform(size=(400, 3)), strict=True,
+            )
+        ),
+        background=(0.3, 0.1, 0.8),
+    )  # fmt: skip
+    poses = PoseSet.around(camera(70, 50, 50.0), moves(x=0.02, yaw=0.01))
+    frame = SplatFrame(splats, GSPLAT_1_4_0, REAL, poses)
+    every, some = np.arange(frame.tile_count), np.array([3, 7, 8, 19])
+    whole = frame.bound(poses.box, every)
+    for within in (None, whole.context):
+        part = frame.bound(poses.box, some, within and frame.bound(poses.box, some, within).context)
+        assert np.array_equal(part.lower, whole.lower[some]) and np.array_equal(part.upper, whole.upper[some])
+    assert np.array_equal(frame.render(poses.box.middle, some), frame.render(poses.box.middle)[some])
+    assert np.ptp(whole.lower[some]) > 0.1
