@@ -40,7 +40,10 @@ FORM_PROJECTION = "methods/splat/form_projection.py"
 WIDE = "arithmetic/wide_forms.py"
 LINE = "methods/splat/line_projection.py"
 RECORDS = "methods/splat/records.py"
-PIXELS = "methods/splat/pixels.py"
+ALPHAS = "methods/splat/alphas.py"
+LAYERS = "methods/splat/layers.py"
+BLEND = "methods/splat/blend.py"
+BLOCK = "methods/splat/block.py"
 COLORS = "methods/splat/colors.py"
 LINE_COLORS = "methods/splat/line_colors.py"
 
@@ -256,7 +259,7 @@ MUTANTS = (
         "test_bounds.py::test_near_plane[2]",
     ),
     Mutant(
-        "tile cut-off taken for sure", PIXELS,
+        "tile cut-off taken for sure", LAYERS,
         "sure = core[0] <= tile_x and tile_x < core[1] and core[2] <= tile_y and tile_y < core[3]",
         "sure = True",
         "test_bounds.py::test_tile_cut[2]",
@@ -335,7 +338,7 @@ MUTANTS = (
         "test_bounds.py::test_reach_counts_every_error",
     ),
     Mutant(
-        "pixels are blended as others", PIXELS,
+        "pixels are blended as others", BLEND,
         "        row, column = top_row + q // BLOCK, left + q % BLOCK",
         "        row, column = top_row + q // BLOCK, left + BLOCK - 1 - q % BLOCK",
         "test_bounds.py::test_one_layer[2]",
@@ -348,12 +351,12 @@ MUTANTS = (
     ),
     # pixels
     Mutant(
-        "order swap is ignored", PIXELS,
+        "order swap is ignored", LAYERS,
         "    return not (abs(center) > (spread + radius)", "    return False and not (abs(center) > (spread + radius)",
         "test_bounds.py::test_depth_swap[2]",
     ),
     Mutant(
-        "order swap raises but does not lower", PIXELS,
+        "order swap raises but does not lower", BLEND,
         "            p0 = p0 + 0.5 * (rises - falls)\n"
         "            r = r + 0.5 * (rises + falls)\n"
         "            bottom = bottom - falls\n",
@@ -362,91 +365,91 @@ MUTANTS = (
         "test_bounds.py::test_depth_swap[2]",
     ),
     Mutant(
-        "equal depths keep the list's order", PIXELS,
-        "return not (abs(center) > (spread + radius) * _UP + rounding + depth_error[i] + depth_error[j])",
-        "return abs(center) < (spread + radius) * _UP",
+        "equal depths keep the list's order", LAYERS,
+        "return not (abs(center) > (spread + radius) * UP + rounding + depth_error[i] + depth_error[j])",
+        "return abs(center) < (spread + radius) * UP",
         "test_bounds.py::test_ties[2]",
     ),
     Mutant(
-        "antichain sorted the wrong way", PIXELS,
+        "antichain sorted the wrong way", BLEND,
         "keys[e] = palette[ends] if side == 0 else -palette[ends + 4]",
         "keys[e] = -palette[ends] if side == 0 else palette[ends + 4]",
         "test_bounds.py::test_three_layers_swap[1]",
     ),
     Mutant(
-        "layers that share a pixel are taken for apart", PIXELS,
+        "layers that share a pixel are taken for apart", LAYERS,
         "shown & int(theirs) == 0", "shown & int(theirs) & 1 == 0",
         "test_bounds.py::test_depth_swap[2]",
     ),
     Mutant(
-        "order swap counts at the first pixel only", PIXELS,
+        "order swap counts at the first pixel only", BLEND,
         "both = drawn[front] & drawn[back]", "both = drawn[front] & drawn[back] & 1",
         "test_bounds.py::test_depth_swap[2]",
     ),
     Mutant(
-        "1/255 is not a jump", PIXELS,
+        "1/255 is not a jump", ALPHAS,
         "jump = where(skips, minimum(alpha_min_high, a_high), 0.0)", "jump = 0.0 * a_high",
         "test_bounds.py::test_alpha_threshold[2]",
     ),
     Mutant(
-        "1/255 does not make 0 possible", PIXELS,
+        "1/255 does not make 0 possible", ALPHAS,
         "a_low = where(skips, 0.0, sure * a_low)", "a_low = sure * a_low",
         "test_bounds.py::test_alpha_threshold[2]",
     ),
     Mutant(
-        "0.999 clamp missing from the interval", PIXELS,
+        "0.999 clamp missing from the interval", ALPHAS,
         "    a_low = minimum(a_low, alpha_max * (1.0 - 2.0 * unit))\n", "",
         "test_bounds.py::test_alpha_clamp[2]",
     ),
     Mutant(
-        "0.999 clamp missing from the form", PIXELS,
+        "0.999 clamp missing from the form", ALPHAS,
         "excess = maximum(0.0, a_high - alpha_max)", "excess = 0.0 * a_high",
         "test_bounds.py::test_alpha_clamp_crossed[2]",
     ),
     Mutant(
-        "stop ignored", PIXELS,
+        "stop ignored", LAYERS,
         "                if alone and t_low <= stop_high:", "                if False and t_low <= stop_high:",
         "test_bounds.py::test_stop[2]",
     ),
     Mutant(
-        "stop drops layers that may be drawn", PIXELS,
+        "stop drops layers that may be drawn", LAYERS,
         "                if alone and t_high <= stop_low:", "                if alone and t_low <= stop_low:",
         "test_bounds.py::test_stop[2]",
     ),
     Mutant(
-        "stop ignored where orders are uncertain", PIXELS,
+        "stop ignored where orders are uncertain", LAYERS,
         "            if t_low > stop_high:\n                continue\n            before = e",
         "            if True:\n                continue\n            before = e",
         "test_bounds.py::test_stop_and_swap[2]",
     ),
     Mutant(
-        "remainder of the exponential's fit is dropped", PIXELS,
+        "remainder of the exponential's fit is dropped", ALPHAS,
         "    fit = fma(1.2e-4 * x, x2 * x2, fma(1.0 - quadratic, 2.0 * x * j2, fit))", "    fit = 0.0 * x",
         "test_bounds.py::test_linear[x-1]",
     ),
     Mutant(
-        "exponent's vertex counted for the wrong end", PIXELS,
+        "exponent's vertex counted for the wrong end", BLOCK,
         "bottom = where(inside, minimum(bottom, vertex), bottom)", "bottom = top",
         "test_bounds.py::test_one_layer[2]",
     ),
     Mutant(
-        "blend picks alpha's other end", PIXELS,
+        "blend picks alpha's other end", BLEND,
         "fma(where(v > 0.0, a_high, a_low), v, high)", "fma(where(v > 0.0, a_low, a_high), v, high)",
         "test_bounds.py::test_one_layer[2]",
     ),
     Mutant(
-        "blend drops the radius of alpha", PIXELS,
-        "fma(layers[at + _FORM + 3], size, fma(_ROUND, fma(1.0 + a1 + a2, size, abs(p0)), added))",
-        "fma(_ROUND, fma(1.0 + a1 + a2, size, abs(p0)), added)",
+        "blend drops the radius of alpha", BLEND,
+        "fma(layers[at + FORM + 3], size, fma(ROUND, fma(1.0 + a1 + a2, size, abs(p0)), added))",
+        "fma(ROUND, fma(1.0 + a1 + a2, size, abs(p0)), added)",
         "test_bounds.py::test_linear[x-2]",
     ),
     Mutant(
-        "pixels that the batch has hidden take further layers", PIXELS,
+        "pixels that the batch has hidden take further layers", LAYERS,
         "            if live != begun:\n", "            if False:\n",
         "test_bounds.py::test_stop_everywhere[2]",
     ),
     Mutant(
-        "columns that a Gaussian may reach without the forms' spread", PIXELS,
+        "columns that a Gaussian may reach without the forms' spread", LAYERS,
         "half = (root(maximum(rest, 0.0)) + spread1) * inverse * _ROOM", "half = root(maximum(rest, 0.0)) * inverse",
         "test_bounds.py::test_alpha_threshold[2]",
     ),

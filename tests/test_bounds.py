@@ -14,9 +14,9 @@ import pytest
 
 from ns_abstract.arithmetic.units import FLOAT32, REAL
 from ns_abstract.methods.splat.activate import Splats, rotation_matrices
+from ns_abstract.methods.splat.blend import _sort as sort_group
 from ns_abstract.methods.splat.bounds import SplatBounds
 from ns_abstract.methods.splat.constants import GSPLAT_1_4_0
-from ns_abstract.methods.splat.pixels import _sort as sort_group
 from ns_abstract.methods.splat.records import FORMS, SPREAD, WILD, columns
 from ns_abstract.methods.splat.render import Renderer
 from ns_abstract.sets.box import ParameterBox
