@@ -206,9 +206,9 @@ def _sharpened(
 def _blend_line(layers, width, lists, palette, forms, begin, end, moves, background, t):
     """Blend the list entries [begin, end) of a pixel back to front, as forms and as intervals (design.md, B7).
 
-    For one parameter and order 2. Lanes are the channels; ``background`` [4] and ``palette`` (`layers._set_colors`, ``forms``
-    rows before the radius) have a fourth one of zeros. ``t`` [m, 4] receives the polynomials; returns their radii, not
-    yet rounded up, the intervals' ends, and the range of all colours.
+    For one parameter and order 2. Lanes are the channels; ``background`` [4] and ``palette`` (`layers._set_colors`,
+    ``forms`` rows before the radius) have a fourth one of zeros. ``t`` [m, 4] receives the polynomials; returns their
+    radii, not yet rounded up, the intervals' ends, and the range of all colours.
     """
     moving = forms > 1
     p0 = load4(background, 0)
