@@ -45,6 +45,7 @@ LAYERS = "methods/splat/layers.py"
 BLEND = "methods/splat/blend.py"
 BLOCK = "methods/splat/block.py"
 COLORS = "methods/splat/colors.py"
+FORM_COLORS = "methods/splat/form_colors.py"
 LINE_COLORS = "methods/splat/line_colors.py"
 
 
@@ -294,8 +295,8 @@ MUTANTS = (
     ),
     Mutant(
         "no compensation when antialiased", FORM_PROJECTION,
-        "scale_add(w, _LOG * one, -0.5, _LOG * one, 0.0, k, d, order, m)",
-        "scale_add(w, _LOG * one, 0.0, _LOG * one, 0.0, k, d, order, m)",
+        "scale_add(w, _LOG * one, -0.5, _LOG * one, 0.0, 0.0, k, d, order, m)",
+        "scale_add(w, _LOG * one, 0.0, _LOG * one, 0.0, 0.0, k, d, order, m)",
         "test_bounds.py::test_antialiased[1]",
     ),
     Mutant(
@@ -455,13 +456,13 @@ MUTANTS = (
     ),
     # colours
     Mutant(
-        "colour forms lose their radius", COLORS,
-        "target[m, q] = (target[m, q] + w * form[m, q] + ", "target[m, q] = (target[m, q] + ",
+        "colour forms lose their radius", FORM_COLORS,
+        "+ weight * load8(w, form + 8 * m) + rounding", "+ rounding",
         "test_bounds.py::test_view_dependence_alone[1]",
     ),
     Mutant(
-        "wrong sign in band 1", COLORS,
-        "scale_add(work[7], -0.48860251190292, work[7]", "scale_add(work[7], 0.48860251190292, work[7]",
+        "wrong sign in band 1", FORM_COLORS,
+        "_scaled(w, y, -0.48860251190292,", "_scaled(w, y, 0.48860251190292,",
         "test_bounds.py::test_view_dependence[1-1]",
     ),
     Mutant(

@@ -29,7 +29,7 @@ def _square(w, a, b, out, d, order, m):
 
 @njit(error_model="numpy")
 def _sum(w, a, b, out, d, order, m):
-    wide_forms.scale_add(pointer(w), a, 0.1, b, -0.7, out, d, order, m)
+    wide_forms.scale_add(pointer(w), a, 0.1, b, -0.7, 0.3, out, d, order, m)
 
 
 @njit(error_model="numpy")
@@ -124,7 +124,10 @@ def same(found: FormArray, kernel: FormArray) -> bool:
 
 PAIRS = {
     "multiply": (_product, *BINARY["mul"]),
-    "scale_add": (_sum, lambda a, b: a * 0.1 - b * 0.7, lambda x, y: rational(0.1) * x + rational(-0.7) * y),
+    "scale_add": (
+        _sum, lambda a, b: a * 0.1 - b * 0.7 + 0.3,
+        lambda x, y: rational(0.1) * x + rational(-0.7) * y + rational(0.3),
+    ),
     "square": (_square, lambda a, b: a.square(), lambda x, y: x * x),
     "sum of products": (
         _sum_of_products, lambda a, b: a * b - b * b + a.square(), lambda x, y: x * y - y * y + x * x,

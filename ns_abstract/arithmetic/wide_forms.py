@@ -56,11 +56,12 @@ def settle(w, out, d, order, m):
 
 
 @njit(cache=True, error_model="numpy")
-def scale_add(w, a, s, b, t, out, d, order, m):
-    """`forms.scale_add` without a shift; ``out`` may be ``a`` or ``b``."""
-    magnitude = abs(s) * reach(w, a, order, m) + abs(t) * reach(w, b, order, m)
+def scale_add(w, a, s, b, t, shift, out, d, order, m):
+    """`forms.scale_add`; ``out`` may be ``a`` or ``b``."""
+    magnitude = abs(s) * reach(w, a, order, m) + abs(t) * reach(w, b, order, m) + abs(shift)
     radius = abs(s) * load8(w, a + 8 * m) + abs(t) * load8(w, b + 8 * m) + _COEFFICIENT * magnitude
-    for k in range(m):
+    store(w, out, s * load8(w, a) + t * load8(w, b) + shift)
+    for k in range(1, m):
         store(w, out + 8 * k, s * load8(w, a + 8 * k) + t * load8(w, b + 8 * k))
     store(w, out + 8 * m, radius * _UP + _TINY)
     settle(w, out, d, order, m)

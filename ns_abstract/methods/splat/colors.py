@@ -7,17 +7,11 @@ import math
 import numpy as np
 from numba import njit, prange
 
-from ns_abstract.arithmetic.compiled import borrowed
-from ns_abstract.arithmetic.forms import (
-    bounds,
-    clamp_below,
-    multiply,
-    reciprocal_square_root,
-    scale_add,
-    settle,
-    square,
-)
+from ns_abstract.arithmetic.compiled import advanced, borrowed, pointer
+from ns_abstract.arithmetic.forms import bounds, clamp_below, settle
 from ns_abstract.arithmetic.units import UNIT64
+from ns_abstract.arithmetic.wide_forms import size
+from ns_abstract.methods.splat.form_colors import WORKSPACE, form_colors
 from ns_abstract.methods.splat.line_colors import accumulate_line, basis_line, directions_line
 from ns_abstract.methods.splat.records import LANES
 
@@ -156,46 +150,6 @@ def fixed_colors(
                 colors[target, 2 * c + 1] = radius
 
 
-@njit(cache=True, error_model="numpy")
-def _accumulate(target, form, weights, m):
-    """``target += weights[q] * form`` with lane-wise weights; `settle` must follow."""
-    for k in range(m):
-        for q in range(LANES):
-            target[k, q] += weights[q] * form[k, q]
-    for q in range(LANES):
-        w = abs(weights[q])
-        size = abs(form[0, q]) + form[m + 1, q] + form[m + 2, q]
-        total = abs(target[0, q]) + w * size
-        target[m, q] = (target[m, q] + w * form[m, q] + _COEFFICIENT * (w * size + total)) * _UP
-
-
-@njit(cache=True, error_model="numpy")
-def _directions(work, scratch, low, high, degree, d, order, m):
-    """Unit directions and their products from the directions; ``low`` [lanes]: bound of the squared lengths."""
-    square(work[0], work[3], d, order, m)
-    for axis in range(1, 3):
-        square(work[axis], work[4], d, order, m)
-        scale_add(work[3], 1.0, work[4], 1.0, 0.0, work[3], d, order, m)
-    bounds(work[3], low, high, d, order, m)
-    reciprocal_square_root(work[3], scratch, work[5], d, order, m)
-    for axis in range(3):
-        multiply(work[axis], work[5], work[6 + axis], d, order, m)
-    if degree >= 2:
-        square(work[8], work[9], d, order, m)
-        square(work[6], work[10], d, order, m)
-        square(work[7], work[4], d, order, m)
-        scale_add(work[10], 1.0, work[4], -1.0, 0.0, work[10], d, order, m)
-        multiply(work[6], work[7], work[4], d, order, m)
-        scale_add(work[4], 2.0, work[4], 0.0, 0.0, work[11], d, order, m)
-    if degree >= 3:
-        multiply(work[6], work[10], work[12], d, order, m)
-        multiply(work[7], work[11], work[4], d, order, m)
-        scale_add(work[12], 1.0, work[4], -1.0, 0.0, work[12], d, order, m)
-        multiply(work[6], work[11], work[13], d, order, m)
-        multiply(work[7], work[10], work[4], d, order, m)
-        scale_add(work[13], 1.0, work[4], 1.0, 0.0, work[13], d, order, m)
-
-
 @njit(cache=True, parallel=True, error_model="numpy")
 def moving_colors(
     indices, means, mean_radius, color_low, color_high, sh, reach, degree, position, origin, position_error, unit,
@@ -213,83 +167,80 @@ def moving_colors(
     n = indices.shape[0]
     count = (degree + 1) * (degree + 1)
     for chunk in prange((n + _CHUNK - 1) // _CHUNK):
-        # 0-2 direction, 3 squared length, 4 spare, 5 inverse length, 6-8 x y z, 9 z^2, 10 c1, 11 s1,
-        # 12 c2, 13 s2, 14 basis, 15 spare, 16-18 channels
+        # 0-2 direction, 16-18 channels; in between what `line_colors` keeps
         work_ = np.empty((19, m + 3, LANES))
-        ends_ = np.empty((9, LANES))
-        work, scratch = borrowed(work_), borrowed(ends_[:5])
-        weights, low, high, angle = borrowed(ends_[5]), borrowed(ends_[6]), borrowed(ends_[7]), borrowed(ends_[8])
+        ends_ = np.empty((4, LANES))
+        wide_ = np.empty(WORKSPACE * size(m))
+        numbers_ = np.empty(LANES, np.int64)
+        work, numbers, wide = borrowed(work_), borrowed(numbers_), borrowed(wide_)
+        weights, low, high, angle = borrowed(ends_[0]), borrowed(ends_[1]), borrowed(ends_[2]), borrowed(ends_[3])
         s = borrowed(work_.reshape(-1))
         line = d == 1 and order == 2
         for first in range(chunk * _CHUNK, min(n, (chunk + 1) * _CHUNK), LANES):
             lanes = min(LANES, min(n, (chunk + 1) * _CHUNK) - first)
+            for q in range(LANES):
+                numbers[q] = indices[first + min(q, lanes - 1), 1]
             for axis in range(3):
                 form = work[axis]
                 for k in range(m):
                     for q in range(LANES):
                         form[k, q] = -position[k, axis]
                 for q in range(LANES):
-                    i = indices[first + min(q, lanes - 1), 1]
+                    i = numbers[q]
                     form[0, q] = (means[i, axis] - origin[axis]) + (origin[axis] - position[0, axis])
                     form[m, q] = position[m, axis] + _COEFFICIENT * (
                         abs(means[i, axis] - origin[axis]) + abs(origin[axis] - position[0, axis])
                     )
                 if not line:
                     settle(form, d, order, m)
-            if line:
-                directions_line(s, low.shape[0], degree, low)
-            else:
-                _directions(work, scratch, low, high, degree, d, order, m)
-            for q in range(LANES):
-                i = indices[first + min(q, lanes - 1), 1]
-                distance = math.sqrt(low[q]) * (1.0 - _COEFFICIENT) if low[q] > 0.0 else 0.0
-                angle[q] = _direction_error(distance, position_error, means, mean_radius, i, unit)
             for channel in range(3):
                 form = work[16 + channel]
                 for k in range(m + 3):
                     for q in range(LANES):
                         form[k, q] = 0.0
                 for q in range(LANES):
-                    i = indices[first + min(q, lanes - 1), 1]
-                    form[0, q] = 0.2820947917738781 * sh[i, 0, channel] + 0.5
-                    form[m, q] = _COEFFICIENT * (abs(sh[i, 0, channel]) + 1.0)
-            for k in range(1, count):
-                if line:
+                    form[0, q] = 0.2820947917738781 * sh[numbers[q], 0, channel] + 0.5
+                    form[m, q] = _COEFFICIENT * (abs(sh[numbers[q], 0, channel]) + 1.0)
+            if line:
+                directions_line(s, low.shape[0], degree, low)
+                for k in range(1, count):
                     basis_line(s, low.shape[0], k)
-                else:
-                    _basis_form(work, k, d, order, m)
-                for channel in range(3):
-                    for q in range(LANES):
-                        weights[q] = sh[indices[first + min(q, lanes - 1), 1], k, channel]
-                    if line:
+                    for channel in range(3):
+                        for q in range(LANES):
+                            weights[q] = sh[numbers[q], k, channel]
                         accumulate_line(s, low.shape[0], weights, channel)
-                    else:
-                        _accumulate(work[16 + channel], work[14], weights, m)
+            else:
+                for q in range(0, lanes, 8):
+                    form_colors(
+                        pointer(wide), advanced(pointer(s), q), advanced(pointer(low), q), sh, pointer(weights),
+                        advanced(pointer(numbers), q), degree, d, order, m,
+                    )  # fmt: skip
+            for q in range(lanes):
+                distance = math.sqrt(low[q]) * (1.0 - _COEFFICIENT) if low[q] > 0.0 else 0.0
+                angle[q] = _direction_error(distance, position_error, means, mean_radius, numbers[q], unit)
             for channel in range(3):
                 form = work[16 + channel]
                 settle(form, d, order, m)
-                for q in range(LANES):
-                    i = indices[first + min(q, lanes - 1), 1]
-                    size, change = reach[i, channel], reach[i, 3 + channel]
-                    form[m, q] += _color_error(size, change, unit, angle[q])
+                for q in range(lanes):
+                    most, change = reach[numbers[q], channel], reach[numbers[q], 3 + channel]
+                    form[m, q] += _color_error(most, change, unit, angle[q])
                     # a camera that may stand in the Gaussian's centre: any direction
-                    if not form[m, q] + form[m + 1, q] + form[m + 2, q] <= 2.0 * size + 1.0:
+                    if not form[m, q] + form[m + 1, q] + form[m + 2, q] <= 2.0 * most + 1.0:
                         for r in range(1, m + 3):
                             form[r, q] = 0.0
                         form[0, q] = 0.5
-                        form[m, q] = size * 1.01 + _color_error(size, change, unit, 2.0)
+                        form[m, q] = most * 1.01 + _color_error(most, change, unit, 2.0)
                 bounds(form, low, high, d, order, m)
                 clamp_below(form, 0.0, low, high, d, order, m)
                 if color_low.shape[0] > 0:
-                    for q in range(LANES):
-                        i = indices[first + min(q, lanes - 1), 1]
-                        least, most = color_low[i, channel], color_high[i, channel]
+                    for q in range(lanes):
+                        least, most = color_low[numbers[q], channel], color_high[numbers[q], channel]
                         if least != 0.0 or most != 0.0:
                             middle = 0.5 * (least + most)
-                            size = abs(form[0, q]) + form[m + 1, q] + form[m + 2, q] + form[m, q]
+                            total = abs(form[0, q]) + form[m + 1, q] + form[m + 2, q] + form[m, q]
                             form[0, q] += middle
                             form[m, q] += max(most - middle, middle - least) * _UP + (4.0 * unit + _COEFFICIENT) * (
-                                size + max(abs(least), abs(most))
+                                total + max(abs(least), abs(most))
                             )
                     bounds(form, low, high, d, order, m)
                     clamp_below(form, 0.0, low, high, d, order, m)
@@ -297,37 +248,3 @@ def moving_colors(
                     row = indices[first + q, 0]
                     for k in range(m + 1):
                         colors[row, channel * (m + 1) + k] = form[k, q]
-
-
-@njit(cache=True, error_model="numpy")
-def _basis_form(work, k, d, order, m):
-    """Basis function ``k`` >= 1 into slot 14, from the products kept by `moving_colors`."""
-    out = work[14]
-    if k == 1:
-        scale_add(work[7], -0.48860251190292, work[7], 0.0, 0.0, out, d, order, m)
-    elif k == 2:
-        scale_add(work[8], 0.48860251190292, work[8], 0.0, 0.0, out, d, order, m)
-    elif k == 3:
-        scale_add(work[6], -0.48860251190292, work[6], 0.0, 0.0, out, d, order, m)
-    elif k == 4:
-        scale_add(work[11], 0.5462742152960395, work[11], 0.0, 0.0, out, d, order, m)
-    elif k == 5 or k == 7:
-        multiply(work[8], work[7] if k == 5 else work[6], work[4], d, order, m)
-        scale_add(work[4], -1.092548430592079, work[4], 0.0, 0.0, out, d, order, m)
-    elif k == 6:
-        scale_add(work[9], 0.9461746957575601, work[9], 0.0, -0.3153915652525201, out, d, order, m)
-    elif k == 8:
-        scale_add(work[10], 0.5462742152960395, work[10], 0.0, 0.0, out, d, order, m)
-    elif k == 9:
-        scale_add(work[13], -0.5900435899266435, work[13], 0.0, 0.0, out, d, order, m)
-    elif k == 10 or k == 14:
-        multiply(work[8], work[11] if k == 10 else work[10], work[4], d, order, m)
-        scale_add(work[4], 1.445305721320277, work[4], 0.0, 0.0, out, d, order, m)
-    elif k == 11 or k == 13:
-        scale_add(work[9], -2.285228997322329, work[9], 0.0, 0.4570457994644658, work[4], d, order, m)
-        multiply(work[4], work[7] if k == 11 else work[6], out, d, order, m)
-    elif k == 12:
-        scale_add(work[9], 1.865881662950577, work[9], 0.0, -1.119528997770346, work[4], d, order, m)
-        multiply(work[8], work[4], out, d, order, m)
-    else:
-        scale_add(work[12], -0.5900435899266435, work[12], 0.0, 0.0, out, d, order, m)
