@@ -502,7 +502,7 @@ def collect_layers(
             some_dim = dim & live
             while some_dim != 0:
                 q = lowest_bit(some_dim)
-                some_dim &= some_dim - 1
+                some_dim = signed(some_dim & (some_dim - 1))
                 if s[REACH + q] <= k:
                     live = signed(live & ~(1 << q))
         if live == 0:
