@@ -10,7 +10,7 @@ from test_forms import BINARY, POSITIVE, SIZES, layout
 
 from ns_abstract.arithmetic import wide_forms
 from ns_abstract.arithmetic.compiled import pointer
-from ns_abstract.arithmetic.forms import Basis, FormArray, clamp_below, negate, settle
+from ns_abstract.arithmetic.forms import Basis, FormArray, clamp_below, logarithm, negate, settle
 from ns_abstract.arithmetic.lanes import load8, store
 
 BASES = [Basis(1, 1), Basis(2, 1), Basis(6, 1), Basis(8, 1), Basis(1, 2), Basis(3, 2)]
@@ -62,7 +62,7 @@ def _clamped(w, a, b, out, d, order, m):
     low, high = wide_forms.bounds(f, a, d, order, m)
     for k in range(m + 3):
         store(f, out + 8 * k, load8(f, a + 8 * k))
-    wide_forms.clamp(f, out, -0.25, 0.5, low, high, d, order, m)
+    wide_forms.clamp(f, out, -0.25, 0.5, low, high, order, m)
 
 
 @njit(error_model="numpy")
@@ -164,8 +164,6 @@ def test_functions(name, size, basis):
 
 @pytest.mark.parametrize("basis", BASES, ids=str)
 def test_logarithm_is_the_kernels(basis):
-    from ns_abstract.arithmetic.forms import logarithm
-
     for size in ("plain", "exact", "narrow", "constant", "uncertain"):
         a = forms(6, size, basis, positive=True)
         kernel = FormArray(basis, np.empty_like(a.data), (8,))
@@ -210,7 +208,6 @@ def test_clamp(basis):
         for sign, floor in ((1.0, -0.25), (-1.0, -0.5)):
             if sign < 0.0:
                 negate(kernel.data, basis.monomials)
-            low, high = kernel.bounds()
             low, high = (a.bounds() if sign > 0.0 else tuple(-np.maximum(x, -0.25) for x in reversed(a.bounds())))
             clamp_below(kernel.data, floor, low, high, *layout(basis))
             if sign < 0.0:

@@ -300,7 +300,7 @@ def logarithm(w, a, out, d, order, m):
 
 
 @njit(cache=True, error_model="numpy")
-def clamp(w, a, limit_low, limit_high, low, high, d, order, m):
+def clamp(w, a, limit_low, limit_high, low, high, order, m):
     """Replace ``a`` by ``min(limit_high, max(limit_low, a))`` given its bounds (`forms.clamp_below`; design.md, A5)."""
     if bits(low < limit_low) != 0:
         _raise(w, a, 1.0, limit_low, low, high, order, m)

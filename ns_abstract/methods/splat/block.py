@@ -47,6 +47,15 @@ def parabola(slope, bend):
 
 
 @njit(cache=True, error_model="numpy", forceinline=True)
+def longest_list(lengths):
+    """The largest of the pixels' ``lengths``."""
+    longest = 0
+    for q in range(PIXELS):
+        longest = max(longest, int(lengths[q]))
+    return longest
+
+
+@njit(cache=True, error_model="numpy", forceinline=True)
 def set_unknown(layers, at, high, m):
     """Let the layer at ``at`` have any alpha from 0 to ``high``."""
     layers[at + ALPHA_LOW] = 0.0

@@ -14,7 +14,7 @@ from ns_abstract.methods.splat.activate import Splats
 from ns_abstract.methods.splat.colors import color_reach, fixed_colors, moving_colors
 from ns_abstract.methods.splat.constants import Rasteriser, rules_array
 from ns_abstract.methods.splat.gaussians import covariance_noise, gaussian_stage
-from ns_abstract.methods.splat.lists import depth_order, tile_lists
+from ns_abstract.methods.splat.lists import depth_order, tile_lists, tile_mask
 from ns_abstract.methods.splat.pixels import pixel_stage
 from ns_abstract.methods.splat.records import columns, faint_exponents
 from ns_abstract.methods.splat.render import camera_array
@@ -139,8 +139,7 @@ class SplatBounds:
         )  # fmt: skip
         alive = np.flatnonzero(state)
         colors = self._colors(forms, camera_reach, candidates, alive, n)
-        mask = np.zeros(across * down, np.uint8)
-        mask[wanted] = 1
+        mask = tile_mask(wanted, across * down)
         offsets, entries = tile_lists(depth_order(alive, depth), tiles, mask, across)
         # the third row of the rotation; its float32 rounding is the same for every Gaussian
         slope = np.ascontiguousarray(rotation[:, 6:9])
@@ -198,7 +197,6 @@ class SplatBounds:
             basis.dimensions, basis.order, basis.monomials, colors,
         )  # fmt: skip
         return colors
-
 
 
 def _shifted_colors(varied: VariedSplats, unit: float) -> np.ndarray | None:

@@ -135,9 +135,9 @@ def project_forms(w, s, rotation, offset, camera, rules, d, order, m, antialiase
         # the Jacobian's clamped ratios
         if margin >= 0.0:
             extra = margin * 0.5 * width / fx
-            clamp(w, u, -(cx / fx + extra), (width - cx) / fx + extra, u_low, u_high, d, order, m)
+            clamp(w, u, -(cx / fx + extra), (width - cx) / fx + extra, u_low, u_high, order, m)
             extra = margin * 0.5 * height / fy
-            clamp(w, v, -(cy / fy + extra), (height - cy) / fy + extra, v_low, v_high, d, order, m)
+            clamp(w, v, -(cy / fy + extra), (height - cy) / fy + extra, v_low, v_high, order, m)
         # w = R B, then n0 = w0 - u w2, n1 = w1 - v w2
         none = 0.0 * v0
         for column in range(3):

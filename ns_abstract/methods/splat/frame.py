@@ -14,7 +14,7 @@ from ns_abstract.arithmetic.units import Arithmetic
 from ns_abstract.methods.splat.activate import Splats
 from ns_abstract.methods.splat.bounds import SplatBounds
 from ns_abstract.methods.splat.constants import Rasteriser
-from ns_abstract.methods.splat.lists import touching
+from ns_abstract.methods.splat.lists import tile_mask, touching
 from ns_abstract.methods.splat.render import Renderer
 from ns_abstract.methods.splat.variations import VariedSplats
 from ns_abstract.sets.box import ParameterBox
@@ -170,8 +170,7 @@ class SplatFrame:
             return None
         if tiles.size == self.tile_count:
             return within.visible
-        mask = np.zeros(self.tile_count, np.uint8)
-        mask[tiles] = 1
+        mask = tile_mask(tiles, self.tile_count)
         return within.visible[touching(np.arange(within.visible.size), within.reach, mask, self.across)]
 
     @cached_property

@@ -259,13 +259,13 @@ def _project_block(
     for q in range(LANES):
         places[q] = block[min(q, last)]
     width = record.shape[1]
+    lanes, out, to = pointer(s), pointer(record), pointer(places)
     for q in range(0, LANES, 8):
         for column in range(0, width, 8):
             at = row.RECORD + column * LANES + q
-            lanes = pointer(s)
             # lanes in excess repeat the last one
             scatter_columns(
-                pointer(record), pointer(places), q, width, column, load8(lanes, at), load8(lanes, at + LANES),
+                out, to, q, width, column, load8(lanes, at), load8(lanes, at + LANES),
                 load8(lanes, at + 2 * LANES), load8(lanes, at + 3 * LANES), load8(lanes, at + 4 * LANES),
                 load8(lanes, at + 5 * LANES), load8(lanes, at + 6 * LANES), load8(lanes, at + 7 * LANES),
             )  # fmt: skip
@@ -296,14 +296,11 @@ def _project_block(
 
 @njit(cache=True, error_model="numpy")
 def _fill_records(s, cx, cy, count, m):
-    """The columns of a record before its ``count`` forms, and the float error of the mean in these."""
+    """What `regions` left open of the columns before a record's ``count`` forms; the mean's float error in these."""
     stride = m + 1
     for q in range(0, LANES, 8):
         store(s, row.R_MEAN_X + q, load8(s, row.X0 + q) + cx)
         store(s, row.R_MEAN_Y + q, load8(s, row.Y0 + q) + cy)
-        store(s, row.R_OPACITY_LOW + q, load8(s, row.LOWER + q))
-        store(s, row.R_OPACITY_HIGH + q, load8(s, row.UPPER + q))
-        store(s, row.R_KAPPA + q, load8(s, row.BEND + q))
         # in units of y
         mean_error = load8(s, row.EW + q)
         total = mean_error
@@ -322,4 +319,4 @@ def _fill_records(s, cx, cy, count, m):
             total = total + first + spread
         tame = (load8(s, row.KNOWN + q) == 1.0) & (total < np.inf)
         store(s, row.R_WILD + q, where(tame, 0.0, 1.0))
-        store(s, row.R_FAINT + q, where(tame, load8(s, row.LAST + q), -1.0))
+        store(s, row.R_FAINT + q, where(tame, load8(s, row.R_FAINT + q), -1.0))

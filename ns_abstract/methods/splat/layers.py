@@ -32,6 +32,7 @@ from ns_abstract.methods.splat.block import (
     UP,
     color_ends,
     color_size,
+    longest_list,
     set_unknown,
 )
 from ns_abstract.methods.splat.lists import AHEAD, BLOCK, PIXELS
@@ -246,6 +247,23 @@ def _still_live(found, pixels, live):
     return left
 
 
+@njit(cache=True, error_model="numpy", forceinline=True)
+def _append_layer(number, q, k, t_low, t_high, layers, width, s, lengths, lists, deepest):
+    """Append layer ``number`` to pixel q's list, with the light that it leaves; returns its place there."""
+    at = number * width
+    layers[at + LEFT] = t_low
+    layers[at + LIGHT] = s[THI + q]
+    s[TLO + q] = t_low
+    s[THI + q] = t_high
+    count = lengths[q]
+    entry = LISTED * (q * deepest + count)
+    lists[entry] = number
+    lists[entry + 1] = k
+    lists[entry + 2] = 0
+    lengths[q] = count + 1
+    return count
+
+
 @njit(cache=True, error_model="numpy")
 def _keep_drawn(
     found, pixels, first_layer, k, layers, width, s, lengths, lists, deepest, stop_high, shrink, grow
@@ -265,17 +283,8 @@ def _keep_drawn(
         if not t_low > stop_high:
             rest |= 1 << lane
             continue
-        before = s[THI + q]
-        count = lengths[q]
-        layers[at + LEFT] = t_low
-        layers[at + LIGHT] = before
-        s[TLO + q] = t_low
-        s[THI + q] = before * (1.0 - layers[at + ALPHA_LOW]) * grow
-        entry = LISTED * (q * deepest + count)
-        lists[entry] = number
-        lists[entry + 1] = k
-        lists[entry + 2] = 0
-        lengths[q] = count + 1
+        t_high = s[THI + q] * (1.0 - layers[at + ALPHA_LOW]) * grow
+        _append_layer(number, q, k, t_low, t_high, layers, width, s, lengths, lists, deepest)
     return rest
 
 
@@ -405,10 +414,7 @@ def collect_layers(
         # eight at a time, some in excess
         if used + end + 8 > capacity:
             return GROW, 0
-        longest = 0
-        for q in range(PIXELS):
-            longest = max(longest, int(lengths[q]))
-        if longest + some > deepest:
+        if longest_list(lengths) + some > deepest:
             return GROW, 0
         for b in range(some):
             i = entries[start + b]
@@ -469,7 +475,6 @@ def collect_layers(
                     # surely the stop: neither this layer nor any behind it is drawn
                     live = signed(live & ~(1 << q))
                     continue
-                count = lengths[q]
                 if alone and t_low <= stop_high:
                     # s[LOST] is the most that any stop so far may leave of the light
                     s[LOST + q] = max(s[LOST + q], min(before, stop_high / (1.0 - high)))
@@ -477,21 +482,13 @@ def collect_layers(
                         set_unknown(layers, at, high, m)
                     else:
                         s[RHO + q] = s[LOST + q]
-                layers[at + LEFT] = t_low
-                layers[at + LIGHT] = before
-                entry = LISTED * (q * deepest + count)
-                lists[entry] = used + lane
-                lists[entry + 1] = k
-                lists[entry + 2] = 0
-                lengths[q] = count + 1
-                s[TLO + q] = t_low
-                s[THI + q] = t_high
+                count = _append_layer(used + lane, q, k, t_low, t_high, layers, width, s, lengths, lists, deepest)
                 if t_high <= stop_low:
                     dim = signed(dim | (1 << q))
                 if not alone:
                     if move_count >= move_limit:
                         return GROW, 0
-                    lists[entry + 2] = move_count
+                    lists[LISTED * (q * deepest + count) + 2] = move_count
                     for r in range(MOVES * move_count, MOVES * (move_count + 1), 8):
                         store(moves, r, 0.0 * load8(s, NUMBERS))
                     move_count += 1

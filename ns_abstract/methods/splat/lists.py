@@ -33,6 +33,13 @@ def _sort_ties(order, keys):
     return order
 
 
+def tile_mask(wanted, count):
+    """[count] 1 for the tiles ``wanted`` (numbers), 0 for the others."""
+    mask = np.zeros(count, np.uint8)
+    mask[wanted] = 1
+    return mask
+
+
 @njit(cache=True, error_model="numpy")
 def touching(indices, tiles, wanted, tiles_x):
     """Those of ``indices`` whose range of ``tiles`` holds one of which ``wanted`` is not 0; see `tile_lists`."""

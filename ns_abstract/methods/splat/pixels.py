@@ -13,7 +13,7 @@ from numba import njit, prange
 
 from ns_abstract.arithmetic.compiled import borrowed, pointer, taken
 from ns_abstract.methods.splat.blend import shade, swap_bounds
-from ns_abstract.methods.splat.block import FORM, LISTED, MOVES, NUMBERS, ROWS, color_size
+from ns_abstract.methods.splat.block import FORM, LISTED, MOVES, NUMBERS, ROWS, color_size, longest_list
 from ns_abstract.methods.splat.layers import BATCH, GIVE_UP, GROW, collect_layers, number_chains, settle_stops
 from ns_abstract.methods.splat.lists import BLOCK, PIXELS, block_lists, longest_first
 
@@ -63,9 +63,6 @@ def _block(
                     linear[0, row, column, channel, 0] = 0.5
                     linear[0, row, column, channel, m] = 0.5
         return True
-    deepest = 0
-    for q in range(PIXELS):
-        deepest = max(deepest, int(lengths[q]))
     if slot_count > 0:
         swap_bounds(
             pairs, pair_count, slots, slot_count, drawn, places, layers, width, lists, palette, forms, moves
@@ -74,7 +71,7 @@ def _block(
             layers, width, lists, lengths, first, last, owners, drawn, places, slot_count, s, m, rules[9], unit
         )
         number_chains(last[: listed.size], far)
-    statistics[1] += deepest
+    statistics[1] += longest_list(lengths)
     statistics[2] += pair_count
     shade(
         layers, width, lists, palette, forms, lengths, moves, far, slot_count > 0, background, color_radius, negligible,

@@ -35,7 +35,6 @@ MEAN_X, MEAN_Y, OPACITY_LOW, OPACITY_HIGH, KAPPA, WILD, FAINT, SPREAD = range(8)
 FORMS = SPREAD + 5
 
 
-
 @njit(cache=True, error_model="numpy")
 def columns(count, m):
     """Columns of a record of ``count`` forms of ``m`` monomials: whole cache lines."""
@@ -63,14 +62,16 @@ def columns(count, m):
     EX, EY, EZ, SX, SY, SZ,
     # what `float_errors` leaves
     ZLOW, ZHIGH, MXLO, MXHI, MYLO, MYHI, A, C, DET, EDET, SHARP, RHIGH, RLOW, ETA, EW, TAME,
-    # what `regions` leaves: state, columns of the record, box and tiles
-    GONE, KNOWN, LOWER, UPPER, BEND, LAST, BOX0, BOX1, BOX2, BOX3, T0, T1, T2, T3, T4, T5, T6, T7,
-    # a record, column by column; its forms are FP .. FK, four rows each where there is one parameter, and behind them
-    # the determinant
-    R_MEAN_X, R_MEAN_Y, R_OPACITY_LOW, R_OPACITY_HIGH, R_KAPPA, R_WILD, R_FAINT, R_SPREAD,
-    FP, FQ, FS, FW1, FW2, FK, FD,
-) = (*range(0, 105 * LANES, LANES), *range(109 * LANES, 137 * LANES, 4 * LANES))  # fmt: skip
-RECORD = R_MEAN_X
+    # what `regions` leaves beside columns of the record: state, box and tiles
+    GONE, KNOWN, BOX0, BOX1, BOX2, BOX3, T0, T1, T2, T3, T4, T5, T6, T7,
+) = range(0, 93 * LANES, LANES)  # fmt: skip
+# a record, column by column
+RECORD = T7 + LANES
+R_MEAN_X, R_MEAN_Y, R_OPACITY_LOW, R_OPACITY_HIGH, R_KAPPA, R_WILD, R_FAINT, R_SPREAD = (
+    RECORD + column * LANES for column in (MEAN_X, MEAN_Y, OPACITY_LOW, OPACITY_HIGH, KAPPA, WILD, FAINT, SPREAD)
+)
+# its forms, four rows each where there is one parameter, and behind them the determinant
+FP, FQ, FS, FW1, FW2, FK, FD = range(RECORD + FORMS * LANES, RECORD + (FORMS + 28) * LANES, 4 * LANES)
 
 
 @njit(cache=True, error_model="numpy")
@@ -270,7 +271,8 @@ def _within(x, most):
 def regions(s, n, rules, camera, errors, antialiased):
     """What is known of each Gaussian, from the rows of `float_errors` (design.md, G5-G9): rows GONE .. T7.
 
-    GONE is 1 where no pose shows it, KNOWN where its forms may be relied on. The others may cover every pixel.
+    GONE is 1 where no pose shows it, KNOWN where its forms may be relied on. The others may cover every pixel. Of a
+    record: the opacities, kappa and the exponent from which on alpha is below the threshold.
     """
     near, far, tile, alpha_min, work_tile = rules[0], rules[1], rules[3], rules[7], rules[10]
     width, height = camera[4], camera[5]
@@ -335,13 +337,13 @@ def regions(s, n, rules, camera, errors, antialiased):
             lower = lower * (1.0 - slack) if known else lower
             upper = opacity * (1.0 + slack) if known else upper
             faint = (faint + (above + slack) * REGION) if known else faint
-        s[LOWER + q] = lower
-        s[UPPER + q] = upper
-        s[BEND + q] = kappa if known else 0.0
+        s[R_OPACITY_LOW + q] = lower
+        s[R_OPACITY_HIGH + q] = upper
+        s[R_KAPPA + q] = kappa if known else 0.0
         # pixels where alpha may reach the threshold
         gone = gone | (known & (faint < 0.0))
         faint = faint / (1.0 - kappa)
-        s[LAST + q] = faint if known else -1.0
+        s[R_FAINT + q] = faint if known else -1.0
         extent_x = np.sqrt(2.0 * faint * a) * REGION
         extent_y = np.sqrt(2.0 * faint * c) * REGION
         left, right = mean_x_low - extent_x, mean_x_high + extent_x

@@ -23,6 +23,7 @@ from ns_abstract.methods.splat.lists import (
     depth_order,
     longest_first,
     tile_lists,
+    tile_mask,
     touching,
 )
 from ns_abstract.sets.path import Camera
@@ -336,8 +337,7 @@ class Renderer:
             self._depth, self._visible,
         )  # fmt: skip
         across, down = tile_grid(camera, self.side)
-        mask = np.zeros(across * down, np.uint8)
-        mask[wanted] = 1
+        mask = tile_mask(wanted, across * down)
         seen = np.flatnonzero(self._visible)
         if not mask.all():
             seen = touching(seen, self._tiles, mask, across)
