@@ -35,6 +35,7 @@ TRIGONOMETRY = "arithmetic/trigonometry.py"
 UNITS = "arithmetic/units.py"
 POSES = "sets/poses.py"
 BOX = "sets/box.py"
+ENGINE = "refine/engine.py"
 GAUSSIANS = "methods/splat/gaussians.py"
 FORM_PROJECTION = "methods/splat/form_projection.py"
 WIDE = "arithmetic/wide_forms.py"
@@ -214,6 +215,12 @@ MUTANTS = (
         "bottom, top = low - room - (most - ends[i][1]), high + room - (least - ends[i][0])",
         "bottom, top = low - room, high + room",
         "test_slanted.py::test_feasible_loses_no_pose[six]",
+    ),
+    Mutant(
+        "a part is dropped where some of its poses are none of the set's", ENGINE,
+        "            if inside is not None:\n                first",
+        "            if inside == box:\n                first",
+        "test_engine.py::test_parts_without_poses_take_no_work_and_leave_nothing_open[True-0.0]",
     ),
     Mutant(
         "split leaves a gap", BOX,

@@ -126,6 +126,9 @@ class Waves:
             linear=linear,
         )
 
+    def feasible(self, box: ParameterBox) -> ParameterBox | None:
+        return box
+
     def motion(self, box: ParameterBox) -> np.ndarray:
         return self.pace * (np.array(box.upper) - np.array(box.lower))
 
@@ -521,12 +524,61 @@ def test_children_that_contradict_their_parent_are_not_believed() -> None:
     assert (result.lower[forbidden] == 0.0).all() and (result.upper[forbidden] == 1.0).all()
 
 
+class Triangle(Waves):
+    """A set whose poses have ``u + v <= 0``: the box around it holds parameters of none, shown as the nearest pose."""
+
+    shrinks = True
+
+    def feasible(self, box: ParameterBox) -> ParameterBox | None:
+        if box.lower[0] + box.lower[1] > 0.0:
+            return None
+        for axis in range(2 if self.shrinks else 0):
+            box = box.replace(axis, box.lower[axis], min(box.upper[axis], 0.0 - box.lower[1 - axis]))
+        return box
+
+    def render(self, values: np.ndarray, tiles: np.ndarray | None = None) -> np.ndarray:
+        nearest = np.array(values)
+        nearest[1] = min(nearest[1], -nearest[0])
+        return super().render(nearest, tiles)
+
+
+@pytest.mark.parametrize("pace", [0.0, 4.0])
+@pytest.mark.parametrize("shrinks", [True, False])
+def test_parts_without_poses_take_no_work_and_leave_nothing_open(shrinks: bool, pace: float) -> None:
+    frame = Triangle(3, pace=pace, slack=0.02, weights=np.array([1.0, 0.3, 0.0]))
+    frame.shrinks = shrinks
+    result = refine(frame, Goal(1.0, FOREVER, 1500))
+    assert all(box.lower[0] + box.lower[1] <= 0.0 for box, _, _ in frame.calls)
+    points = frame.box.sample(4000, np.random.default_rng(3))
+    # those beyond the slanted side are taken to it
+    pictures = np.stack([frame.render(values) for values in points])
+    shown = [assemble(a, frame.camera) for a in (pictures.min(axis=0), pictures.max(axis=0))]
+    assert (result.lower <= shown[0]).all() and (result.upper >= shown[1]).all()
+    gaps = [point.mpg for point in result.trace]
+    assert all(b <= a for a, b in itertools.pairwise(gaps))
+    # nearer to what the poses show than to the range over the box
+    low, high, _ = frame.exact(frame.box)
+    seen, whole = (mean_pixel_gap(*shown), mean_pixel_gap(*(assemble(a, frame.camera) for a in (low, high))))
+    assert gaps[-1] - seen < 0.5 * (whole - seen)
+
+
 def test_poses_are_rendered_far_out() -> None:
     """A part that touches an end of the set is looked at there, one that touches both at either."""
     refinement = Refinement(Waves(3), 0, Goal())
     whole = refinement.frame.box
-    part = whole.split(0, 2)[0].split(1, 4)[1]
+    part = refinement._cut(refinement._cut(refinement._whole, 0)[0], 1, 4)[1]
     seen = np.array([refinement._outlying(part) for _ in range(50)])
-    assert (seen[:, 0] == whole.lower[0]).all() and (seen[:, 1] == part.middle[1]).all()
+    assert (seen[:, 0] == whole.lower[0]).all() and (seen[:, 1] == part.box.middle[1]).all()
     assert set(seen[:, 2]) == {whole.lower[2], whole.upper[2]}
-    assert (refinement._outlying(whole.split(0, 2)[1].split(2, 3)[2])[[0, 2]] == np.array(whole.upper)[[0, 2]]).all()
+    part = refinement._cut(refinement._cut(refinement._whole, 0)[1], 2, 3)[2]
+    assert (refinement._outlying(part)[[0, 2]] == np.array(whole.upper)[[0, 2]]).all()
+
+
+def test_ends_beyond_which_there_are_no_poses_are_far_out() -> None:
+    refinement = Refinement(Triangle(2), 0, Goal())
+    # the upper quarter of u allows v below its lower end only, and no u near its own upper end
+    part = refinement._cut(refinement._whole, 0, 4)[3]
+    assert part.box.upper[1] == -part.box.lower[0] < refinement.frame.box.upper[1]
+    assert part.last.all() and not part.first[0] and part.first[1]
+    inner = refinement._cut(part, 1)[0]
+    assert not inner.last[1] and inner.first[1]

@@ -13,7 +13,7 @@ import itertools
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
-from typing import Any, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
@@ -26,8 +26,10 @@ _ROUND_SHARE = 0.8
 _LOOKS = 16
 #: Excess over what the goal allows from which on cells are cut into four parts rather than two.
 _FAR = 4.0
-#: Cells are cut until typical Gaussians move by fewer pixels, before any is bounded.
+#: Cells of one parameter are cut until typical Gaussians move by fewer pixels, before any is bounded.
 FIRST_MOTION = 0.5
+#: The same of several parameters, by each: there, much is gained by cutting some parts of the set more than others.
+FIRST_MOTIONS = 1.0
 #: Leaves whose box is narrower than this part of the set are not split: rounding rules there.
 _NARROWEST = 2.0**-40
 #: Most corners of the set that are rendered at the start.
@@ -84,6 +86,10 @@ class Frame(Protocol):
         """`Bounds` of ``tiles`` over ``box``; ``within`` is the context of a box around it."""
         ...
 
+    def feasible(self, box: ParameterBox) -> ParameterBox | None:
+        """A part of ``box`` that holds all parameters in it of poses of the set; None where there are none."""
+        ...
+
     def motion(self, box: ParameterBox) -> np.ndarray:
         """[d] pixels that the picture moves by over each parameter's range (an estimate)."""
         ...
@@ -112,15 +118,23 @@ class Goal:
         return point.mpg <= self.ratio * point.mpg_witness + self.slack
 
 
+class _Part(NamedTuple):
+    """A part of the set, and whether its lower and upper ends along each axis [d] are ends of the set."""
+
+    box: ParameterBox
+    first: np.ndarray
+    last: np.ndarray
+
+
 class _Cell:
-    """A box, the context for boxes inside it, and how much the picture varies along each axis [d]."""
+    """A part of the set, the context for parts of it, and how much the picture varies along each axis [d]."""
 
-    __slots__ = ("box", "context", "narrow", "number", "slopes")
+    __slots__ = ("box", "context", "narrow", "number", "part", "slopes")
 
-    def __init__(self, number: int, box: ParameterBox, narrow: bool) -> None:
-        self.number, self.box, self.narrow = number, box, narrow
+    def __init__(self, number: int, part: _Part, narrow: bool) -> None:
+        self.number, self.part, self.box, self.narrow = number, part, part.box, narrow
         self.context: Any = None
-        self.slopes = np.zeros(box.dimensions)
+        self.slopes = np.zeros(part.box.dimensions)
 
 
 @dataclass
@@ -262,8 +276,19 @@ class Refinement:
 
     # --- the two sides -------------------------------------------------------------------------
 
-    def _cell(self, box: ParameterBox) -> _Cell:
-        return _Cell(next(self._numbers), box, _narrow(box, self.frame.box))
+    def _cell(self, part: _Part) -> _Cell:
+        return _Cell(next(self._numbers), part, _narrow(part.box, self.frame.box))
+
+    def _cut(self, part: _Part, axis: int, count: int = 2) -> list[_Part]:
+        """What ``count`` equal parts of ``part`` along ``axis`` hold of the set, without those that hold nothing."""
+        whole, found = part.box, []
+        for box in whole.split(axis, count):
+            inside = self.frame.feasible(box)
+            if inside is not None:
+                first = (part.first & np.equal(box.lower, whole.lower)) | np.greater(inside.lower, box.lower)
+                last = (part.last & np.equal(box.upper, whole.upper)) | np.less(inside.upper, box.upper)
+                found.append(_Part(inside, first, last))
+        return found
 
     def _witness(self, values: np.ndarray, tiles: np.ndarray | None = None) -> np.ndarray:
         """Render at ``values`` and widen the inner bound."""
@@ -290,17 +315,16 @@ class Refinement:
         cell.slopes = bounds.slopes
         return (*_usable(bounds.lower, bounds.upper), bounds)
 
-    def _halved(self, cell: _Cell, parts: int) -> list[ParameterBox]:
-        """Up to ``parts`` equal parts of a cell, from halving it again and again."""
+    def _halved(self, cell: _Cell, count: int) -> list[_Part]:
+        """Up to ``count`` parts of a cell, from halving it again and again."""
         if cell.box.dimensions == 1:
-            return cell.box.split(0, parts)
-        boxes, slopes = [cell.box], cell.slopes
-        while 2 * len(boxes) <= parts:
-            axis = self._axis(boxes[0], slopes)
-            boxes = [half for box in boxes for half in box.split(axis)]
-            slopes = slopes.copy()
+            return self._cut(cell.part, 0, count)
+        parts, slopes = [cell.part], cell.slopes.copy()
+        for _ in range(count.bit_length() - 1):
+            axis = self._axis(cell.box, slopes)
+            parts = [half for part in parts for half in self._cut(part, axis)]
             slopes[axis] *= 0.5
-        return boxes
+        return parts
 
     def _axis(self, box: ParameterBox, slopes: np.ndarray) -> int:
         """The axis that the picture varies most along, of those that can be halved."""
@@ -310,22 +334,20 @@ class Refinement:
             slopes = np.nan_to_num(self.frame.motion(box), nan=0.0)
         return int(np.argmax(np.where(_narrow_axes(box, self.frame.box), -1.0, slopes)))
 
-    def _outlying(self, box: ParameterBox) -> np.ndarray:
-        """A point [d] of ``box`` as far out in the set as it reaches, where pixels are likely to be extreme.
+    def _outlying(self, part: _Part) -> np.ndarray:
+        """A point [d] of ``part`` as far out in the set as it reaches, where pixels are likely to be extreme.
 
-        Which end is taken by chance where the box spans the set.
+        Which end is taken by chance where the part spans the set.
         """
-        whole = self.frame.box
-        first, last = np.equal(box.lower, whole.lower), np.equal(box.upper, whole.upper)
-        last &= ~first | (self.random.random(box.dimensions) < 0.5)
-        return np.where(last, box.upper, np.where(first, box.lower, box.middle))
+        box = part.box
+        last = part.last & (~part.first | (self.random.random(box.dimensions) < 0.5))
+        return np.where(last, box.upper, np.where(part.first, box.lower, box.middle))
 
     def _settle(self, tiles: np.ndarray, changes: dict[int, _Change] | None = None) -> None:
         """Update the outer bound of ``tiles``, given what has changed since the round began."""
         for t in tiles:
-            lower, upper = self.tiles[t].outer(None if changes is None else changes[t])
-            self.outer_lower[t] = np.clip(lower, 0.0, 1.0)
-            self.outer_upper[t] = np.clip(upper, 0.0, 1.0)
+            self.outer_lower[t], self.outer_upper[t] = self.tiles[t].outer(None if changes is None else changes[t])
+        self.outer_lower[tiles], self.outer_upper[tiles] = _usable(self.outer_lower[tiles], self.outer_upper[tiles])
 
     # --- measures ------------------------------------------------------------------------------
 
@@ -396,17 +418,17 @@ class Refinement:
 
     def _cover(self) -> bool:
         """Bound a first cover of the set; False if the work was stopped first."""
-        box, everything = self.frame.box, np.arange(self._count)
-        boxes, first, probe = self._first_boxes(everything)
+        everything = np.arange(self._count)
+        parts, first, probe = self._first_parts(everything)
         leaves: list[tuple[_Cell, np.ndarray, np.ndarray]] = []
-        for number, part in enumerate(boxes):
+        for number, part in enumerate(parts):
             if number and self._over():
                 if self.stopped():
                     return False
                 # slower than expected: one cell for the whole set is better than no bounds
                 self.leaf_sets.clear()
                 self._kept_bytes = 0
-                cell = self._cell(box)
+                cell = self._cell(self._whole)
                 lower, upper, bounds = self._bound(cell, None, everything)
                 leaves = [(cell, lower, upper)]
                 self._keep(cell, bounds, everything)
@@ -415,9 +437,9 @@ class Refinement:
             lower, upper, bounds = self._take(cell, probe) if part is first else self._bound(cell, None, everything)
             leaves.append((cell, lower, upper))
             self._keep(cell, bounds, everything)
-            if len(boxes) > 1:
-                self._witness(part.middle)
-            self.progress(self.point(), (number + 1) / len(boxes))
+            if len(parts) > 1:
+                self._witness(part.box.middle)
+            self.progress(self.point(), (number + 1) / len(parts))
         for t in everything:
             cells, lowers, uppers = zip(*((cell, lower[t], upper[t]) for cell, lower, upper in leaves), strict=True)
             self.tiles[t].replace(_Change([], list(cells), list(lowers), list(uppers)))
@@ -430,21 +452,27 @@ class Refinement:
         self._record(1.0)
         return True
 
-    def _first_boxes(self, everything: np.ndarray) -> tuple[list[ParameterBox], ParameterBox, Bounds]:
-        """Boxes that cover the set, as many as motion asks for and time and memory allow; one bounded box."""
-        frame, box = self.frame, self.frame.box
-        boxes, motion = [box], np.nan_to_num(np.array(frame.motion(box), np.float64), nan=0.0)
-        history: list[list[ParameterBox]] = [boxes]
-        limit = FIRST_MOTION if frame.batch is None else np.inf
-        while motion.size and motion.max() > limit and 2 * len(boxes) <= _COVER_CELLS:
+    @property
+    def _whole(self) -> _Part:
+        box = self.frame.box
+        return _Part(box, np.ones(box.dimensions, bool), np.ones(box.dimensions, bool))
+
+    def _first_parts(self, everything: np.ndarray) -> tuple[list[_Part], _Part, Bounds]:
+        """Parts that cover the set, as many as motion asks for and time and memory allow; one of them, bounded."""
+        frame, parts = self.frame, [self._whole]
+        motion = np.nan_to_num(np.array(frame.motion(frame.box), np.float64), nan=0.0)
+        history = [parts]
+        limit = FIRST_MOTION if motion.size <= 1 else FIRST_MOTIONS
+        limit = limit if frame.batch is None else np.inf
+        while motion.size and motion.max() > limit and 2 * len(parts) <= _COVER_CELLS:
             axis = int(np.argmax(motion))
-            boxes = [half for b in boxes for half in b.split(axis)]
+            parts = [half for part in parts for half in self._cut(part, axis)]
             motion[axis] *= 0.5
-            history.append(boxes)
+            history.append(parts)
         # the time and memory of one cell tell how many can be afforded
         started = time.perf_counter()
-        first = boxes[len(boxes) // 2]
-        probe = frame.bound(first, self._numbers_of(everything), None, self.keep_leaves)
+        first = parts[len(parts) // 2]
+        probe = frame.bound(first.box, self._numbers_of(everything), None, self.keep_leaves)
         seconds = time.perf_counter() - started
         allowed = _COVER_SHARE * self.goal.seconds / max(seconds, 1e-4)
         if self.goal.cells is not None:
@@ -452,10 +480,10 @@ class Refinement:
         size = probe.lower.nbytes + probe.upper.nbytes + _array_bytes(probe.context) + _linear_bytes(probe)
         # half: the leaves are copied once when they are sorted by tile
         allowed = max(1.0, min(allowed, 0.5 * self.goal.leaf_bytes / size))
-        while len(boxes) > allowed and len(history) > 1:
+        while len(parts) > allowed and len(history) > 1:
             history.pop()
-            boxes = history[-1]
-        return boxes, first, probe
+            parts = history[-1]
+        return parts, first, probe
 
     def _refine(self) -> None:
         while True:
@@ -557,8 +585,9 @@ class Refinement:
         tiles = np.array(list(rows), np.int64)
         children = [self._cell(part) for part in self._halved(cell, parts)]
         if cell.box.dimensions > 1:
-            # one of them: the first corners have shown most of what there is to see
-            self._witness(self._outlying(children[self.random.integers(len(children))].box), tiles)
+            if children:
+                # one of them: the first corners have shown most of what there is to see
+                self._witness(self._outlying(children[self.random.integers(len(children))].part), tiles)
         else:
             steps = self.frame.witnesses
             for number in range(1, steps * len(children)):

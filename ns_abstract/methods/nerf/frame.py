@@ -140,6 +140,10 @@ class NerfFrame:
         colors = self.renderer.pixels(self.pose_set.camera, self.pose_set.pose(values), self._pixels(which), shift)
         return colors.astype(np.float32)[:, None, None, :]
 
+    def feasible(self, box: ParameterBox) -> ParameterBox | None:
+        """All of ``box``: every parameter in it belongs to a pose of the set."""
+        return box
+
     def motion(self, box: ParameterBox) -> np.ndarray:
         """[d] pixels that points at a typical distance move by over each parameter's range (an estimate)."""
         d = box.dimensions

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 
@@ -47,10 +46,6 @@ class Context:
 
     visible: np.ndarray
     reach: np.ndarray
-
-
-#: Of a cell without poses.
-_NOTHING = Context(np.empty(0, np.int32), np.empty((0, 4), np.int32))
 
 
 @dataclass(frozen=True)
@@ -143,16 +138,14 @@ class SplatFrame:
 
             yield render
 
+    def feasible(self, box: ParameterBox) -> ParameterBox | None:
+        """See `PoseSet.feasible`."""
+        return self.pose_set.feasible(box)
+
     def bound(
         self, box: ParameterBox, tiles: np.ndarray, within: Context | None = None, keep_linear: bool = False
     ) -> TileBounds:
         """Bounds of ``tiles`` over ``box``; ``within`` is the context of these tiles and a box around it."""
-        inside = self.pose_set.feasible(box)
-        if inside is None:
-            # no image at all: one that is known anyhow does no harm
-            picture = self._middle_picture[tiles]
-            return TileBounds(picture, picture, np.zeros(box.dimensions), _NOTHING, None, 0)
-        box = inside
         candidates = self._candidates(tiles, within)
         cell = self.bounds.cell(self.camera, self.pose_set.enclosure(box, self.order), tiles, candidates, keep_linear)
         lower, upper = outward(cell.lower, cell.upper)
@@ -172,10 +165,6 @@ class SplatFrame:
             return within.visible
         mask = tile_mask(tiles, self.tile_count)
         return within.visible[touching(np.arange(within.visible.size), within.reach, mask, self.across)]
-
-    @cached_property
-    def _middle_picture(self) -> np.ndarray:
-        return self.render(self.box.middle)
 
     def _shear(self) -> dict[str, dict[str, float]]:
         """For each rotation, how much of it undoes what one unit of another parameter moves typical Gaussians by."""
