@@ -165,20 +165,54 @@ def test_bounds_hold_the_exact_range(**c: Any) -> None:
     check(frame, result)
     assert result.bounded
     assert 1 <= result.cells <= c["cells"]
-    assert result.cells == len(frame.calls) or len(frame.calls) == result.cells + 1  # one probe may be of no use
+    # cells that were tried to find out how many are needed may be of no use
+    assert 0 <= len(frame.calls) - result.cells <= (12 if c["dimensions"] == 1 else 1)
 
 
-@pytest.mark.parametrize("dimensions", [1, 2])
-def test_ratio_falls_to_the_goal(dimensions: int) -> None:
+@pytest.mark.parametrize("pace", [0.0, 3.0])
+@pytest.mark.parametrize("slack", [0.03, 0.3, 3.0])
+@pytest.mark.parametrize("ratio", [1.05, 1.2])
+def test_first_cover_of_one_parameter_is_what_the_goal_asks_for(ratio: float, slack: float, pace: float) -> None:
+    goal, frame = Goal(ratio, FOREVER), Waves(1, slack=slack, pace=pace)
+    first = refine(frame, goal).trace[0]
+    assert goal.met(first)
+
+    def met(count: int) -> bool:
+        ranges = [[a - frame.slack * r**2 * s for a, s in ((low, 1), (high, -1))] for low, high, r in map(
+            frame.exact, frame.box.split(0, count))]  # fmt: skip
+        lower, upper = np.min([a for a, _ in ranges], axis=0), np.max([a for _, a in ranges], axis=0)
+        gaps = mean_pixel_gap(*(assemble(np.clip(a, 0.0, 1.0), frame.camera) for a in (lower, upper)))
+        return gaps <= ratio * first.mpg_witness
+
+    least = next(count for count in itertools.count(1) if met(count))
+    assert first.cells <= max(2 * least, pace * 8)
+
+
+def test_first_cover_stays_coarse_where_smaller_cells_do_not_help() -> None:
+    frame = Waves(1, slack=0.0)
+    bound = frame.bound
+
+    def loose(box: ParameterBox, tiles: np.ndarray, within: Any = None, keep_linear: bool = False) -> Any:
+        found = bound(box, tiles, within, keep_linear)
+        found.lower[...], found.upper[...] = found.lower - 0.05, found.upper + 0.05
+        return found
+
+    frame.bound = loose  # type: ignore[method-assign]
+    result = refine(frame, Goal(1.05, FOREVER, 200))
+    assert result.trace[0].cells <= 7
+
+
+@pytest.mark.parametrize(("dimensions", "ratio", "first"), [(1, 1.002, 1.01), (2, 1.1, 1.3)])
+def test_ratio_falls_to_the_goal(dimensions: int, ratio: float, first: float) -> None:
     frame = Waves(dimensions)
-    result = refine(frame, Goal(1.1, FOREVER, 4000))
+    result = refine(frame, Goal(ratio, FOREVER, 4000))
     check(frame, result)
     gaps = [point.mpg for point in result.trace]
     assert all(after <= before for before, after in itertools.pairwise(gaps))
     inner = [point.mpg_witness for point in result.trace]
     assert all(after >= before for before, after in itertools.pairwise(inner))
-    assert gaps[0] > 1.3 * inner[0]
-    assert result.trace[-1].mpg <= 1.1 * result.trace[-1].mpg_witness
+    assert gaps[0] > first * inner[0]
+    assert result.trace[-1].mpg <= ratio * result.trace[-1].mpg_witness
     assert result.trace[-1].mpg == pytest.approx(mean_pixel_gap(result.lower, result.upper), rel=1e-12)
     assert result.cells < 4000
 

@@ -10,6 +10,7 @@ cells is the same on every machine and for every number of threads.
 from __future__ import annotations
 
 import itertools
+import math
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
@@ -26,10 +27,13 @@ _ROUND_SHARE = 0.8
 _LOOKS = 16
 #: Excess over what the goal allows from which on cells are cut into four parts rather than two.
 _FAR = 4.0
-#: Cells of one parameter are cut until typical Gaussians move by fewer pixels, before any is bounded.
-FIRST_MOTION = 0.5
-#: The same of several parameters, by each: there, much is gained by cutting some parts of the set more than others.
-FIRST_MOTIONS = 1.0
+#: Pixels that typical Gaussians move by at most in the first cell of one parameter, and by each of several.
+FIRST_MOTION, FIRST_MOTIONS = 0.5, 1.0
+#: A first cover of one parameter aims at this part of the excess that the goal, or the ratio if larger, allows.
+_AIM_SHARE, _AIM_RATIO = 0.6, 1.05
+#: Halving the first cell of one parameter leaves less than this part of its excess, or does not help; an excess from
+#: this part of the largest on may only be cut off at 0 and 1.
+_HELPS, _CUT_OFF = 0.5, 0.25
 #: Leaves whose box is narrower than this part of the set are not split: rounding rules there.
 _NARROWEST = 2.0**-40
 #: Most corners of the set that are rendered at the start.
@@ -390,12 +394,18 @@ class Refinement:
         # the first call compiles kernels; the clock of the trace starts after it
         self.image = self._witness(box.middle)
         self.start = time.perf_counter()
+        corners = self._corners()
+        if box.dimensions == 1:
+            # two, which the first cover asks for
+            for values in corners:
+                self._witness(values)
+            corners = corners[:0]
         if self._cover() and not self._over():
             for render in itertools.islice(self.members, _MEMBERS):
                 self._widen(self._render(render, box.middle, None), None)
                 if self._over():
                     break
-            for values in self._corners():
+            for values in corners:
                 self._witness(values)
                 if self._over():
                     break
@@ -434,7 +444,8 @@ class Refinement:
                 self._keep(cell, bounds, everything)
                 break
             cell = self._cell(part)
-            lower, upper, bounds = self._take(cell, probe) if part is first else self._bound(cell, None, everything)
+            known = part.box == first.box
+            lower, upper, bounds = self._take(cell, probe) if known else self._bound(cell, None, everything)
             leaves.append((cell, lower, upper))
             self._keep(cell, bounds, everything)
             if len(parts) > 1:
@@ -458,32 +469,57 @@ class Refinement:
         return _Part(box, np.ones(box.dimensions, bool), np.ones(box.dimensions, bool))
 
     def _first_parts(self, everything: np.ndarray) -> tuple[list[_Part], _Part, Bounds]:
-        """Parts that cover the set, as many as motion asks for and time and memory allow; one of them, bounded."""
+        """Parts that cover the set, as many as motion asks for and time and memory allow; one part, and its bounds."""
         frame, parts = self.frame, [self._whole]
+        if frame.batch is None and frame.box.dimensions == 1:
+            return self._equal_parts(everything)
         motion = np.nan_to_num(np.array(frame.motion(frame.box), np.float64), nan=0.0)
         history = [parts]
-        limit = FIRST_MOTION if motion.size <= 1 else FIRST_MOTIONS
-        limit = limit if frame.batch is None else np.inf
+        limit = FIRST_MOTIONS if frame.batch is None else np.inf
         while motion.size and motion.max() > limit and 2 * len(parts) <= _COVER_CELLS:
             axis = int(np.argmax(motion))
             parts = [half for part in parts for half in self._cut(part, axis)]
             motion[axis] *= 0.5
             history.append(parts)
-        # the time and memory of one cell tell how many can be afforded
-        started = time.perf_counter()
         first = parts[len(parts) // 2]
-        probe = frame.bound(first.box, self._numbers_of(everything), None, self.keep_leaves)
+        probe, allowed = self._probe(first, everything)
+        while len(parts) > allowed and len(history) > 1:
+            history.pop()
+            parts = history[-1]
+        return parts, first, probe
+
+    def _equal_parts(self, everything: np.ndarray) -> tuple[list[_Part], _Part, Bounds]:
+        """`_first_parts` of one parameter: as many as the excess of a cell in the middle asks for."""
+        motion = float(np.nan_to_num(self.frame.motion(self.frame.box)[0], nan=0.0))
+        # odd: the middle of the set, which is rendered, is that of a part
+        count, before = 2 * int(min(motion / FIRST_MOTION, _COVER_CELLS) / 2.0) + 1, np.inf
+        while True:
+            part = self._cut(self._whole, 0, count)[count // 2]
+            probe, affordable = self._probe(part, everything)
+            ends = [self._witness(np.array(end)) for end in (part.box.lower, part.box.upper)]
+            low, high = np.minimum.reduce([self.image, *ends]), np.maximum.reduce([self.image, *ends])
+            excess = self._mpg(*_usable(probe.lower, probe.upper)) - self._mpg(low, high)
+            ratio = max(self.goal.ratio, _AIM_RATIO)
+            aim = _AIM_SHARE * ((ratio - 1.0) * self._mpg(self.witness_lower, self.witness_upper) + self.goal.slack)
+            # it falls with the square of the width
+            wanted = math.ceil(count * math.sqrt(min(excess / aim, 1e6))) if aim > 0.0 < excess else count
+            most = int(min(affordable, _COVER_CELLS))
+            helped = excess <= _HELPS * before or before >= _CUT_OFF * self._mpg(np.zeros_like(low), np.ones_like(low))
+            if wanted < 2 * count or 2 * count > most or not helped:
+                return self._cut(self._whole, 0, max(1, min(wanted if helped else count, most))), part, probe
+            count, before = 2 * count + 1, excess
+
+    def _probe(self, part: _Part, everything: np.ndarray) -> tuple[Bounds, float]:
+        """Bounds of ``part``, and how many such cells time and memory allow."""
+        started = time.perf_counter()
+        probe = self.frame.bound(part.box, self._numbers_of(everything), None, self.keep_leaves)
         seconds = time.perf_counter() - started
         allowed = _COVER_SHARE * self.goal.seconds / max(seconds, 1e-4)
         if self.goal.cells is not None:
             allowed = self.goal.cells / 2
         size = probe.lower.nbytes + probe.upper.nbytes + _array_bytes(probe.context) + _linear_bytes(probe)
         # half: the leaves are copied once when they are sorted by tile
-        allowed = max(1.0, min(allowed, 0.5 * self.goal.leaf_bytes / size))
-        while len(parts) > allowed and len(history) > 1:
-            history.pop()
-            parts = history[-1]
-        return parts, first, probe
+        return probe, max(1.0, min(allowed, 0.5 * self.goal.leaf_bytes / size))
 
     def _refine(self) -> None:
         while True:
