@@ -133,12 +133,16 @@ class _Part(NamedTuple):
 class _Cell:
     """A part of the set, the context for parts of it, and how much the picture varies along each axis [d]."""
 
-    __slots__ = ("box", "context", "narrow", "number", "part", "slopes")
+    __slots__ = ("context", "narrow", "number", "part", "slopes")
 
     def __init__(self, number: int, part: _Part, narrow: bool) -> None:
-        self.number, self.part, self.box, self.narrow = number, part, part.box, narrow
+        self.number, self.part, self.narrow = number, part, narrow
         self.context: Any = None
         self.slopes = np.zeros(part.box.dimensions)
+
+    @property
+    def box(self) -> ParameterBox:
+        return self.part.box
 
 
 @dataclass
@@ -493,18 +497,19 @@ class Refinement:
         motion = float(np.nan_to_num(self.frame.motion(self.frame.box)[0], nan=0.0))
         # odd: the middle of the set, which is rendered, is that of a part
         count, before = 2 * int(min(motion / FIRST_MOTION, _COVER_CELLS) / 2.0) + 1, np.inf
+        ratio = max(self.goal.ratio, _AIM_RATIO)
+        unsure = _CUT_OFF * self._mpg(np.zeros_like(self.image), np.ones_like(self.image))
         while True:
             part = self._cut(self._whole, 0, count)[count // 2]
             probe, affordable = self._probe(part, everything)
             ends = [self._witness(np.array(end)) for end in (part.box.lower, part.box.upper)]
             low, high = np.minimum.reduce([self.image, *ends]), np.maximum.reduce([self.image, *ends])
             excess = self._mpg(*_usable(probe.lower, probe.upper)) - self._mpg(low, high)
-            ratio = max(self.goal.ratio, _AIM_RATIO)
             aim = _AIM_SHARE * ((ratio - 1.0) * self._mpg(self.witness_lower, self.witness_upper) + self.goal.slack)
             # it falls with the square of the width
             wanted = math.ceil(count * math.sqrt(min(excess / aim, 1e6))) if aim > 0.0 < excess else count
             most = int(min(affordable, _COVER_CELLS))
-            helped = excess <= _HELPS * before or before >= _CUT_OFF * self._mpg(np.zeros_like(low), np.ones_like(low))
+            helped = excess <= _HELPS * before or before >= unsure
             if wanted < 2 * count or 2 * count > most or not helped:
                 return self._cut(self._whole, 0, max(1, min(wanted if helped else count, most))), part, probe
             count, before = 2 * count + 1, excess
