@@ -45,6 +45,7 @@ ALPHAS = "methods/splat/alphas.py"
 LAYERS = "methods/splat/layers.py"
 BLEND = "methods/splat/blend.py"
 BLOCK = "methods/splat/block.py"
+BOUNDS = "methods/splat/bounds.py"
 COLORS = "methods/splat/colors.py"
 FORM_COLORS = "methods/splat/form_colors.py"
 LINE_COLORS = "methods/splat/line_colors.py"
@@ -418,6 +419,31 @@ MUTANTS = (
         "stop ignored", LAYERS,
         "                if alone and t_low <= stop_high:", "                if False and t_low <= stop_high:",
         "test_bounds.py::test_stop[2]",
+    ),
+    Mutant(
+        "what is left out in dim light shows the background", BLEND,
+        "        if passed > 0.0:", "        if False:",
+        "test_bounds.py::test_layers_in_dim_light_are_left_out[0.0-False-2]",
+    ),
+    Mutant(
+        "light that comes to what is left out by its least", LAYERS,
+        "s[OPEN + q] = s[THI + q]", "s[OPEN + q] = s[TLO + q]",
+        "test_bounds.py::test_layers_in_dim_light_are_left_out[1.0-True-2]",
+    ),
+    Mutant(
+        "what is left out is left out of cells inside, too", LAYERS,
+        "            marks[i] = 1\n        color = advanced", "            marks[i] = 0\n        color = advanced",
+        "test_bounds.py::test_layers_that_were_left_out_are_there_for_cells_inside[2]",
+    ),
+    Mutant(
+        "left out are layers that may come before listed ones", LAYERS,
+        "                if s[REACH + q] <= k:", "                if True:",
+        "test_bounds.py::test_left_out_layers_that_swap_with_listed_ones[2]",
+    ),
+    Mutant(
+        "colours are kept where the camera moves", BOUNDS,
+        "self._seen_from is None or self._seen_from[0] != view", "self._seen_from is None",
+        "test_bounds.py::test_colors_are_shared_by_cells_that_turn_and_not_by_others",
     ),
     Mutant(
         "stop drops layers that may be drawn", LAYERS,

@@ -16,7 +16,8 @@ from ns_abstract.arithmetic.units import FLOAT32, REAL
 from ns_abstract.methods.splat.activate import Splats, rotation_matrices
 from ns_abstract.methods.splat.blend import _sort as sort_group
 from ns_abstract.methods.splat.bounds import SplatBounds
-from ns_abstract.methods.splat.constants import GSPLAT_1_4_0
+from ns_abstract.methods.splat.constants import GSPLAT_1_4_0, PAPER
+from ns_abstract.methods.splat.frame import SplatFrame
 from ns_abstract.methods.splat.records import FORMS, SPREAD, WILD, columns
 from ns_abstract.methods.splat.render import Renderer
 from ns_abstract.sets.box import ParameterBox
@@ -84,7 +85,9 @@ class Case:
         generator = np.random.default_rng(0)
         return np.concatenate([box.corners()[:4], box.corners()[-4:], box.sample(count, generator)])
 
-    def check(self, order: int, parts: int = 2, count: int = 9, arithmetic=REAL) -> tuple[np.ndarray, np.ndarray]:
+    def check(
+        self, order: int, parts: int = 2, count: int = 9, arithmetic=REAL, floor: float = -1.0
+    ) -> tuple[np.ndarray, np.ndarray]:
         """Bounds of the set from ``parts`` cells along the first parameter, after checking each cell.
 
         Returns the width of the bounds and the width of the sampled images, [H, W, 3].
@@ -92,7 +95,7 @@ class Case:
         lowest, highest = np.ones((2, self.camera.height, self.camera.width, 3)) * [[[[1.0]]], [[[0.0]]]]
         least, most = lowest.copy(), highest.copy()
         for box in self.poses.box.split(0, parts):
-            cell = self.bounds(box, order, arithmetic, keep_linear=True)
+            cell = self.bounds(box, order, arithmetic, keep_linear=True, floor=floor)
             assert cell.statistics[4] == 0
             lower, upper = assemble(cell.lower, self.camera), assemble(cell.upper, self.camera)
             linear = assemble(cell.linear, self.camera)
@@ -270,8 +273,9 @@ def test_stop(order):
     case = Case(stop_scene(0.9902), moves(x=0.3))
     middle = [case.image(v)[8, 8] for v in case.samples(case.poses.box, 15)]
     assert np.abs(np.diff(middle, axis=0)).max() > 1e-3
-    case.check(order, parts=1, count=21)
-    case.check(order, parts=4, count=5)
+    for floor in (-1.0, 0.003, 0.2):
+        case.check(order, parts=1, count=21, floor=floor)
+        case.check(order, parts=4, count=5, floor=floor)
 
 
 @both_orders
@@ -294,7 +298,105 @@ def test_stop_and_swap(order):
     case = Case(splats, moves(yaw=0.02))
     middle = [case.image(v)[8, 8, 2] for v in case.samples(case.poses.box, 15)]
     assert max(middle) > 5e-3
-    case.check(order, parts=1, count=25)
+    for floor in (-1.0, 0.003, 0.2):
+        case.check(order, parts=1, count=25, floor=floor)
+
+
+def dim_case(background: float, moving: bool) -> Case:
+    """A stack of layers that dims the light to 1e-3 half of the way."""
+    places = [(0.02 * k, -0.01 * k, -4.0 - 0.3 * k) for k in range(20)]
+    colors = [(0.1 * k, 0.2, 2.0 - 0.1 * k) for k in range(20)]
+    stack = [
+        {"mean": place, "scale": 4.0, "opacity": 0.5, "color": color}
+        for place, color in zip(places, colors, strict=True)
+    ]
+    ranges = moves(x=0.05) if moving else moves(yaw=0.01)
+    return Case(scene(*stack, background=(background,) * 3), ranges, camera(8, 8, 8.0))
+
+
+@both_orders
+@pytest.mark.parametrize("moving", [False, True])
+@pytest.mark.parametrize("background", [0.0, 1.0])
+def test_layers_in_dim_light_are_left_out(order, moving, background):
+    """What little light comes to may have any colour that is there: fewer layers, and hardly wider bounds."""
+    case = dim_case(background, moving)
+    full, _ = case.check(order, parts=1, count=5)
+    before = case.bounds(case.poses.box, order).statistics[1]
+    for floor in (5e-3, 0.02, 0.1):
+        width, _ = case.check(order, parts=1, count=5, floor=floor)
+        # no colour is farther than 2 from the background
+        assert (width <= full + 2.1 * floor).all() and (width > full).any()
+        layers = case.bounds(case.poses.box, order, floor=floor).statistics[1]
+        assert layers < before
+        before = layers
+
+
+@both_orders
+def test_left_out_layers_that_swap_with_listed_ones(order):
+    """No layer is left out that may come before one that counts."""
+    splats = scene(
+        {"mean": (0.0, 0.0, -4.0), "scale": 2.0, "opacity": 0.9, "color": (0.2, 0.0, 0.0)},
+        {"mean": (-0.4, 0.0, -5.0), "scale": 0.8, "opacity": 0.9, "color": (1.0, 0.1, 0.0)},
+        {"mean": (0.4, 0.1, -5.0), "scale": 0.8, "opacity": 0.95, "color": (0.0, 0.9, 1.0)},
+        {"mean": (0.4, 0.1, -6.0), "scale": 2.0, "opacity": 0.9, "color": (9.0, 0.9, 1.0)},
+        background=(0.2, 0.3, 0.4),
+    )
+    case = Case(splats, moves(yaw=0.05), camera(8, 8, 8.0))
+    for floor in (0.003, 0.02, 0.2):
+        case.check(order, parts=1, floor=floor)
+
+
+@both_orders
+def test_layers_that_were_left_out_are_there_for_cells_inside(order):
+    """A cell lists for its parts what it left out itself; only what no pose shows is missing there."""
+    case = dim_case(1.0, True)
+    box = case.poses.box
+    visible = case.bounds(box, order, floor=0.1).visible
+    assert visible.size == 20
+    part = box.split(0, 4)[0]
+    cell = case.bounds(part, order, candidates=visible.astype(np.int32))
+    lower, upper = assemble(cell.lower, case.camera), assemble(cell.upper, case.camera)
+    for values in case.samples(part, 9):
+        image = case.image(values)
+        assert (lower <= image).all() and (image <= upper).all()
+
+
+@pytest.mark.parametrize("rasteriser", [GSPLAT_1_4_0, PAPER])
+def test_a_frame_leaves_out_what_little_light_comes_to_as_far_as_that_is_allowed(rasteriser):
+    case = dim_case(1.0, True)
+    frame = SplatFrame(case.splats, rasteriser, FLOAT32, case.poses)
+    part, tiles, gaps = case.poses.box.split(0, 8)[0], np.arange(frame.tile_count), []
+    for excess in (0.0, 1e-6, 0.01, 1.0, 0.0):
+        frame.allow(excess)
+        bounds = frame.bound(part, tiles)
+        gaps.append(float((bounds.upper - bounds.lower).mean()))
+    assert gaps[0] == gaps[1] == gaps[4]
+    if rasteriser is PAPER:
+        # without a stop nobody knows how many layers there are behind
+        assert gaps[0] == gaps[2] == gaps[3]
+    else:
+        assert gaps[0] < gaps[2] < gaps[0] + 0.01
+        assert gaps[2] < gaps[3] < gaps[0] + 0.02
+
+
+def test_colors_are_shared_by_cells_that_turn_and_not_by_others():
+    """Cells seen from the same place have the same colours; from another one they do not."""
+    sh = np.random.default_rng(1).normal(0.0, 0.4, (6, 4, 3))
+    splats = scene(*({"mean": (0.3 * k - 0.8, 0.0, -4.0), "scale": 0.3, "opacity": 0.7, "sh": sh[k]} for k in range(6)))
+    here, there = (
+        PoseSet.around(camera(position=place), moves(yaw=0.05)) for place in ((0.0, 0.0, 0.0), (0.5, 0.2, -1.0))
+    )
+    kept = SplatBounds(splats, GSPLAT_1_4_0, FLOAT32)
+    for poses in (here, here, there, here):
+        for box in (*poses.box.split(0, 2), poses.box):
+            for candidates in (None, np.arange(1, 6, dtype=np.int32)):
+                forms = poses.enclosure(box, 2)
+                found, fresh = (
+                    bounds.cell(poses.camera, forms, candidates=candidates)
+                    for bounds in (kept, SplatBounds(splats, GSPLAT_1_4_0, FLOAT32))
+                )
+                assert (found.lower == fresh.lower).all() and (found.upper == fresh.upper).all()
+                assert (found.visible == fresh.visible).all() and (found.reach == fresh.reach).all()
 
 
 @both_orders

@@ -188,6 +188,52 @@ def test_first_cover_of_one_parameter_is_what_the_goal_asks_for(ratio: float, sl
     assert first.cells <= max(2 * least, pace * 8)
 
 
+class Watched(Waves):
+    """Notes what is rendered, and what the refinement allows, before the first cell is split."""
+
+    def __init__(self) -> None:
+        super().__init__(1)
+        self.rendered: list[float] = []
+        self.allowed: list[float] = []
+        self.before_splits: tuple[list[float], list[float]] | None = None
+
+    def allow(self, excess: float) -> None:
+        self.allowed.append(excess)
+
+    def render(self, values: np.ndarray, tiles: np.ndarray | None = None) -> np.ndarray:
+        self.rendered.append(float(values[0]))
+        return super().render(values, tiles)
+
+    def bound(self, box: ParameterBox, tiles: np.ndarray, within: Any = None, keep_linear: bool = False) -> Any:
+        if within is not None and self.before_splits is None:
+            self.before_splits = list(self.rendered), list(self.allowed)
+        return super().bound(box, tiles, within, keep_linear)
+
+
+def test_first_cover_is_rendered_in_every_other_part_until_the_goal_asks_for_more() -> None:
+    for ratio, split in ((1.06, False), (1.002, True)):
+        frame = Watched()
+        result = refine(frame, Goal(ratio, FOREVER, 4000))
+        check(frame, result)
+        assert (frame.before_splits is not None) == split
+        rendered = frame.rendered if frame.before_splits is None else frame.before_splits[0]
+        parts = frame.box.split(0, result.trace[0].cells)
+        assert len(parts) > 4
+        seen = sum(float(part.middle[0]) in rendered for part in parts)
+        assert seen == len(parts) if split else seen <= len(parts) / 2 + 1
+
+
+def test_only_a_cover_that_may_reach_the_goal_is_allowed_to_be_looser() -> None:
+    """Cells that are split had better tell what they hide."""
+    for ratio, looser in ((1.2, True), (1.05, True), (1.04, False)):
+        frame = Watched()
+        result = refine(frame, Goal(ratio, FOREVER, 4000))
+        first, *before, last = frame.allowed
+        assert first == last == 0.0 and len(before) == looser
+        if looser:
+            assert 0.0 < before[0] <= (ratio - 1.0) * result.trace[0].mpg_witness
+
+
 def test_first_cover_stays_coarse_where_smaller_cells_do_not_help() -> None:
     frame = Waves(1, slack=0.0)
     bound = frame.bound

@@ -218,11 +218,11 @@ def test_directions(dimensions: int, monkeypatch: pytest.MonkeyPatch) -> None:
     """A mean that moves changes the direction it is seen from; colours that ignore it are found."""
     case = direction_case(dimensions)
     assert case.attack()[0].violations == 0
-    for name in ("fixed_colors", "moving_colors"):
-        right = getattr(bounds_module, name)
-        monkeypatch.setattr(
-            bounds_module, name, lambda indices, means, radius, *rest, right=right: right(indices, means, NONE, *rest)
-        )
+    fixed, moving = bounds_module.fixed_colors, bounds_module.moving_colors
+    monkeypatch.setattr(bounds_module, "fixed_colors", lambda means, radius, *rest: fixed(means, NONE, *rest))
+    monkeypatch.setattr(
+        bounds_module, "moving_colors", lambda indices, means, radius, *rest: moving(indices, means, NONE, *rest)
+    )
     assert case.attack()[0].violations > 0
 
 

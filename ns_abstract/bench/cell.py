@@ -8,8 +8,9 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from ns_abstract.bench.sets import pose_set
-from ns_abstract.methods.splat.frame import SplatFrame
+from ns_abstract.methods.splat.frame import Context, SplatFrame, TileBounds
 from ns_abstract.pipeline import Job
+from ns_abstract.refine.engine import Goal, spread
 from ns_abstract.sets.box import ParameterBox
 from ns_abstract.sets.poses import PoseSet
 
@@ -40,7 +41,9 @@ def small_cell(poses: PoseSet, part: float) -> ParameterBox:
 
 
 def cell_cost(job: Job, name: str, frame: int, repeats: int) -> dict[str, object]:
-    """Times of the render, of a cell from nothing and of a cell inside a bounded one, and their ratios.
+    """Times of the render, of a cell of a first cover and of a cell inside a bounded one, and their ratios.
+
+    The first leaves out what a run to the usual goal leaves out of its cover, the second nothing, as in refinement.
 
     Returns:
         Milliseconds (medians), and medians of the ratios to the render: each of ``repeats`` times the three follow one
@@ -48,12 +51,17 @@ def cell_cost(job: Job, name: str, frame: int, repeats: int) -> dict[str, object
     """
     poses = pose_set(job, name, frame)
     view = SplatFrame(job.splats, job.rasteriser, job.arithmetic, poses)
+    excess = (Goal().ratio - 1.0) * spread(view, frame, job.settings.seed) if poses.box.dimensions == 1 else 0.0
     cell = small_cell(poses, PART)
     tiles = np.arange(view.tile_count)
     around = view.bound(cell, tiles).context
+
+    def bounded(allowed: float, within: Context | None) -> TileBounds:
+        view.allow(allowed)
+        return view.bound(cell, tiles, within)
+
     seconds = measure(
-        [lambda: view.render(cell.middle), lambda: view.bound(cell, tiles), lambda: view.bound(cell, tiles, around)],
-        repeats,
+        [lambda: view.render(cell.middle), lambda: bounded(excess, None), lambda: bounded(0.0, around)], repeats
     )
     median, ratios = np.median(seconds, axis=0), np.median(seconds[:, 1:] / seconds[:, :1], axis=0)
     return {

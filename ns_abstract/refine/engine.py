@@ -259,6 +259,8 @@ class Refinement:
         self.trace: list[TracePoint] = []
         self.start = time.perf_counter()
         self.covered = False
+        #: parameters of the first cover's witnesses that are not rendered unless the goal asks for them
+        self._unseen: list[np.ndarray] = []
         #: scene elements that some cell of the cover shows, if the frame tells
         self.shown: np.ndarray | None = None
         self.leaf_sets: dict[tuple[int, int], tuple[ParameterBox, tuple[np.ndarray, ...]]] = {}
@@ -395,6 +397,7 @@ class Refinement:
 
     def _work(self) -> TracePoint:
         box = self.frame.box
+        self._allow(0.0)
         # the first call compiles kernels; the clock of the trace starts after it
         self.image = self._witness(box.middle)
         self.start = time.perf_counter()
@@ -404,6 +407,9 @@ class Refinement:
             for values in corners:
                 self._witness(values)
             corners = corners[:0]
+            if self.goal.ratio >= _AIM_RATIO:
+                # the cover alone may reach the goal; cells that are split had better tell what they hide
+                self._allow((self.goal.ratio - 1.0) * self._mpg(self.witness_lower, self.witness_upper))
         if self._cover() and not self._over():
             for render in itertools.islice(self.members, _MEMBERS):
                 self._widen(self._render(render, box.middle, None), None)
@@ -426,6 +432,12 @@ class Refinement:
     def snapshot(self) -> FrameResult:
         """What is known now; sound at any time after the first render."""
         return self._result(self.point())
+
+    def _allow(self, excess: float) -> None:
+        """Tell the frame how much looser than the inner bounds cells may be from now on."""
+        allow = getattr(self.frame, "allow", None)
+        if allow is not None:
+            allow(excess)
 
     def _corners(self) -> np.ndarray:
         return _first_corners(self.frame.box, self.random)
@@ -452,8 +464,10 @@ class Refinement:
             lower, upper, bounds = self._take(cell, probe) if known else self._bound(cell, None, everything)
             leaves.append((cell, lower, upper))
             self._keep(cell, bounds, everything)
-            if len(parts) > 1:
+            if number % 2:
                 self._witness(part.box.middle)
+            elif len(parts) > 1:
+                self._unseen.append(part.box.middle)
             self.progress(self.point(), (number + 1) / len(parts))
         for t in everything:
             cells, lowers, uppers = zip(*((cell, lower[t], upper[t]) for cell, lower, upper in leaves), strict=True)
@@ -527,10 +541,18 @@ class Refinement:
         return probe, max(1.0, min(allowed, 0.5 * self.goal.leaf_bytes / size))
 
     def _refine(self) -> None:
+        self._allow(0.0)
         while True:
             point = self._record(1.0)
             if self._over() or self.goal.met(point):
                 return
+            if self._unseen:
+                # first what may show that the goal is met already: half of them, then half of the rest
+                middles, self._unseen = self._unseen[::2], self._unseen[1::2]
+                for values in middles:
+                    if not self._over():
+                        self._witness(values)
+                continue
             # what is kept for the result cannot be given up for room
             if self._kept_bytes >= self.goal.leaf_bytes:
                 return
@@ -739,14 +761,18 @@ def shared_goal(frame: Frame, index: int, goal: Goal, seed: int) -> Goal:
     """
     if frame.batch is not None or not frame.box.dimensions:
         return goal
-    corners = _first_corners(frame.box, np.random.default_rng([seed, index]))
-    pictures = [frame.render(values) for values in (frame.box.middle, corners[0], corners[-1])]
-    least, most = np.minimum.reduce(pictures), np.maximum.reduce(pictures)
-    spread = float(gap(least, most)[_pixels_inside(frame)].mean())
     excess = goal.ratio - 1.0
     # rounding of means must not turn the sum around
-    slack = _SLACK_SHARE * excess * spread * (1.0 - 2.0**-20)
+    slack = _SLACK_SHARE * excess * spread(frame, index, seed) * (1.0 - 2.0**-20)
     return replace(goal, ratio=1.0 + (1.0 - _SLACK_SHARE) * excess, slack=slack)
+
+
+def spread(frame: Frame, index: int, seed: int) -> float:
+    """MPG of the pictures at the middle and at two opposite ends of the set: no more than the witnesses'."""
+    corners = _first_corners(frame.box, np.random.default_rng([seed, index]))
+    pictures = [frame.render(values) for values in (frame.box.middle, *corners[[0, -1]])]
+    least, most = np.minimum.reduce(pictures), np.maximum.reduce(pictures)
+    return float(gap(least, most)[_pixels_inside(frame)].mean())
 
 
 def _first_corners(box: ParameterBox, random: np.random.Generator) -> np.ndarray:

@@ -17,6 +17,7 @@ from ns_abstract.methods.splat.block import (
     FORM,
     LIGHT,
     LISTED,
+    OPEN,
     RHO,
     ROUND,
     UP,
@@ -387,16 +388,19 @@ def _form_range(t, r, d, order, m):
 
 @njit(cache=True, error_model="numpy")
 def shade(
-    layers_, width, lists_, palette_, forms, lengths, moves_, chain, reordered, background_, color_radius, negligible,
-    unit, left, top_row, d, order, m, s_, t_, value_, keys_, order_, lower, upper, linear, slopes, statistics,
+    layers_, width, lists_, palette_, forms, lengths, moves_, chain, reordered, background_, unseen_, fade,
+    color_radius, negligible, unit, left, top_row, d, order, m, s_, t_, value_, keys_, order_, lower, upper, linear,
+    slopes, statistics,
 ):  # fmt: skip
     """Blend every pixel's layers and write its bounds; lanes are the channels, a fourth one holds nothing.
 
     The block begins at column ``left`` and row ``top_row`` of its tile; ``reordered`` tells whether layers may move.
+    Row OPEN of ``s`` bounds the light that comes to layers that are missing and have colours between the two that
+    ``unseen`` [8] names; the program adds these up with an error of at most ``fade``.
     """
     layers, lists, palette, moves = pointer(layers_), pointer(lists_), pointer(palette_), pointer(moves_)
     background, s, t, value = pointer(background_), pointer(s_), pointer(t_), pointer(value_)
-    keys, order_of = pointer(keys_), pointer(order_)
+    unseen, keys, order_of = pointer(unseen_), pointer(keys_), pointer(order_)
     deepest = lists_.shape[1]
     # behind the polynomials: scratch, then sums of absolute linear coefficients
     u = advanced(t, 4 * m)
@@ -435,8 +439,16 @@ def shade(
         )
         # a stop that was ignored shows the background in place of what lies behind (B6)
         rho = s[RHO + q] * (1.0 + 16.0 * unit)
-        fall = slack + rho * maximum(0.0, light - behind)
-        rise = slack + rho * maximum(0.0, behind - dark)
+        fall = rho * maximum(0.0, light - behind)
+        rise = rho * maximum(0.0, behind - dark)
+        # or else layers that are missing show in place of the background
+        passed = s[OPEN + q] * (1.0 + 16.0 * unit)
+        if passed > 0.0:
+            faded = fade * max(bright, unseen[4], unseen[5], unseen[6])
+            fall = maximum(fall, fma(passed, behind - load4(unseen, 0), faded))
+            rise = maximum(rise, fma(passed, load4(unseen, 4) - behind, faded))
+        fall = slack + fall
+        rise = slack + rise
         bottom = maximum(low, form_low) - fall
         top = minimum(high, form_high) + rise
         # crossed or not a number: nothing is known

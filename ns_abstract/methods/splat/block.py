@@ -21,9 +21,9 @@ UP = 1.0 + 128.0 * UNIT64
 # Scratch is flat: row r holds its lanes at r * PIXELS .. r * PIXELS + PIXELS - 1, one by pixel.
 (
     C1, C2, L1, L2, B1, B2, S0, SR, SL, SB, SLO, SHI, WEIGHT, CURVE,
-    TLO, THI, REACH, RHO, LOST, MIN, MAX, NUMBERS,
-) = range(0, 22 * PIXELS, PIXELS)  # fmt: skip
-ROWS = 22
+    TLO, THI, REACH, RHO, LOST, OPEN, MIN, MAX, NUMBERS,
+) = range(0, 23 * PIXELS, PIXELS)  # fmt: skip
+ROWS = 23
 #: Columns of a layer: bounds of alpha, transmittance behind it at its least and before it at its most, alpha's
 #: coefficients and then its radius.
 ALPHA_LOW, ALPHA_HIGH, LEFT, LIGHT, FORM = range(5)

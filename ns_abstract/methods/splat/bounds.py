@@ -11,10 +11,10 @@ from numba import get_num_threads
 from ns_abstract.arithmetic.forms import Basis
 from ns_abstract.arithmetic.units import UNIT64, Arithmetic
 from ns_abstract.methods.splat.activate import Splats
-from ns_abstract.methods.splat.colors import color_reach, fixed_colors, moving_colors
+from ns_abstract.methods.splat.colors import color_reach, fixed_colors, gathered, moving_colors
 from ns_abstract.methods.splat.constants import Rasteriser, rules_array
 from ns_abstract.methods.splat.gaussians import covariance_noise, gaussian_stage
-from ns_abstract.methods.splat.lists import depth_order, tile_lists, tile_mask
+from ns_abstract.methods.splat.lists import depth_order, marked, tile_lists, tile_mask
 from ns_abstract.methods.splat.pixels import pixel_stage
 from ns_abstract.methods.splat.records import columns, faint_exponents
 from ns_abstract.methods.splat.render import camera_array
@@ -79,6 +79,7 @@ class SplatBounds:
         self._noise = covariance_noise(splats.axes, a.unit, a.flush)
         self._color_radius = 8.0 * a.unit * float(np.abs(splats.sh).max(initial=1.0)) if splats.degree == 0 else 0.0
         self._color_reach = color_reach(splats.sh, splats.degree) if splats.degree > 0 else None
+        self._seen_from: tuple[tuple[float, ...], np.ndarray] | None = None
         self._plain_colors = _shifted_colors(self.varied, a.unit) if splats.degree == 0 else None
 
     def _buffer(self, name: str, shape: tuple[int, ...], dtype: type = np.float64) -> np.ndarray:
@@ -98,6 +99,7 @@ class SplatBounds:
         wanted: np.ndarray | None = None,
         candidates: np.ndarray | None = None,
         keep_linear: bool = False,
+        floor: float = -1.0,
     ) -> CellBounds:
         """Bounds of the tiles ``wanted`` over the poses enclosed by ``forms``.
 
@@ -107,6 +109,8 @@ class SplatBounds:
             wanted: Tile numbers; all if None.
             candidates: Scene indices that may be visible (from an enclosing cell); all if None.
             keep_linear: Whether to return the linear sets.
+            floor: What no more light comes to may have any colour that is there (B6); negative, and for rasterisers
+                without a stop: every layer counts.
         """
         splats = self.splats
         basis: Basis = forms.rotation.basis
@@ -152,15 +156,21 @@ class SplatBounds:
         statistics = np.zeros((threads, 5), np.int64)
         marks = np.zeros(n, np.uint8)
         negligible = self.rasteriser.alpha_negligible * splats.count
+        stop, alpha_min = self.rules[9], self.rules[7]
+        if stop > 0.0 < floor:
+            # each layer that is drawn dims the light by the least alpha or more, and is added with one rounding (B8)
+            most = math.log(max(floor / stop, 1.0)) / -math.log1p(-alpha_min) + 4.0
+            fade = (1.1 + 4.0 * floor) * most * (self.arithmetic.unit + 8.0 * UNIT64)
+        else:
+            floor, fade = -1.0, 0.0
         pixel_stage(
             wanted, offsets, entries, record, box, tiles, depth, delta, depth_error, colors, self._color_radius,
             slope, np.ascontiguousarray(rotation[0]), view, self.rules, self._errors,
-            splats.background, negligible, PAIR_LIMIT, d, order, m, splats.antialiased, threads,
-            lower, upper, linear, slopes, statistics, marks,
+            splats.background, floor, fade, negligible, PAIR_LIMIT, d, order, m,
+            splats.antialiased, threads, lower, upper, linear, slopes, statistics, marks,
         )  # fmt: skip
-        used = np.flatnonzero(marks)
         return CellBounds(
-            wanted, lower, upper, candidates[used], np.ascontiguousarray(tiles[used, :4]),
+            wanted, lower, upper, *marked(marks, candidates, tiles),
             linear if keep_linear else None, slopes.sum(axis=0) / (max(wanted.size, 1) * self.side**2 * 3),
             statistics.sum(axis=0),
         )  # fmt: skip
@@ -177,19 +187,25 @@ class SplatBounds:
             if n == splats.count:
                 return np.ascontiguousarray(splats.sh[:, 0])
             return splats.sh[candidates, 0]
-        indices = np.empty((alive.size, 2), np.int64)
-        indices[:, 0], indices[:, 1] = alive, candidates[alive]
         unit = self.arithmetic.unit
         # torch.inverse of the view matrix: 80 units of 1 + |T| (design.md, C3)
         position_error = 80.0 * unit * (1.0 + float(camera_reach.sum()))
         if not np.any(forms.position.linear) and float(forms.position.radius.max()) < 1e-9:
-            colors = self._buffer("colors", (n, 6))
             position_error += 2.0 * float(forms.position.radius.max())
-            fixed_colors(
-                indices, varied.mean_middle, varied.mean_radius, varied.color_low, varied.color_high,
-                splats.sh, self._color_reach, splats.degree, forms.position.center, position_error, unit, colors,
-            )  # fmt: skip
-            return colors
+            view = (*forms.position.center.tolist(), position_error)
+            if self._seen_from is None or self._seen_from[0] != view:
+                # of every Gaussian: cells that only turn the camera share them
+                colors = self._buffer("colors", (splats.count, 6))
+                fixed_colors(
+                    varied.mean_middle, varied.mean_radius, varied.color_low, varied.color_high, splats.sh,
+                    self._color_reach, splats.degree, forms.position.center, position_error, unit, colors,
+                )  # fmt: skip
+                self._seen_from = view, colors
+            colors = self._seen_from[1]
+            return colors if n == splats.count else gathered(colors, candidates, alive, self._buffer("some", (n, 6)))
+        indices = np.empty((alive.size, 2), np.int64)
+        indices[:, 0], indices[:, 1] = alive, candidates[alive]
+        self._seen_from = None
         colors = self._buffer("colors", (n, 3 * (basis.monomials + 1)))
         moving_colors(
             indices, varied.mean_middle, varied.mean_radius, varied.color_low, varied.color_high,

@@ -114,25 +114,22 @@ def _direction_error(length, position_error, means, mean_radius, i, unit):
 
 @njit(cache=True, parallel=True, error_model="numpy")
 def fixed_colors(
-    indices, means, mean_radius, color_low, color_high, sh, reach, degree, position, position_error, unit, colors,
+    means, mean_radius, color_low, color_high, sh, reach, degree, position, position_error, unit, colors,
 ):  # fmt: skip
-    """Colours seen from one camera position: centre and radius by Gaussian (design.md, C1, C3, S4).
+    """Colours [N, 6] seen from one camera position: centre and radius by channel (design.md, C1, C3, S4).
 
     Args:
-        indices: [n] rows to fill, with ``colors`` [., 6] = (centre, radius) by channel, and the
-            Gaussian's number in the scene in the second column: [n, 2].
         mean_radius: [N, 3] or [0, 3]; see `gaussians.gaussian_stage`.
         color_low, color_high: [N, 3] ranges of what is added to the colours, or [0, 3].
         reach: [N, 6] see `color_reach`.
         position: [3]; ``position_error`` bounds what float evaluation and the set add to it.
     """
-    for chunk in prange((indices.shape[0] + _CHUNK - 1) // _CHUNK):
+    count = means.shape[0]
+    for chunk in prange((count + _CHUNK - 1) // _CHUNK):
         basis = np.empty(16)
         color = np.empty(3)
         direction = np.empty(3)
-        for row in range(chunk * _CHUNK, min(indices.shape[0], (chunk + 1) * _CHUNK)):
-            target = indices[row, 0]
-            i = indices[row, 1]
+        for i in range(chunk * _CHUNK, min(count, (chunk + 1) * _CHUNK)):
             for k in range(3):
                 direction[k] = means[i, k] - position[k]
             length = math.sqrt(direction[0] ** 2 + direction[1] ** 2 + direction[2] ** 2)
@@ -146,8 +143,18 @@ def fixed_colors(
                     high = max(0.0, color[c] + radius + color_high[i, c] + rounding)
                     color[c] = 0.5 * (low + high)
                     radius = 0.5 * (high - low) * _UP + _COEFFICIENT * high
-                colors[target, 2 * c] = color[c]
-                colors[target, 2 * c + 1] = radius
+                colors[i, 2 * c] = color[c]
+                colors[i, 2 * c + 1] = radius
+
+
+@njit(cache=True, error_model="numpy")
+def gathered(colors, numbers, alive, out):
+    """Rows ``alive`` of ``out`` [n, 6]: the ``colors`` of the Gaussians ``numbers`` [n]; the others are left as is."""
+    for k in alive:
+        i = numbers[k]
+        for column in range(6):
+            out[k, column] = colors[i, column]
+    return out
 
 
 @njit(cache=True, parallel=True, error_model="numpy")

@@ -31,6 +31,9 @@ _MOTION_POSES = 9
 _MOTION_STEP = 2.0**-10
 #: A compensation by less than this part of a rotation's range is left out.
 _SHEAR_MATTERS = 2.0**-7
+#: Light that is not followed further: the part of the excess that may be allowed, and at most, and no less than so many
+#: times the rasteriser's stop.
+_FLOOR_SHARE, _BRIGHTEST_FLOOR, _WORTH_IT = 0.2, 2.0**-7, 1.5
 #: A context that is larger than this part of the one around it is not kept beside it.
 _WORTH_KEEPING = 0.8
 
@@ -104,6 +107,8 @@ class SplatFrame:
         self.varied = self.bounds.varied
         self.renderer = Renderer(self.varied.nearest, rasteriser)
         self.side = rasteriser.work_tile
+        self._stop = rasteriser.transmittance_min
+        self._floor = -1.0
         self.across, self.down = tile_grid(self.camera, self.side)
         if slanted and (shear := self._shear()):
             self.pose_set = pose_set.sheared(shear)
@@ -138,6 +143,11 @@ class SplatFrame:
 
             yield render
 
+    def allow(self, excess: float) -> None:
+        """Save time from now on where that loosens gaps by no more than a small part of ``excess`` on average (B6)."""
+        floor = min(_FLOOR_SHARE * excess, _BRIGHTEST_FLOOR)
+        self._floor = floor if floor > _WORTH_IT * self._stop > 0.0 else -1.0
+
     def feasible(self, box: ParameterBox) -> ParameterBox | None:
         """See `PoseSet.feasible`."""
         return self.pose_set.feasible(box)
@@ -146,8 +156,9 @@ class SplatFrame:
         self, box: ParameterBox, tiles: np.ndarray, within: Context | None = None, keep_linear: bool = False
     ) -> TileBounds:
         """Bounds of ``tiles`` over ``box``; ``within`` is the context of these tiles and a box around it."""
+        forms = self.pose_set.enclosure(box, self.order)
         candidates = self._candidates(tiles, within)
-        cell = self.bounds.cell(self.camera, self.pose_set.enclosure(box, self.order), tiles, candidates, keep_linear)
+        cell = self.bounds.cell(self.camera, forms, tiles, candidates, keep_linear, self._floor)
         lower, upper = outward(cell.lower, cell.upper)
         # hardly smaller: not worth its memory
         kept = within is not None and cell.visible.size > _WORTH_KEEPING * within.visible.size

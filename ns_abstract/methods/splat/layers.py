@@ -24,6 +24,7 @@ from ns_abstract.methods.splat.block import (
     LOST,
     MOVES,
     NUMBERS,
+    OPEN,
     REACH,
     RHO,
     ROUND,
@@ -266,9 +267,9 @@ def _append_layer(number, q, k, t_low, t_high, layers, width, s, lengths, lists,
 
 @njit(cache=True, error_model="numpy")
 def _keep_drawn(
-    found, pixels, first_layer, k, layers, width, s, lengths, lists, deepest, stop_high, shrink, grow
+    found, pixels, first_layer, k, layers, width, s, lengths, lists, deepest, bright, shrink, grow
 ):  # fmt: skip
-    """Keep the layers of a Gaussian whose place is certain in those lanes of ``found`` that no stop can hide.
+    """Keep the layers of a Gaussian whose place is certain in those lanes of ``found`` that leave more than ``bright``.
 
     Lane b is layer number ``first_layer + b`` on the pixel ``pixels[b]``. Returns the other lanes.
     """
@@ -280,7 +281,7 @@ def _keep_drawn(
         number = first_layer + lane
         at = number * width
         t_low = s[TLO + q] * (1.0 - layers[at + ALPHA_HIGH]) * shrink
-        if not t_low > stop_high:
+        if not t_low > bright:
             rest |= 1 << lane
             continue
         t_high = s[THI + q] * (1.0 - layers[at + ALPHA_LOW]) * grow
@@ -310,11 +311,37 @@ def _set_colors(palette, k, color, color_rows):
 
 
 @njit(cache=True, error_model="numpy")
+def _colors_behind(first, length, entries, colors, colors_, color_rows, background, unseen, marks):
+    """Ends of the colours of the list's entries from ``first`` on and of the background; marks them (design.md, B6).
+
+    ``unseen`` [8] receives the darkest and the brightest of three channels and of one of none.
+    """
+    for channel in range(4):
+        unseen[channel] = background[channel]
+        unseen[4 + channel] = background[channel]
+    for k in range(first, length):
+        ahead = entries[min(k + BATCH, length - 1)]
+        for byte in range(0, 24 * color_rows, 64):
+            prefetch(colors_, ahead, byte)
+        i = entries[k]
+        if marks[i] == 0:
+            marks[i] = 1
+        color = advanced(colors, i * 3 * color_rows)
+        for channel in range(3):
+            at = channel * color_rows
+            spread = 0.0
+            for r in range(1, color_rows):
+                spread += abs(color[at + r])
+            unseen[channel] = min(unseen[channel], color[at] - spread * UP)
+            unseen[4 + channel] = max(unseen[4 + channel], color[at] + spread * UP)
+
+
+@njit(cache=True, error_model="numpy")
 def collect_layers(
     entries_, record_, box_, tiles_, tile_x, tile_y, colors_, palette_, depth_, delta_, depth_error_, slope_, ray,
     s_, y1, y2, poly, rows_, layers_, width, offset_x, offset_y, pixels_, batch_, masks_, asked_, lists_, lengths_,
     reach_, deep_, far_, first_, last_, slots_, owners_, drawn_, places_, moves_, pairs_, x0, y0, d, order, m,
-    antialiased, rules, errors, marks_,
+    antialiased, rules, errors, floor, background_, unseen_, marks_,
 ):  # fmt: skip
     """Collect the layers of every pixel, nearest first (design.md, B5-B6).
 
@@ -325,6 +352,10 @@ def collect_layers(
     leads back; the set ``drawn`` holds a slot's pixels and ``places`` its place in their lists. Returns the number of
     pairs and of slots; or GIVE_UP where more pairs are uncertain than ``pairs`` may hold, or GROW where another
     buffer is too small.
+
+    A list may end where no pose leaves more light than ``floor``. All that is missing lies behind what it holds, and
+    row OPEN of ``s`` bounds the light that comes there, ``unseen`` [8] the colours (`_colors_behind`). OPEN is 0 where
+    nothing is missing, as if ``floor`` is negative.
 
     Row RHO of ``s`` receives how much transmittance may be lost to a stop that the kept layers ignore;
     ``marks`` is set for the entries that some pixel that takes light may draw, or stop at; ``palette`` receives
@@ -346,6 +377,7 @@ def collect_layers(
     stop = rules[9]
     stop_low = stop * (1.0 - 8.0 * unit)
     stop_high = stop * (1.0 + 8.0 * unit)
+    dark = max(stop_low, floor)
     # two roundings of the running transmittance
     shrink, grow = 1.0 - 8.0 * unit, 1.0 + 8.0 * unit
     capacity = layers_.size // width
@@ -357,6 +389,7 @@ def collect_layers(
         s[REACH + q] = -1.0
         s[RHO + q] = 0.0
         s[LOST + q] = 0.0
+        s[OPEN + q] = 0.0
         lengths[q] = 0
     room, largest = _depth_reach(entries_, depth_, delta_, depth_error_, slope_, ray, m, reach_, deep_)
     if not room > 0.0:
@@ -379,8 +412,9 @@ def collect_layers(
         moves[r] = 0.0
     move_count = 1
     live = -1
-    # pixels that take no light behind the layers whose place is still open
+    # pixels that take no light, or too little, behind the layers whose place is still open
     dim = 0
+    missing = length
     used = 0
     for start in range(0, length, BATCH):
         some = min(BATCH, length - start)
@@ -459,7 +493,7 @@ def collect_layers(
             if alone:
                 found = _keep_drawn(
                     found, advanced(pixels, begin), used + begin, k, layers, width, s, lengths, lists, deepest,
-                    stop_high, shrink, grow,
+                    max(stop_high, floor), shrink, grow,
                 )  # fmt: skip
             while found != 0:
                 lane = begin + lowest_bit(found)
@@ -483,7 +517,7 @@ def collect_layers(
                     else:
                         s[RHO + q] = s[LOST + q]
                 count = _append_layer(used + lane, q, k, t_low, t_high, layers, width, s, lengths, lists, deepest)
-                if t_high <= stop_low:
+                if t_high <= dark:
                     dim = signed(dim | (1 << q))
                 if not alone:
                     if move_count >= move_limit:
@@ -502,9 +536,16 @@ def collect_layers(
                 some_dim = signed(some_dim & (some_dim - 1))
                 if s[REACH + q] <= k:
                     live = signed(live & ~(1 << q))
+                    if s[THI + q] > stop_low and k + 1 < length:
+                        s[OPEN + q] = s[THI + q]
+                        missing = min(missing, k + 1)
         if live == 0:
             break
         used += end
+    if missing < length:
+        _colors_behind(
+            missing, length, entries, colors, colors_, color_rows, pointer(background_), pointer(unseen_), marks
+        )
     return pair_count, slot_count
 
 

@@ -59,6 +59,23 @@ def touching(indices, tiles, wanted, tiles_x):
 
 
 @njit(cache=True, error_model="numpy")
+def marked(marks, numbers, tiles):
+    """Those of ``numbers`` whose mark is not 0, and the first four columns of their ``tiles``."""
+    count = 0
+    for k in range(marks.size):
+        count += marks[k] != 0
+    found, ranges = np.empty(count, numbers.dtype), np.empty((count, 4), tiles.dtype)
+    count = 0
+    for k in range(marks.size):
+        if marks[k] != 0:
+            found[count] = numbers[k]
+            for column in range(4):
+                ranges[count, column] = tiles[k, column]
+            count += 1
+    return found, ranges
+
+
+@njit(cache=True, error_model="numpy")
 def longest_first(wanted, offsets):
     """Positions in ``wanted`` (tile numbers), those with the longest lists first: threads end together."""
     lengths = np.empty(wanted.size, np.int64)

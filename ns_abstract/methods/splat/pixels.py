@@ -21,7 +21,7 @@ from ns_abstract.methods.splat.lists import BLOCK, PIXELS, block_lists, longest_
 @njit(cache=True, error_model="numpy")
 def _block(
     listed, x0, y0, tile_x, tile_y, record, box, tiles, depth, delta, depth_error, colors, color_radius,
-    slope, direction, camera, rules, errors, background, negligible, d, order, m, antialiased,
+    slope, direction, camera, rules, errors, background, unseen, floor, fade, negligible, d, order, m, antialiased,
     s, t, y1, y2, poly, rows, value, palette, layers, offset_x, offset_y, pixels, batch, masks, asked, lists, lengths,
     reach, deep, far, first, last, slots, owners, drawn, places, pairs, moves, ray, lower, upper, linear, slopes,
     statistics, marks,
@@ -43,7 +43,7 @@ def _block(
         listed, record, box, tiles, tile_x, tile_y, colors, palette, depth, delta, depth_error, slope, ray,
         s, y1, y2, poly, rows, layers, width, offset_x, offset_y, pixels, batch, masks, asked, lists, lengths, reach,
         deep, far, first, last, slots, owners, drawn, places, moves, pairs, x0, y0, d, order, m, antialiased, rules,
-        errors, marks,
+        errors, floor, background, unseen, marks,
     )  # fmt: skip
     if pair_count == GROW:
         return False
@@ -74,8 +74,9 @@ def _block(
     statistics[1] += longest_list(lengths)
     statistics[2] += pair_count
     shade(
-        layers, width, lists, palette, forms, lengths, moves, far, slot_count > 0, background, color_radius, negligible,
-        unit, x0 % side, y0 % side, d, order, m, s, t, value, reach, first, lower, upper, linear, slopes, statistics,
+        layers, width, lists, palette, forms, lengths, moves, far, slot_count > 0, background, unseen, fade,
+        color_radius, negligible, unit, x0 % side, y0 % side, d, order, m, s, t, value, reach, first, lower, upper,
+        linear, slopes, statistics,
     )  # fmt: skip
     return True
 
@@ -91,8 +92,8 @@ def _aligned(size):
 @njit(cache=True, error_model="numpy")
 def _pixel_worker(
     thread, sequence_, counter_, wanted, offsets, entries, record_, box_, tiles_, depth_, delta_, depth_error_, colors_,
-    color_radius, slope_, direction_, camera_, rules_, errors_, background_colors, negligible, pair_limit, d, order, m,
-    antialiased, lower_, upper_, linear_, slopes_, statistics_, marks_,
+    color_radius, slope_, direction_, camera_, rules_, errors_, background_colors, floor, fade, negligible, pair_limit,
+    d, order, m, antialiased, lower_, upper_, linear_, slopes_, statistics_, marks_,
 ):  # fmt: skip
     """One thread's tiles: the next of ``sequence`` that none has taken yet; see `pixel_stage`."""
     sequence, counter = borrowed(sequence_), pointer(counter_)
@@ -112,6 +113,7 @@ def _pixel_worker(
     scratch[NUMBERS : NUMBERS + BLOCK] = np.arange(BLOCK)
     background_ = np.zeros(4)
     background_[:3] = background_colors
+    unseen_ = np.zeros(8)
     channels_ = np.zeros(4 * (2 * m + 4))
     value_ = np.zeros(4 * m)
     planes = np.empty((2 * m, PIXELS))
@@ -122,6 +124,7 @@ def _pixel_worker(
     lengths_ = np.empty(PIXELS, np.uint32)
     ray_ = np.empty(3)
     s, t, value, background = borrowed(scratch), borrowed(channels_), borrowed(value_), borrowed(background_)
+    unseen = borrowed(unseen_)
     y1, y2, poly = borrowed(planes[:m]), borrowed(planes[m:]), borrowed(rows_[FORM : FORM + m])
     rows, batch = borrowed(rows_.reshape(width * PIXELS)), borrowed(batch_)
     offset_x, offset_y = borrowed(offsets_[0]), borrowed(offsets_[1])
@@ -161,8 +164,8 @@ def _pixel_worker(
                 palette_ = np.zeros(2 * listed.size * numbers)
             while not _block(
                 borrowed(listed), x0, y0, tile_x, tile_y, record, box, tiles, depth, delta, depth_error, colors,
-                color_radius, slope, direction, camera, rules, errors, background, negligible, d, order, m,
-                antialiased, s, t, y1, y2, poly, rows, value, borrowed(palette_), borrowed(layers_), offset_x,
+                color_radius, slope, direction, camera, rules, errors, background, unseen, floor, fade, negligible, d,
+                order, m, antialiased, s, t, y1, y2, poly, rows, value, borrowed(palette_), borrowed(layers_), offset_x,
                 offset_y, pixels, batch, borrowed(order_[0]), borrowed(order_[1]), borrowed(lists_), lengths,
                 borrowed(reach_[0]), borrowed(reach_[1]), borrowed(order_[2]), borrowed(order_[3]),
                 borrowed(order_[4]), borrowed(order_[5]), borrowed(order_[6]), borrowed(drawn_), borrowed(places_),
@@ -178,16 +181,16 @@ def _pixel_worker(
                 moves_ = np.empty((32 * capacity, MOVES))
     # the owners of the borrowed arrays live to here
     return (
-        scratch.size + background_.size + channels_.size + value_.size + planes.size + rows_.size + offsets_.size
-        + pixels_.size + batch_.size + lengths_.size + ray_.size + layers_.size + lists_.size + drawn_.size
-        + places_.size + moves_.size + reach_.size + order_.size + palette_.size + pairs_.size
+        scratch.size + background_.size + unseen_.size + channels_.size + value_.size + planes.size + rows_.size
+        + offsets_.size + pixels_.size + batch_.size + lengths_.size + ray_.size + layers_.size + lists_.size
+        + drawn_.size + places_.size + moves_.size + reach_.size + order_.size + palette_.size + pairs_.size
     )  # fmt: skip
 
 
 @njit(cache=True, parallel=True, error_model="numpy")
 def pixel_stage(
     wanted, offsets, entries, record, box, tiles, depth, delta, depth_error, colors, color_radius,
-    slope, direction, camera, rules, errors, background, negligible, pair_limit, d, order, m, antialiased,
+    slope, direction, camera, rules, errors, background, floor, fade, negligible, pair_limit, d, order, m, antialiased,
     threads, lower, upper, linear, slopes, statistics, marks,
 ):  # fmt: skip
     """Bounds of the pixels of the tiles ``wanted`` [t] (tile numbers, row-major).
@@ -200,6 +203,8 @@ def pixel_stage(
         color_radius: Bound of the error of the colours, added to every result.
         slope: [rows, 3] third row of the rotation forms.
         direction: [9] the middle pose's world-to-camera rotation, row-major.
+        floor: Layers are left out where no pose lets more light come to them (B6); none if negative.
+        fade: Bound of the program's rounding when it adds up what was left out, in units of the brightest colour.
         negligible: Bound of what all layers that were left out for a negligible alpha may add up to.
         pair_limit: Most depth-order pairs looked at in one block.
         lower, upper: [t, side, side, 3] outputs.
@@ -215,6 +220,6 @@ def pixel_stage(
     for thread in prange(threads):
         _pixel_worker(
             thread, sequence, counter, wanted, offsets, entries, record, box, tiles, depth, delta, depth_error, colors,
-            color_radius, slope, direction, camera, rules, errors, background, negligible, pair_limit, d, order, m,
-            antialiased, lower, upper, linear, slopes, statistics, marks,
+            color_radius, slope, direction, camera, rules, errors, background, floor, fade, negligible, pair_limit,
+            d, order, m, antialiased, lower, upper, linear, slopes, statistics, marks,
         )  # fmt: skip
