@@ -10,15 +10,16 @@ from ns_abstract.verify.soundness import compiled_renderer, reference_renderer
 
 
 def attack(
-    job: Job, name: str, frame: int, seconds: float, poses: int, reference_poses: int, seed: int, scale: float = 1.0
-) -> dict[str, object]:
-    """Refine one frame, then attack it: random poses, corners, gradient ascent and jumps.
+    job: Job, name: str, frame: int, seconds: float, poses: int, reference_poses: int, seed: int, scale: float = 1.0,
+    ratio: float = 1.0,
+) -> dict[str, object]:  # fmt: skip
+    """Refine one frame to ``ratio``, then attack it: random poses, corners, gradient ascent and jumps.
 
     Gradient ascent goes through the differentiable reference; what it finds is rendered by the compiled renderer.
     The poses that came closest, random ones and corners are then rendered by the reference as well.
     """
     poses_set = pose_set(job, name, frame, scale)
-    result = refine(job, poses_set, frame, seconds, 1.0)
+    result = refine(job, poses_set, frame, seconds, ratio)
     render, probe = compiled_renderer(job.scene, poses_set, job.rasteriser)
     other, other_probe, twin = reference_renderer(job.scene, poses_set, job.rasteriser)
     first = falsify(result.lower, result.upper, poses_set.box, render, twin, probe=probe, poses=poses, seed=seed)

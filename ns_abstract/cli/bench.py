@@ -82,6 +82,8 @@ class Soundness(Scenes):
     """Images by the compiled renderer for every scene and set."""
     reference_poses: int = 20
     """Images by the independent reference."""
+    target_ratio: float = 1.0
+    """Where a set is tight enough; from 1.05 on, a first cover leaves out what hardly any light comes to."""
     scale: float = 1.0
     """Multiplies the ranges of translations and rotations."""
     seed: int = 0
@@ -258,7 +260,7 @@ def rows_of(options: Cell | Soundness | Plan | Rules | Rays, job: Job, name: str
         return [
             attack(
                 job, name, options.frame, options.seconds, options.poses, options.reference_poses, options.seed,
-                options.scale,
+                options.scale, options.target_ratio,
             )
         ]  # fmt: skip
     if isinstance(options, Plan):
