@@ -336,6 +336,12 @@ class Job:
         known = [numbers for numbers in shown if numbers is not None]
         count = int(np.unique(np.concatenate(known)).size) if len(known) == len(shown) else None
         plan = self.method.frame_plan(frame, count, result.lower, result.upper)
+        floor = max(part.floor for part in parts)
+        if floor > 0.0:
+            plan.append(
+                f"layers that at most {floor:.2%} of the light comes to left out of the first cells, and bounded by "
+                "the range of their colours"
+            )
         if len(parts) > 1:
             plan.append(
                 f"bounded in {len(parts)} groups of tiles side by side: cells are the sum of theirs, seconds those of "

@@ -197,8 +197,9 @@ class Watched(Waves):
         self.allowed: list[float] = []
         self.before_splits: tuple[list[float], list[float]] | None = None
 
-    def allow(self, excess: float) -> None:
+    def allow(self, excess: float) -> float:
         self.allowed.append(excess)
+        return 0.5 * excess
 
     def render(self, values: np.ndarray, tiles: np.ndarray | None = None) -> np.ndarray:
         self.rendered.append(float(values[0]))
@@ -227,9 +228,11 @@ def test_only_a_cover_that_may_reach_the_goal_is_allowed_to_be_looser() -> None:
     """Cells that are split had better tell what they hide."""
     for ratio, looser in ((1.2, True), (1.05, True), (1.04, False)):
         frame = Watched()
-        result = refine(frame, Goal(ratio, FOREVER, 4000))
+        refinement = Refinement(frame, 0, Goal(ratio, FOREVER, 4000))
+        result = refinement.run()
         first, *before, last = frame.allowed
         assert first == last == 0.0 and len(before) == looser
+        assert refinement.floor == (0.5 * before[0] if looser else 0.0)
         if looser:
             assert 0.0 < before[0] <= (ratio - 1.0) * result.trace[0].mpg_witness
 

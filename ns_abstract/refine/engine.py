@@ -263,6 +263,8 @@ class Refinement:
         self._unseen: list[np.ndarray] = []
         #: scene elements that some cell of the cover shows, if the frame tells
         self.shown: np.ndarray | None = None
+        #: what no more light comes to is left out of the first cover
+        self.floor = 0.0
         self.leaf_sets: dict[tuple[int, int], tuple[ParameterBox, tuple[np.ndarray, ...]]] = {}
         self._kept_bytes = 0
         self._held_bytes = 0
@@ -409,7 +411,7 @@ class Refinement:
             corners = corners[:0]
             if self.goal.ratio >= _AIM_RATIO:
                 # the cover alone may reach the goal; cells that are split had better tell what they hide
-                self._allow((self.goal.ratio - 1.0) * self._mpg(self.witness_lower, self.witness_upper))
+                self.floor = self._allow((self.goal.ratio - 1.0) * self._mpg(self.witness_lower, self.witness_upper))
         if self._cover() and not self._over():
             for render in itertools.islice(self.members, _MEMBERS):
                 self._widen(self._render(render, box.middle, None), None)
@@ -433,11 +435,10 @@ class Refinement:
         """What is known now; sound at any time after the first render."""
         return self._result(self.point())
 
-    def _allow(self, excess: float) -> None:
-        """Tell the frame how much looser than the inner bounds cells may be from now on."""
+    def _allow(self, excess: float) -> float:
+        """Tell the frame how much looser than the inner bounds cells may be from now on; what it makes of it."""
         allow = getattr(self.frame, "allow", None)
-        if allow is not None:
-            allow(excess)
+        return 0.0 if allow is None else allow(excess)
 
     def _corners(self) -> np.ndarray:
         return _first_corners(self.frame.box, self.random)
@@ -737,6 +738,7 @@ class Refinement:
             trace=tuple(self.trace),
             bounded=self.covered,
             shown=self.shown,
+            floor=self.floor,
             leaves=self._leaves() if self.covered else None,
         )
 

@@ -94,6 +94,7 @@ class PartResult:
         pixels: Number of the tiles' pixels that belong to the image.
         trace: Measures are those of these pixels.
         shown: Scene elements that some cell shows in these tiles, or None.
+        floor: What no more light comes to was left out of the first cover; 0: nothing.
     """
 
     index: int
@@ -110,6 +111,7 @@ class PartResult:
     trace: tuple[TracePoint, ...]
     bounded: bool
     shown: NDArray[np.int64] | None
+    floor: float = 0.0
     leaves: Leaves | None = field(default=None, repr=False)
 
 

@@ -143,10 +143,15 @@ class SplatFrame:
 
             yield render
 
-    def allow(self, excess: float) -> None:
-        """Save time from now on where that loosens gaps by no more than a small part of ``excess`` on average (B6)."""
+    def allow(self, excess: float) -> float:
+        """Save time from now on where that loosens gaps by no more than a small part of ``excess`` on average (B6).
+
+        Returns:
+            What no more light comes to is left out; 0: nothing is.
+        """
         floor = min(_FLOOR_SHARE * excess, _BRIGHTEST_FLOOR)
         self._floor = floor if floor > _WORTH_IT * self._stop > 0.0 else -1.0
+        return max(self._floor, 0.0)
 
     def feasible(self, box: ParameterBox) -> ParameterBox | None:
         """See `PoseSet.feasible`."""
