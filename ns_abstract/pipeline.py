@@ -339,8 +339,8 @@ class Job:
         floor = max(part.floor for part in parts)
         if floor > 0.0:
             plan.append(
-                f"layers that at most {floor:.2%} of the light comes to left out of the first cells, and bounded by "
-                "the range of their colours"
+                f"dim light: layers that at most {floor:.2%} of the light comes to are left out of the first cells, "
+                "and bounded by the range of their colours"
             )
         if len(parts) > 1:
             plan.append(
