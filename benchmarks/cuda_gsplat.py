@@ -18,11 +18,11 @@ from typing import Any
 import numpy as np
 import torch
 
-from ns_abstract.bench.sets import open_jobs, pose_set
+from ns_abstract.bench.sets import open_jobs, pose_set, splat_of
 from ns_abstract.bench.tables import markdown, write
 from ns_abstract.bench.tightness import refine
+from ns_abstract.geometry.camera_path import Camera
 from ns_abstract.methods.splat.scene import SplatScene
-from ns_abstract.sets.path import Camera
 
 
 class CudaRenderer:
@@ -91,7 +91,7 @@ def check(job: Any, name: str, frame: int, seconds: float, poses: int) -> dict[s
     """Bound one set and compare ``poses`` CUDA renders with it."""
     a_set = pose_set(job, name, frame)
     result = refine(job, a_set, frame, seconds, 1.0)
-    renderer = CudaRenderer(job.scene)
+    renderer = CudaRenderer(splat_of(job).scene)
     corners = a_set.box.corners()[:64]
     values = np.concatenate([corners, a_set.box.sample(max(0, poses - len(corners)), np.random.default_rng(0))])
     violations, worst, compared = 0, 0.0, 0
@@ -104,7 +104,7 @@ def check(job: Any, name: str, frame: int, seconds: float, poses: int) -> dict[s
         beyond = np.nan_to_num(np.maximum(result.lower - image, image - result.upper), nan=np.inf)
         worst = max(worst, float(beyond.max()))
     return {
-        "scene": job.scene.name,
+        "scene": job.method.name,
         "set": name,
         "size": f"{a_set.camera.width}x{a_set.camera.height}",
         "poses": len(values),

@@ -21,12 +21,12 @@ from typing import Any
 import numba
 import numpy as np
 
-from ns_abstract.bench.sets import open_jobs, pose_set
+from ns_abstract.bench.sets import open_jobs, pose_set, splat_of
 from ns_abstract.bench.tables import markdown, write
+from ns_abstract.geometry.camera_path import Camera
 from ns_abstract.methods.splat.frame import SplatFrame
 from ns_abstract.methods.splat.ply import write_ply
 from ns_abstract.methods.splat.scene import SplatScene
-from ns_abstract.sets.path import Camera
 
 
 class Open3DRenderer:
@@ -64,9 +64,10 @@ def compare(config: Path, size: int, repeats: int, folder: Path) -> dict[str, An
     width = open_jobs((config,), None, 1.0)[0].path.cameras[0].width
     (job,) = open_jobs((config,), None, width / size)
     poses = pose_set(job, "x", 0)
-    view = SplatFrame(job.splats, job.rasteriser, job.arithmetic, poses)
+    splat = splat_of(job)
+    view = SplatFrame(splat.splats, splat.rasteriser, splat.arithmetic, poses)
     camera = view.camera
-    theirs = Open3DRenderer(job.scene, camera)
+    theirs = Open3DRenderer(splat.scene, camera)
     low, high = np.array(poses.box.lower), np.array(poses.box.upper)
     seconds = np.empty((repeats, 2))
     difference = 0.0
@@ -87,7 +88,7 @@ def compare(config: Path, size: int, repeats: int, folder: Path) -> dict[str, An
     imsave(folder / f"open3d-{camera.width}.png", np.clip(np.hstack([ours, other / 255.0]), 0.0, 1.0))
     median = np.median(seconds, axis=0)
     return {
-        "scene": job.scene.name,
+        "scene": job.method.name,
         "size": f"{camera.width}x{camera.height}",
         "ours s": float(median[0]),
         "Open3D s": float(median[1]),

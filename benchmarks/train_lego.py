@@ -20,11 +20,11 @@ import torch
 from torch.nn import functional
 
 from ns_abstract.demo.nerf_fit import NerfNetwork
-from ns_abstract.demo.nerf_runs import write_nerf_run
+from ns_abstract.geometry.camera_path import Camera
 from ns_abstract.methods.nerf.render import NerfRenderer, Sampling, camera_rays
 from ns_abstract.methods.nerf.scene import NerfScene
 from ns_abstract.methods.nerf.smoothness import log_lipschitz
-from ns_abstract.sets.path import Camera
+from ns_abstract.methods.nerf.write import write_nerf_run
 
 HULL, REACH = 96, 1.4
 BINS = 96

@@ -1,0 +1,61 @@
+"""Sound bounds of what Nerfstudio renders over sets of camera poses, and certificates of networks behind them.
+
+The public names; each is imported when it is first used.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from ns_abstract.api.bounding import BoundResult, Progress, bound
+    from ns_abstract.api.certifying import Certificate, CertifiedCell, CertifyProgress, certify
+    from ns_abstract.api.poses import Camera, PoseSet
+    from ns_abstract.api.scenes import Scene, load_scene, render
+    from ns_abstract.geometry.camera_path import CameraPath, load_camera_path
+    from ns_abstract.io.errors import InputError
+
+__version__ = "0.1.0"
+
+_HOMES = {
+    "api.bounding": ("BoundResult", "Progress", "bound"),
+    "api.certifying": ("Certificate", "CertifiedCell", "CertifyProgress", "certify"),
+    "api.poses": ("Camera", "PoseSet"),
+    "api.scenes": ("Scene", "load_scene", "render"),
+    "geometry.camera_path": ("CameraPath", "load_camera_path"),
+    "io.errors": ("InputError",),
+}
+_HOME = {name: home for home, names in _HOMES.items() for name in names}
+
+__all__ = [
+    "BoundResult",
+    "Camera",
+    "CameraPath",
+    "Certificate",
+    "CertifiedCell",
+    "CertifyProgress",
+    "InputError",
+    "PoseSet",
+    "Progress",
+    "Scene",
+    "__version__",
+    "bound",
+    "certify",
+    "load_camera_path",
+    "load_scene",
+    "render",
+]
+
+
+def __getattr__(name: str) -> object:
+    if name not in _HOME:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    from importlib import import_module
+
+    found = getattr(import_module(f"{__name__}.{_HOME[name]}"), name)
+    globals()[name] = found
+    return found
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

@@ -27,11 +27,16 @@ def chromium() -> str | None:
     return next((found for name in NAMES if (found := shutil.which(name))), None)
 
 
-def until(question: Callable[[], Any], seconds: float, what: str) -> Any:
-    """Ask until the answer is true; fails after ``seconds``."""
-    end = time.monotonic() + seconds
+#: Seconds after which something hangs; no verdict depends on how fast the machine is.
+HANG = 3600.0
+
+
+def until(question: Callable[[], Any], what: str, alive: Callable[[], bool] = lambda: True) -> Any:
+    """Ask until the answer is true; fails if what is waited for has ended (not ``alive``) or hangs."""
+    end = time.monotonic() + HANG
     while not (answer := question()):
-        assert time.monotonic() < end, f"{what}: not within {seconds} s"
+        assert alive(), f"{what}: its process has ended"
+        assert time.monotonic() < end, f"{what}: hangs"
         time.sleep(0.1)
     return answer
 
@@ -52,9 +57,13 @@ class Browser:
         self.process = subprocess.Popen([*command, "about:blank"], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
         try:
             note = self.profile / "DevToolsActivePort"
-            until(lambda: note.exists() and note.read_text().count("\n"), 60, "Chromium's start")
+            until(
+                lambda: note.exists() and note.read_text().count("\n"),
+                "Chromium's start",
+                lambda: self.process.poll() is None,
+            )
             port = note.read_text().split("\n")[0]
-            with urllib.request.urlopen(f"http://127.0.0.1:{port}/json/list", timeout=30) as answer:
+            with urllib.request.urlopen(f"http://127.0.0.1:{port}/json/list", timeout=HANG) as answer:
                 tab = next(entry for entry in json.load(answer) if entry["type"] == "page")
             self.socket = self.stack.enter_context(connect(tab["webSocketDebuggerUrl"], max_size=None))
             self.call("Page.navigate", url=self.url)
@@ -66,14 +75,14 @@ class Browser:
     def __exit__(self, *_: Any) -> None:
         self.stack.close()
         self.process.terminate()
-        self.process.wait(30)
+        self.process.wait(HANG)
 
     def call(self, method: str, **parameters: Any) -> dict[str, Any]:
         """One command of the protocol."""
         number = next(self.numbers)
         self.socket.send(json.dumps({"id": number, "method": method, "params": parameters}))
         while True:
-            message = json.loads(self.socket.recv(timeout=60))
+            message = json.loads(self.socket.recv(timeout=HANG))
             if message.get("id") == number:
                 assert "error" not in message, message
                 return message["result"]

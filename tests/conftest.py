@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import logging
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,9 +13,12 @@ import numba
 import numpy as np
 import pytest
 
-from ns_abstract.demo.paths import View, look_at, path_json
-from ns_abstract.demo.runs import write_splatfacto_run
+from ns_abstract.geometry.views import View, look_at, path_json
 from ns_abstract.methods.splat.scene import SplatScene
+from ns_abstract.methods.splat.write import write_splatfacto_run
+
+# what is said of compiling depends on what was compiled before
+logging.getLogger("ns_abstract.kernels").setLevel(logging.ERROR)
 
 TIMESTAMP = "2026-01-01_000000"
 
@@ -23,6 +27,8 @@ TIMESTAMP = "2026-01-01_000000"
 def one_thread():
     """Small pictures gain nothing from threads, and waiting threads take the processor from other workers."""
     numba.set_num_threads(1)
+
+
 #: A sideways shift, wide enough for several cells.
 SHIFT = {"version": 1, "translation": {"x": 0.03}}
 

@@ -9,13 +9,13 @@ import torch
 from torch.nn import functional
 
 from ns_abstract.demo.nerf_fit import NerfNetwork
-from ns_abstract.demo.paths import look_at
+from ns_abstract.geometry.camera_path import Camera
+from ns_abstract.geometry.poses import PoseSet
+from ns_abstract.geometry.views import look_at
 from ns_abstract.methods.nerf.field import Field, encode
 from ns_abstract.methods.nerf.render import NerfRenderer, Sampling
 from ns_abstract.methods.nerf.scene import FieldWeights, Layer, NerfScene
-from ns_abstract.sets.path import Camera
-from ns_abstract.sets.perturbation import parse_perturbation
-from ns_abstract.sets.poses import PoseSet
+from ns_abstract.perturbation.specification import parse_perturbation
 
 UNIFORM = Sampling("uniform", 0.0, 4.0, 24, 0, (0.2, 0.6, 1.0))
 

@@ -103,7 +103,7 @@ class Server:
         """Where the viewer is, once it answers."""
         import urllib.request
 
-        end = time.monotonic() + 300.0
+        end = time.monotonic() + 3600.0
         opener = urllib.request.build_opener(urllib.request.ProxyHandler({}))
         while True:
             assert self.process.poll() is None, self.said()

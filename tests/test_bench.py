@@ -9,24 +9,24 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from ns_abstract.api.files import PathJob
 from ns_abstract.bench import paper as paper_tables
 from ns_abstract.bench import plan, rules, scale
-from ns_abstract.bench.sets import open_jobs, pose_set
+from ns_abstract.bench.sets import open_jobs, pose_set, splat_of
 from ns_abstract.cli.bench import Plan, Rules, Scale, Tightness, bench
 from ns_abstract.cli.common import DONE
-from ns_abstract.errors import InputError
-from ns_abstract.methods.splat import paper
+from ns_abstract.io.errors import InputError
 from ns_abstract.methods.splat.activate import activate
 from ns_abstract.methods.splat.constants import PAPER
-from ns_abstract.pipeline import Job
+from ns_abstract.paper import splat as paper
 
 
 @pytest.fixture(scope="module")
-def job(blobs) -> Job:
+def job(blobs) -> PathJob:
     return open_jobs((blobs.config,), blobs.path, 1.0)[0]
 
 
-def test_ours_are_tighter_than_the_papers(job: Job) -> None:
+def test_ours_are_tighter_than_the_papers(job: PathJob) -> None:
     rows = rules.compare(job, "yaw", 0, 8, pixels=3, most=12)
     assert [row["rules"] for row in rows] == ["ours", *rules.PAPER_RULES]
     assert all(row["violations"] == 0 for row in rows)
@@ -36,7 +36,7 @@ def test_ours_are_tighter_than_the_papers(job: Job) -> None:
     assert others[0] < others[-1]
 
 
-def test_wrong_rules_are_noticed(job: Job, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_wrong_rules_are_noticed(job: PathJob, monkeypatch: pytest.MonkeyPatch) -> None:
     own = rules._own
 
     def shrunk(*arguments):
@@ -48,9 +48,9 @@ def test_wrong_rules_are_noticed(job: Job, monkeypatch: pytest.MonkeyPatch) -> N
     assert [row["violations"] for row in rows] == [2, 0, 0, 0, 0]
 
 
-def test_weights_are_algorithm_1(job: Job) -> None:
+def test_weights_are_algorithm_1(job: PathJob) -> None:
     """The weights make the picture."""
-    splats, poses = activate(job.scene, PAPER), pose_set(job, "point", 0)
+    splats, poses = activate(splat_of(job).scene, PAPER), pose_set(job, "point", 0)
     pose = poses.world_to_camera(poses.box.middle)
     for u in ([10.5, 12.5], [16.5, 16.5], [20.5, 14.5]):
         shown = paper.render(splats, poses.camera, *pose, np.array([u]))[0]
@@ -58,7 +58,7 @@ def test_weights_are_algorithm_1(job: Job) -> None:
         np.testing.assert_allclose(weights @ splats.sh[:, 0], shown, rtol=0.0, atol=1e-12)
 
 
-def test_plan_changes_nothing(job: Job) -> None:
+def test_plan_changes_nothing(job: PathJob) -> None:
     rows = plan.without(job, "x", 0, 6)
     assert [row["taken back"] for row in rows] == [
         "as planned", "every Gaussian in every cell", "harmonics that are zero",
@@ -69,7 +69,7 @@ def test_plan_changes_nothing(job: Job) -> None:
     assert rows[1]["looser by"] == 0.0 and rows[2]["looser by"] < 1e-4
 
 
-def test_a_plan_that_loses_something_is_noticed(job: Job, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_plan_that_loses_something_is_noticed(job: PathJob, monkeypatch: pytest.MonkeyPatch) -> None:
     whole = plan._EveryGaussian.bound
 
     def wider(self, *arguments, **options):
@@ -111,8 +111,8 @@ def test_tables_in_the_papers_shape(blobs, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("count", [5, 40, 130])
-def test_resampled_scenes_cover_as_much(job: Job, count: int) -> None:
-    scene = job.scene
+def test_resampled_scenes_cover_as_much(job: PathJob, count: int) -> None:
+    scene = splat_of(job).scene
     found = scale.resampled(scene, count)
     assert found.count == count
 
@@ -127,9 +127,7 @@ def test_resampled_scenes_cover_as_much(job: Job, count: int) -> None:
 
 
 def test_cost_by_scale(blobs, tmp_path: Path) -> None:
-    options = Scale(
-        (blobs.config,), blobs.path, tmp_path, gaussians=(10, 60), widths=(24,), repeats=1, seconds=1.0
-    )
+    options = Scale((blobs.config,), blobs.path, tmp_path, gaussians=(10, 60), widths=(24,), repeats=1, seconds=1.0)
     assert bench(options) == DONE
     with open(tmp_path / "scale.csv", newline="") as stream:
         small, large = csv.DictReader(stream)

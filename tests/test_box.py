@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ns_abstract.sets.box import ParameterBox
+from ns_abstract.geometry.box import ParameterBox
 
 ends = st.floats(-1e6, 1e6)
 

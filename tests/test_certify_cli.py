@@ -23,16 +23,18 @@ from certifying import classifier, linear
 from conftest import Inputs, write_json
 from nerfs import tiny_scene
 
-from ns_abstract import certification
-from ns_abstract.certification import Certification, CertifySettings, examine_block
+from ns_abstract.api import certifying
+from ns_abstract.api.certification import Certification, CertifySettings, examine_block, open_certification
 from ns_abstract.cli import certify as certify_command
-from ns_abstract.cli import certifying
 from ns_abstract.cli.certify import Certify, certify
-from ns_abstract.demo.nerf_runs import write_nerf_run
 from ns_abstract.demo.writing import write_demo
-from ns_abstract.engines import Here, Processes
-from ns_abstract.errors import InputError
+from ns_abstract.execution.engines import Here, Processes
+from ns_abstract.execution.opening import forget
+from ns_abstract.io.errors import InputError
+from ns_abstract.methods.nerf.write import write_nerf_run
+from ns_abstract.methods.splat.method import SplatMethod
 from ns_abstract.methods.splat.reference import Reference
+from ns_abstract.verify import model
 from ns_abstract.verify.network import OutputBounds
 
 MODULE = "ns_abstract.cli.certify"
@@ -75,7 +77,7 @@ class Case:
 
     @property
     def job(self) -> Certification:
-        return Certification(CertifySettings(self.blobs.config, self.blobs.path, self.net, self.prop, self.spec))
+        return open_certification(CertifySettings(self.blobs.config, self.blobs.path, self.net, self.prop, self.spec))
 
 
 def report(folder: Path) -> dict[str, Any]:
@@ -142,7 +144,9 @@ def attack(case: Case, folder: Path, frame: int = 0, poses: int = 6) -> tuple[in
     job = case.job
     pictures = job.pictures(frame)
     claim = job.claim(pictures)
-    reference = Reference(job.job.scene, job.job.rasteriser)
+    splat = job.job.method
+    assert isinstance(splat, SplatMethod)
+    reference = Reference(splat.scene, splat.rasteriser)
     names = [name for name, _ in job.parameters]
     order = [names.index(name) for name in pictures.box.names]
     session = onnxruntime.InferenceSession(str(case.net), providers=["CPUExecutionProvider"])
@@ -165,7 +169,7 @@ def attack(case: Case, folder: Path, frame: int = 0, poses: int = 6) -> tuple[in
         values = [low, high, *rng.uniform(low, high, (poses, len(low)))] if len(low) else [low]
         middle = torch.from_numpy(0.5 * (low + high)).requires_grad_(True)
         if len(low):
-            margin = claim.margin(job.model.differentiable(pictures.twin(middle)[None]), middle[None])[0]
+            margin = claim.margin(job.model.differentiable(pictures.differentiable(middle)[None]), middle[None])[0]
             (slope,) = torch.autograd.grad(margin, middle)
             values.append(np.where(slope.numpy() > 0, low, high))
         for number, pose in enumerate(values):
@@ -193,9 +197,7 @@ def test_planted_violation(planted: Case, finished: Path, bright: tuple[Path, fl
     ]  # fmt: skip
     assert broken
     for x in broken:
-        kinds = {
-            row[3] for row in cells(finished) if json.loads(row[1])[0] <= x <= json.loads(row[2])[0]
-        }
+        kinds = {row[3] for row in cells(finished) if json.loads(row[1])[0] <= x <= json.loads(row[2])[0]}
         assert "certified" not in kinds
 
 
@@ -240,14 +242,14 @@ def test_unsound_network_bounds_are_caught_by_the_attack(
     planted: Case, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The attack of these tests can fail: bounds raised a little are noticed."""
-    real = certification.bound_outputs
+    real = model.bound_outputs
 
     def raised(*arguments: Any, **more: Any) -> OutputBounds:
         found = real(*arguments, **more)
         return OutputBounds(found.lower + 2e-2, found.a, found.b + 2e-2)
 
-    monkeypatch.setattr(certification, "bound_outputs", raised)
-    certification._opened.clear()
+    monkeypatch.setattr(model, "bound_outputs", raised)
+    forget()
     try:
         assert certify(Certify(**planted.values(tmp_path / "out"))) == 0
     except RuntimeError as error:
@@ -255,13 +257,13 @@ def test_unsound_network_bounds_are_caught_by_the_attack(
         assert "internal error" in str(error)
         return
     finally:
-        certification._opened.clear()
+        forget()
     assert attack(planted, tmp_path / "out")[1] > 0
 
 
 @pytest.mark.parametrize("kind", ["nan", "infinite", "crossed", "raises"])
 def test_broken_bounds_never_certify(kind: str, planted: Case, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    real = certification.bound_outputs
+    real = model.bound_outputs
 
     def broken(network: Any, images: Any, *arguments: Any, **more: Any) -> OutputBounds:
         if kind == "raises":
@@ -273,10 +275,10 @@ def test_broken_bounds_never_certify(kind: str, planted: Case, tmp_path: Path, m
         found = real(network, images, *arguments, **more)
         return OutputBounds(np.full_like(found.lower, value), found.a * value, found.b * value)
 
-    monkeypatch.setattr(certification, "bound_outputs", broken)
-    certification._opened.clear()
+    monkeypatch.setattr(model, "bound_outputs", broken)
+    forget()
     assert certify(Certify(**planted.values(tmp_path / "out", time_budget=5.0))) == 0
-    certification._opened.clear()
+    forget()
     document = report(tmp_path / "out")
     assert document["coverage"]["certified"] == 0.0
     assert {row[3] for row in cells(tmp_path / "out")} <= {"falsified", "unknown"}
@@ -306,9 +308,7 @@ def test_segments_have_one_table_of_parameters(
 ) -> None:
     """The last entry of a path has no segment behind it; its cells are listed with the parameter at 0."""
     spec = {"version": 1, "sweep": "segments", "translation": {"z": 0.001}}
-    case = Case(
-        tmp_path / "case", blobs, bright[0], {"type": "classification", "label": 0, "preprocess": PRE}, spec
-    )
+    case = Case(tmp_path / "case", blobs, bright[0], {"type": "classification", "label": 0, "preprocess": PRE}, spec)
     case.run(tmp_path / "out", frames=(1, 2), time_budget=2.0)
     with sqlite3.connect(tmp_path / "out" / "cells.sqlite") as base:
         assert [row[1] for row in base.execute("SELECT * FROM parameters ORDER BY position")] == ["z", "segment"]
@@ -317,9 +317,7 @@ def test_segments_have_one_table_of_parameters(
     assert all(low[1] == high[1] == 0.0 for frame, low, high in sides if frame == 2)
 
 
-def test_partitions(
-    blobs: Inputs, bright: tuple[Path, float, float], tmp_path: Path
-) -> None:
+def test_partitions(blobs: Inputs, bright: tuple[Path, float, float], tmp_path: Path) -> None:
     prop = {"type": "classification", "label": 0, "preprocess": PRE, "partitions": 300}
     case = Case(tmp_path / "case", blobs, bright[0], prop)
     document = case.run(tmp_path / "out")
@@ -484,11 +482,11 @@ def test_two_dask_workers_equal_one_process(planted: Case, finished: Path, tmp_p
 
 @needs_dask
 def test_dask_worker_killed(planted: Case, finished: Path, tmp_path: Path) -> None:
-    from ns_abstract.engines import Cluster, connected
+    from ns_abstract.execution.engines import Cluster, connected
     from ns_abstract.verify.store import Store
 
     job = planted.job
-    settings, grid = job.settings.absolute(), job.grid(0)
+    recipe, grid = job.recipe, job.grid(0)
     store = Store(tmp_path / "out", job.fingerprint, job.parameters, job.fixed, resume=False)
     store.begin(0, grid, job.first_blocks(grid))
     with connected(None, 2) as client:
@@ -498,7 +496,7 @@ def test_dask_worker_killed(planted: Case, finished: Path, tmp_path: Path) -> No
         while True:
             for block in store.pending(set(flying), engine.capacity - len(flying)):
                 flying[block.number] = block
-                engine.submit(block.number, examine_block, settings, job.fingerprint, 0, grid, block.cells)
+                engine.submit(block.number, examine_block, recipe, 0, grid, block.cells)
             if not flying:
                 break
             if not killed and store.count:
@@ -514,7 +512,7 @@ def test_dask_worker_killed(planted: Case, finished: Path, tmp_path: Path) -> No
 
 @needs_dask
 def test_cluster_on_this_machine_keeps_torch_quick() -> None:
-    from ns_abstract.engines import connected
+    from ns_abstract.execution.engines import connected
 
     with connected(None, 1) as client:
         (found,) = client.run(lambda: os.environ.get("MALLOC_TRIM_THRESHOLD_")).values()
@@ -547,9 +545,7 @@ def test_report(planted: Case, finished: Path) -> None:
     assert document["trace"][-1]["certified"] == pytest.approx(document["coverage"]["certified"])
 
 
-def test_substitutions_are_compared(
-    blobs: Inputs, net: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_substitutions_are_compared(blobs: Inputs, net: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Half-widths that any way certifies hold under attack, and the way of the verdicts gives no smaller ones."""
     monkeypatch.setattr(certifying, "_COMPARE_LEAST", 120.0)
     spec = {"version": 1, "translation": {"x": 0.02}}
@@ -631,9 +627,7 @@ def test_ring_strip_plane_and_bars() -> None:
     ]  # fmt: skip
 
 
-def test_foreign_text_is_escaped(
-    blobs: Inputs, bright: tuple[Path, float, float], tmp_path: Path
-) -> None:
+def test_foreign_text_is_escaped(blobs: Inputs, bright: tuple[Path, float, float], tmp_path: Path) -> None:
     net = tmp_path / "<b>net&.onnx"
     net.write_bytes(bright[0].read_bytes())
     prop = {"type": "classification", "label": 0, "preprocess": PRE}
@@ -679,9 +673,7 @@ def test_mistake_is_one_line(name: str, planted: Case, call: Callable[..., tuple
         assert fragment in said
 
 
-def test_size_that_does_not_fit(
-    blobs: Inputs, net: Path, call: Callable[..., tuple[int, str]], tmp_path: Path
-) -> None:
+def test_size_that_does_not_fit(blobs: Inputs, net: Path, call: Callable[..., tuple[int, str]], tmp_path: Path) -> None:
     case = Case(tmp_path / "case", blobs, net, {"type": "classification", "label": 0})
     code, said = call(case.options(tmp_path / "out"))
     assert code == 2 and "prop.json" in said and "preprocess.resize" in said and f"[{SIZE}, {SIZE}]" in said
@@ -695,9 +687,7 @@ def test_partition_that_does_not_fit(
     assert code == 2 and "prop.json: partitions" in said
 
 
-def test_nerf_is_refused(
-    blobs: Inputs, net: Path, call: Callable[..., tuple[int, str]], tmp_path: Path
-) -> None:
+def test_nerf_is_refused(blobs: Inputs, net: Path, call: Callable[..., tuple[int, str]], tmp_path: Path) -> None:
     config = write_nerf_run(tiny_scene(0), tmp_path / "runs", timestamp="2026-01-01_000000", experiment_name="tiny")
     prop = {"type": "classification", "label": 0, "preprocess": PRE}
     case = Case(tmp_path / "case", Inputs(config, blobs.path, tmp_path / "unused"), net, prop)

@@ -12,11 +12,11 @@ import pytest
 import torch
 from conftest import write_json
 
-from ns_abstract.demo.paths import look_at
-from ns_abstract.errors import InputError
-from ns_abstract.sets.path import Camera
-from ns_abstract.sets.perturbation import parse_perturbation
-from ns_abstract.sets.poses import PoseSet
+from ns_abstract.geometry.camera_path import Camera
+from ns_abstract.geometry.poses import PoseSet
+from ns_abstract.geometry.views import look_at
+from ns_abstract.io.errors import InputError
+from ns_abstract.perturbation.specification import parse_perturbation
 from ns_abstract.verify.network import OutputBounds
 from ns_abstract.verify.preprocess import Preprocess, parse_preprocess
 from ns_abstract.verify.properties import Claim, DetectionClaim, Truth, decode, load_property
@@ -67,6 +67,22 @@ BAD: dict[str, tuple[Any, str, Any]] = {
         {"type": "regression", "target": [0] * 10, "origin": [0, 0], "tolerance": {"relative": 1}}, "origin", None,
     ),
     "scale": ({"type": "regression", "target": [0] * 10, "scale": 0, "tolerance": {"relative": 1}}, "scale", None),
+    **{
+        f"{name} {number:g}": (
+            {"type": "regression", "target": [0] * 10, "tolerance": {"relative": 1}} | {name: value}, name, None,
+        )
+        for number in (1e308, -1e308, 1e-200)
+        for name, value in {
+            "target": [0] * 9 + [number], "origin": [0, 0, number], "scale": number, "tolerance": {"absolute": number},
+        }.items()
+    },
+    "std 1e-300": ({"type": "classification", "label": 1, "preprocess": {"std": [1, 1e-300, 1]}}, "std", None),
+    "mean 1e300": ({"type": "classification", "label": 1, "preprocess": {"mean": [1, 1e300, 1]}}, "mean", None),
+    "range 1e300": ({"type": "classification", "label": 1, "preprocess": {"range": [0, 1e300]}}, "range", None),
+    "box 1e308": (
+        {"type": "detection", "class": 7, "iou": 0.1, "confidence": 0.4, "box": [0, 0, 1e308, 1e308]}, "box", HEAD,
+    ),
+    "confidence 1e-320": ({"type": "detection", "class": 7, "iou": None, "confidence": 1e-320}, "confidence", HEAD),
     "no head": ({"type": "detection", "class": 7, "iou": 0.5, "confidence": 0.4}, "type", None),
     "no class": ({"type": "detection", "iou": 0.5, "confidence": 0.4}, "class", HEAD),
     "class": ({"type": "detection", "class": 20, "iou": 0.5, "confidence": 0.4}, "class", HEAD),
@@ -200,6 +216,17 @@ def test_vnnlib(tmp_path: Path) -> None:
         "(declare-const Y_0 Real)(check-sat)",
         "(vnnlib-version <2.0>)",
         "(" * 300,
+        "(declare-const Y_0 Real)(assert (<= (* 1e300 (* 1e300 Y_0)) 1))",
+        "(declare-const Y_0 Real)(assert (<= (* 1e-300 (* 1e-300 Y_0)) 1))",
+        "(declare-const Y_0 Real)(assert (<= (+ (* 1e308 Y_0) (* 1e308 Y_0)) 1))",
+        "(declare-const Y_0 Real)(assert (<= (+ Y_0 1e308 1e308) 1))",
+        "(declare-const Y_0 Real)(declare-const Y_1 Real)(assert (<= (* 1e300 Y_0) (* 1e-300 Y_1)))",
+        "(declare-const Y_0 Real)(assert (<= (* 1e-300 Y_0) 1e300))",
+        "(declare-const Y_0 Real)(assert (<= (* 1e300 Y_0) 1e-12))",
+        "(declare-const Y_0 Real)(assert (<= Y_0 1e-400))",
+        "(declare-const Y_0 Real)(assert (<= Y_0 1_000))",
+        "(declare-const Y_0 Real)(assert (<= Y_0 " + "9" * 400 + "))",
+        "(declare-const Y_" + "1" * 5000 + " Real)",
     ],
 )
 def test_vnnlib_mistakes(text: str, tmp_path: Path) -> None:
@@ -208,6 +235,24 @@ def test_vnnlib_mistakes(text: str, tmp_path: Path) -> None:
     with pytest.raises(InputError) as caught:
         load_vnnlib(file, 3)
     assert caught.value.file == str(file) and caught.value.fix
+
+
+@pytest.mark.parametrize("factor", ["1", "1e300", "-1e300", "1e-300", "1e38"])
+def test_vnnlib_factors_change_no_verdict(factor: str, tmp_path: Path) -> None:
+    """Both sides of a constraint times one number: the same margins' signs, however large the outputs are."""
+    sign = ">=" if factor.startswith("-") else "<="
+    (tmp_path / "a.vnnlib").write_text(
+        "(declare-const Y_0 Real)(declare-const Y_1 Real)"
+        f"(assert ({sign} (* {factor} (+ Y_0 (* 3.0 Y_1))) (* {factor} 0.5)))"
+    )
+    claim = parsed(tmp_path, {"type": "vnnlib", "file": "a.vnnlib"}, (SHAPE, (2,))).bind(poses(), lambda: np.zeros(2))
+    for size in (1.0, 1e10, 1e38):
+        y = size * np.random.default_rng(0).normal(size=(200, 2))
+        margin = claim.margin(torch.from_numpy(y), torch.zeros(200, 2)).numpy()
+        assert np.isfinite(margin).all() and ((margin > 0.0) == (y[:, 0] + 3.0 * y[:, 1] > 0.5)).all()
+    exact = load_vnnlib(tmp_path / "a.vnnlib", 2)
+    if factor in ("1", "1e38"):
+        assert math.frexp(exact.rows[0, 1])[0] == math.frexp(3.0 * float(factor))[0]
 
 
 # ---------------------------------------------------------------- regression

@@ -15,8 +15,8 @@ import numpy as np
 import pytest
 import torch
 
-from ns_abstract.errors import InputError
-from ns_abstract.sets.box import ParameterBox
+from ns_abstract.geometry.box import ParameterBox
+from ns_abstract.io.errors import InputError
 from ns_abstract.verify.cells import HALVINGS, Cell, Grid, coarse_parts
 from ns_abstract.verify.network import ImageSets, OutputBounds
 from ns_abstract.verify.properties import LinearClaim, Query
@@ -52,7 +52,7 @@ class Ramp:
         reach = np.abs(a).sum(-1) + self.slack
         return (a, b - self.slack, a, b + self.slack), b - reach, b + reach, self.gains * half
 
-    def twin(self, values: torch.Tensor) -> torch.Tensor:
+    def differentiable(self, values: torch.Tensor) -> torch.Tensor:
         return (0.5 + (torch.from_numpy(self.gains) * values).sum()).expand(2, 2, 3)
 
 
@@ -102,9 +102,7 @@ def volume(leaves: list[Leaf], verdict: str | None = None) -> int:
     return sum(leaf.cell.volume for leaf in leaves if verdict in (None, leaf.verdict))
 
 
-def search_of(
-    scene: Any = None, model: Any = None, coarse: tuple[int, ...] = (5,), **more: Any
-) -> Search:
+def search_of(scene: Any = None, model: Any = None, coarse: tuple[int, ...] = (5,), **more: Any) -> Search:
     scene = scene or Ramp()
     return Search(scene, model or Threshold(0.43), CLAIM, Grid.adaptive(scene.box, coarse), **more)
 
@@ -186,7 +184,7 @@ def test_gradient_finds_what_samples_miss() -> None:
         def image(self, values: np.ndarray) -> np.ndarray:
             return np.full((2, 2, 3), 0.2 + 0.1 * np.sum((values - spot) ** 2), np.float32)
 
-        def twin(self, values: torch.Tensor) -> torch.Tensor:
+        def differentiable(self, values: torch.Tensor) -> torch.Tensor:
             return (0.2 + 0.1 * ((values - torch.from_numpy(spot)) ** 2).sum()).expand(2, 2, 3)
 
         def sets(self, box: ParameterBox) -> Any:
@@ -252,14 +250,30 @@ def test_bad_network_bounds_certify_nothing(name: str) -> None:
     assert {leaf.verdict for leaf in leaves} == {"unknown"}
 
 
-@pytest.mark.parametrize("value", [np.nan, -np.inf])
-def test_network_without_a_number_is_not_certified(value: float) -> None:
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+def test_network_without_a_number_decides_nothing(value: float) -> None:
     class Broken(Threshold):
         def outputs(self, images: np.ndarray) -> np.ndarray:
             return super().outputs(images) * value
 
-    leaves, _ = drive(Search(Ramp(), Broken(0.1), CLAIM, Grid(interval(), (8,), (2,))))
-    assert {leaf.verdict for leaf in leaves} == {"falsified"}
+    search = Search(Ramp(), Broken(0.1), CLAIM, Grid(interval(), (8,), (2,)))
+    leaves, _ = drive(search)
+    assert {leaf.verdict for leaf in leaves} == {"unknown"}
+    assert {leaf.reason for leaf in leaves} == {"the margin of a picture is no finite number"}
+    assert not any(holds for _, holds in search.examine(search.grid.roots()).samples)
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+def test_number_that_is_lost_after_a_proof_takes_it_back(value: float) -> None:
+    """Middle and ends have margins, what is rendered after the proof has none."""
+    known = {-1.0, 0.0, 1.0}
+
+    class Gap(Ramp):
+        def image(self, values: np.ndarray) -> np.ndarray:
+            return super().image(values) * np.float32(1.0 if float(values[0]) in known else value)
+
+    leaves, _ = drive(Search(Gap(), Threshold(-0.5), CLAIM, Grid(interval(), (1,), (1,))))
+    assert [leaf.verdict for leaf in leaves] == ["unknown"]
 
 
 def test_false_proof_is_noticed() -> None:
@@ -448,14 +462,58 @@ def test_impossible_leaves_are_refused_and_nothing_is_stored(tmp_path: Path) -> 
         assert store.count == 0 and store.pending(set(), 1) == [block]
 
 
-def test_pending_takes_large_cells_first_and_skips_known(tmp_path: Path) -> None:
+def test_pending_takes_what_is_nearest_to_a_proof_and_now_and_then_the_largest(tmp_path: Path) -> None:
     store, search = open_store(tmp_path), search_of(coarse=(40,))
     fill(store, search, 0)
     blocks = store.pending(set(), 3)
     assert [b.number for b in blocks] == [1, 2, 3]
-    store.settle(blocks[0], Findings((), ((Cell((0,), (1,)),),), (), 0, 0.0), search.grid)
-    assert [b.number for b in store.pending({2}, 10)] == [3, 4, 5, 6]
-    assert store.pending({2, 3, 4, 5, 6}, 10) == []
+    parts = tuple((Cell((k,), (k + 1,)),) for k in range(3))
+    store.settle(blocks[0], Findings((), parts, (), 0, 0.0, ranks=(5.0, 2.0, 1e9)), search.grid)
+    # the fourth is the largest, the part with the last rank comes behind all first cells
+    assert [b.number for b in store.pending({2}, 10)] == [3, 7, 6, 4, 5, 8]
+    assert store.pending({2, 3, 4, 5, 6, 7, 8}, 10) == []
+
+
+def test_cells_far_from_a_proof_come_last() -> None:
+    """Ranks: a near miss, a far one, a broken one, and one of which nothing is known."""
+    search = search_of(Ramp(slack=0.02), Threshold(0.43), (16,))
+    found = search.examine(search.grid.roots()[:BLOCK])
+    assert list(found.ranks) == sorted(found.ranks) and found.ranks
+    near, far = (search_of(Ramp(slack=s), Threshold(0.49), (4,)) for s in (0.03, 0.045))
+    cell = near.grid.roots()[2]
+    assert 1.0 < near.examine([cell]).ranks[0] < far.examine([cell]).ranks[0]
+    nothing = search_of(spoilt(fail)(), Threshold(0.43), (4,))
+    assert nothing.examine([cell]).ranks[0] > 1e6
+
+
+def test_deep_first_proves_early() -> None:
+    """Where every cell needs several cuts, half of the work proves nearly half of the set."""
+
+    class Even(Ramp):
+        """One brightness, and bounds that miss it by a quarter of a cell's width."""
+
+        def __init__(self) -> None:
+            super().__init__(2)
+            self.gains = np.zeros(2)
+
+        def sets(self, box: ParameterBox) -> Any:
+            self.slack = 0.125 * float(np.mean(np.array(box.upper) - np.array(box.lower)))
+            return super().sets(box)
+
+    search = search_of(Even(), Threshold(0.48), (2, 2))
+    roots = [(1e6, tuple(search.grid.roots()))]
+    done = proved = 0
+    shares = []
+    while roots:
+        roots.sort(key=lambda item: item[0])
+        _, block = roots.pop(0)
+        found = search.examine(block)
+        roots += zip(found.ranks, found.blocks, strict=True)
+        done += len(block)
+        proved += volume(list(found.leaves), "certified")
+        shares.append((done, proved / search.grid.volume))
+    half = max(share for count, share in shares if count <= 0.5 * done)
+    assert shares[-1][1] == 1.0 and half > 0.3
 
 
 @pytest.mark.parametrize("change", [{"scene": "b", "rules": 1}, {"scene": "a"}, {"scene": "a", "rules": 2}])

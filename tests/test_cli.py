@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import importlib.util
 import json
 import os
@@ -19,12 +20,13 @@ import numpy as np
 import pytest
 from conftest import SHIFT, Inputs, blob_scene, ring, write_json
 
+from ns_abstract.api.files import Settings, open_job
 from ns_abstract.cli import demo as demo_command
 from ns_abstract.cli import render as render_command
 from ns_abstract.cli.common import complaint
-from ns_abstract.demo.paths import View, path_json
+from ns_abstract.geometry.views import View, path_json
+from ns_abstract.io.folder import MARK
 from ns_abstract.methods.splat.scene import SplatScene
-from ns_abstract.pipeline import Job, Settings
 from ns_abstract.report.files import StoredFrame, load_frame
 
 MODULE = "ns_abstract.cli.render"
@@ -86,7 +88,7 @@ def same_pictures(first: StoredFrame, second: StoredFrame) -> None:
 
 def check_samples(inputs: Inputs, folder: Path, index: int, **settings: Any) -> None:
     """Renders at random poses lie in a stored frame's bounds, without any tolerance."""
-    job = Job(Settings(inputs.config, inputs.path, inputs.spec, **settings))
+    job = open_job(Settings(inputs.config, inputs.path, inputs.spec, **settings))
     live, result = job.frame(index), frame(folder, index).result
     for values in live.box.sample(12, np.random.default_rng(5)):
         picture = live.renderer.image(live.camera, *live.pose_set.world_to_camera(values))
@@ -418,7 +420,7 @@ def finished(blobs: Inputs, tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_a_run_writes_what_it_promises(blobs: Inputs, finished: Path) -> None:
     names = {file.name for file in finished.iterdir()}
     frames = {f"frame_0000{k}.{kind}" for k in range(3) for kind in ("npz", "png")}
-    assert names == frames | {"report.json", "report.html"}
+    assert names == frames | {"report.json", "report.html", MARK}
     document = report(finished)
     assert (document["version"], document["state"], document["guarantee"]) == (1, "done", "float32-sound")
     assert document["renderer"] == {"name": "gsplat", "version": "1.4.0"}
@@ -527,7 +529,7 @@ def test_stored_cells_cover_the_set_and_hold_renders(
     for tile in tiles:
         mine = (leaves.tile == tile).all(axis=1)
         assert volume[mine].sum() == pytest.approx(whole, rel=1e-12)
-    live = Job(Settings(inputs.config, inputs.path, inputs.spec)).frame(0)
+    live = open_job(Settings(inputs.config, inputs.path, inputs.spec)).frame(0)
     rng = np.random.default_rng(11)
     for values in [*box.sample(25, rng), *box.corners()]:
         picture = live.renderer.image(live.camera, *live.pose_set.world_to_camera(values))
@@ -682,21 +684,22 @@ def test_cluster_on_this_machine_gives_the_same(blobs: Inputs, finished: Path, t
 
 @needs_dask
 def test_worker_with_other_files_is_refused(blobs: Inputs, tmp_path: Path) -> None:
-    from ns_abstract.cli.cluster import Part, bound_part
-    from ns_abstract.errors import InputError
+    from ns_abstract.api.bounding import Part, bound_part
+    from ns_abstract.io.errors import InputError
 
-    job = Job(Settings(blobs.config, blobs.path, blobs.spec))
+    job = open_job(Settings(blobs.config, blobs.path, blobs.spec))
     goal = job.goal(1.5, 1.0, 2)
-    assert bound_part(job.settings, job.fingerprint, Part(0, None), goal, False).index == 0
+    assert bound_part(job.recipe, Part(0, None), goal, False).index == 0
     with pytest.raises(InputError, match="other content"):
-        bound_part(job.settings, job.fingerprint | {"scene": "another"}, Part(0, None), goal, False)
+        other = dataclasses.replace(job.recipe, fingerprint=job.fingerprint | {"scene": "another"})
+        bound_part(other, Part(0, None), goal, False)
 
 
 @needs_dask
 def test_no_scheduler_at_the_address(
     blobs: Inputs, tmp_path: Path, call: Callable[..., tuple[int, str]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from ns_abstract import engines
+    from ns_abstract.execution import engines
 
     monkeypatch.setattr(engines, "_CONNECT", "1s")
     options = blobs.options(tmp_path / "out", engine="dask", scheduler_address="127.0.0.1:1")
@@ -719,7 +722,7 @@ def test_demo_writes_what_the_next_command_needs(
     tmp_path: Path, call: Callable[..., tuple[int, str]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     assert call(["--output-dir", str(tmp_path), "--splats-only"], demo_command.main)[0] == 0
-    job = Job(Settings(next(tmp_path.rglob("config.yml")), tmp_path / "camera_path.json", tmp_path / "SPEC.json"))
+    job = open_job(Settings(next(tmp_path.rglob("config.yml")), tmp_path / "camera_path.json", tmp_path / "SPEC.json"))
     assert job.frame_count == 5
     assert job.pose_sets[0].box.names == ("x",)
     assert len(list((tmp_path / "data" / "images").glob("*.png"))) == 10

@@ -19,17 +19,11 @@ import pytest
 
 from ns_abstract.demo import airfield as airfield_module
 from ns_abstract.demo.airfield import GROUND, PLANE_LENGTH, TARGET, airfield
-from ns_abstract.demo.paths import (
-    View,
-    airfield_orbit,
-    airfield_path,
-    airfield_views,
-    dataset_views,
-    write_airfield_paths,
-)
-from ns_abstract.demo.runs import write_splatfacto_run
-from ns_abstract.errors import InputError
+from ns_abstract.demo.paths import airfield_orbit, airfield_path, airfield_views, dataset_views, write_airfield_paths
+from ns_abstract.geometry.views import View
+from ns_abstract.io.errors import InputError
 from ns_abstract.methods.splat.scene import DataparserTransform, SplatScene
+from ns_abstract.methods.splat.write import write_splatfacto_run
 
 ARRAYS = ("means", "log_scales", "quats", "opacity_logits", "sh", "background")
 TIMESTAMP = "2026-11-21_000000"
@@ -42,9 +36,7 @@ def scene() -> SplatScene:
 
 @pytest.fixture(scope="module")
 def run(scene: SplatScene, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write_splatfacto_run(
-        scene, tmp_path_factory.mktemp("demo"), timestamp=TIMESTAMP, experiment_name="airfield"
-    )
+    return write_splatfacto_run(scene, tmp_path_factory.mktemp("demo"), timestamp=TIMESTAMP, experiment_name="airfield")
 
 
 def small_scene(**changes: object) -> SplatScene:
@@ -329,9 +321,7 @@ def test_dataset_images_come_from_the_renderer(tmp_path: Path) -> None:
         seen.append(view)
         return ramp
 
-    write_splatfacto_run(
-        small_scene(), tmp_path, timestamp="t", experiment_name="e", views=views, render=render
-    )
+    write_splatfacto_run(small_scene(), tmp_path, timestamp="t", experiment_name="e", views=views, render=render)
     assert seen == views
     meta = json.loads((tmp_path / "data" / "transforms.json").read_text())
     assert (meta["h"], meta["w"], len(meta["frames"])) == (4, 6, 3)
@@ -426,6 +416,4 @@ def test_nerfstudio_itself_loads_the_run(run: Path, scene: SplatScene, tmp_path:
     np.testing.assert_array_equal(found["opacities"][:, 0], written.opacity_logits)
     np.testing.assert_array_equal(found["features_dc"], written.sh[:, 0])
     np.testing.assert_array_equal(found["features_rest"][:, : written.sh.shape[1] - 1], written.sh[:, 1:])
-    assert json.loads(transform.read_text()) == json.loads(
-        (run.parent / "dataparser_transforms.json").read_text()
-    )
+    assert json.loads(transform.read_text()) == json.loads((run.parent / "dataparser_transforms.json").read_text())

@@ -15,8 +15,8 @@ from oracle import escapes, inside, points, rational, value, weights
 
 from ns_abstract.arithmetic.elementary import EXP_HIGHEST, EXP_LOWEST, EXP_RELATIVE_ERROR, exp_kernel
 from ns_abstract.arithmetic.forms import Basis, FormArray, settle
+from ns_abstract.arithmetic.rounding import FLOAT32, REAL, UNIT32, UNIT64, arithmetic, gamma
 from ns_abstract.arithmetic.trigonometry import cos_sin
-from ns_abstract.arithmetic.units import FLOAT32, REAL, UNIT32, UNIT64, arithmetic, gamma
 
 
 @njit(error_model="numpy")

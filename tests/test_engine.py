@@ -12,11 +12,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from ns_abstract.geometry.box import ParameterBox
+from ns_abstract.geometry.tiles import assemble
 from ns_abstract.refine import engine
 from ns_abstract.refine.engine import Goal, Refinement
 from ns_abstract.refine.result import FrameResult, mean_pixel_gap
-from ns_abstract.sets.box import ParameterBox
-from ns_abstract.sets.tiles import assemble
 
 SIDE = 4
 FOREVER = 1e9
@@ -49,7 +49,8 @@ class Waves:
     Pixels outside the image are NaN everywhere.
     """
 
-    batch: int | None = None
+    tilewise = False
+    tiles_at_once: int | None = None
     witnesses = 1
 
     def __init__(
@@ -122,12 +123,18 @@ class Waves:
             lower=lower,
             upper=upper,
             slopes=np.abs(self.weight).mean(axis=(0, 1, 2, 3)) * half,
-            context=SimpleNamespace(box=box, visible=None),
+            context=SimpleNamespace(box=box, shown=None, nbytes=0),
             linear=linear,
         )
 
     def feasible(self, box: ParameterBox) -> ParameterBox | None:
         return box
+
+    def watch(self, tiles: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> None:
+        pass
+
+    def allow(self, excess: float) -> float:
+        return 0.0
 
     def motion(self, box: ParameterBox) -> np.ndarray:
         return self.pace * (np.array(box.upper) - np.array(box.lower))

@@ -19,10 +19,10 @@ from onnx import numpy_helper
 from PIL import Image
 from test_cli import call, one_line  # noqa: F401
 
-from ns_abstract.certification import Certification, CertifySettings
+from ns_abstract.api.certification import Certification, CertifySettings, open_certification
 from ns_abstract.cli import export as export_command
 from ns_abstract.cli import render as render_command
-from ns_abstract.errors import InputError
+from ns_abstract.io.errors import InputError
 from ns_abstract.methods.splat.load import load_scene
 from ns_abstract.methods.splat.ply import write_ply
 from ns_abstract.methods.splat.scene import SplatScene
@@ -186,7 +186,7 @@ def instances(blobs: Inputs, tmp_path_factory: pytest.TempPathFactory) -> Callab
             patch.setattr("sys.argv", ["command", *map(str, options), *map(str, more)])
             export_command.main()
         assert leave.value.code == 0
-        return folder / name, Certification(settings)
+        return folder / name, open_certification(settings)
 
     return make
 

@@ -11,15 +11,15 @@ import numpy as np
 import pytest
 import torch
 
+from ns_abstract.geometry.box import ParameterBox
+from ns_abstract.geometry.camera_path import Camera
+from ns_abstract.geometry.poses import PoseSet
 from ns_abstract.methods.splat.constants import GSPLAT_1_4_0
 from ns_abstract.methods.splat.scene import SplatScene
-from ns_abstract.sets.box import ParameterBox
-from ns_abstract.sets.path import Camera
-from ns_abstract.sets.perturbation import parse_perturbation
-from ns_abstract.sets.poses import PoseSet
-from ns_abstract.verify import soundness
-from ns_abstract.verify.falsify import Attack, falsify, merge
-from ns_abstract.verify.soundness import (
+from ns_abstract.perturbation.specification import parse_perturbation
+from ns_abstract.verify.attack import soundness
+from ns_abstract.verify.attack.falsify import Attack, falsify, merge
+from ns_abstract.verify.attack.soundness import (
     bound_cells,
     check_run,
     compiled_renderer,

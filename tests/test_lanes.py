@@ -10,9 +10,10 @@ import pytest
 from numba import njit
 from numba.core.errors import TypingError
 
-from ns_abstract.arithmetic.compiled import advanced, pointer, signed
 from ns_abstract.arithmetic.elementary import exp_kernel, fma
-from ns_abstract.arithmetic.lanes import (
+from ns_abstract.arithmetic.outward import outward
+from ns_abstract.arithmetic.simd.intrinsics import advanced, pointer, signed
+from ns_abstract.arithmetic.simd.lanes import (
     bits,
     load4,
     load8,
@@ -25,7 +26,6 @@ from ns_abstract.arithmetic.lanes import (
     store_columns,
     where,
 )
-from ns_abstract.arithmetic.outward import outward
 
 SPECIAL = [0.0, -0.0, 1.0, -1.0, 1e-310, -1e308, np.inf, -np.inf, np.nan, 3.0, np.nextafter(1.0, 2.0), 1e-16]
 

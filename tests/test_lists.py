@@ -7,12 +7,12 @@ import pytest
 from numba import get_num_threads, njit, prange
 from test_bounds import TURN, camera, moves, scene
 
-from ns_abstract.arithmetic.compiled import pointer, taken
-from ns_abstract.arithmetic.units import REAL
+from ns_abstract.arithmetic.rounding import REAL
+from ns_abstract.arithmetic.simd.intrinsics import pointer, taken
+from ns_abstract.geometry.poses import PoseSet
 from ns_abstract.methods.splat.constants import GSPLAT_1_4_0
 from ns_abstract.methods.splat.frame import SplatFrame
 from ns_abstract.methods.splat.lists import depth_order, longest_first, tile_lists, touching
-from ns_abstract.sets.poses import PoseSet
 
 ACROSS, DOWN = 5, 4
 

@@ -24,7 +24,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from plyfile import PlyData, PlyElement
 
-from ns_abstract.errors import InputError
+from ns_abstract.io.errors import InputError
 from ns_abstract.methods import runs
 from ns_abstract.methods.splat.load import load_scene
 from ns_abstract.methods.splat.scene import SplatScene
@@ -375,9 +375,7 @@ def test_non_contiguous_tensors(run: Run) -> None:
         (0, 1000, 0, "sigmoid"),
     ],
 )
-def test_degree_evaluated_after_loading(
-    run: Run, stored: int, interval: int, degree: int, model: str
-) -> None:
+def test_degree_evaluated_after_loading(run: Run, stored: int, interval: int, degree: int, model: str) -> None:
     run.replace("sh_degree: 3", f"sh_degree: {stored}")
     run.replace("sh_degree_interval: 1000", f"sh_degree_interval: {interval}")
     tensors = parameters(bands=(stored + 1) ** 2 - 1)
@@ -702,11 +700,7 @@ BAD_CHECKPOINTS: dict[str, tuple[Spoil, tuple[str, ...]]] = {
         ("_rebuild_tensor_xx",),
     ),
     "storage too small": (
-        _index(
-            lambda data: data.replace(b"K\x05K\x0f\x8a", b"K\xffK\x0f\x8a").replace(
-                b"K\x05K\x03", b"K\xfeK\x03"
-            )
-        ),
+        _index(lambda data: data.replace(b"K\x05K\x0f\x8a", b"K\xffK\x0f\x8a").replace(b"K\x05K\x03", b"K\xfeK\x03")),
         ("checkpoint",),
     ),
     "a list": (lambda run: run.save([1, 2]), ("pipeline",)),

@@ -11,15 +11,15 @@ import pytest
 import torch
 from nerfs import UNIFORM, images, pixels_of, poses, tiny_scene
 
+from ns_abstract.geometry.poses import PoseSet
 from ns_abstract.methods.nerf import bounds as bounds_module
 from ns_abstract.methods.nerf import frame as frame_module
 from ns_abstract.methods.nerf.bounds import Division, NerfBounds, RayBounds
 from ns_abstract.methods.nerf.frame import NerfFrame
 from ns_abstract.methods.nerf.scene import NerfScene
 from ns_abstract.refine.engine import Goal, Refinement
-from ns_abstract.sets.poses import PoseSet
-from ns_abstract.verify.falsify import falsify
-from ns_abstract.verify.soundness import nerf_renderer
+from ns_abstract.verify.attack.falsify import falsify
+from ns_abstract.verify.attack.soundness import nerf_renderer
 
 SETS = {
     "point": {"rotation": {"yaw": [0.1, 0.1]}},
@@ -113,7 +113,7 @@ def test_the_whole_set_costs_nothing_and_rays_come_in_batches() -> None:
     assert (whole.lower == 0.0).all() and (whole.upper == 1.0).all()
     sizes = []
     bound = frame.bound
-    frame.batch = 5
+    frame.tiles_at_once = 5
     frame.bound = lambda box, tiles, *rest: sizes.append(len(tiles)) or bound(box, tiles, *rest)  # type: ignore[method-assign]
     Refinement(frame, 0, Goal(ratio=1.0, seconds=60.0, cells=9)).run()
     assert sizes[0] == 12 and max(sizes[1:]) <= 5
@@ -224,7 +224,7 @@ def test_processes_find_what_this_process_finds_and_survive_a_kill() -> None:
     box = pose_set.box.split(0, 2)[0]
     tiles = np.arange(12)
     shared, alone = NerfFrame(scene, UNIFORM, pose_set, workers=2), NerfFrame(scene, UNIFORM, pose_set)
-    assert shared.batch == 2 * alone.batch
+    assert shared.tiles_at_once == 2 * alone.tiles_at_once
     engine = frame_module._processes(2)
     try:
         together = shared.bound(box, tiles)

@@ -8,15 +8,15 @@ import numpy as np
 import pytest
 from nerfs import UNIFORM, pixels_of, poses, tiny_scene
 
-from ns_abstract.errors import InputError
+from ns_abstract.geometry.poses import PoseSet
+from ns_abstract.io.errors import InputError
 from ns_abstract.methods.nerf import bounds as bounds_module
 from ns_abstract.methods.nerf.bounds import NerfBounds, RayBounds
 from ns_abstract.methods.nerf.frame import NerfFrame
 from ns_abstract.methods.nerf.method import NerfMethod
 from ns_abstract.methods.nerf.scene import NerfScene
-from ns_abstract.sets.poses import PoseSet
-from ns_abstract.verify.falsify import falsify
-from ns_abstract.verify.soundness import nerf_renderer
+from ns_abstract.verify.attack.falsify import falsify
+from ns_abstract.verify.attack.soundness import nerf_renderer
 
 BINS = dataclasses.replace(UNIFORM, kind="hierarchical", samples=32, importance=40)
 SETS = {

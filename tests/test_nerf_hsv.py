@@ -9,14 +9,14 @@ import pytest
 import torch
 from nerfs import UNIFORM, pixels_of, poses, tiny_scene
 
-from ns_abstract.errors import InputError
+from ns_abstract.io.errors import InputError
 from ns_abstract.methods.nerf import frame as frame_module
 from ns_abstract.methods.nerf import hsv
 from ns_abstract.methods.nerf.frame import NerfFrame
 from ns_abstract.methods.nerf.hsv import shifted, shifted_bounds
 from ns_abstract.refine.engine import Goal, Refinement
-from ns_abstract.verify.falsify import falsify
-from ns_abstract.verify.soundness import nerf_renderer
+from ns_abstract.verify.attack.falsify import falsify
+from ns_abstract.verify.attack.soundness import nerf_renderer
 
 
 def test_shifts_are_those_of_hsv() -> None:

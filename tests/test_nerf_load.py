@@ -19,17 +19,17 @@ import torch
 from nerfs import UNIFORM, other_view, tiny_scene, view
 from test_cli import one_line
 
+from ns_abstract.api.files import Settings, open_job
 from ns_abstract.cli import render as render_command
 from ns_abstract.demo.nerf_fit import NerfNetwork
-from ns_abstract.demo.nerf_runs import write_nerf_run
-from ns_abstract.demo.paths import View, path_json
-from ns_abstract.errors import InputError
+from ns_abstract.geometry.views import View, path_json
+from ns_abstract.io.errors import InputError
 from ns_abstract.methods import runs
 from ns_abstract.methods.load import load_any
 from ns_abstract.methods.nerf.load import load_nerf
 from ns_abstract.methods.nerf.render import NerfRenderer, Sampling
 from ns_abstract.methods.nerf.scene import NerfScene
-from ns_abstract.pipeline import Job, Settings
+from ns_abstract.methods.nerf.write import write_nerf_run
 
 
 @pytest.fixture
@@ -138,7 +138,7 @@ def test_end_to_end_and_resume(inputs: dict[str, Path], tmp_path: Path, monkeypa
     assert any("Algorithm 2" in line for line in report["plan"])
     with np.load(out / "frame_00000.npz", allow_pickle=False) as stored:
         lower, upper = stored["lower"], stored["upper"]
-    job = Job(Settings(**inputs, num_samples=16))
+    job = open_job(Settings(**inputs, num_samples=16))
     frame = job.frame(0)
     for values in frame.box.sample(40, np.random.default_rng(1)):
         picture = frame.renderer.image(frame.camera, frame.pose_set.pose(values))
@@ -176,10 +176,10 @@ def test_samples_are_an_option_of_nerfs_alone(blobs, tmp_path: Path, monkeypatch
 
 
 def test_the_papers_renderer_is_black_behind(inputs: dict[str, Path]) -> None:
-    assert Job(Settings(**inputs, renderer="paper")).method.program["name"] == "paper-nerf"
-    frame = Job(Settings(**inputs, renderer="paper")).frame(0)
+    assert open_job(Settings(**inputs, renderer="paper")).method.program["name"] == "paper-nerf"
+    frame = open_job(Settings(**inputs, renderer="paper")).frame(0)
     assert frame.renderer.sampling.background == (0.0, 0.0, 0.0)
-    assert Job(Settings(**inputs)).frame(0).renderer.sampling.background == (1.0, 1.0, 1.0)
+    assert open_job(Settings(**inputs)).frame(0).renderer.sampling.background == (1.0, 1.0, 1.0)
 
 
 # ---------------------------------------------------------------- the concrete renderer

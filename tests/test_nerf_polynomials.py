@@ -11,7 +11,7 @@ from nerfs import poses
 
 from ns_abstract.arithmetic.chebyshev import ROUNDING, ChebyshevBasis, bernstein_matrices, chebyshev_values
 from ns_abstract.arithmetic.taylor import TaylorArray, TaylorBasis, taylor_cos_sin
-from ns_abstract.sets.poses import PoseSet
+from ns_abstract.geometry.poses import PoseSet
 
 SETS = {
     "yaw": {"rotation": {"yaw": 0.05}},

@@ -23,9 +23,9 @@ from nerfstudio_runs import BIN, Server, command, environment, free_port, lpips_
 from PIL import Image
 
 from ns_abstract.cli.viewer import Viewer
-from ns_abstract.demo.paths import path_json
-from ns_abstract.demo.runs import write_splatfacto_run
-from ns_abstract.errors import InputError
+from ns_abstract.geometry.camera_path import load_camera_path
+from ns_abstract.geometry.views import path_json
+from ns_abstract.io.errors import InputError
 from ns_abstract.methods.load import load_any
 from ns_abstract.methods.nerf.render import NerfRenderer, Sampling
 from ns_abstract.methods.nerf.scene import Encoding, NerfScene
@@ -34,9 +34,9 @@ from ns_abstract.methods.splat.constants import GSPLAT_1_4_0
 from ns_abstract.methods.splat.load import load_scene
 from ns_abstract.methods.splat.ply import write_ply
 from ns_abstract.methods.splat.render import Renderer
+from ns_abstract.methods.splat.write import write_splatfacto_run
 from ns_abstract.nerfstudio import torchvision_operators
-from ns_abstract.sets.path import load_camera_path
-from ns_abstract.sets.perturbation import load_perturbation
+from ns_abstract.perturbation.specification import load_perturbation
 from ns_abstract.viewer.background import Status
 from ns_abstract.viewer.views import View, perturbation_of
 
@@ -311,7 +311,7 @@ def viewer(opened: tuple[Any, Any], model: Any, monkeypatch: pytest.MonkeyPatch)
     monkeypatch.setattr(run_viewer, "time", SimpleNamespace(sleep=end))
     thread = threading.Thread(target=run_viewer._start_viewer, args=(config, pipeline, 29999), daemon=True)
     thread.start()
-    until(lambda: made and made[0].ready and hasattr(made[0], "camera_handles"), 60, "the viewer")
+    until(lambda: made and made[0].ready and hasattr(made[0], "camera_handles"), "the viewer")
     yield made[0]
     made[0].over = True
     thread.join(30)
@@ -354,7 +354,7 @@ def test_viewer_finds_the_panel_and_works_in_the_background(
     first = draw()
     # nothing is waited for: what is not known yet is not claimed
     assert (first["abstract_lower"] == 0).all() and (first["abstract_upper"] == 1).all()
-    until(lambda: draw() and model._background.status.state == "idle", 120, "bounds")
+    until(lambda: draw() and model._background.status.state == "idle", "bounds")
     found = draw()
     assert (found["abstract_lower"] <= found["rgb"]).all() and (found["rgb"] <= found["abstract_upper"]).all()
     assert float(found["abstract_gap"].mean()) < 0.5
@@ -373,7 +373,7 @@ def test_viewer_finds_the_panel_and_works_in_the_background(
     # refine goes on
     cells = model._background.best(model.abstract._last, 1.0).cells
     model.abstract.elements[-3].cb_hook(model.abstract.elements[-3])
-    until(lambda: model._background.status.state == "idle", 120, "refinement")
+    until(lambda: model._background.status.state == "idle", "refinement")
     assert model._background.best(model.abstract._last, 1.0).cells >= cells
     # send to certify
     model.abstract._file.value = str(tmp_path / "sent" / "view.json")
@@ -395,7 +395,7 @@ def test_viewer_finds_the_panel_and_works_in_the_background(
     model.abstract._select.value = '{"box": [[-9, -9, -9], [9, 9, 9]]}'
     model.abstract._sliders["color"].value = 50.0
     assert (draw()["abstract_upper"] == 1).all()
-    until(lambda: draw() and model._background.status.state == "idle", 120, "bounds of the variation")
+    until(lambda: draw() and model._background.status.state == "idle", "bounds of the variation")
     varied = draw()
     assert float(varied["abstract_gap"].mean()) > whole
     assert (varied["abstract_lower"] <= varied["rgb"]).all() and (varied["rgb"] <= varied["abstract_upper"]).all()
@@ -452,6 +452,8 @@ def test_options_are_ns_viewers() -> None:
 
     theirs = {entry.name: entry.default for entry in dataclasses.fields(ViewerConfig)}
     del theirs["num_rays_per_chunk"]
+    # ours listens on this machine alone
+    theirs["websocket_host"] = "127.0.0.1"
     assert {entry.name: entry.default for entry in dataclasses.fields(Viewer)} == theirs
     from ns_abstract.cli.viewer import View as Command
 
@@ -559,8 +561,9 @@ def test_the_loader_reads_what_was_trained(nerfstudio: SimpleNamespace, folder: 
     loaded = load_any(file)
     assert isinstance(loaded, NerfScene)
     directions = chosen["num_direction_frequencies"]
-    encodings = Encoding(int(chosen["num_frequencies"]), 0.0, chosen["max_frequency_exponent"]), Encoding(
-        int(directions), 0.0, directions - 1.0
+    encodings = (
+        Encoding(int(chosen["num_frequencies"]), 0.0, chosen["max_frequency_exponent"]),
+        Encoding(int(directions), 0.0, directions - 1.0),
     )
     assert (loaded.fine.position, loaded.fine.direction) == encodings
     assert [layer.weight.shape[0] for layer in loaded.fine.base] == [24] * 3
@@ -618,7 +621,6 @@ def test_a_nerf_in_the_viewer(nerfstudio: SimpleNamespace, folder: Path, monkeyp
                 and model._background.status.state == "idle"
                 and said
             ),
-            300,
             "bounds of rays",
         )
         assert "uniform samples" in text and "real-sound" in text
@@ -627,9 +629,7 @@ def test_a_nerf_in_the_viewer(nerfstudio: SimpleNamespace, folder: Path, monkeyp
         small = View(nerfstudio.panel.camera_of(camera), model.abstract.perturbation).at_most(source.most)
         snapshot = model._background.best(small, 20.0)
         assert snapshot.untreated < snapshot.size[0] * snapshot.size[1]
-        frame = source.frame(
-            small.camera.rescaled(small.camera.height / snapshot.size[0]), small.perturbation
-        )
+        frame = source.frame(small.camera.rescaled(small.camera.height / snapshot.size[0]), small.perturbation)
         for values in [*frame.box.corners(), *frame.box.sample(10, np.random.default_rng(0))]:
             picture = frame.renderer.image(frame.camera, frame.pose_set.pose(values))
             assert ((picture >= snapshot.lower) & (picture <= snapshot.upper)).all()

@@ -11,7 +11,7 @@ import pytest
 import torch
 from onnx_files import OnnxFile, attack, image_sets, session
 
-from ns_abstract.errors import InputError
+from ns_abstract.io.errors import InputError
 from ns_abstract.verify.network import ImageSets, Network, bound_outputs, load_network
 from ns_abstract.verify.network import bounds as module
 

@@ -11,7 +11,7 @@ import pytest
 import torch
 from onnx_files import OnnxFile, image_sets, members, session
 
-from ns_abstract.errors import InputError
+from ns_abstract.io.errors import InputError
 from ns_abstract.verify.interop import write_vnnlib
 from ns_abstract.verify.network import ImageSets, bound_outputs, load_network
 

@@ -10,9 +10,9 @@ import pytest
 import torch
 from onnx_files import attack, session
 
+from ns_abstract.api.files import Settings, open_job
+from ns_abstract.geometry.box import ParameterBox
 from ns_abstract.methods.splat.frame import linear_sets
-from ns_abstract.pipeline import Job, Settings
-from ns_abstract.sets.box import ParameterBox
 from ns_abstract.verify.network import ImageSets, bound_outputs, load_network
 
 _FOLDERS = [parent / "shared" / "models" for parent in Path(__file__).resolve().parents]
@@ -109,7 +109,7 @@ def test_rendered_images_of_an_orbit(width: float) -> None:
     configs = list(runs.glob("splatfacto/*/config.yml"))
     if not configs:
         pytest.skip(f"{runs} is not there")
-    job = Job(Settings(configs[0], runs / "camera_path_orbit.json"))
+    job = open_job(Settings(configs[0], runs / "camera_path_orbit.json"))
     frame, network, run = job.frame(0), load_network(file), session(file)
     whole, tiles = job.pose_sets[0].box, np.arange(frame.tile_count)
     rows = np.concatenate([np.eye(10), -np.eye(10), np.eye(10)[:1] - np.eye(10)[1:]])

@@ -17,15 +17,16 @@ import pytest
 from conftest import Inputs
 from nerfs import UNIFORM, images, poses, tiny_scene
 
-from ns_abstract.cli.cluster import Part, bound_on_cluster, bound_part
+from ns_abstract.api import bounding
+from ns_abstract.api.bounding import Part, bound_frames, bound_part
+from ns_abstract.api.files import PathJob, Settings, open_job
 from ns_abstract.cli.render import Render, render
-from ns_abstract.engines import Cluster, connected
-from ns_abstract.errors import InputError
+from ns_abstract.execution.engines import Cluster, Machine, connected
+from ns_abstract.geometry.tiles import assemble
+from ns_abstract.io.errors import InputError
 from ns_abstract.methods.nerf.frame import NerfFrame
-from ns_abstract.pipeline import Job, Settings
 from ns_abstract.refine.engine import Goal, Refinement, groups, shared_goal
 from ns_abstract.refine.result import FrameResult, PartResult, joined, mean_pixel_gap
-from ns_abstract.sets.tiles import assemble
 
 FOREVER = 600.0
 PICTURES = ("lower", "upper", "witness_lower", "witness_upper", "image")
@@ -38,13 +39,13 @@ VARIED = {
 needs_dask = pytest.mark.skipif(importlib.util.find_spec("distributed") is None, reason="dask is not installed")
 
 
-def job_of(blobs: Inputs) -> Job:
-    return Job(Settings(blobs.config.absolute(), blobs.path.absolute(), blobs.spec.absolute()))
+def job_of(blobs: Inputs) -> PathJob:
+    return open_job(Settings(blobs.config.absolute(), blobs.path.absolute(), blobs.spec.absolute()))
 
 
-def in_groups(job: Job, count: int, goal: Goal, index: int = 0, keep_leaves: bool = False) -> list[PartResult]:
+def in_groups(job: PathJob, count: int, goal: Goal, index: int = 0, keep_leaves: bool = False) -> list[PartResult]:
     frame = job.frame(index)
-    goal = shared_goal(frame, index, goal, job.settings.seed)
+    goal = shared_goal(frame, index, goal, job.seed)
     return [job.bound_part(index, goal, tiles, keep_leaves=keep_leaves) for tiles in groups(frame, count)]
 
 
@@ -58,7 +59,7 @@ def same(first: FrameResult, second: FrameResult) -> None:
             np.testing.assert_array_equal(getattr(first.leaves, name), getattr(second.leaves, name))
 
 
-def violations(job: Job, result: FrameResult, count: int = 40, index: int = 0) -> int:
+def violations(job: PathJob, result: FrameResult, count: int = 40, index: int = 0) -> int:
     """Pixel channels of pictures of the set, of members too, outside the bounds."""
     frame = job.frame(index)
     rng = np.random.default_rng(5)
@@ -185,9 +186,7 @@ def test_scenes_that_vary(make_blobs: Callable[..., Inputs]) -> None:
 def test_rays_of_a_nerf() -> None:
     scene, pose_set = tiny_scene(2, density=30.0), poses({"rotation": {"yaw": 0.01}})
     frame = NerfFrame(scene, UNIFORM, pose_set)
-    parts = [
-        Refinement(frame, 0, Goal(1.2, FOREVER, 200), tiles=tiles).run_part() for tiles in groups(frame, 3)
-    ]
+    parts = [Refinement(frame, 0, Goal(1.2, FOREVER, 200), tiles=tiles).run_part() for tiles in groups(frame, 3)]
     result = joined(parts, frame.camera)
     assert result.bounded and mean_pixel_gap(result.lower, result.upper) < 0.9
     for picture in images(scene, pose_set, pose_set.box.sample(100, np.random.default_rng(0))):
@@ -204,12 +203,12 @@ def test_two_workers_one_of_them_killed_equal_this_process(blobs: Inputs) -> Non
     goal = Goal(1.02, FOREVER, 60)
     expected = job.joined(in_groups(job, 4, goal, keep_leaves=True))
     frame = job.frame(0)
-    shared = shared_goal(frame, 0, goal, job.settings.seed)
+    shared = shared_goal(frame, 0, goal, job.seed)
     with connected(None, 2) as client:
         engine = Cluster(client)
         assert engine.threads == 2
         for key, tiles in enumerate(groups(frame, 4)):
-            engine.submit(key, bound_part, job.settings, job.fingerprint, Part(0, tiles), shared, True, 2)
+            engine.submit(key, bound_part, job.recipe, Part(0, tiles), shared, True, 2)
         found: dict[int, PartResult] = {}
         killed = False
         deadline = time.monotonic() + 300
@@ -226,88 +225,82 @@ def test_two_workers_one_of_them_killed_equal_this_process(blobs: Inputs) -> Non
     same(job.joined([found[k] for k in (2, 0, 3, 1)]), expected)
 
 
-class Threads:
-    """A client that runs tasks at once; stands in for Dask's."""
+class Machines:
+    """An engine on several machines that works in this process: tasks in order, their goals noted.
 
-    def __init__(self, nthreads: dict[str, int]) -> None:
-        self._nthreads, self.goals, self.parts = nthreads, [], []
+    Args:
+        threads: Threads by process, the processes by machine.
+    """
 
-    def nthreads(self) -> dict[str, int]:
-        return self._nthreads
+    shares = False
 
+    def __init__(self, *threads: list[int]) -> None:
+        self._machines = threads
+        self.threads = sum(map(sum, threads))
+        self.capacity = 2 * self.threads
+        self.goals: list[Goal] = []
+        self.parts: list[Part] = []
+        self._tasks: list[tuple[int, Any, Any]] = []
 
-@pytest.fixture
-def stand_in(monkeypatch: pytest.MonkeyPatch) -> type[Threads]:
-    """In place of the engine: tasks in order, their goals noted."""
-    from ns_abstract.cli import cluster
+    def machine(self) -> Machine:
+        return Machine(max(map(len, self._machines)), max(map(sum, self._machines)))
 
-    class Engine:
-        def __init__(self, client: Threads) -> None:
-            self.client, self.tasks = client, []
-            self.threads = sum(client.nthreads().values())
+    def submit(self, key: int, function: Any, *arguments: Any) -> None:
+        self._tasks.append((key, function, arguments))
+        self.goals.append(arguments[2])
+        self.parts.append(arguments[1])
+        assert len(self._tasks) <= self.threads
 
-        def submit(self, key: int, function: Any, *arguments: Any) -> None:
-            self.tasks.append((key, function, arguments))
-            self.client.goals.append(arguments[3])
-            self.client.parts.append(arguments[2])
-            assert len(self.tasks) <= self.threads
+    def collect(self, seconds: float) -> list[tuple[int, Any]]:
+        key, function, arguments = self._tasks.pop(0)
+        return [(key, function(*arguments))]
 
-        def collect(self, seconds: float) -> list[tuple[int, Any]]:
-            key, function, arguments = self.tasks.pop(0)
-            return [(key, function(*arguments))]
-
-        def close(self) -> None:
-            self.tasks.clear()
-
-    monkeypatch.setattr(cluster, "Cluster", Engine)
-    return Threads
+    def close(self) -> None:
+        self._tasks.clear()
 
 
 def options(blobs: Inputs, folder: Path, **more: Any) -> Render:
     return Render(blobs.config, blobs.path, folder, blobs.spec, **more)
 
 
-def test_frames_are_divided_where_threads_are_many(blobs: Inputs, stand_in: type[Threads], tmp_path: Path) -> None:
+def test_frames_are_divided_where_threads_are_many(blobs: Inputs) -> None:
     job = job_of(blobs)
     for frames, threads, tasks in (([0, 1, 2], 2, 3), ([0], 1, 1), ([0], 2, 4), ([0, 2], 3, 6)):
-        client = stand_in({"tcp://one:1": threads})
-        chosen = options(blobs, tmp_path, target_ratio=3.0)
-        results = list(bound_on_cluster(client, job, chosen, frames, 60.0, lambda: False))
+        engine = Machines([threads])
+        results = list(bound_frames(job, frames, engine=engine, budget=60.0, target_ratio=3.0))
         assert sorted(r.index for r in results) == frames and all(r.bounded for r in results)
-        assert len(client.goals) == tasks
+        assert len(engine.goals) == tasks
         # all the time, shared by the rounds, and what is left goes to the last one
         rounds = -(-tasks // threads)
-        assert client.goals[0].seconds == pytest.approx(60.0 / rounds, rel=0.05)
-        assert client.goals[-1].seconds > 0.5 * 60.0 / rounds
+        assert engine.goals[0].seconds == pytest.approx(60.0 / rounds, rel=0.05)
+        assert engine.goals[-1].seconds > 0.5 * 60.0 / rounds
         for result in results:
             assert violations(job, result, 5, result.index) == 0
 
 
-def test_no_time_leaves_frames_missing_but_no_frame_in_part(
-    blobs: Inputs, stand_in: type[Threads], tmp_path: Path
-) -> None:
+def test_no_time_leaves_frames_missing_but_no_frame_in_part(blobs: Inputs) -> None:
     job = job_of(blobs)
-    client = stand_in({"tcp://one:1": 4})
-    results = list(bound_on_cluster(client, job, options(blobs, tmp_path), [0, 1, 2], 1e-9, lambda: False))
+    engine = Machines([4])
+    results = list(bound_frames(job, [0, 1, 2], engine=engine, budget=1e-9))
     # the first frame is begun and finished, others are not begun
-    assert [r.index for r in results] == [0] and {p.index for p in client.parts} == {0}
+    assert [r.index for r in results] == [0] and {p.index for p in engine.parts} == {0}
     assert violations(job, results[0]) == 0
     # stopped before its last group is there: no result
     asked = iter([False, False, True, True, True])
-    assert not list(bound_on_cluster(client, job, options(blobs, tmp_path), [0], 60.0, lambda: next(asked)))
+    assert not list(bound_frames(job, [0], engine=engine, budget=60.0, stop=lambda: next(asked)))
 
 
-def test_memory_is_shared_by_the_tasks_of_a_machine(blobs: Inputs, stand_in: type[Threads], tmp_path: Path) -> None:
+def test_memory_is_shared_by_the_tasks_of_a_machine(blobs: Inputs) -> None:
     job = job_of(blobs)
     limit = (4 * job.base_memory + (6 << 30)) / 2**30
-    limited = Job(dataclasses.replace(job.settings, memory_limit=limit))
-    client = stand_in({"tcp://one:1": 2, "tcp://one:2": 1, "tcp://two:1": 1})
-    list(bound_on_cluster(client, limited, options(blobs, tmp_path, target_ratio=3.0), [0], 60.0, lambda: False))
+    limited = open_job(dataclasses.replace(job.settings, memory_limit=limit))
+    engine = Machines([2, 1], [1])
+    list(bound_frames(limited, [0], engine=engine, budget=60.0, target_ratio=3.0))
     leaves = (limited.memory - 2 * job.base_memory) // 2
-    assert {goal.leaf_bytes for goal in client.goals} == {leaves // 3}
-    tight = Job(dataclasses.replace(job.settings, memory_limit=1.5 * job.base_memory / 2**30))
+    assert {goal.leaf_bytes for goal in engine.goals} == {leaves // 3}
+    tight = open_job(dataclasses.replace(job.settings, memory_limit=1.5 * job.base_memory / 2**30))
     with pytest.raises(InputError, match="2 workers on one machine") as refused:
-        list(bound_on_cluster(client, tight, options(blobs, tmp_path), [0], 60.0, lambda: False))
+        list(bound_frames(tight, [0], engine=engine, budget=60.0))
     assert refused.value.field == "--memory-limit"
 
 
@@ -315,9 +308,7 @@ def test_memory_is_shared_by_the_tasks_of_a_machine(blobs: Inputs, stand_in: typ
 def test_one_frame_on_two_workers_from_the_command_line(
     blobs: Inputs, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from ns_abstract.cli import cluster
-
-    monkeypatch.setattr(cluster, "local_workers", lambda job: 2)
+    monkeypatch.setattr(bounding, "local_workers", lambda job: 2)
     done = render(options(blobs, tmp_path / "out", frames=(1,), engine="dask", save_cells=True, time_budget=60.0))
     assert done == 0
     (entry,) = json.loads((tmp_path / "out" / "report.json").read_text())["frames"]

@@ -14,9 +14,9 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from ns_abstract.errors import InputError
-from ns_abstract.jsonio import is_number, load_json, parse_json
-from ns_abstract.sets.path import CameraPath, load_camera_path
+from ns_abstract.geometry.camera_path import CameraPath, load_camera_path
+from ns_abstract.io.errors import InputError
+from ns_abstract.io.jsonio import is_number, load_json, parse_json
 
 RUNS = Path(__file__).parents[2] / "shared" / "runs"
 POSE = [0.0, 0.0, 1.0, 2.0, 1.0, 0.0, 0.0, -0.5, 0.0, 1.0, 0.0, 0.25, 0.0, 0.0, 0.0, 1.0]
@@ -280,9 +280,7 @@ def test_bad_path(tmp_path: Path, case: str) -> None:
     refused(write(tmp_path, data), "path.json", *mentions)
 
 
-@pytest.mark.parametrize(
-    "factor", [0, -1, float("nan"), float("inf"), 201, 1e30, 1e-30, 1e-320, 0.01, True, "2"]
-)
+@pytest.mark.parametrize("factor", [0, -1, float("nan"), float("inf"), 201, 1e30, 1e-30, 1e-320, 0.01, True, "2"])
 def test_bad_factor(tmp_path: Path, factor: Any) -> None:
     refused(write(tmp_path, content()), "--downscale-factor", factor=factor)
 

@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ns_abstract.errors import InputError
-from ns_abstract.sets.perturbation import Orbit, Perturbation, load_perturbation, parse_perturbation
+from ns_abstract.io.errors import InputError
+from ns_abstract.perturbation.specification import Orbit, Perturbation, load_perturbation, parse_perturbation
 
 ORBIT = {"target": [0, 0, 0], "axis": [0, 0, 1], "azimuth": [0, 6.2832]}
 

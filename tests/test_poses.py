@@ -10,12 +10,12 @@ import pytest
 from flint import fmpq
 from oracle import BITS, big, inside, rational, rational_of
 
-from ns_abstract.arithmetic.units import UNIT64
-from ns_abstract.errors import InputError
-from ns_abstract.sets.box import ParameterBox
-from ns_abstract.sets.path import Camera
-from ns_abstract.sets.perturbation import Orbit, Perturbation
-from ns_abstract.sets.poses import PoseSet, axis_angle, orthonormal, rotation_about, translation_only
+from ns_abstract.arithmetic.rounding import UNIT64
+from ns_abstract.geometry.box import ParameterBox
+from ns_abstract.geometry.camera_path import Camera
+from ns_abstract.geometry.poses import PoseSet, axis_angle, orthonormal, rotation_about, translation_only
+from ns_abstract.io.errors import InputError
+from ns_abstract.perturbation.specification import Orbit, Perturbation
 
 Matrix = mpmath.matrix
 FLIP = (1, -1, -1)
@@ -217,8 +217,6 @@ def segment(angle: float, perturbation: Perturbation | None = None, seed: int = 
     return PoseSet.around(camera(rotation), sweep, camera(turned(rotation, angle), (1.0, 0.5, 0.75)))
 
 
-
-
 def thin_escapes(poses: PoseSet, order: int = 1) -> list:
     """`escapes` of cells of zero width along the segment: nothing but the rounding is left."""
     return [
@@ -246,9 +244,7 @@ def test_segment_and_more(order):
     assert escapes(poses, poses.box, order, 2) == []
 
 
-@pytest.mark.parametrize(
-    "angle", [0.0, 1e-12, 1e-9, 4e-7, 6e-7, 1e-6, 1e-4]
-)
+@pytest.mark.parametrize("angle", [0.0, 1e-12, 1e-9, 4e-7, 6e-7, 1e-6, 1e-4])
 def test_segment_nearly_equal(angle):
     poses = segment(angle)
     assert escapes(poses, poses.box, 1) == [] and thin_escapes(poses) == []

@@ -10,14 +10,14 @@ import numpy as np
 import pytest
 import torch
 
+from ns_abstract.geometry.camera_path import Camera, load_camera_path
+from ns_abstract.geometry.poses import rotation_about
 from ns_abstract.methods.splat.activate import activate
 from ns_abstract.methods.splat.constants import GSPLAT_1_4_0, PAPER, Rasteriser
 from ns_abstract.methods.splat.load import load_scene
 from ns_abstract.methods.splat.reference import Projection, Reference, project, reference_image, rotations, sh_colors
 from ns_abstract.methods.splat.render import Renderer
 from ns_abstract.methods.splat.scene import SplatScene
-from ns_abstract.sets.path import Camera, load_camera_path
-from ns_abstract.sets.poses import rotation_about
 
 torch.set_num_threads(1)
 RUNS = Path(__file__).resolve().parents[2] / "shared" / "runs"

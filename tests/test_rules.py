@@ -15,7 +15,13 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from ns_abstract.arithmetic.forms import FormArray
-from ns_abstract.arithmetic.rules import (
+from ns_abstract.geometry.camera_path import Camera
+from ns_abstract.geometry.poses import PoseSet
+from ns_abstract.methods.splat.activate import activate
+from ns_abstract.methods.splat.constants import GSPLAT_1_4_0, PAPER
+from ns_abstract.methods.splat.render import Renderer
+from ns_abstract.methods.splat.scene import SplatScene
+from ns_abstract.paper import (
     RULES,
     Enclosure,
     Interval,
@@ -32,14 +38,8 @@ from ns_abstract.arithmetic.rules import (
     sumcumprod,
     vr_ind,
 )
-from ns_abstract.methods.splat import paper
-from ns_abstract.methods.splat.activate import activate
-from ns_abstract.methods.splat.constants import GSPLAT_1_4_0, PAPER
-from ns_abstract.methods.splat.render import Renderer
-from ns_abstract.methods.splat.scene import SplatScene
-from ns_abstract.sets.path import Camera
-from ns_abstract.sets.perturbation import Perturbation
-from ns_abstract.sets.poses import PoseSet
+from ns_abstract.paper import splat as paper
+from ns_abstract.perturbation.specification import Perturbation
 
 KINDS = ("random", "wide", "degenerate", "denormal", "huge", "cancelling", "corner")
 

@@ -11,8 +11,8 @@ import pytest
 from flint import arb
 
 from ns_abstract.arithmetic import selfcheck
+from ns_abstract.arithmetic.rounding import UNIT64
 from ns_abstract.arithmetic.selfcheck import ASSUMED_ERRORS, FUNCTIONS, check_functions, table
-from ns_abstract.arithmetic.units import UNIT64
 
 EXACT = {
     "exp": arb.exp,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -10,14 +11,14 @@ from flint import fmpq
 from oracle import rational
 from test_poses import SETS, camera, escapes, random_rotation
 
-from ns_abstract.bench.sets import open_jobs, pose_set
+from ns_abstract.api.files import PathJob
+from ns_abstract.bench.sets import open_jobs, pose_set, splat_of
+from ns_abstract.geometry.box import ParameterBox
+from ns_abstract.geometry.poses import PoseSet
+from ns_abstract.geometry.tiles import assemble
 from ns_abstract.methods.splat.frame import SplatFrame
-from ns_abstract.pipeline import Job
 from ns_abstract.refine.engine import Goal, Refinement
 from ns_abstract.refine.result import FrameResult
-from ns_abstract.sets.box import ParameterBox
-from ns_abstract.sets.poses import PoseSet
-from ns_abstract.sets.tiles import assemble
 
 #: As found for real scenes, and steeper, of both signs.
 SHEARS = {
@@ -118,20 +119,25 @@ def test_concrete_poses_belong_to_the_set() -> None:
 
 
 @pytest.fixture(scope="module")
-def job(blobs) -> Job:
+def job(blobs) -> PathJob:
     return open_jobs((blobs.config,), blobs.path, 1.0)[0]
 
 
-def refined(job: Job, slant: bool, cells: int) -> tuple[PoseSet, FrameResult]:
+def program_of(job: PathJob) -> tuple[Any, Any, Any]:
+    splat = splat_of(job)
+    return splat.splats, splat.rasteriser, splat.arithmetic
+
+
+def refined(job: PathJob, slant: bool, cells: int) -> tuple[PoseSet, FrameResult]:
     poses = pose_set(job, "six", 0, 8.0)
-    frame = SplatFrame(job.splats, job.rasteriser, job.arithmetic, poses, slanted=slant)
+    frame = SplatFrame(*program_of(job), poses, slanted=slant)
     assert bool(frame.pose_set.shear) == slant
     return poses, Refinement(frame, 0, Goal(1.0001, 300.0, cells)).run()
 
 
-def test_slanted_cells_enclose_and_are_tighter(job: Job) -> None:
+def test_slanted_cells_enclose_and_are_tighter(job: PathJob) -> None:
     poses, result = refined(job, True, 150)
-    frame = SplatFrame(job.splats, job.rasteriser, job.arithmetic, poses)
+    frame = SplatFrame(*program_of(job), poses)
     for values in [*poses.box.corners(), *poses.box.sample(60, np.random.default_rng(1))]:
         picture = assemble(frame.render(values), frame.camera)
         assert (result.lower <= picture).all() and (picture <= result.upper).all()
@@ -140,7 +146,7 @@ def test_slanted_cells_enclose_and_are_tighter(job: Job) -> None:
     assert excess[0] < excess[1]
 
 
-def test_a_shear_that_loses_poses_is_noticed(job: Job, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_shear_that_loses_poses_is_noticed(job: PathJob, monkeypatch: pytest.MonkeyPatch) -> None:
     whole = PoseSet.sheared
 
     def narrowed(self, shear):
@@ -148,6 +154,6 @@ def test_a_shear_that_loses_poses_is_noticed(job: Job, monkeypatch: pytest.Monke
 
     monkeypatch.setattr(PoseSet, "sheared", narrowed)
     poses, result = refined(job, True, 150)
-    frame = SplatFrame(job.splats, job.rasteriser, job.arithmetic, poses)
+    frame = SplatFrame(*program_of(job), poses)
     pictures = [assemble(frame.render(values), frame.camera) for values in poses.box.corners()]
     assert any((p < result.lower).any() or (p > result.upper).any() for p in pictures)

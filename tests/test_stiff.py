@@ -13,17 +13,17 @@ import numpy as np
 import pytest
 import torch
 
-from ns_abstract.arithmetic.units import Arithmetic
+from ns_abstract.arithmetic.rounding import Arithmetic
 from ns_abstract.bench import stiff
 from ns_abstract.bench.stiff import ARITHMETICS, Case, WatchedFrame, all_cases, run_case
 from ns_abstract.cli.bench import Stiff, bench
 from ns_abstract.cli.common import DONE
-from ns_abstract.errors import InputError
+from ns_abstract.geometry.poses import PoseSet
+from ns_abstract.io.errors import InputError
 from ns_abstract.methods.splat.activate import Splats
 from ns_abstract.methods.splat.bounds import CellBounds, SplatBounds
 from ns_abstract.methods.splat.constants import GSPLAT_1_4_0, Rasteriser
-from ns_abstract.sets.poses import PoseSet
-from ns_abstract.verify.soundness import compiled_renderer
+from ns_abstract.verify.attack.soundness import compiled_renderer
 
 torch.set_num_threads(1)
 CASES = all_cases()

@@ -12,9 +12,15 @@ import pytest
 import torch
 from conftest import SHIFT, Inputs, blob_scene, write_json
 
-from ns_abstract.arithmetic.units import FLOAT32, REAL, Arithmetic
+from ns_abstract.api.files import Settings, open_job
+from ns_abstract.arithmetic.rounding import FLOAT32, REAL, Arithmetic
+from ns_abstract.bench.sets import splat_of
 from ns_abstract.cli import render as render_command
-from ns_abstract.errors import InputError
+from ns_abstract.geometry.box import ParameterBox
+from ns_abstract.geometry.camera_path import Camera
+from ns_abstract.geometry.poses import PoseSet
+from ns_abstract.geometry.tiles import assemble
+from ns_abstract.io.errors import InputError
 from ns_abstract.methods.splat import bounds as bounds_module
 from ns_abstract.methods.splat.activate import activate
 from ns_abstract.methods.splat.bounds import CellBounds, SplatBounds
@@ -24,13 +30,8 @@ from ns_abstract.methods.splat.reference import Reference
 from ns_abstract.methods.splat.render import Renderer
 from ns_abstract.methods.splat.scene import SplatScene
 from ns_abstract.methods.splat.variations import VariedSplats, selected, vary
-from ns_abstract.pipeline import Job, Settings
-from ns_abstract.sets.box import ParameterBox
-from ns_abstract.sets.path import Camera
-from ns_abstract.sets.perturbation import load_perturbation, parse_perturbation
-from ns_abstract.sets.poses import PoseSet
-from ns_abstract.sets.tiles import assemble
-from ns_abstract.verify.soundness import check_run
+from ns_abstract.perturbation.specification import load_perturbation, parse_perturbation
+from ns_abstract.verify.attack.soundness import check_run
 from ns_abstract.verify.varied import VariedAttack, attack_varied, check_varied, show_compiled, show_reference
 
 NONE = np.empty((0, 3))
@@ -67,7 +68,7 @@ class Case:
 
     def cell(self, bounds: SplatBounds, box: ParameterBox | None = None, candidates=None) -> CellBounds:
         box = self.poses.box if box is None else box
-        order = 2 if box.dimensions <= 1 else 1
+        order = 2 if box.dimensions == 1 else 1
         return bounds.cell(self.camera, self.poses.enclosure(box, order), candidates=candidates)
 
     def attack(
@@ -127,6 +128,16 @@ def test_sigmoid_colors_stay_below_one() -> None:
     found, width, _ = case.attack()
     assert found.violations == 0
     assert width.sum() < 1.01 * (found.most - found.least).sum()
+
+
+def test_one_mean_that_varies() -> None:
+    """Two layers of one mean have no certain order where their means vary apart."""
+    near = {"mean": (0.0, 0.0, -5.0), "scale": 0.8, "opacity": 0.9}
+    case = Case(
+        layers({**near, "color": (1.0, 0.1, 0.0)}, {**near, "color": (0.0, 0.9, 1.0)}), {"scene": scene_of(mean=0.015)}
+    )
+    found, _, _ = case.attack()
+    assert found.violations == 0 and (found.most - found.least).max() > 0.1
 
 
 def swap() -> Case:
@@ -219,9 +230,13 @@ def test_directions(dimensions: int, monkeypatch: pytest.MonkeyPatch) -> None:
     case = direction_case(dimensions)
     assert case.attack()[0].violations == 0
     fixed, moving = bounds_module.fixed_colors, bounds_module.moving_colors
-    monkeypatch.setattr(bounds_module, "fixed_colors", lambda means, radius, *rest: fixed(means, NONE, *rest))
     monkeypatch.setattr(
-        bounds_module, "moving_colors", lambda indices, means, radius, *rest: moving(indices, means, NONE, *rest)
+        bounds_module, "fixed_colors", lambda scene, *rest: fixed(scene._replace(mean_radius=NONE), *rest)
+    )
+    monkeypatch.setattr(
+        bounds_module,
+        "moving_colors",
+        lambda indices, scene, *rest: moving(indices, scene._replace(mean_radius=NONE), *rest),
     )
     assert case.attack()[0].violations > 0
 
@@ -232,9 +247,8 @@ def test_planted_depth_order(monkeypatch: pytest.MonkeyPatch) -> None:
     right = bounds_module.pixel_stage
 
     def certain(*arguments):
-        values = list(arguments)
-        values[8] = np.zeros_like(values[8])
-        right(*values)
+        lists, gaussians, *rest = arguments
+        right(lists, gaussians._replace(depth_error=np.zeros_like(gaussians.depth_error)), *rest)
 
     monkeypatch.setattr(bounds_module, "pixel_stage", certain)
     assert case.attack()[0].violations > 0
@@ -401,15 +415,15 @@ def test_command(poses: dict, make_blobs, tmp_path: Path, monkeypatch: pytest.Mo
         lower, upper = result["lower"], result["upper"]
         assert (lower <= result["witness_lower"]).all() and (result["witness_upper"] <= upper).all()
         assert (result["witness_upper"] - result["witness_lower"]).max() > 0.1
-    job = Job(Settings(inputs.config, inputs.path, inputs.spec))
-    pose_set = job.pose_sets[0]
-    varied = job.splat.varied(pose_set.perturbation.scene)
+    job = open_job(Settings(inputs.config, inputs.path, inputs.spec))
+    pose_set, splat = job.pose_sets[0], splat_of(job)
+    varied = splat.varied(pose_set.perturbation.scene)
     text = f"the opacity of {varied.counts['opacity']} of 50 Gaussians varies"
     report = json.loads((tmp_path / "out" / "report.json").read_text())
     assert 0 < varied.counts["opacity"] < 40 and text in " ".join(report["frames"][0]["plan"])
-    shows = [show_compiled(Renderer(job.splats, job.rasteriser), pose_set)]
+    shows = [show_compiled(Renderer(splat.splats, splat.rasteriser), pose_set)]
     found = attack_varied(
-        lower, upper, pose_set.box, varied, shows, job.scene, pose_set, job.rasteriser, members=30, targets=6
+        lower, upper, pose_set.box, varied, shows, splat.scene, pose_set, splat.rasteriser, members=30, targets=6
     )
     assert found.violations == 0
 
@@ -427,7 +441,7 @@ def test_fingerprint(make_blobs, tmp_path: Path) -> None:
     found = []
     for index, radius in ((0, 0.1), (1, 0.1), (0, 0.2), (0, 0.1)):
         write_json(inputs.spec, SHIFT | {"scene": [{"select": {"indices": [index]}, "mean": radius}]})
-        found.append(Job(Settings(inputs.config, inputs.path, inputs.spec)).fingerprint["poses"])
+        found.append(open_job(Settings(inputs.config, inputs.path, inputs.spec)).fingerprint["poses"])
     assert found[0] == found[3] and len(set(found)) == 3
 
 

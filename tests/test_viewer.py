@@ -21,17 +21,16 @@ from nerfs import view as nerf_camera
 from test_cli import call, one_line  # noqa: F401
 
 from ns_abstract.cli import viewer as viewer_command
-from ns_abstract.errors import InputError
+from ns_abstract.geometry.camera_path import Camera
+from ns_abstract.io.errors import InputError
 from ns_abstract.methods.splat.activate import activate
 from ns_abstract.methods.splat.constants import GSPLAT_1_4_0
 from ns_abstract.methods.splat.frame import SplatFrame, TileBounds
+from ns_abstract.perturbation.specification import Perturbation, parse_perturbation, perturbation_object
 from ns_abstract.refine.engine import Goal, Refinement
-from ns_abstract.sets.path import Camera
-from ns_abstract.sets.perturbation import Perturbation, parse_perturbation, perturbation_object
 from ns_abstract.viewer.background import Background
 from ns_abstract.viewer.views import NerfSource, Snapshot, Source, SplatSource, View, perturbation_of
 
-PATIENCE = 120.0
 Call = Callable[..., tuple[int, str]]
 
 
@@ -108,7 +107,7 @@ def answer(background: Background, view: View, seconds: float = 1.0, size: tuple
         assert state.state != "failed", state.detail
         return found if state.state == "idle" else None
 
-    return until(look, PATIENCE, "an abstract image")
+    return until(look, "an abstract image")
 
 
 def violations(snapshot: Snapshot, view: View, count: int = 30) -> int:
@@ -131,7 +130,7 @@ def test_pictures_grow_and_hold(background: Callable[..., Background]) -> None:
             seen[found.size] = found
         return one.status.state == "idle"
 
-    until(look, PATIENCE, "the last picture")
+    until(look, "the last picture")
     sizes = list(seen)
     assert sizes[-1] == (120, 160)
     assert sizes == sorted(sizes)
@@ -182,7 +181,7 @@ def odd_view() -> View:
 )
 def test_trouble_is_told_and_over(background: Callable[..., Background], odd: str, said: str) -> None:
     one = background(odd)
-    until(lambda: one.best(odd_view(), 1.0) or one.status.state == "failed", PATIENCE, "the failure")
+    until(lambda: one.best(odd_view(), 1.0) or one.status.state == "failed", "the failure")
     assert said in one.status.detail
     # nothing is shown, and it is not tried again and again
     asked = one._wanted
@@ -193,10 +192,10 @@ def test_trouble_is_told_and_over(background: Callable[..., Background], odd: st
 
 def test_a_worker_that_is_stuck_is_replaced(background: Callable[..., Background]) -> None:
     one = background("hangs")
-    until(lambda: [w.scene for w in one._workers] == [0, 0], PATIENCE, "two workers")
+    until(lambda: [w.scene for w in one._workers] == [0, 0], "two workers")
     stuck = one._workers[0]
     assert one.best(odd_view(), 1.0) is None
-    until(lambda: stuck.busy is not None, PATIENCE, "the hanging work")
+    until(lambda: stuck.busy is not None, "the hanging work")
     assert violations(answer(one, view()), view()) == 0
     assert stuck not in one._workers
     assert stuck.process.wait(30) != 0
@@ -339,7 +338,7 @@ def test_selections_that_cannot_be_read(text: str) -> None:
 def test_an_empty_selection_is_told(background: Callable[..., Background]) -> None:
     one = background()
     nothing = varied_view('{"box": [[8, 8, 8], [9, 9, 9]]}', mean=0.1)
-    until(lambda: one.best(nothing, 1.0) or one.status.state == "failed", PATIENCE, "the failure")
+    until(lambda: one.best(nothing, 1.0) or one.status.state == "failed", "the failure")
     assert "picks none of 50 Gaussians" in one.status.detail
     assert answer(one, view()).final
 
@@ -360,7 +359,7 @@ def test_bounds_of_a_nerf_ray_by_ray(background: Callable[..., Background]) -> N
         assert one.status.state != "failed", one.status.detail
         return one.status.state == "idle"
 
-    until(look, PATIENCE, "the end of the work")
+    until(look, "the end of the work")
     assert seen[-1].final and seen[-1].guarantee == "real-sound" and seen[-1].size == (5, 6)
     # rays that were not reached are [0, 1], and fewer and fewer
     assert [s.untreated for s in seen] == sorted((s.untreated for s in seen), reverse=True)

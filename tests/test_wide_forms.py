@@ -8,10 +8,10 @@ from numba import njit
 from oracle import escapes, random_forms, rational
 from test_forms import BINARY, POSITIVE, SIZES, layout
 
-from ns_abstract.arithmetic import wide_forms
-from ns_abstract.arithmetic.compiled import pointer
 from ns_abstract.arithmetic.forms import Basis, FormArray, clamp_below, logarithm, negate, settle
-from ns_abstract.arithmetic.lanes import load8, store
+from ns_abstract.arithmetic.simd import wide_forms
+from ns_abstract.arithmetic.simd.intrinsics import pointer
+from ns_abstract.arithmetic.simd.lanes import load8, store
 
 BASES = [Basis(1, 1), Basis(2, 1), Basis(6, 1), Basis(8, 1), Basis(1, 2), Basis(3, 2)]
 _A, _B, _OUT = range(3)
@@ -208,7 +208,7 @@ def test_clamp(basis):
         for sign, floor in ((1.0, -0.25), (-1.0, -0.5)):
             if sign < 0.0:
                 negate(kernel.data, basis.monomials)
-            low, high = (a.bounds() if sign > 0.0 else tuple(-np.maximum(x, -0.25) for x in reversed(a.bounds())))
+            low, high = a.bounds() if sign > 0.0 else tuple(-np.maximum(x, -0.25) for x in reversed(a.bounds()))
             clamp_below(kernel.data, floor, low, high, *layout(basis))
             if sign < 0.0:
                 negate(kernel.data, basis.monomials)

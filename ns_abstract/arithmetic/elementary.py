@@ -15,7 +15,7 @@ from llvmlite import ir
 from numba import config, njit
 from numba.extending import intrinsic
 
-from ns_abstract.arithmetic.lanes import LanesType, by_intrinsic, common_type, operands
+from ns_abstract.arithmetic.simd.lanes import LanesType, by_intrinsic, common_type, operands
 
 #: Proven bound of ``|exp_kernel(x) - exp(x)| / exp(x)`` for ``EXP_LOWEST <= x <= EXP_HIGHEST``
 #: (design.md, E1): truncation 2.4e-16, reduction and Horner rounding 3 units, scaling exact.
@@ -80,7 +80,10 @@ if config.DISABLE_JIT:  # pyright: ignore[reportAttributeAccessIssue]
 
 @njit(inline="always", error_model="numpy")
 def exp_kernel(x):
-    """exp(x), ``EXP_LOWEST <= x <= EXP_HIGHEST``, of floats or lanes; relative error ``<= EXP_RELATIVE_ERROR``."""
+    """exp(x), ``EXP_LOWEST <= x <= EXP_HIGHEST``, of floats or lanes; relative error ``<= EXP_RELATIVE_ERROR``.
+
+    See design.md, E1.
+    """
     shifted = fma(x, _LOG2E, _ROUND_TO_INTEGER)
     k = shifted - _ROUND_TO_INTEGER
     r = fma(-k, _LN2_HIGH, x)

@@ -29,7 +29,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from ns_abstract.arithmetic.units import UNDERFLOW64, UNIT64
+from ns_abstract.arithmetic.rounding import UNDERFLOW64, UNIT64
 
 Float64Array = NDArray[np.float64]
 
@@ -78,7 +78,7 @@ class Basis:
 
 @njit(cache=True, error_model="numpy")
 def settle(out, d, order, m):
-    """Recompute the rows ``sum |g|`` and ``sum |q|`` of ``out`` [rows, n]."""
+    """Recompute the rows ``sum |g|`` and ``sum |q|`` of ``out`` [rows, n] (design.md, A1)."""
     n = out.shape[1]
     for q in range(n):
         out[m + 1, q] = 0.0
@@ -96,7 +96,10 @@ def settle(out, d, order, m):
 
 @njit(cache=True, error_model="numpy")
 def scale_add(a, s, b, t, shift, out, d, order, m):
-    """``out = s * a + t * b + shift`` for numbers ``s``, ``t``, ``shift``; ``out`` may be ``a`` or ``b``."""
+    """``out = s * a + t * b + shift`` for numbers ``s``, ``t``, ``shift``; ``out`` may be ``a`` or ``b``.
+
+    See design.md, A1.
+    """
     n = out.shape[1]
     absolute_s = abs(s)
     absolute_t = abs(t)

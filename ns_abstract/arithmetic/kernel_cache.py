@@ -1,37 +1,346 @@
-"""Keeps numba from loading kernels that were compiled from other sources of this package.
+"""Compiled kernels, kept between runs in the user's cache folder.
 
 numba keeps compiled code by the file of each function alone, but that code holds the functions and constants of other
-modules, too: after an update of one of them it would compute with both versions.
+modules, too, and numba reads back whatever lies in its files. Here, kernels belong to a hash of all sources that they
+may use, and what is read back is what was written:
+
+* ``ROOT/<hash of the sources>/manifest.json`` names the files of every kernel and their SHA-256;
+* ``ROOT/<hash>/blobs/<SHA-256>`` are these files; one that is damaged is dropped, and its kernel compiled again;
+* ``ROOT/<hash>/session-<host>-<process>-*`` is where numba reads and writes in one process. New files are published
+  from there, so that processes that start at once do not get into each other's way.
+
+ROOT is ``$NS_ABSTRACT_CACHE_DIR``, or ``kernels`` in the cache folder that the platform provides. Where that cannot be
+written, a temporary folder serves the process and those that it starts. The installation itself is never written to.
+numba is told by its setting ``CACHE_LOCATOR_CLASSES``.
 """
 
 from __future__ import annotations
 
 import hashlib
+import json
+import logging
+import os
+import shutil
+import socket
+import tempfile
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from functools import cache
+from multiprocessing.util import Finalize
 from pathlib import Path
 from typing import Any
 
-from numba.core import caching
+import numba
+import numba.core.config as settings
+import platformdirs
+
+from ns_abstract.io.atomic import write_atomic
+from ns_abstract.io.errors import InputError
 
 PACKAGE = Path(__file__).resolve().parents[1]
 #: Folders of the package that kernels lie in or use.
-FOLDERS = ("arithmetic", "sets", "methods")
+FOLDERS = ("arithmetic", "geometry", "methods", "perturbation")
+#: Variable that names the folder of compiled kernels.
+VARIABLE = "NS_ABSTRACT_CACHE_DIR"
+#: Versions of the sources whose kernels are kept.
+_KEPT = 4
+#: Bytes that have to be free where kernels are written.
+_FREE = 32 << 20
+#: Seconds between two words on progress, and between two times that kernels are published.
+_PACE = 10.0
+
+#: What numba asks by default.
+_LOCATORS = "UserProvidedCacheLocator,InTreeCacheLocator,UserWideCacheLocator,IPythonCacheLocator,ZipCacheLocator"
+
+_log = logging.getLogger("ns_abstract.kernels")
 
 
 @cache
 def source_key() -> str:
-    """Hash of the names and contents of all sources that kernels may use."""
-    found = hashlib.sha256()
+    """Hash of the names and contents of all sources that kernels may use, and of the compiler's version."""
+    found = hashlib.sha256(numba.__version__.encode())
     for path in sorted(path for folder in FOLDERS for path in (PACKAGE / folder).rglob("*.py")):
         found.update(path.relative_to(PACKAGE).as_posix().encode() + b"\0" + path.read_bytes() + b"\0")
     return found.hexdigest()
 
 
-def _stamped(locator: Any) -> Any:
-    stamp = _by_file(locator)
-    inside = any(PACKAGE / folder in Path(locator._py_file).resolve().parents for folder in FOLDERS)
-    return (stamp, source_key()) if inside else stamp
+class KernelStore:
+    """The kernels of one version of the sources, as one process sees them.
+
+    Args:
+        root: Folder of all versions.
+        key: Names the version.
+
+    Raises:
+        OSError: ``root`` cannot be written.
+    """
+
+    def __init__(self, root: Path, key: str) -> None:
+        self._folder = root / key[:32]
+        self._sources = [self._folder]
+        self._blobs = self._folder / "blobs"
+        self._blobs.mkdir(parents=True, exist_ok=True)
+        owner = f"session-{socket.gethostname()}-{os.getpid()}-"
+        self.session = Path(tempfile.mkdtemp(prefix=owner, dir=self._folder))
+        self._published: dict[Path, tuple[int, int]] = {}
+        self._entries = _read_manifest(self._folder)
+        self.compiled = 0
+        self._said = time.monotonic()
+        with suppress(OSError):
+            os.utime(self._folder)
+        self._clear(root)
+
+    @property
+    def empty(self) -> bool:
+        """Whether nothing was kept when this process began."""
+        return not self._entries
+
+    def also_from(self, folder: Path) -> None:
+        """Take what is missing from a version's folder that cannot be written."""
+        self._sources.append(folder)
+        self._entries = _read_manifest(folder) | self._entries
+
+    def fetch(self, place: str) -> str:
+        """The session's folder of one module, with what is kept of its functions; damaged files are left out."""
+        folder = self.session / place
+        if folder.exists():
+            return str(folder)
+        folder.mkdir(parents=True)
+        for name, wanted in self._entries.items():
+            if name.rpartition("/")[0] != place:
+                continue
+            blobs = {file: blob for file, digest in wanted.items() if (blob := self._blob(digest)) is not None}
+            if len(blobs) < len(wanted):
+                continue
+            for file, blob in blobs.items():
+                path = folder / file
+                try:
+                    os.link(blob, path)
+                except OSError:
+                    shutil.copyfile(blob, path)
+                self._published[path] = _stamp(path)
+        return str(folder)
+
+    def _blob(self, digest: str) -> Path | None:
+        for source in self._sources:
+            path = source / "blobs" / digest
+            with suppress(OSError):
+                if hashlib.sha256(path.read_bytes()).hexdigest() == digest:
+                    return path
+                path.unlink()
+        return None
+
+    def publish(self) -> None:
+        """Keep what this process has compiled."""
+        changed: dict[str, dict[str, str]] = {}
+        for index in self.session.rglob("*.nbi"):
+            base = index.name.removesuffix(".nbi")
+            files = [index, *index.parent.glob(f"{_escaped(base)}.*.nbc")]
+            if len(files) > 1 and any(self._published.get(path) != _stamp(path) for path in files):
+                place = index.parent.relative_to(self.session).as_posix()
+                changed[f"{place}/{base}"] = {path.name: self._keep(path) for path in files}
+        if not changed:
+            return
+        with _locked(self._folder / "lock"):
+            entries = _read_manifest(self._folder) | changed
+            text = json.dumps(entries, indent=0).encode()
+            write_atomic(self._folder / "manifest.json", lambda stream: stream.write(text))
+
+    def _keep(self, path: Path) -> str:
+        self._published[path] = _stamp(path)
+        content = path.read_bytes()
+        digest = hashlib.sha256(content).hexdigest()
+        if not (self._blobs / digest).exists():
+            write_atomic(self._blobs / digest, lambda stream: stream.write(content))
+        return digest
+
+    def before_saving(self) -> None:
+        """A kernel was compiled and is about to be written to the session's folder.
+
+        Raises:
+            InputError: The disk is full.
+        """
+        free = shutil.disk_usage(self.session).free
+        if free < _FREE:
+            raise InputError(
+                f"{free >> 20} MiB are left on the disk of the compiled kernels",
+                file=self._folder,
+                fix=f"free some, or set {VARIABLE} to a folder elsewhere",
+            )
+        self.compiled += 1
+        now = time.monotonic()
+        if now - self._said > _PACE:
+            self._said = now
+            # not after every kernel: it looks at all files of the session
+            self.publish()
+            _log.info("compiling kernels (first use only): %d done", self.compiled)
+
+    def close(self) -> None:
+        """Publish, and remove the session's folder."""
+        with suppress(OSError):
+            self.publish()
+        shutil.rmtree(self.session, ignore_errors=True)
+
+    def _clear(self, root: Path) -> None:
+        """Remove versions not used for long, and sessions of processes that are gone."""
+        with suppress(OSError):
+            versions = [path for path in root.iterdir() if (path / "blobs").is_dir()]
+            versions.sort(key=lambda path: path.stat().st_mtime, reverse=True)
+            for path in versions[_KEPT:]:
+                if path != self._folder and not any(map(_in_use, path.glob("session-*"))):
+                    shutil.rmtree(path, ignore_errors=True)
+            for path in self._folder.glob(f"session-{socket.gethostname()}-*"):
+                if not _in_use(path):
+                    shutil.rmtree(path, ignore_errors=True)
 
 
-_by_file = caching._SourceFileBackedLocatorMixin.get_source_stamp
-caching._SourceFileBackedLocatorMixin.get_source_stamp = _stamped  # pyright: ignore[reportAttributeAccessIssue]
+def _read_manifest(folder: Path) -> dict[str, dict[str, str]]:
+    """Files of every function and their digests; empty where there is none or it is damaged."""
+    try:
+        found = json.loads((folder / "manifest.json").read_bytes())
+    except (OSError, ValueError, RecursionError):
+        return {}
+    if not isinstance(found, dict):
+        return {}
+    return {name: files for name, files in found.items() if _are_files(files)}
+
+
+def _are_files(files: object) -> bool:
+    # names and digests become paths
+    return isinstance(files, dict) and all(
+        isinstance(name, str)
+        and isinstance(digest, str)
+        and not set(name + digest) & set("/\0")
+        and name.endswith((".nbi", ".nbc"))
+        and len(digest) == 64
+        for name, digest in files.items()
+    )
+
+
+def _stamp(path: Path) -> tuple[int, int]:
+    # numba replaces files, it does not change them
+    status = path.stat()
+    return status.st_ino, status.st_mtime_ns
+
+
+def _escaped(name: str) -> str:
+    return "".join(f"[{c}]" if c in "*?[" else c for c in name)
+
+
+def _in_use(session: Path) -> bool:
+    """Whether the process of a session's folder may still live; nobody knows of other machines'."""
+    host, process = session.name.removeprefix("session-").rsplit("-", 2)[:2]
+    return host != socket.gethostname() or not process.isdigit() or _alive(int(process))
+
+
+def _alive(process: int) -> bool:
+    try:
+        os.kill(process, 0)
+    except ProcessLookupError:
+        return False
+    except OSError:
+        return True
+    return True
+
+
+@contextmanager
+def _locked(path: Path) -> Iterator[None]:
+    """Hold the lock of a file; where there are no locks the last writer wins, and what it loses is compiled again."""
+    try:
+        import fcntl
+    except ImportError:
+        yield
+        return
+    with open(path, "ab") as stream:
+        with suppress(OSError):
+            fcntl.flock(stream, fcntl.LOCK_EX)
+        yield
+
+
+def _open() -> KernelStore:
+    named = os.environ.get(VARIABLE)
+    key = source_key()
+    root: Path | None = None
+    try:
+        root = Path(named) if named else platformdirs.user_cache_path("ns-abstract") / "kernels"
+        return KernelStore(root.absolute(), key)
+    except (OSError, RuntimeError) as error:
+        problem = error
+    try:
+        temporary = Path(tempfile.mkdtemp(prefix="ns-abstract-kernels-"))
+        found = KernelStore(temporary, key)
+    except OSError as error:
+        raise InputError(
+            f"no folder for compiled kernels can be written ({error.strerror})",
+            fix=f"set {VARIABLE} to a folder that can be written",
+        ) from error
+    if root is not None:
+        found.also_from(root / key[:32])
+    # processes that this one starts share it
+    os.environ[VARIABLE] = str(temporary)
+    process = os.getpid()
+    Finalize(None, lambda: os.getpid() == process and shutil.rmtree(temporary, ignore_errors=True), exitpriority=-90)
+    reason = getattr(problem, "strerror", None) or problem
+    _log.warning(
+        "compiled kernels are kept for this run only (%s); set %s to a folder that can be written", reason, VARIABLE
+    )
+    return found
+
+
+@cache
+def store() -> KernelStore:
+    """The kernels of these sources.
+
+    Raises:
+        InputError: No folder can be written, not even a temporary one.
+    """
+    found = _open()
+    process = os.getpid()
+    Finalize(None, lambda: os.getpid() == process and found.close(), exitpriority=-80)
+    if found.empty:
+        _log.info("kernels are compiled at first use, which takes a minute or two")
+    return found
+
+
+class KernelLocator:
+    """Tells numba where the kernels of this package are kept (its interface of cache locators)."""
+
+    def __init__(self, py_func: Any, path: Path) -> None:
+        self._line = py_func.__code__.co_firstlineno
+        self._path = store().fetch(path.relative_to(PACKAGE).with_suffix("").as_posix())
+
+    @classmethod
+    def from_function(cls, py_func: Any, py_file: str) -> KernelLocator | None:
+        """The locator of a kernel of this package, else None."""
+        path = Path(py_file).resolve()
+        return cls(py_func, path) if any(PACKAGE / folder in path.parents for folder in FOLDERS) else None
+
+    def get_cache_path(self) -> str:
+        """Folder of the function's files."""
+        return self._path
+
+    def get_source_stamp(self) -> str:
+        """What the files belong to."""
+        return source_key()
+
+    def get_disambiguator(self) -> str:
+        """Tells functions of one name apart."""
+        return str(self._line)
+
+    def ensure_cache_path(self) -> None:
+        """Called before a compiled function is written."""
+        # makes it again where it was cleared away
+        self.get_cache_path()
+        store().before_saving()
+
+
+def install() -> None:
+    """Have numba ask `KernelLocator` first."""
+    ours = f"{KernelLocator.__module__}.{KernelLocator.__name__}"
+    others = settings.CACHE_LOCATOR_CLASSES or _LOCATORS  # pyright: ignore[reportAttributeAccessIssue]
+    if ours not in others:
+        settings.CACHE_LOCATOR_CLASSES = f"{ours},{others}"  # pyright: ignore[reportAttributeAccessIssue]
+
+
+install()

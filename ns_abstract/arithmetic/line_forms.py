@@ -1,5 +1,7 @@
 """Forms of order 2 in one parameter as four numbers ``(c, g, q, r)``: the rules of `forms` for one quantity.
 
+See design.md, A6.
+
 Sets of one parameter are the common case. Compiled loops over many quantities keep these numbers in registers, which
 takes a fifth of the time that the array kernels take for the same rules; each function names its kernel.
 """

@@ -20,7 +20,7 @@ from numba import njit
 
 from ns_abstract.arithmetic.elementary import EXP_RELATIVE_ERROR, exp_kernel
 from ns_abstract.arithmetic.forms import Float64Array
-from ns_abstract.arithmetic.units import UNIT64
+from ns_abstract.arithmetic.rounding import UNIT64
 
 #: Assumed errors: (relative to the value, absolute), by function.
 #: exp: `elementary.EXP_RELATIVE_ERROR`. log: `forms.logarithm` charges four units of ``|log x| + 1``. sqrt and
@@ -80,9 +80,7 @@ FUNCTIONS: dict[str, Callable[[Float64Array, Float64Array], None]] = {
 
 def table(name: str) -> tuple[Float64Array, Float64Array, Float64Array]:
     """Points of one function and the float64 neighbours of its values: x, lower, upper, each [n]."""
-    x, lower, upper = (
-        np.array([float.fromhex(token) for token in _TABLES[name].split()[k::3]]) for k in range(3)
-    )
+    x, lower, upper = (np.array([float.fromhex(token) for token in _TABLES[name].split()[k::3]]) for k in range(3))
     return x, lower, upper
 
 

@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from ns_abstract.arithmetic.forms import Float64Array
-from ns_abstract.arithmetic.units import UNDERFLOW64, UNIT64
+from ns_abstract.arithmetic.rounding import UNDERFLOW64, UNIT64
 
 # radii are sums of fewer than 2^10 non-negative terms
 _UP = 1.0 + 2.0**11 * UNIT64

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from ns_abstract.arithmetic.forms import Float64Array, FormArray
-from ns_abstract.arithmetic.units import UNIT64
+from ns_abstract.arithmetic.rounding import UNIT64
 
 
 def _cosine_range(low: Float64Array, high: Float64Array) -> tuple[Float64Array, Float64Array]:

@@ -7,12 +7,12 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from ns_abstract.bench.sets import pose_set
+from ns_abstract.api.files import PathJob
+from ns_abstract.bench.sets import pose_set, splat_of
+from ns_abstract.geometry.box import ParameterBox
+from ns_abstract.geometry.poses import PoseSet
 from ns_abstract.methods.splat.frame import Context, SplatFrame, TileBounds
-from ns_abstract.pipeline import Job
 from ns_abstract.refine.engine import Goal, spread
-from ns_abstract.sets.box import ParameterBox
-from ns_abstract.sets.poses import PoseSet
 
 #: Width of the measured cell as a part of the set's: about what refinement ends with.
 PART = 1.0 / 32.0
@@ -40,7 +40,7 @@ def small_cell(poses: PoseSet, part: float) -> ParameterBox:
     return cell
 
 
-def cell_cost(job: Job, name: str, frame: int, repeats: int) -> dict[str, object]:
+def cell_cost(job: PathJob, name: str, frame: int, repeats: int) -> dict[str, object]:
     """Times of the render, of a cell of a first cover and of a cell inside a bounded one, and their ratios.
 
     The first leaves out what a run to the usual goal leaves out of its cover, the second nothing, as in refinement.
@@ -50,8 +50,9 @@ def cell_cost(job: Job, name: str, frame: int, repeats: int) -> dict[str, object
         another, so that they see the machine at the same speed.
     """
     poses = pose_set(job, name, frame)
-    view = SplatFrame(job.splats, job.rasteriser, job.arithmetic, poses)
-    excess = (Goal().ratio - 1.0) * spread(view, frame, job.settings.seed) if poses.box.dimensions == 1 else 0.0
+    splat = splat_of(job)
+    view = SplatFrame(splat.splats, splat.rasteriser, splat.arithmetic, poses)
+    excess = (Goal().ratio - 1.0) * spread(view, frame, job.seed) if poses.box.dimensions == 1 else 0.0
     cell = small_cell(poses, PART)
     tiles = np.arange(view.tile_count)
     around = view.bound(cell, tiles).context
@@ -65,8 +66,8 @@ def cell_cost(job: Job, name: str, frame: int, repeats: int) -> dict[str, object
     )
     median, ratios = np.median(seconds, axis=0), np.median(seconds[:, 1:] / seconds[:, :1], axis=0)
     return {
-        "scene": job.scene.name,
-        "Gaussians": job.splats.count,
+        "scene": job.method.name,
+        "Gaussians": splat.splats.count,
         "size": f"{view.camera.width}x{view.camera.height}",
         "set": name,
         "parameters": cell.dimensions,

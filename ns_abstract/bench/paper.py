@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from typing import Any
 
+from ns_abstract.api.files import PathJob
+from ns_abstract.geometry.poses import PoseSet
 from ns_abstract.methods.splat.method import SplatMethod
-from ns_abstract.pipeline import Job
 from ns_abstract.refine.result import FrameResult, max_pixel_gap
-from ns_abstract.sets.poses import PoseSet
 
 _NAMES = ("scene", "CPR", "Dim", "Res", "method", "Rt min", "MPG", "XPG", "empirical MPG", "empirical XPG")
 #: The paper's figures; it gives no time for scene variations. Table 2 ran on a GPU.
@@ -68,13 +68,13 @@ def _range(poses: PoseSet) -> str:
     return ", ".join(sorted(widths))
 
 
-def ours(job: Job, name: str, poses: PoseSet, result: FrameResult) -> dict[str, Any]:
+def ours(job: PathJob, name: str, poses: PoseSet, result: FrameResult) -> dict[str, Any]:
     """One row of ours: ranges are whole widths, "empirical" is what was really rendered."""
     last = result.trace[-1]
     method = "GS" if isinstance(job.method, SplatMethod) else "NeRF"
     return _completed(
         (
-            job.scene.name, _range(poses), name, f"{result.lower.shape[1]}x{result.lower.shape[0]}", method,
+            job.method.name, _range(poses), name, f"{result.lower.shape[1]}x{result.lower.shape[0]}", method,
             last.seconds / 60.0, last.mpg, max_pixel_gap(result.lower, result.upper), last.mpg_witness,
             max_pixel_gap(result.witness_lower, result.witness_upper),
         )

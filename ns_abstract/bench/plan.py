@@ -8,14 +8,14 @@ from typing import Any
 
 import numpy as np
 
-from ns_abstract.bench.sets import pose_set
+from ns_abstract.api.files import PathJob
+from ns_abstract.bench.sets import pose_set, splat_of
+from ns_abstract.geometry.box import ParameterBox
+from ns_abstract.geometry.poses import PoseSet
 from ns_abstract.methods.splat.activate import activate
 from ns_abstract.methods.splat.frame import Context, SplatFrame, TileBounds
-from ns_abstract.pipeline import Job
 from ns_abstract.refine.engine import Goal, Refinement
 from ns_abstract.refine.result import FrameResult
-from ns_abstract.sets.box import ParameterBox
-from ns_abstract.sets.poses import PoseSet
 
 #: More than any run of a given number of cells takes.
 _LONG = 1e6
@@ -38,35 +38,35 @@ def _refined(frame: SplatFrame, index: int, cells: int, seed: int) -> tuple[Fram
     return result, time.process_time() - started
 
 
-def without(job: Job, name: str, frame: int, cells: int, scale: float = 1.0) -> list[dict[str, Any]]:
+def without(job: PathJob, name: str, frame: int, cells: int, scale: float = 1.0) -> list[dict[str, Any]]:
     """One row for the plan and for every omission that is taken back, with the same number of cells.
 
     Returns:
         Processor seconds, gaps, and by how much any bound of any pixel is tighter or looser than the plan's.
     """
-    poses = pose_set(job, name, frame, scale)
+    poses, splat = pose_set(job, name, frame, scale), splat_of(job)
 
     def view(kind: type[SplatFrame], every_band: bool) -> Callable[[PoseSet], SplatFrame]:
-        splats = activate(job.scene, job.rasteriser, every_band)
-        return lambda p: kind(splats, job.rasteriser, job.arithmetic, p)
+        splats = activate(splat.scene, splat.rasteriser, every_band)
+        return lambda p: kind(splats, splat.rasteriser, splat.arithmetic, p)
 
     variants: dict[str, Callable[[PoseSet], SplatFrame]] = {
         "as planned": view(SplatFrame, False),
         "every Gaussian in every cell": view(_EveryGaussian, False),
     }
-    if activate(job.scene, job.rasteriser, True).degree > job.splats.degree:
+    if activate(splat.scene, splat.rasteriser, True).degree > splat.splats.degree:
         variants["harmonics that are zero"] = view(SplatFrame, True)
     rows: list[dict[str, Any]] = []
     planned: FrameResult | None = None
     first = 0.0
     for variant, make in variants.items():
-        result, seconds = _refined(make(poses), frame, cells, job.settings.seed)
+        result, seconds = _refined(make(poses), frame, cells, job.seed)
         if planned is None:
             planned, first = result, seconds
         raised, lowered = result.lower - planned.lower, planned.upper - result.upper
         rows.append(
             {
-                "scene": job.scene.name,
+                "scene": job.method.name,
                 "size": f"{result.lower.shape[1]}x{result.lower.shape[0]}",
                 "set": name,
                 "taken back": variant,

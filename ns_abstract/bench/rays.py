@@ -9,15 +9,15 @@ from typing import Any
 import numpy as np
 import torch
 
+from ns_abstract.api.files import PathJob
 from ns_abstract.bench.sets import pose_set
-from ns_abstract.errors import InputError
+from ns_abstract.geometry.poses import PoseSet
+from ns_abstract.io.errors import InputError
 from ns_abstract.methods.nerf.frame import NerfFrame
 from ns_abstract.methods.nerf.method import NerfMethod
-from ns_abstract.pipeline import Job
 from ns_abstract.refine.engine import Refinement
-from ns_abstract.sets.poses import PoseSet
-from ns_abstract.verify.falsify import falsify
-from ns_abstract.verify.soundness import nerf_renderer
+from ns_abstract.verify.attack.falsify import falsify
+from ns_abstract.verify.attack.soundness import nerf_renderer
 
 
 class RaySample(NerfFrame):
@@ -35,7 +35,7 @@ class RaySample(NerfFrame):
         return self.chosen[tiles]
 
 
-def measure(job: Job, name: str, frame: int, scale: float, **options: Any) -> dict[str, object]:
+def measure(job: PathJob, name: str, frame: int, scale: float, **options: Any) -> dict[str, object]:
     """One row: CPU seconds by ray to a ratio, and attacks by random poses, corners and gradient ascent.
 
     Args:
@@ -69,7 +69,7 @@ def measure(job: Job, name: str, frame: int, scale: float, **options: Any) -> di
     )  # fmt: skip
     last = result.trace[-1]
     return {
-        "scene": job.scene.name,
+        "scene": job.method.name,
         "field": job.method.scene.fine.text,
         "size": f"{poses.camera.width}x{poses.camera.height}",
         "set": name,

@@ -12,18 +12,18 @@ from dataclasses import replace
 
 import numpy as np
 
+from ns_abstract.api.files import PathJob
 from ns_abstract.arithmetic.forms import Float64Array
-from ns_abstract.arithmetic.rules import Enclosure
-from ns_abstract.arithmetic.units import REAL
-from ns_abstract.bench.sets import pose_set
-from ns_abstract.methods.splat import paper
+from ns_abstract.arithmetic.rounding import REAL
+from ns_abstract.bench.sets import pose_set, splat_of
+from ns_abstract.geometry.box import ParameterBox
+from ns_abstract.geometry.camera_path import Camera
+from ns_abstract.geometry.poses import PoseSet
 from ns_abstract.methods.splat.activate import Splats, activate
 from ns_abstract.methods.splat.bounds import SplatBounds
 from ns_abstract.methods.splat.constants import PAPER
-from ns_abstract.pipeline import Job
-from ns_abstract.sets.box import ParameterBox
-from ns_abstract.sets.path import Camera
-from ns_abstract.sets.poses import PoseSet
+from ns_abstract.paper import Enclosure
+from ns_abstract.paper import splat as paper
 
 #: Poses rendered for the range that the bounds are compared with.
 _SAMPLES = 33
@@ -74,7 +74,7 @@ def _own(splats: Splats, camera: Camera, poses: PoseSet, cell: ParameterBox) -> 
 
 
 def compare(
-    job: Job, name: str, frame: int, parts: int, pixels: int, most: int, seed: int = 0
+    job: PathJob, name: str, frame: int, parts: int, pixels: int, most: int, seed: int = 0
 ) -> list[dict[str, object]]:
     """Mean gaps of all rules over sampled pixels, for the middle one of ``parts`` equal cells of a set.
 
@@ -91,7 +91,7 @@ def compare(
         One row for each rule: gap (length over RGB) relative to that of renders within the cell, its
         largest value over the pixels, and milliseconds by pixel.
     """
-    splats = activate(job.scene, PAPER)
+    splats = activate(splat_of(job).scene, PAPER)
     poses = pose_set(job, name, frame)
     cell = poses.box
     for axis in range(cell.dimensions):
@@ -144,7 +144,7 @@ def compare(
     inner = float(np.mean(gaps["renders"]))
     return [
         {
-            "scene": job.scene.name,
+            "scene": job.method.name,
             "size": f"{camera.width}x{camera.height}",
             "set": name,
             "cell": f"1/{parts}",

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from ns_abstract.bench.cell import PART, measure, small_cell
-from ns_abstract.bench.sets import open_jobs, pose_set
+from ns_abstract.bench.sets import open_jobs, pose_set, splat_of
 from ns_abstract.bench.tightness import refine
 from ns_abstract.methods.splat.activate import rotation_matrices
 from ns_abstract.methods.splat.frame import SplatFrame
@@ -57,16 +57,16 @@ def _row(
     """One row; to be run in a process of its own, whose peak memory is told."""
     (job,) = open_jobs((config,), path, 1.0)
     (job,) = open_jobs((config,), path, job.path.cameras[frame].width / width)
-    job.settings = dataclasses.replace(job.settings, memory_limit=gibibytes)
-    job.method = SplatMethod(resampled(job.splat.scene, count), None, None)
+    job.memory_limit = gibibytes
+    job.method = splat = SplatMethod(resampled(splat_of(job).scene, count), None, None)
     poses = pose_set(job, name, frame, _WIDTH / width)
-    view = SplatFrame(job.splats, job.rasteriser, job.arithmetic, poses)
+    view = SplatFrame(splat.splats, splat.rasteriser, splat.arithmetic, poses)
     cell, tiles = small_cell(poses, PART), np.arange(view.tile_count)
-    entries = view.renderer.lists(job.splats, view.camera, *poses.world_to_camera(cell.middle), tiles)[1]
+    entries = view.renderer.lists(splat.splats, view.camera, *poses.world_to_camera(cell.middle), tiles).entries
     pairs = entries.size * view.side**2
     times = measure([lambda: view.render(cell.middle), lambda: view.bound(cell, tiles)], repeats).min(axis=0)
     found: dict[str, Any] = {
-        "scene": job.scene.name,
+        "scene": job.method.name,
         "Gaussians": count,
         "size": f"{view.camera.width}x{view.camera.height}",
         "million pairs": pairs / 1e6,

@@ -10,10 +10,11 @@ from typing import Any
 
 import numpy as np
 
-from ns_abstract.errors import InputError
-from ns_abstract.pipeline import Job, Settings
-from ns_abstract.sets.perturbation import Perturbation, parse_perturbation
-from ns_abstract.sets.poses import PoseSet
+from ns_abstract.api.files import PathJob, Settings, open_job
+from ns_abstract.geometry.poses import PoseSet
+from ns_abstract.io.errors import InputError
+from ns_abstract.methods.splat.method import SplatMethod
+from ns_abstract.perturbation.specification import Perturbation, parse_perturbation
 
 #: Perturbation objects by name; "orbit" turns about the vertical through the median Gaussian, or a NeRF's origin, and
 #: what varies of a splat scene is the half of it with x above the median.
@@ -44,7 +45,7 @@ def open_jobs(
     downscale_factor: float,
     arithmetic: str | None = None,
     occupancy_grid: Path | None = None,
-) -> list[Job]:
+) -> list[PathJob]:
     """The runs, or the demo scene where none is named.
 
     Without ``arithmetic`` it is the strongest that the method has. Without ``camera_path`` each run's own
@@ -65,11 +66,22 @@ def open_jobs(
         settings = Settings(
             config, path, downscale_factor=downscale_factor, arithmetic=arithmetic, occupancy_grid=occupancy_grid
         )
-        jobs.append(Job(settings, Perturbation()))
+        jobs.append(open_job(settings, Perturbation()))
     return jobs
 
 
-def pose_set(job: Job, name: str, frame: int, scale: float = 1.0) -> PoseSet:
+def splat_of(job: PathJob) -> SplatMethod:
+    """The method of a splat scene.
+
+    Raises:
+        InputError: The run is of another method.
+    """
+    if not isinstance(job.method, SplatMethod):
+        raise InputError("not a splat scene", file=job.settings.load_config, fix="give a run of splatfacto")
+    return job.method
+
+
+def pose_set(job: PathJob, name: str, frame: int, scale: float = 1.0) -> PoseSet:
     """The set ``name`` around entry ``frame`` of the job's path; ``scale`` multiplies every range.
 
     Raises:
@@ -78,7 +90,8 @@ def pose_set(job: Job, name: str, frame: int, scale: float = 1.0) -> PoseSet:
     if name not in SETS:
         raise InputError(f"found {name}", field="--sets", fix=f"the sets are {SET_NAMES}")
     spec = copy.deepcopy(SETS[name])
-    means = getattr(job.scene, "means", np.zeros((1, 3))).astype(np.float64)
+    method = job.method
+    means = method.scene.means.astype(np.float64) if isinstance(method, SplatMethod) else np.zeros((1, 3))
     if name == "orbit":
         spec["orbit"]["target"] = [float(v) for v in np.median(means, axis=0)]
     for entry in spec.get("scene", ()):

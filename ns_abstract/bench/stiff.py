@@ -17,20 +17,20 @@ import numpy as np
 import torch
 from numpy.typing import ArrayLike
 
-from ns_abstract.arithmetic.units import Arithmetic
-from ns_abstract.arithmetic.units import arithmetic as arithmetic_of
+from ns_abstract.arithmetic.rounding import Arithmetic
+from ns_abstract.arithmetic.rounding import arithmetic as arithmetic_of
+from ns_abstract.geometry.box import ParameterBox
+from ns_abstract.geometry.camera_path import Camera
+from ns_abstract.geometry.poses import PoseSet
 from ns_abstract.methods.splat.activate import SH_C0, Splats, activate
 from ns_abstract.methods.splat.constants import GSPLAT_1_4_0, Rasteriser
 from ns_abstract.methods.splat.frame import Context, SplatFrame, TileBounds
 from ns_abstract.methods.splat.scene import SplatScene
+from ns_abstract.perturbation.specification import parse_perturbation
 from ns_abstract.refine.engine import Goal, Refinement
 from ns_abstract.refine.result import mean_pixel_gap
-from ns_abstract.sets.box import ParameterBox
-from ns_abstract.sets.path import Camera
-from ns_abstract.sets.perturbation import parse_perturbation
-from ns_abstract.sets.poses import PoseSet
-from ns_abstract.verify.falsify import Violation, falsify, merge
-from ns_abstract.verify.soundness import compiled_renderer, reference_renderer
+from ns_abstract.verify.attack.falsify import Violation, falsify, merge
+from ns_abstract.verify.attack.soundness import compiled_renderer, reference_renderer
 
 ARITHMETICS = ("float32", "real")
 

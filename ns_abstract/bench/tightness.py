@@ -4,28 +4,28 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from ns_abstract.pipeline import Job
+from ns_abstract.api.files import PathJob
+from ns_abstract.geometry.poses import PoseSet
 from ns_abstract.refine.engine import Refinement
 from ns_abstract.refine.result import FrameResult, max_pixel_gap
-from ns_abstract.sets.poses import PoseSet
 
 #: Ratios whose time is reported.
 MARKS = (1.5, 1.25, 1.1, 1.05, 1.02, 1.01)
 
 
-def refine(job: Job, poses: PoseSet, frame: int, seconds: float, ratio: float) -> FrameResult:
+def refine(job: PathJob, poses: PoseSet, frame: int, seconds: float, ratio: float) -> FrameResult:
     """The abstract image of ``poses`` about entry ``frame``; kernels are compiled before the clock starts."""
-    view, seed = job.method.frame(poses, slanted=True), job.settings.seed
+    view, seed = job.method.frame(poses, slanted=True), job.seed
     view.warm_up()
     result = Refinement(view, frame, job.goal(ratio, seconds), seed=seed, members=view.members(seed)).run()
     return replace(result, box=poses.box)
 
 
-def summary(job: Job, name: str, result: FrameResult) -> dict[str, object]:
+def summary(job: PathJob, name: str, result: FrameResult) -> dict[str, object]:
     """One row: final figures, and the seconds after which each of `MARKS` was reached."""
     last = result.trace[-1]
     row: dict[str, object] = {
-        "scene": job.scene.name,
+        "scene": job.method.name,
         "size": f"{result.lower.shape[1]}x{result.lower.shape[0]}",
         "set": name,
         "Rt s": last.seconds,

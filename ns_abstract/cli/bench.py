@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING, Any, Literal
 import tyro
 
 from ns_abstract.cli.common import DONE, run
-from ns_abstract.errors import InputError
+from ns_abstract.io.errors import InputError
 
 if TYPE_CHECKING:
-    from ns_abstract.pipeline import Job
+    from ns_abstract.api.files import PathJob
 
 #: Seconds after which a case that does not end ends the process, with a trace of where it stands.
 _STUCK = 900.0
@@ -248,7 +248,7 @@ def scale(options: Scale) -> int:
     return DONE
 
 
-def rows_of(options: Cell | Soundness | Plan | Rules | Rays, job: Job, name: str) -> list[dict[str, Any]]:
+def rows_of(options: Cell | Soundness | Plan | Rules | Rays, job: PathJob, name: str) -> list[dict[str, Any]]:
     """What a benchmark without curves finds for one scene and set of poses."""
     if isinstance(options, Cell):
         from ns_abstract.bench.cell import cell_cost
@@ -308,7 +308,7 @@ def bench(options: Cell | Tightness | Soundness | Plan | Rules | Rays | Scale | 
 
                 poses = pose_set(job, name, options.frame, options.scale)
                 result = refine(job, poses, options.frame, options.seconds, options.target_ratio)
-                results[f"{job.scene.name} {name}"] = result
+                results[f"{job.method.name} {name}"] = result
                 rows.append(summary(job, name, result))
                 tables.setdefault(paper.table_of(poses), []).append(paper.ours(job, name, poses, result))
             else:

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import sys
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Annotated, Literal
 
 import tyro
 
 from ns_abstract.cli.common import DONE, INTERRUPTED, Stop, run
-from ns_abstract.errors import InputError
+from ns_abstract.io.errors import InputError
 
 #: Seconds where no time budget is given.
 _SECONDS = 1800.0
@@ -22,6 +23,8 @@ class Certify:
     Splits the set into cells until each is certified, falsified or too small. Writes cells.sqlite,
     report.json, report.html and the images of counterexamples. Exit codes: 0 done, whatever the verdict;
     2 bad input; 3 interrupted, or the time budget ended before every frame had a result.
+
+    --model NET --explain alone prints the network's layers, and memory and time of a cell, and does nothing else.
     """
 
     load_config: Path
@@ -42,13 +45,23 @@ class Certify:
     """Entries of the camera path, counted from 0. Default: all."""
     renderer: Literal["gsplat", "paper"] | None = None
     """gsplat: what Nerfstudio shows (the default). paper: Algorithm 1 of "Abstract Rendering" (no thresholds, RGB)."""
+    gsplat_version: Literal["1.4.0", "1.5.3", "1.6.0"] | None = None
+    """Splats: whose rules are bounded. Default: 1.4.0, which nerfstudio 1.1.5 asks for."""
     arithmetic: Literal["float32", "real"] | None = None
     """float32: images of every float32 evaluation (the default). real: the real-number renderer and its float64
     evaluation."""
+    network_arithmetic: Literal["float32", "real"] = "float32"
+    """float32: every float32 evaluation of the network (the default). real: the exact function of its weights alone."""
     engine: Literal["local", "dask"] = "local"
     """dask: spread the cells over a Dask cluster (needs the extra "cluster")."""
     scheduler_address: str | None = None
     """HOST:PORT of a running Dask scheduler. Default: a cluster on this machine."""
+    tls_ca_file: Path | None = None
+    """Certificate of who signs the scheduler's (PEM), as for `dask scheduler`; with --tls-cert and --tls-key."""
+    tls_cert: Path | None = None
+    """This command's certificate (PEM)."""
+    tls_key: Path | None = None
+    """The certificate's key (PEM)."""
     workers: int | None = None
     """Processes on this machine; 1 works in this process. Default: one by core."""
     resume: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
@@ -63,8 +76,6 @@ def certify(options: Certify) -> int:
     Raises:
         InputError: A file, a field or an option cannot be used.
     """
-    from ns_abstract.cli.certifying import certify_path
-
     if options.time_budget is not None and not 0.0 < options.time_budget < float("inf"):
         raise InputError(f"found {options.time_budget}", field="--time-budget", fix="give a positive number")
     if options.memory_limit is not None and not 0.0 < options.memory_limit < float("inf"):
@@ -75,13 +86,55 @@ def certify(options: Certify) -> int:
         raise InputError("given without --engine dask", field="--scheduler-address", fix="add --engine dask")
     stop = Stop()
     with stop.installed():
-        complete = certify_path(options, stop, options.time_budget or _SECONDS)
+        with stop.at_once():
+            from ns_abstract.api.certification import CertifySettings
+            from ns_abstract.cli.certifying import Order, certify_path
+            from ns_abstract.execution.engines import Tls
+
+        names = {entry.name for entry in fields(CertifySettings)}
+        given = {name: value for name, value in vars(options).items() if name in names}
+        tls = Tls.of(options.tls_ca_file, options.tls_cert, options.tls_key, options.scheduler_address)
+        order = Order(
+            CertifySettings(**given), options.frames, options.output_dir, options.time_budget or _SECONDS,
+            options.engine, options.scheduler_address, tls, options.workers, options.resume, options.memory_limit,
+            vars(options),
+        )  # fmt: skip
+        complete = certify_path(order, stop)
     return DONE if complete and not stop() else INTERRUPTED
+
+
+@dataclass
+class Explain:
+    """Print a network's layers, and what a cell of it will take; nothing is bounded."""
+
+    model: Path
+    """Network: .onnx, or .pt2 of torch.export."""
+    explain: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    """Only this."""
+    parameters: int = 2
+    """How many parameters the poses will have."""
+
+
+def explain(options: Explain) -> int:
+    """Print what a network consists of; returns the exit code.
+
+    Raises:
+        InputError: The file cannot be used.
+    """
+    from ns_abstract.verify.network.explain import explain as explained
+    from ns_abstract.verify.network.load import load_network
+
+    if not 0 <= options.parameters <= 64:
+        raise InputError(f"found {options.parameters}", field="--parameters", fix="give a number from 0 to 64")
+    print("\n".join(explained(load_network(options.model), options.parameters)))
+    return DONE
 
 
 def main() -> None:
     """Entry point of the console script."""
-    run(certify, lambda: tyro.cli(Certify, prog="ns-abstract-certify"))
+    if "--explain" in sys.argv[1:]:
+        run(explain, lambda: tyro.cli(Explain, prog="ns-abstract-certify"))
+    run(certify, lambda: tyro.cli(Certify, prog="ns-abstract-certify"), "give fewer --workers or free memory")
 
 
 if __name__ == "__main__":

@@ -3,47 +3,95 @@
 from __future__ import annotations
 
 import io
+import logging
 import os
 import re
+import resource
 import signal
+import socket
 import sys
+import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, redirect_stderr
 from types import FrameType
 from typing import Any, NoReturn
 
-from ns_abstract.errors import InputError
+from ns_abstract.execution.stopping import StopRequest
+from ns_abstract.io.errors import InputError, visible
 
 DONE, BAD_INPUT, INTERRUPTED = 0, 2, 3
+_SIGNALS = (signal.SIGINT, signal.SIGTERM)
+#: Seconds that a signal may wait for the interpreter.
+_PATIENCE = 3.0
+#: Bytes of address space below which torch and the compiler cannot start.
+_LEAST_ADDRESS_SPACE = 4 << 30
+_SHORTAGE = ("can't allocate memory", "cannot allocate memory", "bad_alloc", "failed to allocate memory")
+#: Most characters of a complaint about options, which may repeat long options.
+_COMPLAINT = 600
 
 # threads that wait, awake, for milliseconds slow down those that work; OpenMP reads this when it is first loaded
 os.environ.setdefault("GOMP_SPINCOUNT", "3000")
 
 
-class Stop:
+class Stop(StopRequest):
     """Turns SIGINT and SIGTERM into a request to stop; a second signal stops at once."""
 
     def __init__(self) -> None:
-        self.signal: int | None = None
+        super().__init__()
+        self._heard = threading.Semaphore(0)
 
-    def __call__(self) -> bool:
-        return self.signal is not None
-
-    def _handle(self, number: int, frame: FrameType | None) -> None:
-        if self.signal is not None:
-            raise KeyboardInterrupt
-        self.signal = number
+    def handle(self, number: int, frame: FrameType | None) -> None:
+        self._heard.release()
+        super().handle(number, frame)
         print("stopping; what is finished is being saved (once more: stop at once)", file=sys.stderr, flush=True)
 
     @contextmanager
     def installed(self) -> Iterator[Stop]:
         """Handle the signals inside the block."""
-        before = {number: signal.signal(number, self._handle) for number in (signal.SIGINT, signal.SIGTERM)}
-        try:
+        with self.handling(*_SIGNALS), self._watched():
             yield self
+
+    @contextmanager
+    def _watched(self) -> Iterator[None]:
+        """End the process where the interpreter does not get to handle a signal: compilers take minutes."""
+        receiver, sender = socket.socketpair()
+        sender.setblocking(False)
+        former = signal.set_wakeup_fd(sender.fileno(), warn_on_full_buffer=False)
+
+        def watch() -> None:
+            # ends when the other side is closed; the bytes are numbers of signals
+            while number := receiver.recv(1):
+                if number[0] in _SIGNALS and not self._heard.acquire(timeout=_PATIENCE):
+                    print("interrupted", file=sys.stderr, flush=True)
+                    os._exit(INTERRUPTED)
+
+        watcher = threading.Thread(target=watch, name="signals", daemon=True)
+        watcher.start()
+        try:
+            yield
         finally:
-            for number, handler in before.items():
-                signal.signal(number, handler)
+            signal.set_wakeup_fd(former)
+            sender.close()
+            watcher.join()
+            receiver.close()
+
+
+class _ToStderr(logging.Handler):
+    """Lines on what is stderr at the time."""
+
+    def emit(self, record: logging.LogRecord) -> None:
+        print(self.format(record), file=sys.stderr, flush=True)
+
+
+def show_log() -> None:
+    """Print what the package has to say, a line each, to stderr."""
+    log = logging.getLogger("ns_abstract")
+    if not log.handlers:
+        handler = _ToStderr()
+        handler.setFormatter(logging.Formatter("%(message)s"))
+        log.addHandler(handler)
+        log.setLevel(logging.INFO)
+        log.propagate = False
 
 
 def parse(read: Callable[[], Any]) -> Any:
@@ -53,6 +101,10 @@ def parse(read: Callable[[], Any]) -> Any:
         InputError: The options cannot be used.
         SystemExit: Help was asked for and printed.
     """
+    empty = [position for position, word in enumerate(sys.argv[1:], 1) if word == "" or word.endswith("=")]
+    if empty:
+        before = sys.argv[empty[0]].rstrip("=") or sys.argv[empty[0] - 1]
+        raise InputError("is empty", field=before if before.startswith("-") else "an option", fix="give a value")
     said = io.StringIO()
     try:
         with redirect_stderr(said):
@@ -82,9 +134,10 @@ def complaint(text: str) -> str:
             words = f"missing {', '.join(_named(section))}"
         if words.startswith("Perhaps you meant"):
             words = f"perhaps {' or '.join(_named(section))}"
-        if words and not words.startswith(("For full helptext", "Argument helptext")):
+        if words and not words.startswith(("For full helptext", "Argument helptext", "Arguments similar to")):
             points.append(words.partition(" Got errors:")[0].rstrip("."))
-    return "; ".join(points) or "the options cannot be read"
+    text = "; ".join(points) or "the options cannot be read"
+    return text if len(text) <= _COMPLAINT else f"{text[: _COMPLAINT - 3]}..."
 
 
 def _named(lines: list[str]) -> list[str]:
@@ -94,19 +147,38 @@ def _named(lines: list[str]) -> list[str]:
     return [match[2] for match in found if len(match[1]) == outermost]
 
 
-def run(main: Callable[..., int], options: Callable[[], Any]) -> NoReturn:
-    """Parse options, run ``main`` and leave with its exit code; a user's mistake is one line and exit code 2."""
+def plain_console() -> Any:
+    """A console on stderr whose texts hold no characters that a terminal acts upon."""
+    from rich.console import Console
+
+    class Plain(Console):
+        def print(self, *objects: Any, **more: Any) -> None:
+            super().print(*(visible(o) if isinstance(o, str) else o for o in objects), **more)
+
+    return Plain(stderr=True, highlight=False)
+
+
+def run(
+    main: Callable[..., int], options: Callable[[], Any], relief: str = "raise --downscale-factor or free memory"
+) -> NoReturn:
+    """Parse options, run ``main`` and leave with its exit code; a user's mistake is one line and exit code 2.
+
+    Args:
+        main: Gets the options.
+        options: Parses them.
+        relief: What a user can do where memory is short.
+    """
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            # names of files need not be text
+            stream.reconfigure(errors="backslashreplace")
+    show_log()
     try:
-        code = main(parse(options))
+        given = parse(options)
+        _check_address_space()
+        code = main(given)
     except InputError as error:
         print(f"error: {error}", file=sys.stderr)
-        code = BAD_INPUT
-    except MemoryError as error:
-        detail = " ".join(str(error).split())
-        print(
-            f"error: not enough memory{': ' + detail if detail else ''}; raise --downscale-factor or free memory",
-            file=sys.stderr,
-        )
         code = BAD_INPUT
     except KeyboardInterrupt:
         print("interrupted", file=sys.stderr)
@@ -114,4 +186,32 @@ def run(main: Callable[..., int], options: Callable[[], Any]) -> NoReturn:
     except BrokenPipeError:
         sys.stderr.close()
         code = INTERRUPTED
+    except Exception as error:
+        if not _is_shortage(error):
+            raise
+        detail = " ".join(str(error).split())[:200]
+        print(f"error: not enough memory{': ' + detail if detail else ''}; {relief}", file=sys.stderr)
+        code = BAD_INPUT
     sys.exit(code)
+
+
+def _is_shortage(error: Exception) -> bool:
+    """Whether memory was short; torch, onnxruntime and the loader of libraries say so in words alone."""
+    words = str(error).lower()
+    return isinstance(error, MemoryError) or any(part in words for part in _SHORTAGE)
+
+
+def _check_address_space() -> None:
+    """Libraries end the process where they get no memory or no thread.
+
+    Raises:
+        InputError: A limit leaves too little.
+    """
+    limit, _ = resource.getrlimit(resource.RLIMIT_AS)
+    # once they are loaded, what is left is a matter of the work
+    loaded = "torch" in sys.modules and "numba" in sys.modules
+    if limit != resource.RLIM_INFINITY and limit < _LEAST_ADDRESS_SPACE and not loaded:
+        raise InputError(
+            f"the address space is limited to {limit / 2**30:.1f} GiB",
+            fix=f"raise `ulimit -v` to at least {_LEAST_ADDRESS_SPACE >> 10}, or use --memory-limit instead",
+        )

@@ -9,7 +9,7 @@ from typing import Annotated
 import tyro
 
 from ns_abstract.cli.common import DONE, run
-from ns_abstract.errors import InputError
+from ns_abstract.io.errors import InputError, visible
 
 
 @dataclass
@@ -49,21 +49,22 @@ def demo(options: Demo) -> int:
         raise InputError(
             f"cannot be written ({error.strerror})", file=folder, field="--output-dir", fix="choose another folder"
         ) from None
-    print(f"run          {config}")
+    lines = [f"run          {config}"]
     for name, title in (("path", "camera path"), ("orbit", "orbit"), ("spec", "perturbation")):
-        print(f"{title:12s} {files[name]}")
-    print(
+        lines.append(f"{title:12s} {files[name]}")
+    lines.append(
         "\nnext:\n"
         f"  ns-abstract-render --load-config {config} --camera-path-filename {files['path']} \\\n"
         f"    --perturbation-filename {files['spec']} --output-dir {folder / 'abstract'}"
     )
     if nerf is not None:
         config, path = nerf
-        print(
+        lines.append(
             f"\nNeRF run     {config}\n"
             f"  ns-abstract-render --load-config {config} --camera-path-filename {path} \\\n"
             f"    --output-dir {folder / 'abstract-nerf'}"
         )
+    print("\n".join(visible(line) for line in "\n".join(lines).split("\n")))
     return DONE
 
 

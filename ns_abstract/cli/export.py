@@ -11,7 +11,7 @@ from typing import Annotated, Literal
 import tyro
 
 from ns_abstract.cli.common import DONE, run
-from ns_abstract.errors import InputError
+from ns_abstract.io.errors import InputError, visible
 
 #: Along each axis of an occupancy grid.
 _MOST_VOXELS = 512
@@ -154,8 +154,8 @@ def export(options: Npz | Png | Mp4 | Ply | VnnLib | Occupancy) -> int:
     except OSError as error:
         raise InputError(f"cannot be written ({error.strerror})", file=target, fix="choose another place") from None
     for note in notes:
-        print(note, file=sys.stderr)
-    print(target)
+        print(visible(note), file=sys.stderr)
+    print(visible(str(target)))
     return DONE
 
 
@@ -192,9 +192,9 @@ def _occupancy(options: Occupancy) -> list[str]:
 
 
 def _vnnlib(options: VnnLib) -> list[str]:
-    from ns_abstract.atomic import write_atomic
-    from ns_abstract.certification import Certification, CertifySettings
-    from ns_abstract.pipeline import check_frames
+    from ns_abstract.api.certification import CertifySettings, open_certification
+    from ns_abstract.api.job import check_frames
+    from ns_abstract.io.atomic import write_atomic
     from ns_abstract.verify.cells import Grid
 
     if options.timeout < 1:
@@ -202,7 +202,7 @@ def _vnnlib(options: VnnLib) -> list[str]:
     if any(n < 1 for n in options.parts):
         raise InputError(f"found {min(options.parts)}", field="--parts", fix="give numbers of at least 1")
     names = {entry.name for entry in fields(CertifySettings)} & {entry.name for entry in fields(VnnLib)}
-    job = Certification(CertifySettings(**{name: getattr(options, name) for name in names}))
+    job = open_certification(CertifySettings(**{name: getattr(options, name) for name in names}))
     options.output_dir.mkdir(parents=True, exist_ok=True)
     lines, boxes = [], {}
     for frame in check_frames(options.frames, job.job.frame_count):
@@ -237,9 +237,10 @@ def _path(options: Npz | Png | Mp4) -> list[str]:
         write_pictures(results, options.output_dir, options.pictures)
     else:
         write_video(results, options.output_filename, options.pictures, options.fps)
+    notes = [] if results.checked else ["no report.json beside the frames: nothing says whether they were changed"]
     if results.unbounded:
-        return [f"no bounds but [0, 1] in frames {', '.join(map(str, results.unbounded))}"]
-    return []
+        notes.append(f"no bounds but [0, 1] in frames {', '.join(map(str, results.unbounded))}")
+    return notes
 
 
 def main() -> None:

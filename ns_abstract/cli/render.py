@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import os
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Annotated, Literal
 
 import tyro
 
 from ns_abstract.cli.common import DONE, INTERRUPTED, Stop, run
-from ns_abstract.errors import InputError
-
-#: Seconds by frame where no time budget is given.
-_SECONDS_BY_FRAME = 60.0
+from ns_abstract.io.errors import InputError
 
 
 @dataclass
@@ -42,6 +40,8 @@ class Render:
     renderer: Literal["gsplat", "paper"] | None = None
     """gsplat: what Nerfstudio shows of splats (the default for them). paper: Algorithm 1 (splats: no thresholds,
     RGB) or 2 (NeRF: black behind the last sample) of "Abstract Rendering"."""
+    gsplat_version: Literal["1.4.0", "1.5.3", "1.6.0"] | None = None
+    """Splats: whose rules are bounded. Default: 1.4.0, which nerfstudio 1.1.5 asks for."""
     arithmetic: Literal["float32", "real"] | None = None
     """float32: enclose every float32 evaluation (splats, the default for them). real: the real-number renderer and
     its float64 evaluation."""
@@ -61,6 +61,12 @@ class Render:
     """dask: spread the frames, and tiles where frames are few, over a Dask cluster (needs the extra "cluster")."""
     scheduler_address: str | None = None
     """HOST:PORT of a running Dask scheduler. Default: a cluster on this machine."""
+    tls_ca_file: Path | None = None
+    """Certificate of who signs the scheduler's (PEM), as for `dask scheduler`; with --tls-cert and --tls-key."""
+    tls_cert: Path | None = None
+    """This command's certificate (PEM)."""
+    tls_key: Path | None = None
+    """The certificate's key (PEM)."""
     workers: int | None = None
     """NeRF: processes that bound rays. Default: one for every core."""
     resume: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
@@ -77,8 +83,6 @@ def render(options: Render) -> int:
     Raises:
         InputError: A file, a field or an option cannot be used.
     """
-    from ns_abstract.cli.rendering import render_path
-
     for name, value in (("--target-ratio", options.target_ratio), ("--time-budget", options.time_budget)):
         if value is not None and not 0.0 < value < float("inf"):
             raise InputError(f"found {value}", field=name, fix="give a positive number")
@@ -92,7 +96,21 @@ def render(options: Render) -> int:
         raise InputError("given without --engine dask", field="--scheduler-address", fix="add --engine dask")
     stop = Stop()
     with stop.installed():
-        complete = render_path(options, stop, _SECONDS_BY_FRAME)
+        with stop.at_once():
+            from ns_abstract.api.files import Settings
+            from ns_abstract.cli.rendering import Order, render_path
+            from ns_abstract.execution.engines import Tls
+
+        names = {entry.name for entry in fields(Settings)}
+        given = {name: value for name, value in vars(options).items() if name in names}
+        if options.workers is None:
+            given["workers"] = 1 if options.engine == "dask" else len(os.sched_getaffinity(0))
+        tls = Tls.of(options.tls_ca_file, options.tls_cert, options.tls_key, options.scheduler_address)
+        order = Order(
+            Settings(**given), options.frames, options.output_dir, options.time_budget, options.target_ratio,
+            options.engine, options.scheduler_address, tls, options.resume, options.save_cells, vars(options),
+        )  # fmt: skip
+        complete = render_path(order, stop)
     return DONE if complete and not stop() else INTERRUPTED
 
 

@@ -2,117 +2,136 @@
 
 from __future__ import annotations
 
-import dataclasses
-import os
 import sys
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Mapping
 from contextlib import ExitStack
-from typing import TYPE_CHECKING, Any
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
 
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
-from ns_abstract.arithmetic.selfcheck import check_functions
-from ns_abstract.pipeline import LEAST_SECONDS, Job, Settings, check_frames
-from ns_abstract.refine.result import FrameResult, TracePoint
+from ns_abstract.api import bounding
+from ns_abstract.api.files import PathJob, Settings, open_job
+from ns_abstract.api.job import Job, check_frames
+from ns_abstract.api.scenes import platform_problems
+from ns_abstract.cli.common import Stop, plain_console
+from ns_abstract.execution.engines import Engine, EngineName, Tls, started
+from ns_abstract.io.folder import claim
 from ns_abstract.report.record import Report, Run
 
-if TYPE_CHECKING:
-    from ns_abstract.cli.render import Render
+#: Seconds by frame where no time budget is given.
+_SECONDS_BY_FRAME = 60.0
 
 
-def settings_of(options: Render) -> Settings:
-    """The part of the options that says what is bounded."""
-    names = {field.name for field in dataclasses.fields(Settings)}
-    given = {name: value for name, value in vars(options).items() if name in names}
-    if options.workers is None:
-        given["workers"] = 1 if options.engine == "dask" else len(os.sched_getaffinity(0))
-    return Settings(**given)
+@dataclass(frozen=True)
+class Order:
+    """What the command line asks for.
+
+    Attributes:
+        settings: The files and what is bounded.
+        frames: Entries of the camera path, or None for all.
+        output_dir: Folder for the results.
+        budget: Seconds for all frames together, or None.
+        target_ratio: Where a frame is good enough.
+        engine, scheduler_address, tls: Where the work is done.
+        resume: Whether to keep finished frames.
+        save_cells: Whether to store leaf cells.
+        options: All options, for the report.
+    """
+
+    settings: Settings
+    frames: tuple[int, ...] | None
+    output_dir: Path
+    budget: float | None
+    target_ratio: float
+    engine: EngineName
+    scheduler_address: str | None
+    tls: Tls | None
+    resume: bool
+    save_cells: bool
+    options: Mapping[str, Any]
 
 
-def make_run(job: Job, options: Render, frames: tuple[int, ...], problems: list[str]) -> Run:
+def make_run(job: PathJob, order: Order, frames: tuple[int, ...], problems: tuple[str, ...]) -> Run:
     """What the report says about the command; ``problems`` of the platform take the guarantee away."""
-    guarantee = "sampled" if problems else job.method.guarantee
     limits = [f"The platform's arithmetic failed the self-check, so nothing is guaranteed: {p}" for p in problems]
     return Run(
-        guarantee=guarantee,
+        guarantee="sampled" if problems else job.method.guarantee,
         renderer=job.method.program,
         scene=job.describe(),
         frames=frames,
         fingerprint=job.fingerprint,
-        settings=dataclasses.asdict(options),
+        settings=order.options,
         plan=job.plan,
         command=("ns-abstract-render", *sys.argv[1:]),
         limits=tuple(limits),
+        size=(job.path.cameras[0].height, job.path.cameras[0].width),
     )
 
 
-def render_path(options: Render, stop: Callable[[], bool], seconds_by_frame: float) -> bool:
+def render_path(order: Order, stop: Stop) -> bool:
     """Bound the frames and write the results; returns whether every frame has one.
 
     Raises:
         InputError: A file, a field or an option cannot be used.
     """
-    console = Console(stderr=True, highlight=False)
-    job = Job(settings_of(options))
-    frames = check_frames(options.frames, job.frame_count)
-    problems = check_functions()
+    console = plain_console()
+    with stop.at_once():
+        job = open_job(order.settings)
+        frames = check_frames(order.frames, job.frame_count)
+        problems = platform_problems()
     with ExitStack() as stack:
-        client = None
-        if options.engine == "dask":
-            from ns_abstract.cli.cluster import local_workers
-            from ns_abstract.engines import connected
-
-            client = stack.enter_context(connected(options.scheduler_address, local_workers(job)))
-        run = make_run(job, options, frames, problems)
-        report = (Report.resume if options.resume else Report)(options.output_dir, run)
+        # before the workers: another command may be writing there
+        stack.enter_context(claim(order.output_dir))
+        # frames follow one another in this process; a NeRF has processes of its own
+        workers = bounding.local_workers(job) if order.engine == "dask" else 1
+        engine = stack.enter_context(started(order.engine, order.scheduler_address, workers, order.tls))
+        run = make_run(job, order, frames, problems)
+        report = (Report.resume if order.resume else Report)(order.output_dir, run)
         for problem in problems:
             console.print(f"warning: {problem}", markup=False)
         for reason in report.ignored:
             console.print(f"not used: {reason}", markup=False)
         _introduce(console, job, report)
-        _fill(report, job, options, client, stop, console, seconds_by_frame)
+        _fill(report, job, order, engine, stop, console)
     if report.missing:
         console.print(f"no bounds yet for frames {', '.join(map(str, report.missing))}: raise --time-budget, --resume")
-    console.print(f"report: {options.output_dir / 'report.html'}", markup=False, soft_wrap=True)
+    console.print(f"report: {order.output_dir / 'report.html'}", markup=False, soft_wrap=True)
     return not report.missing
 
 
-def _fill(
-    report: Report,
-    job: Job,
-    options: Render,
-    client: Any,
-    stop: Callable[[], bool],
-    console: Console,
-    seconds_by_frame: float,
-) -> None:
-    """Bound what is pending and write it, here or through the Dask ``client``."""
+def _fill(report: Report, job: Job, order: Order, engine: Engine, stop: Stop, console: Console) -> None:
+    """Bound what is pending and write it."""
     # a frame without bounds comes before one that could be tighter
     missing = set(report.missing)
     pending = sorted(report.pending, key=lambda index: index not in missing)
-    budget = options.time_budget if options.time_budget is not None else seconds_by_frame * max(1, len(pending))
+    budget = order.budget if order.budget is not None else _SECONDS_BY_FRAME * max(1, len(pending))
+    progress = Progress(
+        TextColumn("{task.description}"), BarColumn(), TextColumn("{task.fields[state]}"), TimeElapsedColumn(),
+        console=console, disable=not console.is_terminal, transient=True,
+    )  # fmt: skip
     try:
-        if client is not None:
-            from ns_abstract.cli.cluster import bound_on_cluster
-
-            results = bound_on_cluster(client, job, options, pending, budget, stop)
-        else:
-            results = _bound_here(job, options, pending, budget, stop, console)
-        for result in results:
-            entry = report.add(result)
-            _tell(console, entry)
+        with progress:
+            meter = _Meter(progress, len(pending), order.target_ratio)
+            results = bounding.bound_frames(
+                job, pending, engine=engine, budget=budget, target_ratio=order.target_ratio,
+                keep_leaves=order.save_cells, stop=stop, on_progress=meter.told,
+            )  # fmt: skip
+            for done, result in enumerate(results, 1):
+                _tell(console, report.add(result))
+                meter.finished(done)
     finally:
         # also after a failure: what is finished is written
         report.finish("interrupted" if stop() else "budget" if report.missing else "done")
 
 
 def _introduce(console: Console, job: Job, report: Report) -> None:
-    scene = job.scene
-    program = job.method.program
-    console.print(f"{scene.name}: {job.method.content}, {program['name']} {program['version']}", markup=False)
-    for note in (*scene.notes, *job.plan):
+    method = job.method
+    program = method.program
+    console.print(f"{method.name}: {method.content}, {program['name']} {program['version']}", markup=False)
+    for note in (*method.notes, *job.plan):
         console.print(f"  {note}", markup=False, soft_wrap=True)
     if report.kept:
         console.print(f"  kept from before: frames {', '.join(map(str, report.kept))}", markup=False)
@@ -132,62 +151,30 @@ def _tell(console: Console, entry: dict[str, Any]) -> None:
         console.print(f"  {sentence}", markup=False, soft_wrap=True)
 
 
-def _bound_here(
-    job: Job, options: Render, pending: list[int], budget: float, stop: Callable[[], bool], console: Console
-) -> Iterator[FrameResult]:
-    """Frame after frame on this machine; what one leaves of the time is shared by the rest."""
-    progress = Progress(
-        TextColumn("{task.description}"),
-        BarColumn(),
-        TextColumn("{task.fields[state]}"),
-        TimeElapsedColumn(),
-        console=console,
-        disable=not console.is_terminal,
-        transient=True,
-    )
-    with progress:
-        whole = progress.add_task("frames", total=max(1, len(pending)), state="compiling kernels on first use")
-        job.warm_up(pending[0] if pending else None)
-        deadline = time.perf_counter() + budget
-        for done, index in enumerate(pending):
-            # one frame is always tried, so that resuming with any budget gets on
-            if stop() or (done and time.perf_counter() >= deadline):
-                return
-            share = max(LEAST_SECONDS, (deadline - time.perf_counter()) / (len(pending) - done))
-            meter = _Meter(progress, whole, done, index, share, options.target_ratio)
-            yield job.bound(
-                index,
-                job.goal(options.target_ratio, share),
-                keep_leaves=options.save_cells,
-                stopped=stop,
-                progress=meter,
-            )
-            progress.update(whole, completed=done + 1)
-
-
 class _Meter:
-    """Turns a frame's trace into a progress bar with the current ratio and an estimate of the rest."""
+    """A progress bar with the current ratio and an estimate of the rest."""
 
-    def __init__(self, progress: Progress, task: Any, done: int, index: int, seconds: float, target: float) -> None:
-        self.progress, self.task, self.done, self.index = progress, task, done, index
-        self.seconds, self.target = seconds, target
-        self.first: TracePoint | None = None
+    def __init__(self, progress: Progress, frames: int, target: float) -> None:
+        self.progress, self.target = progress, target
+        self.task = progress.add_task("frames", total=max(1, frames), state="compiling kernels on first use")
 
-    def __call__(self, point: TracePoint, cover: float) -> None:
-        part = min(0.99, point.seconds / self.seconds)
-        if cover < 1.0:
-            state = f"frame {self.index}: covering the set, {cover:.0%}"
+    def finished(self, frames: int) -> None:
+        self.progress.update(self.task, completed=frames)
+
+    def told(self, point: bounding.Progress) -> None:
+        part = min(0.99, point.seconds / point.budget)
+        if point.covered < 1.0:
+            state = f"frame {point.frame}: covering the set, {point.covered:.0%}"
         else:
-            ratio = point.mpg / point.mpg_witness if point.mpg_witness > 0.0 else float("inf")
-            left = self._left(point, ratio)
-            state = f"frame {self.index}: ratio {ratio:.3f} (target {self.target:g}), {left:.0f} s left"
+            left = self._left(point)
+            state = f"frame {point.frame}: ratio {point.ratio:.3f} (target {self.target:g}), {left:.0f} s left"
             part = max(part, min(0.99, point.seconds / (point.seconds + left))) if left > 0.0 else part
-        self.progress.update(self.task, completed=self.done + part, state=state)
+        self.progress.update(self.task, completed=point.frames_done + part, state=state)
 
-    def _left(self, point: TracePoint, ratio: float) -> float:
+    def _left(self, point: bounding.Progress) -> float:
         """Seconds to the target if ``ratio - 1`` goes on falling in proportion to 1 / time; at most the budget."""
-        rest = max(0.0, self.seconds - point.seconds)
+        rest = max(0.0, point.budget - point.seconds)
         goal = self.target - 1.0
-        if goal <= 0.0 or ratio <= self.target:
+        if goal <= 0.0 or point.ratio <= self.target:
             return rest if goal <= 0.0 else 0.0
-        return min(rest, point.seconds * ((ratio - 1.0) / goal - 1.0))
+        return min(rest, point.seconds * ((point.ratio - 1.0) / goal - 1.0))

@@ -10,7 +10,7 @@ from typing import Literal
 import tyro
 
 from ns_abstract.cli.common import DONE, run
-from ns_abstract.errors import InputError
+from ns_abstract.io.errors import InputError
 
 
 @dataclass
@@ -23,8 +23,8 @@ class Viewer:
     """The websocket port to connect to. If None, find an available port."""
     websocket_port_default: int = 7007
     """The default websocket port to connect to if websocket_port is not specified."""
-    websocket_host: str = "0.0.0.0"
-    """The host address to bind the websocket server to."""
+    websocket_host: str = "127.0.0.1"
+    """The address that the viewer listens on: this machine only. 0.0.0.0: everyone who reaches this machine."""
     max_num_display_images: int = 512
     """Maximum number of training images to display in the viewer. If -1, display all."""
     quit_on_train_completion: bool = False
@@ -46,8 +46,8 @@ class View:
     """View a trained run with lower and upper bounds of what its camera could show.
 
     nerfstudio's viewer with the output types abstract_lower, abstract_upper, abstract_gap and
-    abstract_witness and a panel for the set of poses (Control tab, Custom Elements). Open trusted
-    runs only: nerfstudio's reader of config.yml can run code.
+    abstract_witness and a panel for the set of poses (Control tab, Custom Elements). Refuses a config.yml
+    that names other Python objects than nerfstudio's runs do, as nerfstudio's reader could run code.
     """
 
     load_config: Path

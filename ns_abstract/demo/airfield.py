@@ -212,9 +212,7 @@ def _lattice(
     return _surfels(points, tangent_u, normals, sigma, albedo, opacity=opacity, gloss=gloss)
 
 
-def _revolution(
-    radius: Callable[[Array], Array], centre: Callable[[Array], Array], x0: float, x1: float
-) -> Surface:
+def _revolution(radius: Callable[[Array], Array], centre: Callable[[Array], Array], x0: float, x1: float) -> Surface:
     """Circles of ``radius(v)`` around ``centre(v)`` ([n, 2] y, z), for x from x0 to x1; u turns once."""
 
     def surface(u: Array, v: Array) -> Array:
@@ -388,9 +386,7 @@ def _engine(front: Array, spacing: float) -> list[_Surfels]:
 
     def cowl(v: Array) -> Array:
         return (
-            radius
-            * (0.86 + 0.14 * np.sin(np.pi * np.clip(0.15 + 0.75 * v, 0, 1)))
-            * (1 - 0.30 * _smooth(v, 0.55, 1.0))
+            radius * (0.86 + 0.14 * np.sin(np.pi * np.clip(0.15 + 0.75 * v, 0, 1))) * (1 - 0.30 * _smooth(v, 0.55, 1.0))
         )
 
     def paint(points: Array, u: Array, v: Array) -> Array:
@@ -412,9 +408,7 @@ def _engine(front: Array, spacing: float) -> list[_Surfels]:
     )
     parts.append(
         _lattice(
-            _revolution(
-                lambda v: radius * 0.24 * np.sqrt(v) + 1e-4, centre, front[0] + 0.004, front[0] - 0.012
-            ),
+            _revolution(lambda v: radius * 0.24 * np.sqrt(v) + 1e-4, centre, front[0] + 0.004, front[0] - 0.012),
             fine,
             [0.55, 0.56, 0.60],
         )
@@ -445,22 +439,16 @@ def _landing_gear() -> _Surfels:
         bottom = -0.125
         z = np.linspace(top, bottom, 7)
         strut = np.stack([np.full(7, x), np.full(7, y), z], axis=1)
-        parts.append(
-            _surfels(strut, [0, 0, 1], [0, 1, 0], [0.010, 0.0032, 0.0032], [0.75, 0.76, 0.78], opacity=0.97)
-        )
+        parts.append(_surfels(strut, [0, 0, 1], [0, 1, 0], [0.010, 0.0032, 0.0032], [0.75, 0.76, 0.78], opacity=0.97))
         for offset in (-0.012, 0.012):
             angle = np.arange(14) * 2 * np.pi / 14
             tyre = np.stack(
                 [x + wheel * np.cos(angle), np.full(14, y + offset), bottom + wheel * np.sin(angle)], axis=1
             )
             along = np.stack([-np.sin(angle), np.zeros(14), np.cos(angle)], axis=1)
-            parts.append(
-                _surfels(tyre, along, [0, np.sign(offset), 0], [0.0050, 0.0048, 0.0042], 0.09, opacity=0.98)
-            )
+            parts.append(_surfels(tyre, along, [0, np.sign(offset), 0], [0.0050, 0.0048, 0.0042], 0.09, opacity=0.98))
             hub = np.array([[x, y + 1.25 * offset, bottom]])
-            parts.append(
-                _surfels(hub, [1, 0, 0], [0, np.sign(offset), 0], [0.0055, 0.0055, 0.003], 0.7, opacity=0.98)
-            )
+            parts.append(_surfels(hub, [1, 0, 0], [0, np.sign(offset), 0], [0.0055, 0.0055, 0.003], 0.7, opacity=0.98))
     return _join(parts)
 
 
@@ -572,10 +560,7 @@ def _pavements(rng: np.random.Generator) -> _Surfels:
         nx, ny = nx | 1, ny | 1  # odd, so that a centre row exists
         i, j = np.meshgrid(np.arange(nx), np.arange(ny), indexing="ij")
         cell = np.array([2 * half_x / nx, 2 * half_y / ny])
-        xy = (
-            np.array([x, y])
-            + (np.stack([i.ravel(), j.ravel()], axis=1) - 0.5 * np.array([nx - 1, ny - 1])) * cell
-        )
+        xy = np.array([x, y]) + (np.stack([i.ravel(), j.ravel()], axis=1) - 0.5 * np.array([nx - 1, ny - 1])) * cell
         points = np.concatenate([xy, np.full((len(xy), 1), GROUND)], axis=1)
         tone = 1.0 + 0.04 * _waves(xy, rng, 8.0)[:, None] + 0.02 * rng.standard_normal((len(xy), 1))
         if (x, y, half_x, half_y) == _APRON:
@@ -584,12 +569,8 @@ def _pavements(rng: np.random.Generator) -> _Surfels:
         else:
             albedo = np.array([0.36, 0.36, 0.37]) * tone
             centre = ((j == ny // 2) if half_x > half_y else (i == nx // 2)).ravel()
-            albedo = np.where(
-                centre[:, None], _mix(albedo, [0.85, 0.66, 0.10], np.full(len(xy), 0.8)), albedo
-            )
-        parts.append(
-            _surfels(points, [1, 0, 0], [0, 0, 1], [*(0.70 * cell), 0.05 * step], albedo, opacity=0.95)
-        )
+            albedo = np.where(centre[:, None], _mix(albedo, [0.85, 0.66, 0.10], np.full(len(xy), 0.8)), albedo)
+        parts.append(_surfels(points, [1, 0, 0], [0, 0, 1], [*(0.70 * cell), 0.05 * step], albedo, opacity=0.95))
     return _join(parts)
 
 
@@ -633,9 +614,7 @@ def _grass(rng: np.random.Generator, finest: float = 0.030) -> _Surfels:
     stripe = np.where(np.floor(xy[:, 0] / 0.11) % 2 == 0, 1.07, 0.95)
     albedo *= np.where(mown, stripe, 1.0)[:, None]
     albedo *= 1.0 + 0.05 * rng.standard_normal((count, 1))
-    fields_tone = np.where(np.floor(xy[:, 0] * 2.2 + 0.7 * xy[:, 1]) % 3 == 0, 1.0, 0.0) * _smooth(
-        radius, 0.85, 0.95
-    )
+    fields_tone = np.where(np.floor(xy[:, 0] * 2.2 + 0.7 * xy[:, 1]) % 3 == 0, 1.0, 0.0) * _smooth(radius, 0.85, 0.95)
     albedo = _mix(albedo, [0.62, 0.57, 0.29], 0.5 * fields_tone)
     haze = 0.70 * _smooth(radius, 0.7, 0.85 * _HORIZON)
     points = np.concatenate([xy, np.full((count, 1), GROUND - 0.002)], axis=1)
@@ -647,9 +626,7 @@ def _hazed(surfels: _Surfels, haze: Array) -> _Surfels:
     """Mix shaded colours towards the haze; the result takes no more light."""
     albedo = _mix(_shaded(surfels, np.ones(len(surfels))), _HAZE, haze)
     blend = np.where(haze > 1e-3, 0.0, 1.0)
-    return replace(
-        surfels, albedo=np.where(blend[:, None] > 0, surfels.albedo, albedo), lit=surfels.lit * blend
-    )
+    return replace(surfels, albedo=np.where(blend[:, None] > 0, surfels.albedo, albedo), lit=surfels.lit * blend)
 
 
 def _box(
@@ -687,9 +664,7 @@ def _buildings() -> _Surfels:
         return colour
 
     parts = [_box([-0.34, 0.60, GROUND], [0.16, 0.70, GROUND + 0.085], 0.017, front, [0.74, 0.74, 0.72])]
-    parts.append(
-        _box([-0.16, 0.62, GROUND + 0.085], [0.00, 0.70, GROUND + 0.12], 0.018, front, [0.68, 0.69, 0.70])
-    )
+    parts.append(_box([-0.16, 0.62, GROUND + 0.085], [0.00, 0.70, GROUND + 0.12], 0.018, front, [0.68, 0.69, 0.70]))
     for x in (-0.78, -0.58):
         parts += _hangar(x)
     tower = np.array([0.36, 0.62])
@@ -720,15 +695,11 @@ def _buildings() -> _Surfels:
         _lattice(
             turned(cab, z + 0.20, z + 0.245),
             0.010,
-            lambda p, u, v: _mix(
-                [0.10, 0.18, 0.24], [0.85, 0.85, 0.83], ((v < 0.2) | (v > 0.88)).astype(float)
-            ),
+            lambda p, u, v: _mix([0.10, 0.18, 0.24], [0.85, 0.85, 0.83], ((v < 0.2) | (v > 0.88)).astype(float)),
             gloss=0.10,
         )
     )
-    parts.append(
-        _lattice(turned(lambda v: 0.040 * (1 - v) + 1e-3, z + 0.245, z + 0.256), 0.012, [0.80, 0.80, 0.78])
-    )
+    parts.append(_lattice(turned(lambda v: 0.040 * (1 - v) + 1e-3, z + 0.245, z + 0.256), 0.012, [0.80, 0.80, 0.78]))
     mast = np.stack([np.full(5, tower[0]), np.full(5, tower[1]), z + np.linspace(0.256, 0.31, 5)], axis=1)
     parts.append(_surfels(mast, [0, 0, 1], [0, -1, 0], [0.009, 0.0022, 0.0022], _ORANGE, opacity=0.97))
     return _join(parts)
@@ -740,9 +711,7 @@ def _hangar(x: float) -> list[_Surfels]:
 
     def roof(u: Array, v: Array) -> Array:
         angle = np.pi * u
-        return np.stack(
-            [x - 0.5 * width * np.cos(angle), y0 + depth * v, GROUND + wall + rise * np.sin(angle)], axis=1
-        )
+        return np.stack([x - 0.5 * width * np.cos(angle), y0 + depth * v, GROUND + wall + rise * np.sin(angle)], axis=1)
 
     def gable(u: Array, v: Array) -> Array:
         top = wall + rise * np.sqrt(np.maximum(0.0, 1.0 - (2 * u - 1.0) ** 2))
@@ -756,9 +725,7 @@ def _hangar(x: float) -> list[_Surfels]:
         return colour
 
     parts = [
-        _lattice(
-            roof, 0.017, lambda p, u, v: _mix([0.60, 0.64, 0.67], [0.50, 0.54, 0.58], np.floor(v * 8) % 2)
-        ),
+        _lattice(roof, 0.017, lambda p, u, v: _mix([0.60, 0.64, 0.67], [0.50, 0.54, 0.58], np.floor(v * 8) % 2)),
         _lattice(gable, 0.015, doors),
     ]
     for side in (-0.5, 0.5):
@@ -807,9 +774,7 @@ def _trees(rng: np.random.Generator) -> _Surfels:
         parts.append(_surfels(inner, [1, 0, 0], [0, 0, 1], 0.48 * size, [0.09, 0.15, 0.06], opacity=0.97))
         trunk = np.stack([np.full(3, x), np.full(3, y), GROUND + size * np.array([0.1, 0.45, 0.8])], axis=1)
         parts.append(
-            _surfels(
-                trunk, [0, 0, 1], [0, -1, 0], [0.25 * size, 0.09 * size, 0.09 * size], [0.26, 0.19, 0.12]
-            )
+            _surfels(trunk, [0, 0, 1], [0, -1, 0], [0.25 * size, 0.09 * size, 0.09 * size], [0.26, 0.19, 0.12])
         )
     return _join(parts)
 
@@ -987,9 +952,7 @@ def _glossy_sh(diffuse: Array, normals: Array, gloss: Array) -> Array:
         weighted = basis * (0.25 + cosine)[None, :, None]
         normal_matrix = weighted.transpose(0, 2, 1) @ basis
         ridge = 0.02 * count * np.diag([0.0, 0.5, 0.5, 0.5, 1, 1, 1, 1, 1])
-        coefficients[part] = np.linalg.solve(
-            normal_matrix + ridge, weighted.transpose(0, 2, 1) @ (target - 0.5)
-        )
+        coefficients[part] = np.linalg.solve(normal_matrix + ridge, weighted.transpose(0, 2, 1) @ (target - 0.5))
     return coefficients
 
 

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from ns_abstract.demo.nerf_fit import NerfNetwork, fit_field
-from ns_abstract.demo.paths import View, look_at, path_json
+from ns_abstract.geometry.views import View, look_at, path_json
 from ns_abstract.methods.nerf.scene import NerfScene
 
 #: Everything lies inside this distance of the origin.

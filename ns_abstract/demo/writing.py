@@ -9,13 +9,15 @@ import numpy as np
 
 from ns_abstract.demo.airfield import airfield
 from ns_abstract.demo.buoy import buoy_path, buoy_scene, buoy_views
-from ns_abstract.demo.nerf_runs import write_nerf_run
-from ns_abstract.demo.paths import View, write_airfield_paths
-from ns_abstract.demo.runs import write_file, write_splatfacto_run
+from ns_abstract.demo.paths import dataset_views, write_airfield_paths
+from ns_abstract.geometry.camera_path import Camera
+from ns_abstract.geometry.views import View
+from ns_abstract.methods.nerf.write import write_nerf_run
+from ns_abstract.methods.run_writer import write_file
 from ns_abstract.methods.splat.activate import activate
 from ns_abstract.methods.splat.constants import GSPLAT_1_4_0
 from ns_abstract.methods.splat.render import Renderer
-from ns_abstract.sets.path import Camera
+from ns_abstract.methods.splat.write import write_splatfacto_run
 
 #: Name of the run's folder: a fixed time, so that the demo is the same every time.
 TIMESTAMP = "2026-01-01_120000"
@@ -51,6 +53,6 @@ def write_demo(folder: Path) -> tuple[Path, dict[str, Path]]:
         return renderer.image(camera, rotation, np.ascontiguousarray(pose[:3, 3]))
 
     config = write_splatfacto_run(
-        scene, folder, timestamp=TIMESTAMP, experiment_name="airfield", render=picture
+        scene, folder, timestamp=TIMESTAMP, experiment_name="airfield", views=dataset_views(), render=picture
     )
     return config, write_airfield_paths(folder)

@@ -4,21 +4,36 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
+from typing import Any
 
+from ns_abstract.io.errors import InputError
 from ns_abstract.methods import runs
-from ns_abstract.methods.nerf.load import holds_nerf, load_nerf
-from ns_abstract.methods.nerf.scene import NerfScene
-from ns_abstract.methods.splat.load import load_scene
-from ns_abstract.methods.splat.scene import SplatScene
+from ns_abstract.methods.nerf.method import NERF
+from ns_abstract.methods.representation import Representation
+from ns_abstract.methods.splat.method import SPLAT
+
+#: What is asked in turn; the last one explains what it cannot read.
+REPRESENTATIONS: list[Representation] = [NERF, SPLAT]
 
 
-def load_any(path: str | os.PathLike[str]) -> SplatScene | NerfScene:
+def open_scene(path: str | os.PathLike[str]) -> tuple[Representation, Any]:
     """Read the scene of a run (by the method that its config.yml names) or of a 3DGS ``.ply``.
+
+    Returns:
+        The representation, and its scene.
 
     Raises:
         InputError: For any content of the files that cannot be used.
     """
-    if not os.path.isdir(path) and Path(path).suffix.lower() not in (".yml", ".yaml"):
-        return load_scene(path)
-    run = runs.read_config(path)
-    return load_nerf(run) if holds_nerf(run) else load_scene(path)
+    source: runs.RunConfig | Path = Path(path)
+    if os.path.isdir(path) or Path(path).suffix.lower() in (".yml", ".yaml"):
+        source = runs.read_config(path)
+    for found in REPRESENTATIONS:
+        if found.reads(source):
+            return found, found.load(source)
+    raise InputError("holds no scene known here", file=str(path), fix="give config.yml of a run, or a .ply")
+
+
+def load_any(path: str | os.PathLike[str]) -> Any:
+    """The scene alone; see `open_scene`."""
+    return open_scene(path)[1]

@@ -27,8 +27,8 @@ import yaml.composer
 import yaml.constructor
 from numpy.typing import NDArray
 
-from ns_abstract.errors import InputError
-from ns_abstract.jsonio import FIX_ACCESS, file_size, is_number, load_json, read_text, show
+from ns_abstract.io.errors import InputError, visible
+from ns_abstract.io.jsonio import FIX_ACCESS, file_size, is_number, load_json, read_text, show
 from ns_abstract.methods.transform import DataparserTransform
 
 if TYPE_CHECKING:
@@ -41,12 +41,14 @@ DEFAULT_MODEL_FOLDER = "nerfstudio_models"
 CONFIG_BYTES_LIMIT = 2**20
 CONFIG_NODES_LIMIT = 100_000
 CONFIG_DEPTH_LIMIT = 64
+NUMBER_CHARACTERS_LIMIT = 300
 TRANSFORMS_BYTES_LIMIT = 2**20
 PICKLE_BYTES_LIMIT = 16 * 2**20
 ARCHIVE_MEMBERS_LIMIT = 100_000
 
 _PYTHON_TAG = "tag:yaml.org,2002:python/"
 _MERGE_TAG = "tag:yaml.org,2002:merge"
+_NUMBER_TAGS = {f"tag:yaml.org,2002:{python}{kind}" for python in ("", "python/") for kind in ("int", "long", "float")}
 _CHECKPOINT_NAME = re.compile(r"step-(\d{1,18})\.ckpt")
 _RECOPY = "copy the checkpoint again from the run"
 _PICKLE_MODULES = {"torch", "collections", "numpy", "_codecs"}
@@ -117,9 +119,7 @@ class RunConfig:
             raise self._error(name, value, f"one of {', '.join(options)}")
         return value
 
-    def color(
-        self, name: str, default: str, extra: dict[str, tuple[float, float, float]]
-    ) -> NDArray[np.float32]:
+    def color(self, name: str, default: str, extra: dict[str, tuple[float, float, float]]) -> NDArray[np.float32]:
         """RGB field of ``pipeline.model`` as float32 [3] in [0, 1]; ``default`` if absent.
 
         Args:
@@ -139,9 +139,7 @@ class RunConfig:
         raise self._error(name, value, f"{names} or three numbers from 0 to 1")
 
     def _error(self, name: str, value: Any, wanted: str) -> InputError:
-        return InputError(
-            f"found {show(value)}", file=self.file, field=f"pipeline.model.{name}", fix=f"write {wanted}"
-        )
+        return InputError(f"found {show(value)}", file=self.file, field=f"pipeline.model.{name}", fix=f"write {wanted}")
 
 
 def read_config(path: str | os.PathLike[str]) -> RunConfig:
@@ -168,7 +166,7 @@ def read_config(path: str | os.PathLike[str]) -> RunConfig:
         file=file,
         folder=folder,
         method_name=_name(root, "method_name", "unknown", file),
-        experiment_name=_name(root, "experiment_name", folder.resolve().name or "run", file),
+        experiment_name=_name(root, "experiment_name", visible(folder.resolve().name) or "run", file),
         model=model,
         model_folder=folder / _model_folder(root, file),
         root=root,
@@ -300,9 +298,7 @@ def read_model_state(path: Path) -> dict[str, torch.Tensor]:
     root = _load_checkpoint(path)
     pipeline = root.get("pipeline") if isinstance(root, dict) else None
     if not isinstance(pipeline, dict):
-        raise InputError(
-            "no model state", file=path, field="pipeline", fix="give a checkpoint that ns-train wrote"
-        )
+        raise InputError("no model state", file=path, field="pipeline", fix="give a checkpoint that ns-train wrote")
     state = {}
     for key, value in pipeline.items():
         if not isinstance(key, str):
@@ -517,7 +513,7 @@ def _name(root: dict[str, Any], key: str, default: str, file: Path) -> str:
     if not isinstance(value, (str, int, float)) or isinstance(value, bool):
         raise InputError(f"found {show(value)}", file=file, field=key, fix="write a name")
     text = value if isinstance(value, str) else show(value)
-    return " ".join(text.split())[:120] or default
+    return visible(" ".join(text.split()))[:120] or default
 
 
 def _model_folder(root: dict[str, Any], file: Path) -> str:
@@ -591,6 +587,13 @@ class _InertLoader(yaml.SafeLoader):
         if self._open[-1] > CONFIG_NODES_LIMIT:
             raise _composer_error(f"more than {CONFIG_NODES_LIMIT} values after expansion of aliases", mark)
         return node
+
+    def construct_scalar(self, node: Any) -> Any:
+        value = super().construct_scalar(node)
+        # PyYAML's time for a number grows with the square of its length
+        if node.tag in _NUMBER_TAGS and len(value) > NUMBER_CHARACTERS_LIMIT:
+            raise _constructor_error(f"a number of {len(value):,} characters", node.start_mark)
+        return value
 
     def flatten_mapping(self, node: Any) -> None:
         for key, _ in node.value:

@@ -2,13 +2,27 @@
 
 from __future__ import annotations
 
+import importlib
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import is_dataclass
+from enum import Enum
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
 from nerfstudio.utils.rich_utils import CONSOLE
 from torchmetrics.functional.image import lpips as lpips_module
+
+from ns_abstract.io.errors import InputError
+from ns_abstract.io.jsonio import show
+from ns_abstract.methods.runs import Tagged
+
+#: Packages whose objects a run may name, by the way of naming them.
+_OURS = ("nerfstudio.", "ns_abstract.")
+_MODULES = {"name": (*_OURS, "torch.optim."), "object": _OURS, "object/apply": _OURS}
+_FUNCTIONS = ("nerfstudio.data.utils.nerfstudio_collate.nerfstudio_collate",)
 
 
 def allow_numpy_scalars() -> None:
@@ -55,3 +69,51 @@ def lpips_weights(*, download: bool) -> Iterator[None]:
 def lpips_known(metric: torch.nn.Module) -> bool:
     """Whether an LPIPS metric has weights."""
     return any(bool(parameter.any()) for name, parameter in metric.named_parameters() if "slice1" in name)
+
+
+def check_tags(value: Any, file: Path) -> None:
+    """Refuse a configuration that names other Python objects than nerfstudio's own runs do.
+
+    nerfstudio reads config.yml with a loader that imports and calls what the file names. What its runs name are
+    classes of nerfstudio, of this package and of torch.optim, members of nerfstudio's enumerations, paths, and the
+    function in `_FUNCTIONS`.
+
+    Args:
+        value: What `ns_abstract.methods.runs` has read, without running anything.
+        file: Where it is from.
+
+    Raises:
+        InputError: Names the first other object.
+    """
+    if isinstance(value, Tagged):
+        kind, _, name = value.tag.removeprefix("tag:yaml.org,2002:python/").partition(":")
+        if not _expected(kind, name):
+            raise InputError(
+                f"names the Python object {show(name or value.tag)} ({kind}); nothing was run",
+                file=file,
+                fix="open only runs that ns-train wrote; ns-abstract-render reads this file without running anything",
+            )
+        check_tags(value.value, file)
+    elif isinstance(value, dict):
+        for key, item in value.items():
+            check_tags(key, file)
+            check_tags(item, file)
+    elif isinstance(value, (list, tuple)):
+        for item in value:
+            check_tags(item, file)
+
+
+def _expected(kind: str, name: str) -> bool:
+    """Whether a run of nerfstudio may name an object in this way."""
+    if kind == "name" and name in _FUNCTIONS:
+        return True
+    if not name.startswith(_MODULES.get(kind, ())):
+        return False
+    module, _, last = name.rpartition(".")
+    try:
+        found = getattr(importlib.import_module(module), last)
+    except (ImportError, AttributeError, ValueError):
+        return False
+    if not isinstance(found, type):
+        return False
+    return {"name": True, "object": is_dataclass(found), "object/apply": issubclass(found, Enum)}[kind]

@@ -17,7 +17,7 @@ from nerfstudio.fields.vanilla_nerf_field import NeRFField
 from nerfstudio.models.vanilla_nerf import NeRFModel, VanillaModelConfig
 from nerfstudio.utils.colors import COLORS_DICT
 
-from ns_abstract.errors import InputError
+from ns_abstract.io.errors import InputError
 from ns_abstract.methods.nerf.load import field_weights
 from ns_abstract.methods.nerf.scene import NerfScene
 from ns_abstract.methods.nerf.smoothness import log_lipschitz
@@ -153,7 +153,7 @@ class AbstractNerfModel(AbstractOutputs, NeRFModel):
         shown = camera_of(camera)
         box = None if obb_box is None else tuple(torch.cat([obb_box.R.flatten(), obb_box.T, obb_box.S]).tolist())
         key = shown.camera_to_world.tobytes(), round(shown.fy / shown.height, 6), box
-        best, seconds = (self._drawn[1:] if self._drawn is not None and self._drawn[0] == key else ({}, _FIRST))
+        best, seconds = self._drawn[1:] if self._drawn is not None and self._drawn[0] == key else ({}, _FIRST)
         if seconds <= _LAST:
             # pictures of one view never shrink, however slow the machine has become
             rows = max([_ROWS, *(value.shape[0] for value in best.values())])

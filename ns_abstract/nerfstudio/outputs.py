@@ -1,4 +1,4 @@
-"""Abstract images among the outputs of a nerfstudio model."""
+"""Abstract images among the outputs of a nerfstudio model (design.md, W4)."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ import torch
 from nerfstudio.utils.rich_utils import CONSOLE
 
 from ns_abstract.arithmetic.selfcheck import check_functions
-from ns_abstract.errors import InputError
+from ns_abstract.io.errors import InputError
 from ns_abstract.nerfstudio.loading import lpips_known
 from ns_abstract.nerfstudio.panel import AbstractPanel, camera_of
+from ns_abstract.perturbation.specification import ROTATIONS, TRANSLATIONS
+from ns_abstract.perturbation.variations import VARIATIONS
 from ns_abstract.refine.engine import Goal, Refinement
-from ns_abstract.sets.perturbation import ROTATIONS, TRANSLATIONS
-from ns_abstract.sets.variations import VARIATIONS
 from ns_abstract.viewer.background import Background
 from ns_abstract.viewer.views import Snapshot, Source, View
 

@@ -22,14 +22,14 @@ from nerfstudio.viewer.viewer_elements import (
 )
 from viser import ViserServer
 
-from ns_abstract.atomic import write_atomic
-from ns_abstract.demo.paths import View as PathView
-from ns_abstract.demo.paths import path_json
-from ns_abstract.errors import InputError
+from ns_abstract.geometry.camera_path import Camera
+from ns_abstract.geometry.views import View as PathView
+from ns_abstract.geometry.views import path_json
+from ns_abstract.io.atomic import write_atomic
+from ns_abstract.io.errors import InputError
+from ns_abstract.perturbation.specification import ROTATIONS, TRANSLATIONS, Perturbation, perturbation_object
+from ns_abstract.perturbation.variations import VARIATIONS
 from ns_abstract.report.figures import number
-from ns_abstract.sets.path import Camera
-from ns_abstract.sets.perturbation import ROTATIONS, TRANSLATIONS, Perturbation, perturbation_object
-from ns_abstract.sets.variations import VARIATIONS
 from ns_abstract.viewer.background import Status
 from ns_abstract.viewer.views import Snapshot, View, perturbation_of
 

@@ -11,9 +11,9 @@ import torch
 from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.models.splatfacto import SplatfactoModel, SplatfactoModelConfig
 
-from ns_abstract.errors import InputError
+from ns_abstract.io.errors import InputError
 from ns_abstract.methods.splat.activate import Splats, activate
-from ns_abstract.methods.splat.constants import GSPLAT_1_4_0
+from ns_abstract.methods.splat.constants import installed_gsplat
 from ns_abstract.methods.splat.load import scene_from_parameters
 from ns_abstract.methods.splat.render import Renderer
 from ns_abstract.methods.splat.scene import SplatScene
@@ -73,7 +73,7 @@ class AbstractSplatfactoModel(AbstractOutputs, SplatfactoModel):
                 rasterize_mode=cast(Literal["classic", "antialiased"], self.config.rasterize_mode),
                 background=np.zeros(3, np.float32),
             )
-            self._active = (state, self.step), scene, activate(scene, GSPLAT_1_4_0)
+            self._active = (state, self.step), scene, activate(scene, installed_gsplat())
         return self._active[1:]
 
     def _scene(self) -> tuple[SplatSource, Renderer]:
@@ -90,7 +90,8 @@ class AbstractSplatfactoModel(AbstractOutputs, SplatfactoModel):
                 splats = dataclasses.replace(splats, **parts)
                 scene = cropped(scene, inside)
             splats = dataclasses.replace(splats, background=background)
-            self._shown = state, SplatSource(splats, scene), Renderer(splats, GSPLAT_1_4_0)
+            rules = installed_gsplat()
+            self._shown = state, SplatSource(splats, scene, version=rules.version), Renderer(splats, rules)
         return self._shown[1:]
 
     def abstract_source(self) -> SplatSource:

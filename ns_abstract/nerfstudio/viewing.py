@@ -17,16 +17,18 @@ from nerfstudio.pipelines.base_pipeline import Pipeline
 from nerfstudio.scripts.viewer.run_viewer import _start_viewer
 from nerfstudio.utils.eval_utils import eval_setup
 
-from ns_abstract.demo.paths import around
-from ns_abstract.demo.runs import write_splatfacto_run
-from ns_abstract.errors import InputError
-from ns_abstract.methods.runs import find_checkpoint, read_config
+from ns_abstract.geometry.views import around
+from ns_abstract.io.errors import InputError
+from ns_abstract.methods.runs import find_checkpoint, read_config, read_model_state
 from ns_abstract.methods.splat.load import load_scene
-from ns_abstract.nerfstudio.loading import allow_numpy_scalars
+from ns_abstract.methods.splat.write import write_splatfacto_run
+from ns_abstract.nerfstudio.loading import allow_numpy_scalars, check_tags
 from ns_abstract.nerfstudio.nerf import AbstractNerfModelConfig
 from ns_abstract.nerfstudio.pipeline import AbstractPipeline
 from ns_abstract.nerfstudio.splat import AbstractSplatfactoModelConfig
 
+#: Hosts that only this machine reaches.
+_LOOPBACK = ("127.0.0.1", "localhost", "::1")
 #: Rays of a NeRF that are drawn at once on a CPU.
 _CHUNK = 256
 _FIX_DATA = "start the command in the folder that ns-train was started in, or put the data set back"
@@ -48,6 +50,12 @@ def view(load_config: Path, vis: Literal["viewer", "viewer_legacy"], options: di
         if config_file.suffix.lower() == ".ply":
             config_file = run_of_ply(config_file, Path(scratch))
         config, pipeline, step = open_run(config_file)
+        if options["websocket_host"] not in _LOOPBACK or options["make_share_url"]:
+            print(
+                "the viewer is open to others: whoever reaches this machine sees the scene, moves the camera and "
+                "starts work here",
+                flush=True,
+            )
         chunk = config.viewer.num_rays_per_chunk
         config.vis = vis
         config.viewer = ViewerConfig(**options, num_rays_per_chunk=chunk)
@@ -66,7 +74,8 @@ def run_of_ply(file: Path, folder: Path) -> Path:
 def open_run(config_file: Path) -> tuple[TrainerConfig, Pipeline, int]:
     """nerfstudio's ``eval_setup`` with models that bound; the run may have been moved.
 
-    config.yml is read by nerfstudio's own loader, which can run code: open trusted runs only.
+    config.yml is read by nerfstudio's own loader, which can run code, so it is read before by ours, which runs none,
+    and so is the checkpoint: what names other objects than runs of nerfstudio do is refused.
 
     Returns:
         Configuration, pipeline and training step.
@@ -75,7 +84,8 @@ def open_run(config_file: Path) -> tuple[TrainerConfig, Pipeline, int]:
         InputError: The run cannot be opened.
     """
     run = read_config(config_file)
-    find_checkpoint(run)
+    check_tags(run.root, run.file)
+    read_model_state(find_checkpoint(run))
     allow_numpy_scalars()
 
     def prepare(config: TrainerConfig) -> TrainerConfig:

@@ -13,13 +13,16 @@ import itertools
 import math
 import time
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
-from typing import Any, NamedTuple, Protocol
+from typing import NamedTuple
 
 import numpy as np
 
+from ns_abstract.execution.ending import AbandonedError, abandoning
+from ns_abstract.geometry.box import ParameterBox
+from ns_abstract.refine.protocol import Bounds, Context, Frame, Render
 from ns_abstract.refine.result import FrameResult, Leaves, PartResult, TracePoint, gap, joined
-from ns_abstract.sets.box import ParameterBox
 
 #: Part of the whole excess that one round of splitting takes on.
 _ROUND_SHARE = 0.8
@@ -48,55 +51,6 @@ _COVER_CELLS = 4096
 _SLACK_SHARE = 0.1
 #: Cells that may still be bounded where their number is not limited.
 _PLENTY = 1 << 60
-
-
-class Bounds(Protocol):
-    """What a frame's ``bound`` returns; see `ns_abstract.methods.splat.frame.TileBounds`."""
-
-    lower: np.ndarray
-    upper: np.ndarray
-    slopes: np.ndarray
-    context: Any
-    linear: tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray] | None
-
-
-class Frame(Protocol):
-    """What refinement needs to know about a frame; see `ns_abstract.methods.splat.frame.SplatFrame`.
-
-    Attributes:
-        batch: Most tiles of one call while cells are split, so that time is looked at in between; the whole set
-            then takes a single call of no cost. None: every call takes all tiles that it concerns.
-        witnesses: Poses rendered in every part of a cell of one parameter that is split.
-    """
-
-    batch: int | None
-    witnesses: int
-    box: ParameterBox
-    camera: Any
-    side: int
-    across: int
-    down: int
-
-    @property
-    def tile_count(self) -> int:
-        """Number of tiles, row by row."""
-        ...
-
-    def render(self, values: np.ndarray, tiles: np.ndarray | None = None) -> np.ndarray:
-        """Tiles [t, side, side, 3] float32 of the image at parameter values [d]; all tiles if None."""
-        ...
-
-    def bound(self, box: ParameterBox, tiles: np.ndarray, within: Any = None, keep_linear: bool = False) -> Any:
-        """`Bounds` of ``tiles`` over ``box``; ``within`` is the context of a box around it."""
-        ...
-
-    def feasible(self, box: ParameterBox) -> ParameterBox | None:
-        """A part of ``box`` that holds all parameters in it of poses of the set; None where there are none."""
-        ...
-
-    def motion(self, box: ParameterBox) -> np.ndarray:
-        """[d] pixels that the picture moves by over each parameter's range (an estimate)."""
-        ...
 
 
 @dataclass(frozen=True)
@@ -137,7 +91,7 @@ class _Cell:
 
     def __init__(self, number: int, part: _Part, narrow: bool) -> None:
         self.number, self.part, self.narrow = number, part, narrow
-        self.context: Any = None
+        self.context: Context | None = None
         self.slopes = np.zeros(part.box.dimensions)
 
     @property
@@ -231,7 +185,7 @@ class Refinement:
         keep_leaves: bool = False,
         stopped: Callable[[], bool] = lambda: False,
         progress: Callable[[TracePoint, float], None] = lambda point, share: None,
-        members: Iterator[Callable[[np.ndarray, np.ndarray | None], np.ndarray]] | None = None,
+        members: Iterator[Render] | None = None,
         tiles: np.ndarray | None = None,
     ) -> None:
         self.members = iter(()) if members is None else members
@@ -242,16 +196,13 @@ class Refinement:
         side = frame.side
         shape = (side, side, 3)
         self.tiles = [
-            _Tile(np.full(shape, np.inf, np.float32), np.full(shape, -np.inf, np.float32))
-            for _ in range(self._count)
+            _Tile(np.full(shape, np.inf, np.float32), np.full(shape, -np.inf, np.float32)) for _ in range(self._count)
         ]
         whole = (self._count, *shape)
         self.outer_lower, self.outer_upper = np.zeros(whole, np.float32), np.ones(whole, np.float32)
         self.witness_lower, self.witness_upper = np.full(whole, np.inf, np.float32), np.full(whole, -np.inf, np.float32)
         self.image = np.zeros(whole, np.float32)
-        watch = getattr(frame, "watch", None)
-        if watch is not None:
-            watch(self._numbers_of(None), self.witness_lower, self.witness_upper)
+        frame.watch(self._numbers_of(None), self.witness_lower, self.witness_upper)
         self.inside = _pixels_inside(frame)[self._numbers_of(None)]
         self.outer_lower[~self.inside] = 0.0
         self.outer_upper[~self.inside] = 0.0
@@ -381,8 +332,11 @@ class Refinement:
         self.progress(point, share)
         return point
 
+    def _late(self) -> bool:
+        return self.stopped() or time.perf_counter() - self.start >= self.goal.seconds
+
     def _over(self) -> bool:
-        return self.stopped() or time.perf_counter() - self.start >= self.goal.seconds or self._cells_left() < 1
+        return self._late() or self._cells_left() < 1
 
     def _cells_left(self) -> int:
         return _PLENTY if self.goal.cells is None else self.goal.cells - self.cells
@@ -390,7 +344,11 @@ class Refinement:
     # --- the work ------------------------------------------------------------------------------
 
     def run(self) -> FrameResult:
-        """Refine until the goal is reached; sound whenever it ends."""
+        """Refine until the goal is reached; sound whenever it ends.
+
+        Raises:
+            AbandonedError: ``stopped`` was true before a first picture was there.
+        """
         return self._result(self._work())
 
     def run_part(self) -> PartResult:
@@ -401,28 +359,37 @@ class Refinement:
         box = self.frame.box
         self._allow(0.0)
         # the first call compiles kernels; the clock of the trace starts after it
-        self.image = self._witness(box.middle)
+        with abandoning(self.stopped):
+            self.image = self._witness(box.middle)
         self.start = time.perf_counter()
+        # where the whole set costs nothing, or rays may be left at [0, 1], the cover keeps to the time
+        with abandoning(self._late if self.frame.tilewise else self.stopped), suppress(AbandonedError):
+            corners = self._begin()
+            if self._cover() and not self._over():
+                for render in itertools.islice(self.members, _MEMBERS):
+                    self._widen(self._render(render, box.middle, None), None)
+                    if self._over():
+                        break
+                for values in corners:
+                    self._witness(values)
+                    if self._over():
+                        break
+                self._refine()
+        return self._record(1.0)
+
+    def _begin(self) -> np.ndarray:
+        """What the first cover asks for; returns the corners of the set that are left for later."""
         corners = self._corners()
-        if box.dimensions == 1:
-            # two, which the first cover asks for
+        if self.frame.box.dimensions == 1:
+            # two
             for values in corners:
-                self._witness(values)
+                with suppress(AbandonedError):
+                    self._witness(values)
             corners = corners[:0]
             if self.goal.ratio >= _AIM_RATIO:
                 # the cover alone may reach the goal; cells that are split had better tell what they hide
                 self.floor = self._allow((self.goal.ratio - 1.0) * self._mpg(self.witness_lower, self.witness_upper))
-        if self._cover() and not self._over():
-            for render in itertools.islice(self.members, _MEMBERS):
-                self._widen(self._render(render, box.middle, None), None)
-                if self._over():
-                    break
-            for values in corners:
-                self._witness(values)
-                if self._over():
-                    break
-            self._refine()
-        return self._record(1.0)
+        return corners
 
     def proceed(self, goal: Goal) -> FrameResult:
         """Go on after `run` has covered the set; time between the two does not count."""
@@ -437,8 +404,7 @@ class Refinement:
 
     def _allow(self, excess: float) -> float:
         """Tell the frame how much looser than the inner bounds cells may be from now on; what it makes of it."""
-        allow = getattr(self.frame, "allow", None)
-        return 0.0 if allow is None else allow(excess)
+        return self.frame.allow(excess)
 
     def _corners(self) -> np.ndarray:
         return _first_corners(self.frame.box, self.random)
@@ -474,10 +440,10 @@ class Refinement:
             cells, lowers, uppers = zip(*((cell, lower[t], upper[t]) for cell, lower, upper in leaves), strict=True)
             self.tiles[t].replace(_Change([], list(cells), list(lowers), list(uppers)))
         self.covered = True
-        visible = [getattr(cell.context, "visible", None) for cell, _, _ in leaves]
-        known = [v for v in visible if v is not None]
-        if len(known) == len(visible):
-            self.shown = np.unique(np.concatenate(known))
+        elements = [None if cell.context is None else cell.context.shown for cell, _, _ in leaves]
+        told = [numbers for numbers in elements if numbers is not None]
+        if len(told) == len(elements):
+            self.shown = np.unique(np.concatenate(told))
         self._settle(everything)
         self._record(1.0)
         return True
@@ -490,11 +456,11 @@ class Refinement:
     def _first_parts(self, everything: np.ndarray) -> tuple[list[_Part], _Part, Bounds]:
         """Parts that cover the set, as many as motion asks for and time and memory allow; one part, and its bounds."""
         frame, parts = self.frame, [self._whole]
-        if frame.batch is None and frame.box.dimensions == 1:
+        if not frame.tilewise and frame.box.dimensions == 1:
             return self._equal_parts(everything)
         motion = np.nan_to_num(np.array(frame.motion(frame.box), np.float64), nan=0.0)
         history = [parts]
-        limit = FIRST_MOTIONS if frame.batch is None else np.inf
+        limit = np.inf if frame.tilewise else FIRST_MOTIONS
         while motion.size and motion.max() > limit and 2 * len(parts) <= _COVER_CELLS:
             axis = int(np.argmax(motion))
             parts = [half for part in parts for half in self._cut(part, axis)]
@@ -537,12 +503,17 @@ class Refinement:
         allowed = _COVER_SHARE * self.goal.seconds / max(seconds, 1e-4)
         if self.goal.cells is not None:
             allowed = self.goal.cells / 2
-        size = probe.lower.nbytes + probe.upper.nbytes + _array_bytes(probe.context) + _linear_bytes(probe)
+        size = probe.lower.nbytes + probe.upper.nbytes + _context_bytes(probe.context) + _linear_bytes(probe)
         # half: the leaves are copied once when they are sorted by tile
         return probe, max(1.0, min(allowed, 0.5 * self.goal.leaf_bytes / size))
 
     def _refine(self) -> None:
         self._allow(0.0)
+        # nothing is changed before all that a step needs is there
+        with abandoning(self._late), suppress(AbandonedError):
+            self._rounds()
+
+    def _rounds(self) -> None:
         while True:
             point = self._record(1.0)
             if self._over() or self.goal.met(point):
@@ -566,7 +537,10 @@ class Refinement:
                 count = min(parts, self._cells_left())
                 if self._over() or count < 2 or (changes and not room):
                     break
-                added += self._split(cell, rows, count, changes)
+                try:
+                    added += self._split(cell, rows, count, changes)
+                except AbandonedError:
+                    break
                 fresh.update(rows)
                 # by number, not by time: where a round ends must not depend on the machine
                 if (number + 1) % look == 0 and number + 1 < len(jobs):
@@ -600,7 +574,7 @@ class Refinement:
         jobs = []
         for cell, rows in by_cell.values():
             ordered = sorted(rows.items())
-            step = self.frame.batch or len(ordered)
+            step = self.frame.tiles_at_once or len(ordered)
             jobs += [(cell, dict(ordered[i : i + step])) for i in range(0, len(ordered), step)]
         # excess falls at least in proportion to the width: far from the goal, levels are skipped
         allowed = (self.goal.ratio - 1.0) * float((self.witness_upper - self.witness_lower)[self.inside].sum())
@@ -613,7 +587,7 @@ class Refinement:
         """
         excess: list[np.ndarray] = [np.empty(0)]
         owner: list[tuple[int, int]] = []
-        contexts: dict[int, Any] = {}
+        contexts: dict[int, Context | None] = {}
         self._held_bytes = 0
         for t, tile in enumerate(self.tiles):
             if tile.lower is None or tile.upper is None:
@@ -630,7 +604,7 @@ class Refinement:
                 contexts[id(cell.context)] = cell.context
             excess.append(amount)
             owner.extend((t, k) for k in range(amount.size))
-        self._held_bytes += sum(_array_bytes(context) for context in contexts.values())
+        self._held_bytes += sum(_context_bytes(context) for context in contexts.values())
         return np.concatenate(excess), owner
 
     def _close_least(self, order: np.ndarray, owner: list[tuple[int, int]]) -> None:
@@ -674,7 +648,7 @@ class Refinement:
         for child, (_, _, bounds) in zip(children, found, strict=True):
             self._keep(child, bounds, tiles, cell)
             if child.context is not cell.context:
-                added += _array_bytes(child.context)
+                added += _context_bytes(child.context)
         return added
 
     # --- results -------------------------------------------------------------------------------
@@ -751,7 +725,7 @@ def groups(frame: Frame, count: int) -> list[np.ndarray]:
     """
     count = max(1, min(count, frame.tile_count))
     everything = np.arange(frame.tile_count)
-    if frame.batch is not None:
+    if frame.tilewise:
         return [everything[k::count] for k in range(count)]
     return np.array_split(everything, count)
 
@@ -761,7 +735,7 @@ def shared_goal(frame: Frame, index: int, goal: Goal, seed: int) -> Goal:
 
     Parts that hardly move would never come near a ratio; they may miss it by what the others stay below it.
     """
-    if frame.batch is not None or not frame.box.dimensions:
+    if frame.tilewise or not frame.box.dimensions:
         return goal
     excess = goal.ratio - 1.0
     # rounding of means must not turn the sum around
@@ -804,9 +778,8 @@ def _usable_linear(linear: tuple[np.ndarray, ...]) -> tuple[np.ndarray, ...]:
     return tuple(found)
 
 
-def _array_bytes(holder: Any) -> int:
-    """Bytes of the arrays that an object's attributes hold."""
-    return sum(value.nbytes for value in getattr(holder, "__dict__", {}).values() if isinstance(value, np.ndarray))
+def _context_bytes(context: Context | None) -> int:
+    return 0 if context is None else context.nbytes
 
 
 def _linear_bytes(bounds: Bounds) -> int:

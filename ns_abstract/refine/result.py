@@ -1,4 +1,4 @@
-"""What refinement knows about one frame: an abstract image, its witnesses, and how it got there."""
+"""What refinement knows about one frame: an abstract image, its witnesses, and how it got there (design.md, R6)."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ns_abstract.sets.box import ParameterBox
-from ns_abstract.sets.tiles import assemble, tile_grid
+from ns_abstract.geometry.box import ParameterBox
+from ns_abstract.geometry.tiles import assemble, tile_grid
 
 Float32Array = NDArray[np.float32]
 Float64Array = NDArray[np.float64]

@@ -9,8 +9,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from ns_abstract.atomic import write_atomic
-from ns_abstract.errors import InputError
+from ns_abstract.io.atomic import write_atomic
+from ns_abstract.io.folder import unwritable
 from ns_abstract.report.record import guarantee_text, plain, versions
 
 VERSION = 1
@@ -25,6 +25,7 @@ METRICS = {
     "substitution": "certified cells bounded in weaker ways, too: margin on the cell, and the largest half-widths "
     "about its middle that each way certifies, on a ladder of steps by the given factor; says how much the shared "
     "parameters are worth, and is no part of the certificate",
+    "cells_seal": "rows of cells that have a verdict, and the sum of their SHA-256: --resume refuses other rows",
     "PCP-S": "parts of the fixed partition where no sample breaks the property (certified ones cannot be broken)",
     "PCP-V": "parts of the fixed partition that are certified as a whole",
 }
@@ -93,6 +94,7 @@ def certificate_document(
     seconds: float,
     effort: Mapping[str, float],
     reasons: Mapping[str, int],
+    cells_seal: Mapping[str, Any],
     substitution: Mapping[str, Any],
 ) -> dict[str, Any]:
     """Content of report.json.
@@ -106,6 +108,7 @@ def certificate_document(
         seconds: Wall time, earlier runs included.
         effort: Figures of the work done.
         reasons: Why cells are unknown, and how many.
+        cells_seal: Number of rows of ``cells`` with a verdict, and the sum of their hashes.
         substitution: A few certified cells bounded in weaker ways, too.
     """
     covered = coverage(frames)
@@ -140,6 +143,7 @@ def certificate_document(
             "seconds": seconds,
             "effort": effort,
             "unknown_because": reasons,
+            "cells_seal": cells_seal,
             "substitution": substitution,
             "plan": run.plan,
             "limits": run.limits,
@@ -166,6 +170,4 @@ def write_certificate(folder: Path, document: Mapping[str, Any], page: str) -> N
         write_atomic(folder / "report.json", lambda stream: stream.write(f"{text}\n".encode()))
         write_atomic(folder / "report.html", lambda stream: stream.write(page.encode()))
     except OSError as error:
-        raise InputError(
-            f"cannot be written: {error.strerror}", file=folder, field="--output-dir", fix="choose another folder"
-        ) from None
+        raise unwritable(folder, error) from None

@@ -351,10 +351,7 @@ def _frames(document: Mapping[str, Any]) -> str:
             f"<td>{percent(entry['sampled']['sampled_right'])}</td><td>{number(entry['least_margin'])}</td></tr>"
         )
 
-    head = "".join(
-        f"<th>{name}</th>"
-        for name in (*_VERDICTS, *_COLUMNS)
-    )
+    head = "".join(f"<th>{name}</th>" for name in (*_VERDICTS, *_COLUMNS))
     reasons = "".join(
         f"<li>{escape(reason)}: {counted(cells, 'cell')}</li>" for reason, cells in document["unknown_because"].items()
     )

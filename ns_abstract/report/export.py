@@ -11,13 +11,16 @@ from typing import Any, BinaryIO
 
 import numpy as np
 
-from ns_abstract.atomic import write_atomic
-from ns_abstract.errors import InputError
+from ns_abstract.io.atomic import write_atomic
+from ns_abstract.io.errors import InputError
+from ns_abstract.io.jsonio import load_json
 from ns_abstract.refine.result import FrameResult, gap
 from ns_abstract.report.files import IMAGES, frame_index, load_frame
 from ns_abstract.report.picture import heat, to_bytes
+from ns_abstract.report.record import file_stamp, frame_digests
 
 PICTURES = ("lower", "upper", "gap", "witness", "image")
+_REPORT_LIMIT = 2**30
 _FIX_RESULTS = "give the folder that ns-abstract-render wrote"
 
 
@@ -28,7 +31,10 @@ class Results:
         folder: The folder.
 
     Raises:
-        InputError: There are no frames in it, one is damaged, or their sizes differ.
+        InputError: There are no frames in it, one is damaged or not the one that was written, or their sizes differ.
+
+    Attributes:
+        checked: Whether report.json is there and says of all of them that they are as they were written.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -41,6 +47,17 @@ class Results:
         if not files:
             raise InputError("no frame_*.npz here", file=folder, field="--input-dir", fix=_FIX_RESULTS)
         self.files = dict(sorted(files.items()))
+        report = folder / "report.json"
+        self.checked = report.exists()
+        if self.checked:
+            digests = frame_digests(load_json(report, "report", limit=_REPORT_LIMIT))
+            for file in self.files.values():
+                if digests.get(file.name) != file_stamp(file)["sha256"]:
+                    raise InputError(
+                        "not as report.json knows it",
+                        file=file,
+                        fix="wait for the command that writes it, or bound it again with ns-abstract-render --resume",
+                    )
         self.size: tuple[int, int] = (0, 0)
         self.largest = 0.0
         self.guarantees: set[str] = set()

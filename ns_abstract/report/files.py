@@ -7,9 +7,7 @@ import json
 import math
 import os
 import re
-import struct
 import zipfile
-import zlib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields
 from pathlib import Path
@@ -17,11 +15,13 @@ from typing import Any, BinaryIO
 
 import numpy as np
 
-from ns_abstract.atomic import write_atomic
-from ns_abstract.errors import InputError
-from ns_abstract.jsonio import parse_json
+from ns_abstract.geometry.box import ParameterBox
+from ns_abstract.io.arrays import Archive, open_archive
+from ns_abstract.io.atomic import write_atomic
+from ns_abstract.io.errors import InputError
+from ns_abstract.io.jsonio import parse_json
+from ns_abstract.methods.runs import check_memory
 from ns_abstract.refine.result import FrameResult, Leaves, TracePoint
-from ns_abstract.sets.box import ParameterBox
 
 FORMAT = "ns-abstract frame"
 VERSION = 1
@@ -34,11 +34,8 @@ _NAME = re.compile(r"frame_(\d{5,})\.npz")
 _IGNORED = "the frame is computed again"
 # Level 6 takes longer and saves 1 to 3 % more of two real frames.
 _COMPRESSION = 1
-# What zipfile, zlib, numpy and a record of the wrong shape raise on damaged files.
-_DAMAGE = (
-    OSError, EOFError, ValueError, LookupError, TypeError, AttributeError, ArithmeticError, RuntimeError,
-    MemoryError, SyntaxError, zipfile.BadZipFile, zlib.error, struct.error,
-)  # fmt: skip
+#: Most bytes of the record (a text of 4 bytes by character) and of the table of parameters.
+_RECORD_LIMIT, _TABLE_LIMIT = 64 << 20, 1 << 20
 
 
 def frame_name(index: int, suffix: str) -> str:
@@ -50,12 +47,6 @@ def frame_index(path: Path) -> int | None:
     """The frame number in the name of a frame file, or None for any other name."""
     match = _NAME.fullmatch(path.name)
     return int(match[1]) if match else None
-
-
-def remove_parts(folder: Path) -> None:
-    """Remove what killed runs left of unfinished files."""
-    for part in folder.glob(".*.????????.part"):
-        part.unlink(missing_ok=True)
 
 
 def check_frame(result: FrameResult) -> None:
@@ -193,12 +184,15 @@ class StoredFrame:
     has_leaves: bool
 
 
-def load_frame(path: str | os.PathLike[str], *, leaves: bool = True) -> StoredFrame:
+def load_frame(
+    path: str | os.PathLike[str], *, leaves: bool = True, size: tuple[int, int] | None = None
+) -> StoredFrame:
     """Read a frame file and check all of it; nothing in the file is run.
 
     Args:
         path: A file that `save_frame` wrote.
         leaves: Whether to read the leaf cells, which may be large.
+        size: Height and width that the frame must have; None: any for which there is memory.
 
     Raises:
         InputError: The file is absent, truncated, damaged or not a frame file, or holds what no
@@ -209,19 +203,20 @@ def load_frame(path: str | os.PathLike[str], *, leaves: bool = True) -> StoredFr
     def fail(problem: str) -> InputError:
         return InputError(problem, file=path, fix=_IGNORED)
 
+    if not path.exists():
+        raise fail("no such file")
     try:
-        with np.load(path, allow_pickle=False) as archive:
-            names = set(archive.files) if isinstance(archive, np.lib.npyio.NpzFile) else set()
-            missing = {*IMAGES, "parameters", "record"} - names
+        with open_archive(path, "frame file", _IGNORED) as archive:
+            missing = {*IMAGES, "parameters", "record"} - set(archive.declared)
             if missing:
                 raise fail(f"not a frame file: no {', '.join(sorted(missing))}")
-            stored = _parse(archive, set(LEAVES) <= names, leaves)
+            has_leaves = set(LEAVES) <= set(archive.declared)
+            _check_declared(archive, size, has_leaves and leaves, path)
+            stored = _parse(archive, has_leaves, leaves)
         check_frame(stored.result)
     except InputError as error:
         raise error if error.file else fail(error.problem) from None
-    except FileNotFoundError:
-        raise fail("no such file") from None
-    except _DAMAGE as error:
+    except ValueError as error:
         raise fail(f"cannot be read: {type(error).__name__}: {error}") from None
     named = frame_index(path)
     if named is not None and named != stored.result.index:
@@ -229,13 +224,34 @@ def load_frame(path: str | os.PathLike[str], *, leaves: bool = True) -> StoredFr
     return stored
 
 
-def _parse(archive: Mapping[str, np.ndarray], has_leaves: bool, read_leaves: bool) -> StoredFrame:
-    record = parse_json(str(archive["record"][()]))
+def _check_declared(archive: Archive, size: tuple[int, int] | None, leaves: bool, path: Path) -> None:
+    """Refuse arrays that no frame has, or that there is no memory for, before they are unpacked."""
+    (shape, kind) = archive.declared["lower"]
+    if len(shape) != 3 or shape[2] != 3 or kind != np.float32:
+        raise InputError(f"lower is {kind} {list(shape)[:4]}, not float32 [H, W, 3]")
+    for name in IMAGES:
+        if archive.declared[name] != (shape, kind):
+            raise InputError(
+                f"{name} is {archive.declared[name][1]} {list(archive.declared[name][0])[:4]}, unlike lower"
+            )
+    if size is not None and shape[:2] != size:
+        raise InputError(f"has {shape[1]} x {shape[0]} pixels, not {size[1]} x {size[0]}")
+    for name, most in (("record", _RECORD_LIMIT), ("parameters", _TABLE_LIMIT)):
+        rows, kind = archive.declared[name]
+        if math.prod(rows) * kind.itemsize > most:
+            raise InputError(f"{name} has {math.prod(rows) * kind.itemsize:,} bytes")
+    wanted = (*IMAGES, *(LEAVES if leaves else ()))
+    needed = sum(math.prod(archive.declared[name][0]) * archive.declared[name][1].itemsize for name in wanted)
+    check_memory(2 * needed, path, "the frame")
+
+
+def _parse(archive: Archive, has_leaves: bool, read_leaves: bool) -> StoredFrame:
+    record = parse_json(str(archive.read("record")[()]))
     if not isinstance(record, dict) or record.get("format") != FORMAT:
         raise InputError("not a frame file")
     if record.get("version") != VERSION:
         raise InputError(f"frame file of version {record.get('version')}, not {VERSION}")
-    table = archive["parameters"]
+    table = archive.read("parameters")
     if table.ndim != 1 or table.dtype.names != ("name", "unit", "lower", "upper"):
         raise InputError("the parameters are not a list of (name, unit, lower, upper)")
     box = ParameterBox(
@@ -247,13 +263,13 @@ def _parse(archive: Mapping[str, np.ndarray], has_leaves: bool, read_leaves: boo
     result = FrameResult(
         index=_integer(record["index"]),
         box=box,
-        **{name: archive[name] for name in IMAGES},
+        **{name: archive.read(name) for name in IMAGES},
         seconds=float(record["seconds"]),
         cells=_integer(record["cells"]),
         trace=tuple(TracePoint(float(s), _integer(c), float(m), float(w)) for s, c, m, w in record["trace"]),
         plan=tuple(map(str, record["plan"])),
         bounded=record["bounded"] is True,
-        leaves=Leaves(**{name: archive[name] for name in LEAVES}) if has_leaves and read_leaves else None,
+        leaves=Leaves(**{name: archive.read(name) for name in LEAVES}) if has_leaves and read_leaves else None,
     )
     if record["status"] not in ("done", "partial", "missing"):
         raise InputError("the status is not one of done, partial, missing")

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ns_abstract.atomic import write_atomic
+from ns_abstract.io.atomic import write_atomic
 from ns_abstract.refine.result import FrameResult, gap, max_pixel_gap
 from ns_abstract.report.figures import interval, metrics, number
 
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-    from ns_abstract.sets.box import ParameterBox
+    from ns_abstract.geometry.box import ParameterBox
 
 #: Colour map of gaps: perceptually uniform, black where the bounds meet.
 GAP_COLORS = "inferno"

@@ -16,9 +16,10 @@ from typing import Any, Literal
 
 import numpy as np
 
-from ns_abstract.atomic import write_atomic
-from ns_abstract.errors import InputError
-from ns_abstract.jsonio import file_size, is_number, load_json
+from ns_abstract.io.atomic import write_atomic
+from ns_abstract.io.errors import InputError
+from ns_abstract.io.folder import remove_parts, unwritable
+from ns_abstract.io.jsonio import file_size, is_number, load_json
 from ns_abstract.refine.result import FrameResult, TracePoint
 from ns_abstract.report.figures import metrics
 from ns_abstract.report.files import (
@@ -27,7 +28,6 @@ from ns_abstract.report.files import (
     frame_index,
     frame_name,
     load_frame,
-    remove_parts,
     save_frame,
 )
 
@@ -52,13 +52,15 @@ METRICS = {
     "ratio": "mpg / mpg_witness; null where that is no finite number; never below 1 for sound bounds",
     "seconds": "wall time spent on the frame",
     "cells": "cells (boxes of parameters) bounded",
+    "sha256": "of the npz files; a file that is another one is not continued with --resume, nor exported",
     "images": "RGB in [0, 1], so gaps lie in [0, sqrt(3)]",
 }
 
 _PROGRAMS = {"gsplat": "gsplat's formulas give", "paper": "the paper's Algorithm 1 gives"}
 _LIMITS = {
-    "gsplat": "Weakest link: the CUDA program itself is modelled from its source, not run. The bounds hold as far as "
-    "gsplat's source was read rightly and the compiled program follows it within CUDA's documented error bounds.",
+    "gsplat": "Weakest link: the compiled CUDA program was not run on a GPU. The formulas were checked against "
+    "gsplat's own kernels compiled for a CPU; the bounds hold as far as the device follows them within CUDA's "
+    "documented errors.",
     "paper": "Weakest link: Algorithm 1 is the paper's, not what Nerfstudio shows; use the gsplat renderer for that.",
 }
 
@@ -126,6 +128,12 @@ def file_stamp(path: str | os.PathLike[str]) -> dict[str, Any]:
     return {"name": path.name, "bytes": size, "sha256": digest.hexdigest()}
 
 
+def frame_digests(document: Any) -> dict[str, str]:
+    """SHA-256 of the frame files by name, as report.json has them; what is damaged is left out."""
+    known = document.get("sha256") if isinstance(document, dict) else None
+    return {str(k): v for k, v in known.items() if isinstance(v, str)} if isinstance(known, dict) else {}
+
+
 def versions() -> dict[str, str | None]:
     """Versions of what computed the bounds; None where a package has no metadata."""
     found: dict[str, str | None] = {"python": platform.python_version(), "machine": platform.machine()}
@@ -154,6 +162,7 @@ class Run:
         plan: What was left out for this scene and why, one sentence each.
         command: The command line.
         limits: Further conditions on the guarantee, one sentence each.
+        size: Height and width of the pictures; None: any that stored frames have.
     """
 
     guarantee: str
@@ -165,6 +174,7 @@ class Run:
     plan: tuple[str, ...] = ()
     command: tuple[str, ...] = ()
     limits: tuple[str, ...] = ()
+    size: tuple[int, int] | None = None
 
 
 def _leaves_of(value: Any, path: str = "") -> dict[str, Any]:
@@ -261,6 +271,7 @@ class Report:
         self.ignored: list[str] = []
         self._entries: dict[int, dict[str, Any]] = {}
         self._before: dict[int, tuple[float, int, tuple[TracePoint, ...]]] = {}
+        self._digests: dict[str, str] = {}
         self._previews: dict[int, Mapping[str, bytes]] = {}
         self._undrawn: set[int] = set()
         self._state = "running"
@@ -282,16 +293,18 @@ class Report:
             remove_parts(folder)
             self._found = sorted(path.name for kind in ("npz", "png") for path in folder.glob(f"frame_*.{kind}"))
         except OSError as error:
-            raise _unwritable(folder, error) from None
+            raise unwritable(folder, error) from None
 
     def _keep(self) -> None:
         run, path = self.run, self.folder / "report.json"
+        digests: dict[str, str] = {}
         if path.exists():
             try:
                 old = load_json(path, "report", limit=_JSON_LIMIT)
             except InputError as error:
                 old = None
                 self.ignored.append(f"report.json: {error.problem}")
+            digests = frame_digests(old)
             prints = old.get("fingerprint") if isinstance(old, dict) else None
             if isinstance(prints, dict):
                 changed = differences(prints, run.fingerprint)
@@ -307,12 +320,17 @@ class Report:
         for index in sorted({index for index in stored_before if index is not None}):
             path = self.folder / frame_name(index, "npz")
             try:
-                stored = load_frame(path, leaves=False)
+                stored = load_frame(path, leaves=False, size=run.size)
+                digest = file_stamp(path)["sha256"]
             except InputError as error:
                 self.ignored.append(f"{path.name}: {error.problem}")
                 continue
+            if digest == digests.get(path.name):
+                self._digests[path.name] = digest
             if differences(stored.about.get("fingerprint") or {}, run.fingerprint):
                 self.ignored.append(f"{path.name}: computed with other settings")
+            elif path.name not in self._digests:
+                self.ignored.append(f"{path.name}: not as report.json knows it, so it is computed again")
             elif run.settings.get("save_cells") and not stored.has_leaves:
                 self.ignored.append(f"{path.name}: has no leaf cells")
             else:
@@ -383,13 +401,14 @@ class Report:
             status = "done" if self._reached(result) else "partial"
         try:
             save_frame(path, result, status=status, about=self._about)
+            self._digests[path.name] = file_stamp(path)["sha256"]
             self._entries[index] = self._entry(result, status)
             self._previews.pop(index, None)
             self._undrawn.add(index)
             if picture:
                 self._draw(result)
         except OSError as error:
-            raise _unwritable(self.folder, error) from None
+            raise unwritable(self.folder, error) from None
         self._publish(page=time.monotonic() >= self._page_due)
         return self._entries[index]
 
@@ -418,7 +437,7 @@ class Report:
             for index in sorted(self._undrawn):
                 self._draw(load_frame(self.folder / frame_name(index, "npz"), leaves=False).result)
         except OSError as error:
-            raise _unwritable(self.folder, error) from None
+            raise unwritable(self.folder, error) from None
         self._publish(page=True)
         return self.document()
 
@@ -471,6 +490,7 @@ class Report:
                 "settings": run.settings,
                 "fingerprint": run.fingerprint,
                 "command": run.command,
+                "sha256": self._digests,
                 "packages": self._packages,
                 "started": self._started,
                 "updated": _now(),
@@ -488,7 +508,7 @@ class Report:
             if page:
                 self._write_page(document)
         except OSError as error:
-            raise _unwritable(self.folder, error) from None
+            raise unwritable(self.folder, error) from None
 
     def _write_page(self, document: dict[str, Any]) -> None:
         from ns_abstract.report.page import render_page, shown_frames
@@ -513,11 +533,3 @@ class Report:
 
 def _now() -> str:
     return time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime())
-
-
-def _unwritable(folder: Path, error: OSError) -> InputError:
-    return InputError(
-        f"cannot be written: {error.strerror or type(error).__name__}",
-        file=folder,
-        fix="give an --output-dir on a disk with space where files may be made",
-    )

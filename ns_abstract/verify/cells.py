@@ -1,4 +1,4 @@
-"""Cells of a set of poses on an integer grid, so that they tile it exactly (docs/design.md, V6)."""
+"""Cells of a set of poses on an integer grid, so that they tile it exactly (docs/design.md, V6, V7)."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ns_abstract.errors import InputError
-from ns_abstract.sets.box import ParameterBox
+from ns_abstract.geometry.box import ParameterBox
+from ns_abstract.io.errors import InputError
 
 #: Halvings of a first cell along each parameter.
 HALVINGS = 10
@@ -88,13 +88,9 @@ class Grid:
 
     def roots(self) -> list[Cell]:
         """The first cells, in order."""
-        lines = [
-            [n * i // c for i in range(c + 1)] for n, c in zip(self.units, self.coarse, strict=True)
-        ]
+        lines = [[n * i // c for i in range(c + 1)] for n, c in zip(self.units, self.coarse, strict=True)]
         spans = [list(itertools.pairwise(line)) for line in lines]
-        return [
-            Cell(tuple(a for a, _ in part), tuple(b for _, b in part)) for part in itertools.product(*spans)
-        ]
+        return [Cell(tuple(a for a, _ in part), tuple(b for _, b in part)) for part in itertools.product(*spans)]
 
     def split(self, cell: Cell, slopes: np.ndarray, parts: int) -> list[Cell]:
         """The cell cut along the parameter with the largest slope that has more than one unit; empty if none has.

@@ -1,5 +1,7 @@
 """Abstract images for other verifiers: ONNX with the linear renderer in front of the network, and VNN-LIB.
 
+See design.md, N8.
+
 The written network takes ``X = (p, e)``, the cell's parameters p in [-1, 1]^d and one e in [-1, 1] for every
 number of the image, and computes ``A p + c + r e`` (the abstract image), the network, and the rows of the
 property. The VNN-LIB file (version 1) asks for an X in that box with a group of rows none of which is positive:
@@ -16,10 +18,10 @@ import numpy as np
 import onnx
 from onnx import TensorProto, helper, numpy_helper
 
-from ns_abstract.atomic import write_atomic
-from ns_abstract.errors import InputError
+from ns_abstract.io.atomic import write_atomic
+from ns_abstract.io.errors import InputError
 from ns_abstract.verify.network import ImageSets, load_network
-from ns_abstract.verify.network.onnx_file import parse_model
+from ns_abstract.verify.network.onnx_tensors import parse_model
 
 Form = Literal["slice", "gemm"]
 

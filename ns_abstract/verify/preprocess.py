@@ -13,9 +13,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 
-from ns_abstract.arithmetic.units import UNIT64
-from ns_abstract.errors import InputError
-from ns_abstract.jsonio import is_number, show
+from ns_abstract.arithmetic.rounding import UNIT64
+from ns_abstract.io.errors import InputError
+from ns_abstract.io.jsonio import FIX_MODERATE, is_moderate, show
 
 if TYPE_CHECKING:
     from ns_abstract.verify.network import ImageSets
@@ -152,8 +152,8 @@ def parse_preprocess(value: Any) -> Preprocess:
 
     def numbers(name: str, count: int, default: tuple[float, ...]) -> tuple[float, ...]:
         found = value.get(name, list(default))
-        if not (isinstance(found, list) and len(found) == count and all(is_number(v) for v in found)):
-            raise fail(f".{name}", found, f"write {count} finite numbers")
+        if not (isinstance(found, list) and len(found) == count and all(is_moderate(v) for v in found)):
+            raise fail(f".{name}", found, f"write {count} numbers, each {FIX_MODERATE}")
         return tuple(float(v) for v in found)
 
     def choice(name: str, choices: tuple[str, str]) -> str:

@@ -19,11 +19,11 @@ import numpy as np
 import torch
 
 from ns_abstract.arithmetic.forms import FormArray
-from ns_abstract.errors import InputError
-from ns_abstract.jsonio import is_number, load_json, show
-from ns_abstract.sets.box import ParameterBox
-from ns_abstract.sets.poses import PoseSet
-from ns_abstract.sets.twin import pose_twin
+from ns_abstract.geometry.box import ParameterBox
+from ns_abstract.geometry.differentiable_pose import differentiable_pose
+from ns_abstract.geometry.poses import PoseSet
+from ns_abstract.io.errors import InputError
+from ns_abstract.io.jsonio import FIX_MODERATE, MODERATE, file_beside, is_moderate, is_number, load_json, show
 from ns_abstract.verify.preprocess import Preprocess, parse_preprocess
 from ns_abstract.verify.vnnlib import UnsafeSet, load_vnnlib
 
@@ -226,7 +226,7 @@ class RegressionClaim(Claim):
     pose_set: PoseSet
 
     def margin(self, outputs: torch.Tensor, values: torch.Tensor) -> torch.Tensor:
-        pose = pose_twin(self.pose_set)
+        pose = differentiable_pose(self.pose_set)
         truth = torch.stack([self.truth.at(pose(v.to(torch.float64))) for v in values]).to(outputs.dtype)
         error = outputs - truth
         if self.relative is not None:
@@ -504,7 +504,7 @@ def load_property(path: Path, input_shape: tuple[int, ...], output_shape: tuple[
     """
     root = load_json(path, "property file")
     try:
-        return _parse(root, path, input_shape, math.prod(output_shape))
+        return parse_property(root, path.parent, input_shape, output_shape)
     except InputError as error:
         raise error.within(path) from None
 
@@ -513,7 +513,13 @@ def _fail(name: str, found: Any, fix: str) -> InputError:
     return InputError(f"found {show(found)}", field=name, fix=fix)
 
 
-def _parse(root: Any, path: Path, input_shape: tuple[int, ...], outputs: int) -> Property:
+def parse_property(root: Any, folder: Path, input_shape: tuple[int, ...], output_shape: tuple[int, ...]) -> Property:
+    """The property that a parsed PROP.json describes; files that it names lie in ``folder``.
+
+    Raises:
+        InputError: A field cannot be used.
+    """
+    outputs = math.prod(output_shape)
     if not isinstance(root, dict):
         raise InputError(f"the top level is {show(root)}, not an object", fix='write {"type": ...}')
     kind = root.get("type")
@@ -537,7 +543,10 @@ def _parse(root: Any, path: Path, input_shape: tuple[int, ...], outputs: int) ->
     name = root.get("file")
     if not isinstance(name, str) or not name:
         raise _fail("file", name, "write the name of a VNN-LIB file, relative to this one")
-    file = path.parent / name
+    try:
+        file = file_beside(folder, name)
+    except InputError as error:
+        raise InputError(error.problem, field="file", fix=error.fix) from None
     return VnnLib(file=file, unsafe=load_vnnlib(file, outputs), **common)
 
 
@@ -566,19 +575,19 @@ def _regression(root: dict[str, Any], outputs: int, common: dict[str, Any]) -> P
         target = [f"{target}.{axis}" for axis in "xyz"]
     elif target == "distance":
         target = [target]
-    if not isinstance(target, list) or not all(is_number(v) or v in _COMPONENTS for v in target):
-        names = ", ".join(_COMPONENTS)
-        raise _fail("target", root.get("target"), f"write camera, object, distance, or a list of numbers or {names}")
+    if not isinstance(target, list) or not all(is_moderate(v) or v in _COMPONENTS for v in target):
+        names = f"numbers ({FIX_MODERATE}) or {', '.join(_COMPONENTS)}"
+        raise _fail("target", root.get("target"), f"write camera, object, distance, or a list of {names}")
     if len(target) != outputs:
         raise InputError(
             f"{len(target)} values, the network has {outputs} outputs", field="target", fix="write one value by output"
         )
     origin = root.get("origin", [0.0, 0.0, 0.0])
-    if not (isinstance(origin, list) and len(origin) == 3 and all(is_number(v) for v in origin)):
-        raise _fail("origin", origin, "write three finite numbers, a point of the normalised frame")
+    if not (isinstance(origin, list) and len(origin) == 3 and all(is_moderate(v) for v in origin)):
+        raise _fail("origin", origin, f"write a point of the normalised frame, each number {FIX_MODERATE}")
     scale = root.get("scale", 1.0)
-    if not is_number(scale) or scale == 0:
-        raise _fail("scale", scale, "write a finite number other than 0")
+    if not is_moderate(scale) or scale == 0:
+        raise _fail("scale", scale, f"write a number other than 0: {FIX_MODERATE}")
     tolerance = root.get("tolerance")
     if not isinstance(tolerance, dict) or len(tolerance) != 1 or not set(tolerance) <= {"absolute", "relative"}:
         raise _fail("tolerance", tolerance, 'write {"relative": 0.2} or {"absolute": 0.1}')
@@ -586,9 +595,10 @@ def _regression(root: dict[str, Any], outputs: int, common: dict[str, Any]) -> P
     relative: float | None = None
     name, value = next(iter(tolerance.items()))
     values: list[Any] = value if isinstance(value, list) and name == "absolute" else [value]
-    if not all(is_number(v) and v > 0 for v in values) or len(values) not in (1, outputs):
+    if not all(is_moderate(v) and v > 0 for v in values) or len(values) not in (1, outputs):
         more = f" or {outputs} of them" if name == "absolute" else ""
-        raise _fail(f"tolerance.{name}", value, f"write a number above 0{more}")
+        low, high = MODERATE
+        raise _fail(f"tolerance.{name}", value, f"write a number from {low:g} to {high:g}{more}")
     if name == "absolute":
         absolute = tuple(float(v) for v in values)
     else:
@@ -613,10 +623,10 @@ def _detection(root: dict[str, Any], outputs: int, height: int, width: int, comm
     if label is not None and (type(label) is not int or not 0 <= label < _CLASSES):
         raise _fail("class", label, f"write an integer from 0 to {_CLASSES - 1}, or null for objectness alone")
     for name, value in (("iou", iou), ("confidence", confidence)):
-        if not (name == "iou" and value is None) and not (is_number(value) and 0 < value < 1):
-            raise _fail(name, value, "write a number between 0 and 1")
+        if not (name == "iou" and value is None) and not (is_number(value) and MODERATE[0] <= value < 1):
+            raise _fail(name, value, f"write a number from {MODERATE[0]:g} to 1")
     if box is not None:
-        good = isinstance(box, list) and len(box) == 4 and all(is_number(v) for v in box)
+        good = isinstance(box, list) and len(box) == 4 and all(is_moderate(v) for v in box)
         if not good or not (box[0] < box[2] and box[1] < box[3]):
             raise _fail("box", box, "write [x0, y0, x1, y1] in pixels of the network's input")
         if iou is None:

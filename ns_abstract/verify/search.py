@@ -15,8 +15,9 @@ from typing import TYPE_CHECKING, Any, Literal, Protocol
 import numpy as np
 import torch
 
-from ns_abstract.errors import InputError
-from ns_abstract.sets.box import ParameterBox
+from ns_abstract.execution.ending import checkpoint
+from ns_abstract.geometry.box import ParameterBox
+from ns_abstract.io.errors import InputError
 from ns_abstract.verify.cells import Cell, Grid
 from ns_abstract.verify.properties import Claim, Query
 
@@ -30,6 +31,11 @@ BLOCK = 8
 #: Mean width of the linear sets, as a part of the range of a pixel, from which on a cell that can be cut is cut
 #: without asking the network.
 _HOPELESS = 0.1
+#: Rank of first cells: behind what is known to be near a proof, before what has been found to be far from one.
+RANK_FIRST = 1e3
+#: Rank of cells of which nothing is known, and of those in which the property fails in places: they are cut to the end,
+#: and what is left shrinks slowly.
+_RANK_UNKNOWN, _RANK_BROKEN = 1e6, 2e3
 #: A cell is cut into four where its bound misses by more than so many times the margin that samples show.
 _FAR = 4.0
 #: Corners sampled before and after a cell's bounds are known, and random poses besides.
@@ -52,7 +58,7 @@ class Scene(Protocol):
         """(A_lower, b_lower, A_upper, b_upper) [H, W, 3, d] and [H, W, 3], lower, upper, and slopes [d]."""
         ...
 
-    def twin(self, values: torch.Tensor) -> torch.Tensor:
+    def differentiable(self, values: torch.Tensor) -> torch.Tensor:
         """Picture [H, W, 3] at parameter values [d], differentiable."""
         ...
 
@@ -109,6 +115,7 @@ class Findings:
     Attributes:
         leaves: Cells that are done with.
         blocks: Cells to examine next.
+        ranks: How far off a proof of each block is, about (see `Search._rank`); the nearest are best examined first.
         samples: Whether the property holds at the middle of each cell.
         bounded: Cells whose network bounds were computed.
         seconds: Time spent.
@@ -119,6 +126,7 @@ class Findings:
     samples: tuple[tuple[Cell, bool], ...]
     bounded: int
     seconds: float
+    ranks: tuple[float, ...] = ()
 
 
 @dataclass
@@ -132,13 +140,18 @@ class _Seen:
 
     @property
     def worst(self) -> int:
-        """The pose with the smallest margin; NaN is smaller than any."""
-        return int(np.argmin(np.where(np.isnan(self.margins), -np.inf, self.margins)))
+        """The pose with the smallest margin that is a number."""
+        return int(np.argmin(np.where(np.isfinite(self.margins), self.margins, np.inf)))
 
     @property
     def broken(self) -> int:
         """Poses at which the property fails."""
-        return sum(not margin > 0.0 for margin in self.margins)
+        return sum(math.isfinite(margin) and margin <= 0.0 for margin in self.margins)
+
+    @property
+    def undecided(self) -> int:
+        """Poses of whose margin nothing is known: it is no finite number."""
+        return sum(not math.isfinite(margin) for margin in self.margins)
 
 
 class Search:
@@ -168,17 +181,22 @@ class Search:
 
     def margins(self, poses: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
         """[s] concrete margins and [s, n] outputs at parameter values."""
-        images = np.stack([self.scene.image(values) for values in poses])
+        images = np.stack([self._image(values) for values in poses])
         outputs = np.asarray(self.model.outputs(images), np.float64)
         with torch.no_grad():
             margin = self.claim.margin(torch.from_numpy(outputs), torch.from_numpy(np.stack(poses)))
         return margin.numpy(), outputs
+
+    def _image(self, values: np.ndarray) -> np.ndarray:
+        checkpoint()
+        return self.scene.image(values)
 
     def examine(self, block: Sequence[Cell]) -> Findings:
         """Examine the cells.
 
         Raises:
             ContradictionError: A cell was proved and has a counterexample: the program has a fault.
+            AbandonedError: There is no time for it (`ns_abstract.execution.ending`).
         """
         begin = time.perf_counter()
         seen = [_Seen(cell, self.grid.box_of(cell)) for cell in block]
@@ -186,7 +204,7 @@ class Search:
         bounded: dict[int, float] = {}
         reasons: dict[int, str] = {}
         slopes = np.zeros((len(seen), self.grid.box.dimensions))
-        open_cells = [k for k, cell in enumerate(seen) if not cell.broken]
+        open_cells = [k for k, cell in enumerate(seen) if not (cell.broken or cell.undecided)]
         if open_cells:
             self._bound([seen[k] for k in open_cells], outputs, open_cells, bounded, reasons, slopes)
         proved = {k for k in open_cells if bounded.get(k, -math.inf) > 0.0}
@@ -196,12 +214,15 @@ class Search:
         self._ascend(failing)
         leaves, children = self._settle(seen, bounded, reasons, slopes)
         seconds = time.perf_counter() - begin
-        blocks = [tuple(children[i : i + self.block]) for i in range(0, len(children), self.block)]
+        # cells of one rank are examined together
+        children.sort(key=lambda child: child[0])
+        parts = [children[i : i + self.block] for i in range(0, len(children), self.block)]
         share = seconds / len(seen)
         return Findings(
             leaves=tuple(_timed(leaf, share) for leaf in leaves),
-            blocks=tuple(blocks),
-            samples=tuple((cell.cell, cell.margins[0] > 0.0) for cell in seen),
+            blocks=tuple(tuple(cell for _, cell in part) for part in parts),
+            ranks=tuple(part[0][0] for part in parts),
+            samples=tuple((cell.cell, 0.0 < cell.margins[0] < math.inf) for cell in seen),
             bounded=len(bounded),
             seconds=seconds,
         )
@@ -265,7 +286,7 @@ class Search:
         def evaluate(scaled: torch.Tensor) -> tuple[float, torch.Tensor]:
             scaled = scaled.detach().requires_grad_(True)
             values = low + 0.5 * (scaled + 1.0) * (high - low)
-            outputs = self.model.differentiable(self.scene.twin(values)[None])
+            outputs = self.model.differentiable(self.scene.differentiable(values)[None])
             margin = self.claim.margin(outputs, values[None])[0]
             slope = torch.zeros_like(scaled)
             if margin.requires_grad:
@@ -304,6 +325,7 @@ class Search:
         kept: list[int] = []
         parts: list[Any] = []
         for number, cell in zip(numbers, cells, strict=True):
+            checkpoint()
             try:
                 linear, lower, upper, slope = self.scene.sets(cell.box)
             except InputError:
@@ -346,9 +368,9 @@ class Search:
 
     def _settle(
         self, seen: Sequence[_Seen], bounded: dict[int, float], reasons: dict[int, str], slopes: np.ndarray
-    ) -> tuple[list[Leaf], list[Cell]]:
+    ) -> tuple[list[Leaf], list[tuple[float, Cell]]]:
         leaves: list[Leaf] = []
-        children: list[Cell] = []
+        children: list[tuple[float, Cell]] = []
         for number, cell in enumerate(seen):
             bound = bounded.get(number)
             if bound is not None and bound > 0.0:
@@ -358,21 +380,41 @@ class Search:
                         f"internal error: margin proved to be at least {bound} on {cell.box.lower} to "
                         f"{cell.box.upper}, found {cell.margins[cell.worst]} at {cell.poses[cell.worst].tolist()}"
                     )
-                leaves.append(Leaf(cell.cell, "certified", bound, 0.0))
-                continue
-            hopeless = cell.broken == len(cell.margins) and not self.every_unit
+                if not cell.undecided:
+                    leaves.append(Leaf(cell.cell, "certified", bound, 0.0))
+                    continue
+                bound = None
+            if cell.undecided:
+                reasons.setdefault(number, "the margin of a picture is no finite number")
+            hopeless = cell.broken + cell.undecided == len(cell.margins) and not self.every_unit
             if self._splittable(cell.cell) and not hopeless:
-                children += self.grid.split(cell.cell, slopes[number], self._parts(cell, bound))
+                rank = self._rank(cell, bound)
+                parts = self.grid.split(cell.cell, slopes[number], self._parts(cell, bound))
+                children += [(rank, part) for part in parts]
             elif cell.broken:
                 leaves.append(self._counterexample(cell))
             else:
                 leaves.append(Leaf(cell.cell, "unknown", bound, 0.0, reason=reasons.get(number, "the finest cell")))
         return leaves, children
 
+    def _rank(self, cell: _Seen, bound: float | None) -> float:
+        """How many times the bound of ``cell`` misses the margin that samples show: its parts need about as many cuts.
+
+        Largest cells first would prove nothing for long where all cells need several cuts; the nearest to a proof
+        first go deep at once, and come back from where the property is about to fail.
+        """
+        share = cell.cell.volume / self.grid.volume
+        if cell.broken:
+            return _RANK_BROKEN - math.log2(share)
+        margin = cell.margins[cell.worst]
+        if bound is None or not 0.0 < margin < math.inf:
+            return _RANK_UNKNOWN * (1.0 + share)
+        return min((margin - bound) / margin, _RANK_UNKNOWN)
+
     def _parts(self, cell: _Seen, bound: float | None) -> int:
         if cell.broken or bound is None:
             return 4
-        margin = min(cell.margins)
+        margin = cell.margins[cell.worst]
         return 4 if margin - bound > _FAR * margin else 2
 
     def _counterexample(self, cell: _Seen) -> Leaf:
@@ -381,12 +423,12 @@ class Search:
         image = self.scene.image(values)
         margins, outputs = self.margins([values])
         margin = float(margins[0])
-        if margin > 0.0 or not cell.box.contains(values):
+        if not -math.inf < margin <= 0.0 or not cell.box.contains(values):
             return Leaf(cell.cell, "unknown", None, 0.0, reason="a counterexample was not confirmed")
         return Leaf(
             cell.cell,
             "falsified",
-            margin if math.isfinite(margin) else None,
+            margin,
             0.0,
             counterexample=tuple(values.tolist()),
             image=image,

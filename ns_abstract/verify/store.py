@@ -1,41 +1,98 @@
-"""``cells.sqlite``: what a search has found, as it comes.
+"""``cells.sqlite``: what a search has found, as it comes (design.md, V8).
 
 A block's findings are one transaction, which also takes the block off the list of open ones and puts its
 children there. So a kill at any moment loses at most the blocks that were being examined, and what arrives
 twice (a retried worker) counts once.
 
-Tables ``parameters`` and ``cells`` are for readers; ``search_*`` are the search's own.
+Tables ``parameters`` and ``cells`` are for readers; ``search_*`` are the search's own. What was changed by others
+since is noticed (`Seal`) and not continued.
 """
 
 from __future__ import annotations
 
-import fcntl
+import hashlib
 import json
 import math
 import sqlite3
 import time
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import closing, contextmanager, suppress
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
+from urllib.parse import quote
 
-from ns_abstract.errors import InputError
-from ns_abstract.sets.box import ParameterBox
+from ns_abstract.geometry.box import ParameterBox
+from ns_abstract.io.atomic import write_atomic
+from ns_abstract.io.errors import InputError
+from ns_abstract.io.folder import claim, remove_parts, unwritable
+from ns_abstract.io.jsonio import load_json
 from ns_abstract.verify.cells import Cell, Grid
-from ns_abstract.verify.search import Findings, Leaf, Verdict
+from ns_abstract.verify.search import RANK_FIRST, Findings, Leaf, Verdict
 
 NAME = "cells.sqlite"
-VERSION = 1
+VERSION = 3
+#: One open block of so many is the one with the largest cells, all others are those nearest to a proof.
+_LARGEST_EVERY = 4
+#: Folder of the images of counterexamples.
+IMAGES = "counterexamples"
 _SCHEMA = """
 CREATE TABLE parameters(position INTEGER, name TEXT, unit TEXT);
 CREATE TABLE cells(frame INTEGER, lower TEXT, upper TEXT, verdict TEXT, margin REAL, seconds REAL, counterexample TEXT);
 CREATE TABLE search_state(key TEXT PRIMARY KEY, value TEXT);
 CREATE TABLE search_frames(frame INTEGER PRIMARY KEY, units TEXT, coarse TEXT, lower TEXT, upper TEXT, total TEXT,
   certified TEXT, falsified TEXT, unknown TEXT, poses INTEGER, holding INTEGER);
-CREATE TABLE search_blocks(id INTEGER PRIMARY KEY AUTOINCREMENT, frame INTEGER, volume REAL, depth INTEGER, cells TEXT);
+CREATE TABLE search_blocks(id INTEGER PRIMARY KEY AUTOINCREMENT, frame INTEGER, volume REAL, rank REAL, depth INTEGER,
+  cells TEXT);
+CREATE INDEX search_near ON search_blocks(rank, volume, id);
+CREATE INDEX search_large ON search_blocks(volume DESC, id);
 CREATE TABLE search_reasons(reason TEXT PRIMARY KEY, cells INTEGER);
 CREATE TABLE search_trace(seconds REAL, cells INTEGER, certified REAL, falsified REAL, unknown REAL);
+CREATE TABLE search_images(name TEXT PRIMARY KEY, sha256 TEXT);
 """
+_REPORT_LIMIT = 2**30
+#: What a file that others have changed may raise when it is read.
+_DAMAGE = (sqlite3.DatabaseError, ValueError, TypeError, LookupError, AttributeError, ArithmeticError)
+_CELL = "frame, lower, upper, verdict, margin, seconds, counterexample"
+_FRAME = "frame, units, coarse, lower, upper, total, certified, falsified, unknown, poses, holding"
+_BLOCK = "id, frame, volume, rank, depth, cells"
+
+
+@dataclass
+class Seal:
+    """Number and sum of the hashes of a table's rows: rows come and go in any order, and no other rows fit.
+
+    It finds what was damaged or edited; who also writes the seal anew is not found out.
+    """
+
+    rows: int = 0
+    total: int = 0
+
+    def add(self, row: Sequence[Any], sign: int = 1) -> None:
+        """Take in a row as the file holds it, or take it out with ``sign`` -1."""
+        digest = hashlib.sha256(json.dumps(list(row)).encode()).digest()
+        self.rows += sign
+        self.total = (self.total + sign * int.from_bytes(digest, "big")) % (1 << 256)
+
+    @property
+    def text(self) -> str:
+        """The sum as 64 hexadecimal digits."""
+        return f"{self.total:064x}"
+
+
+@dataclass
+class _Seals:
+    """Of the cells that have a verdict, the open blocks and the frames."""
+
+    cells: Seal = field(default_factory=Seal)
+    blocks: Seal = field(default_factory=Seal)
+    frames: Seal = field(default_factory=Seal)
+
+    def plain(self) -> dict[str, Any]:
+        return {name: [seal.rows, seal.text] for name, seal in vars(self).items()}
+
+    def copy(self) -> _Seals:
+        return _Seals(**{name: Seal(seal.rows, seal.total) for name, seal in vars(self).items()})
 
 
 @dataclass(frozen=True)
@@ -97,39 +154,62 @@ class Store:
         resume: bool,
     ) -> None:
         self._base: Any = None
+        self._turn = 0
         self._names, self._fixed = [name for name, _ in parameters], fixed
-        self.file = folder / NAME
+        self.folder, self.file = folder, folder / NAME
+        self._seals = _Seals()
+        self._lock = claim(folder)
         try:
-            folder.mkdir(parents=True, exist_ok=True)
-            self._lock = _locked(folder / f".{NAME}.lock")
+            self.resumed = not self._open_base(fingerprint, parameters, resume)
+            self._before = float(self._get("seconds") or 0.0)
         except OSError as error:
-            raise InputError(
-                f"cannot be written: {error.strerror}", file=folder, field="--output-dir", fix="choose another folder"
-            ) from None
-        try:
-            fresh = self._open_base(fingerprint, parameters, resume)
-        except BaseException as error:
             self.close()
-            if isinstance(error, sqlite3.DatabaseError):
-                fix = "run without --resume" if resume else "choose another --output-dir"
-                raise InputError(f"cannot be used: {error}", file=self.file, fix=fix) from None
+            raise unwritable(folder, error) from None
+        except InputError:
+            self.close()
             raise
-        self.resumed = not fresh
-        if self.resumed:
-            with self._transaction():
-                # what an ended run had left open stands there as unknown; it is examined now
-                self._base.execute(
-                    "DELETE FROM cells WHERE rowid IN (SELECT value FROM json_each("
-                    "(SELECT value FROM search_state WHERE key = 'open_rows')))"
-                )
-                self._put("open_rows", [])
+        except _DAMAGE as error:
+            self.close()
+            if isinstance(error, sqlite3.DatabaseError) and not resume:
+                raise self._failure(error) from None
+            raise self._damaged(" ".join(str(error).split()) or type(error).__name__) from None
+        except BaseException:
+            self.close()
+            raise
         self._begun = time.perf_counter()
-        self._before = float(self._get("seconds") or 0.0)
+
+    def _damaged(self, problem: str) -> InputError:
+        return InputError(
+            f"cannot be used: {problem}", file=self.file, field="--resume", fix="run without --resume to search again"
+        )
+
+    def _failure(self, error: sqlite3.Error) -> InputError:
+        """What a user is told when the file cannot be read or written."""
+        return InputError(
+            f"cannot be used: {error}",
+            file=self.file,
+            field="--output-dir",
+            fix="make room there and --resume, or choose a folder on another disk; finished cells are kept",
+        )
+
+    @contextmanager
+    def told(self) -> Iterator[None]:
+        """Errors of the file inside the block are told like a user's mistakes.
+
+        Raises:
+            InputError: The disk is full, or the file was damaged meanwhile.
+        """
+        try:
+            yield
+        except sqlite3.Error as error:
+            raise self._failure(error) from None
 
     def _open_base(self, fingerprint: Mapping[str, Any], parameters: Sequence[tuple[str, str]], resume: bool) -> bool:
         """Open the file; whether it is a new one."""
         fresh = not (resume and self.file.exists())
+        remove_parts(self.folder)
         if fresh:
+            self._remove_images()
             for suffix in ("", "-wal", "-shm"):
                 Path(f"{self.file}{suffix}").unlink(missing_ok=True)
         self._base = sqlite3.connect(self.file, isolation_level=None)
@@ -145,7 +225,94 @@ class Store:
                 rows = [(k, *names) for k, names in enumerate(parameters)]
                 self._base.executemany("INSERT INTO parameters VALUES (?, ?, ?)", rows)
         self._check(fingerprint)
+        if not fresh:
+            self._verify(parameters)
+            with self._transaction():
+                # what an ended run had left open stands there as unknown; it is examined now
+                self._base.execute("DELETE FROM cells WHERE rowid IN (SELECT value FROM json_each(?))", self._left())
+                self._put("open_rows", [])
         return fresh
+
+    def _left(self) -> tuple[str]:
+        """Rows of ``cells`` that stand for open blocks, as a JSON list."""
+        return (json.dumps([int(row) for row in self._get("open_rows") or []]),)
+
+    def _verify(self, parameters: Sequence[tuple[str, str]]) -> None:
+        """Refuse a file that others have changed.
+
+        Raises:
+            InputError: Its rows are not those that were written.
+        """
+        (state,) = self._base.execute("PRAGMA quick_check(1)").fetchone()
+        if state != "ok":
+            raise self._damaged(state)
+        known = self._base.execute("SELECT * FROM parameters ORDER BY position").fetchall()
+        if known != [(k, *names) for k, names in enumerate(parameters)]:
+            raise self._damaged("its parameters are others")
+        written = self._reported()
+        found = _Seals()
+        cells = f"SELECT {_CELL} FROM cells WHERE rowid NOT IN (SELECT value FROM json_each(?)) ORDER BY rowid"
+        for row in self._base.execute(cells, self._left()):
+            found.cells.add(row)
+            if written and found.cells.rows == written[0] and found.cells.text != written[1]:
+                raise self._damaged("the cells are not those of report.json: they were changed since")
+        for row in self._base.execute(f"SELECT {_BLOCK} FROM search_blocks"):
+            found.blocks.add(row)
+        for row in self._base.execute(f"SELECT {_FRAME} FROM search_frames"):
+            found.frames.add(row)
+        if found.plain() != self._get("seals"):
+            raise self._damaged("its content was changed since it was written")
+        self._seals = found
+
+    def _reported(self) -> tuple[int, str] | None:
+        """Number and sum of the cells that report.json speaks of, if it is of this search."""
+        try:
+            document = load_json(self.folder / "report.json", "report", limit=_REPORT_LIMIT)
+            if document["fingerprint"] != self._get("fingerprint"):
+                return None
+            return int(document["cells_seal"]["rows"]), str(document["cells_seal"]["sum"])
+        except (InputError, LookupError, TypeError, ValueError):
+            return None
+
+    # ---------------------------------------------------------------- images
+
+    def _remove_images(self) -> None:
+        """Remove the images that the search before has written, and none that anyone has put there or changed."""
+        if not self.file.exists():
+            return
+        try:
+            # closing() does not commit: nothing is to be written
+            with closing(sqlite3.connect(f"file:{quote(str(self.file.absolute()))}?mode=ro", uri=True)) as base:
+                known = dict(base.execute("SELECT name, sha256 FROM search_images"))
+        except sqlite3.Error:
+            return
+        for name, digest in known.items():
+            file = self.folder / IMAGES / Path(name).name
+            if _digest(file) == digest:
+                file.unlink(missing_ok=True)
+        with suppress(OSError):
+            (self.folder / IMAGES).rmdir()
+
+    def keep_image(self, name: str, data: bytes) -> None:
+        """Write the image of a counterexample; a file of that name that is not ours stays, and ours gets another.
+
+        Raises:
+            InputError: It cannot be written.
+        """
+        folder = self.folder / IMAGES
+        file, number = folder / f"{name}.npz", 1
+        known = dict(self._base.execute("SELECT name, sha256 FROM search_images"))
+        try:
+            folder.mkdir(exist_ok=True)
+            while file.exists() and known.get(file.name) != _digest(file):
+                number += 1
+                file = folder / f"{name}_{number}.npz"
+            with self._transaction():
+                row = file.name, hashlib.sha256(data).hexdigest()
+                self._base.execute("INSERT OR REPLACE INTO search_images VALUES (?, ?)", row)
+            write_atomic(file, lambda stream: stream.write(data))
+        except OSError as error:
+            raise unwritable(folder, error) from None
 
     def _check(self, fingerprint: Mapping[str, Any]) -> None:
         if self._get("version") != VERSION:
@@ -168,8 +335,20 @@ class Store:
 
     # ---------------------------------------------------------------- small helpers
 
-    def _transaction(self) -> _Transaction:
-        return _Transaction(self._base)
+    @contextmanager
+    def _transaction(self) -> Iterator[None]:
+        before = self._seals.copy()
+        self._base.execute("BEGIN IMMEDIATE")
+        try:
+            yield
+            self._put("seals", self._seals.plain())
+            self._base.execute("COMMIT")
+        except BaseException:
+            self._seals = before
+            # a full disk may have ended it already
+            if self._base.in_transaction:
+                self._base.execute("ROLLBACK")
+            raise
 
     def _put(self, key: str, value: Any) -> None:
         self._base.execute("INSERT OR REPLACE INTO search_state VALUES (?, ?)", (key, json.dumps(value)))
@@ -194,29 +373,43 @@ class Store:
         """Note a frame's first blocks, once."""
         box = grid.box
         with self._transaction():
-            self._base.execute(
-                "INSERT INTO search_frames VALUES (?, ?, ?, ?, ?, ?, '0', '0', '0', 0, 0)",
-                (frame, *(json.dumps(v) for v in (grid.units, grid.coarse, box.lower, box.upper)), str(grid.volume)),
+            row = (
+                int(frame),
+                *(json.dumps(v) for v in (grid.units, grid.coarse, box.lower, box.upper)),
+                str(grid.volume),
             )
-            self._open(frame, 0, grid, blocks)
+            row = (*row, "0", "0", "0", 0, 0)
+            self._base.execute(f"INSERT INTO search_frames VALUES ({', '.join('?' * len(row))})", row)
+            self._seals.frames.add(row)
+            self._open(frame, 0, grid, ((cells, RANK_FIRST) for cells in blocks))
 
-    def _open(self, frame: int, depth: int, grid: Grid, blocks: Iterable[Sequence[Cell]]) -> None:
-        rows = [
-            (frame, max(c.volume for c in cells) / grid.volume, depth, json.dumps([[c.first, c.past] for c in cells]))
-            for cells in blocks
-        ]
-        self._base.executemany("INSERT INTO search_blocks(frame, volume, depth, cells) VALUES (?, ?, ?, ?)", rows)
+    def _open(self, frame: int, depth: int, grid: Grid, blocks: Iterable[tuple[Sequence[Cell], float]]) -> None:
+        for cells, rank in blocks:
+            volume = max(c.volume for c in cells) / grid.volume
+            row = frame, volume, float(rank), depth, json.dumps([[c.first, c.past] for c in cells])
+            query = "INSERT INTO search_blocks(frame, volume, rank, depth, cells) VALUES (?, ?, ?, ?, ?)"
+            self._seals.blocks.add((self._base.execute(query, row).lastrowid, *row))
 
     def pending(self, known: set[int], count: int) -> list[Block]:
-        """Up to ``count`` open blocks that are not in ``known``, largest cells first."""
+        """Up to ``count`` open blocks that are not in ``known``: those nearest to a proof, now and then the largest."""
         found: list[Block] = []
-        query = "SELECT id, frame, depth, cells FROM search_blocks ORDER BY volume DESC, id LIMIT ?"
-        for number, frame, depth, cells in self._base.execute(query, (count + len(known),)):
-            if number not in known and len(found) < count:
-                found.append(
-                    Block(number, frame, depth, tuple(Cell(tuple(a), tuple(b)) for a, b in json.loads(cells)))
-                )
+        for _ in range(count):
+            self._turn += 1
+            order = "volume DESC" if self._turn % _LARGEST_EVERY == 0 else "rank, volume"
+            for block in self._listed(f"ORDER BY {order}, id LIMIT {len(known) + len(found) + 1}"):
+                if block.number not in known and block not in found:
+                    found.append(block)
+                    break
+            else:
+                break
         return found
+
+    def _listed(self, which: str) -> list[Block]:
+        rows = self._base.execute(f"SELECT id, frame, depth, cells FROM search_blocks {which}").fetchall()
+        return [
+            Block(number, frame, depth, tuple(Cell(tuple(a), tuple(b)) for a, b in json.loads(cells)))
+            for number, frame, depth, cells in rows
+        ]
 
     @property
     def open_blocks(self) -> int:
@@ -226,9 +419,12 @@ class Store:
     def settle(self, block: Block, findings: Findings, grid: Grid) -> bool:
         """Store what became of a block; false, and nothing changes, if that was stored before."""
         with self._transaction():
-            gone = self._base.execute("DELETE FROM search_blocks WHERE id = ?", (block.number,)).rowcount
-            if not gone:
+            query = f"SELECT {_BLOCK} FROM search_blocks WHERE id = ?"
+            gone = self._base.execute(query, (block.number,)).fetchone()
+            if gone is None:
                 return False
+            self._base.execute("DELETE FROM search_blocks WHERE id = ?", (block.number,))
+            self._seals.blocks.add(gone, -1)
             volumes: dict[str, int] = {"certified": 0, "falsified": 0, "unknown": 0}
             for leaf in findings.leaves:
                 self._add(block.frame, leaf, grid)
@@ -238,11 +434,11 @@ class Store:
                         "INSERT INTO search_reasons VALUES (?, 1) ON CONFLICT(reason) DO UPDATE SET cells = cells + 1",
                         (leaf.reason,),
                     )
-            self._open(block.frame, block.depth + 1, grid, findings.blocks)
-            row = self._base.execute(
-                "SELECT certified, falsified, unknown FROM search_frames WHERE frame = ?", (block.frame,)
-            ).fetchone()
-            sums = [str(int(old) + new) for old, new in zip(row, volumes.values(), strict=True)]
+            ranks = findings.ranks or (0.0,) * len(findings.blocks)
+            self._open(block.frame, block.depth + 1, grid, zip(findings.blocks, ranks, strict=True))
+            query = f"SELECT {_FRAME} FROM search_frames WHERE frame = ?"
+            row = self._base.execute(query, (block.frame,)).fetchone()
+            sums = [str(int(old) + new) for old, new in zip(row[6:9], volumes.values(), strict=True)]
             # the first cells alone are evenly spread
             first = list(findings.samples) if block.depth == 0 else []
             self._base.execute(
@@ -250,6 +446,8 @@ class Store:
                 "holding = holding + ? WHERE frame = ?",
                 (*sums, len(first), sum(holds for _, holds in first), block.frame),
             )
+            self._seals.frames.add(row, -1)
+            self._seals.frames.add(self._base.execute(query, (block.frame,)).fetchone())
             self._put("seconds", self.seconds)
             self._put("bounded", int(self._get("bounded") or 0) + findings.bounded)
             self._put("work", float(self._get("work") or 0.0) + findings.seconds)
@@ -267,24 +465,23 @@ class Store:
             raise ValueError(f"frame {frame}: certified with margin {leaf.margin}")
         if leaf.verdict == "falsified" and leaf.counterexample is None:
             raise ValueError(f"frame {frame}: falsified without a counterexample")
-        self._base.execute(
-            "INSERT INTO cells VALUES (?, ?, ?, ?, ?, ?, ?)",
-            (
-                frame,
-                self._list(frame, box, box.lower),
-                self._list(frame, box, box.upper),
-                leaf.verdict,
-                margin,
-                leaf.seconds,
-                None if leaf.counterexample is None else self._list(frame, box, leaf.counterexample),
-            ),
+        row = (
+            frame,
+            self._list(frame, box, box.lower),
+            self._list(frame, box, box.upper),
+            leaf.verdict,
+            None if margin is None else float(margin),
+            float(leaf.seconds),
+            None if leaf.counterexample is None else self._list(frame, box, leaf.counterexample),
         )
+        self._base.execute("INSERT INTO cells VALUES (?, ?, ?, ?, ?, ?, ?)", row)
+        self._seals.cells.add(row)
 
     def finish(self, grids: Mapping[int, Grid]) -> None:
         """List what is still open as unknown, so that the cells cover the set; `Store` takes it back on resuming."""
         with self._transaction():
             rows = []
-            for block in self.pending(set(), self.open_blocks):
+            for block in self._listed("ORDER BY id"):
                 grid = grids[block.frame]
                 for cell in block.cells:
                     box = grid.box_of(cell)
@@ -310,6 +507,11 @@ class Store:
         names = ("seconds", "cells", "certified", "falsified", "unknown")
         rows = self._base.execute("SELECT * FROM search_trace ORDER BY rowid").fetchall()
         return [dict(zip(names, row, strict=True)) for row in rows]
+
+    @property
+    def seal(self) -> Seal:
+        """Of the rows of ``cells`` that have a verdict."""
+        return self._seals.cells
 
     @property
     def count(self) -> int:
@@ -353,35 +555,11 @@ class Store:
         return sorted(found, key=lambda row: row["lower"])
 
 
-def _locked(file: Path) -> BinaryIO:
-    """The open file, locked as long as it is open, also against a command that is killed later.
-
-    Raises:
-        InputError: Another command holds it.
-    """
-    stream = open(file, "ab")  # noqa: SIM115 (open as long as the store)
-    try:
-        fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
-        stream.close()
-        raise InputError(
-            "locked by a command that is still running",
-            file=file.parent,
-            field="--output-dir",
-            fix="wait for it, or choose another folder",
-        ) from None
-    return stream
-
-
-class _Transaction:
-    def __init__(self, base: sqlite3.Connection) -> None:
-        self._base = base
-
-    def __enter__(self) -> None:
-        self._base.execute("BEGIN IMMEDIATE")
-
-    def __exit__(self, kind: object, *rest: object) -> None:
-        self._base.execute("COMMIT" if kind is None else "ROLLBACK")
+def _digest(file: Path) -> str | None:
+    """SHA-256 of a regular file; None of anything else."""
+    if not file.is_file() or file.is_symlink():
+        return None
+    return hashlib.sha256(file.read_bytes()).hexdigest()
 
 
 def fractions(tally: Tally) -> dict[str, float]:

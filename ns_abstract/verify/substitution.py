@@ -13,8 +13,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ns_abstract.errors import InputError
-from ns_abstract.sets.box import ParameterBox
+from ns_abstract.geometry.box import ParameterBox
+from ns_abstract.io.errors import InputError
 from ns_abstract.verify.network import Substitution
 from ns_abstract.verify.search import FAILURES, Search
 

@@ -1,6 +1,6 @@
 """An attack on the abstract image of a set of poses and of scenes whose Gaussians vary.
 
-Tolerance is zero, as in `ns_abstract.verify.falsify`; what differs is the number of parameters, seven by
+Tolerance is zero, as in `ns_abstract.verify.attack.falsify`; what differs is the number of parameters, seven by
 Gaussian. Members of the set are rendered at corners (of all Gaussians alike and of random signs), inside, and
 where signed gradients lead that go through the reference renderer from the pixels that came closest to a bound.
 """
@@ -16,6 +16,10 @@ from typing import Any
 import numpy as np
 import torch
 
+from ns_abstract.geometry.box import Float64Array, ParameterBox
+from ns_abstract.geometry.camera_path import load_camera_path
+from ns_abstract.geometry.differentiable_pose import differentiable_pose
+from ns_abstract.geometry.poses import PoseSet
 from ns_abstract.methods.splat.activate import Splats, activate
 from ns_abstract.methods.splat.constants import GSPLAT_1_4_0, Rasteriser
 from ns_abstract.methods.splat.load import load_scene
@@ -23,12 +27,8 @@ from ns_abstract.methods.splat.reference import Reference
 from ns_abstract.methods.splat.render import Renderer
 from ns_abstract.methods.splat.scene import SplatScene
 from ns_abstract.methods.splat.variations import VariedSplats, vary
-from ns_abstract.sets.box import Float64Array, ParameterBox
-from ns_abstract.sets.path import load_camera_path
-from ns_abstract.sets.perturbation import parse_perturbation
-from ns_abstract.sets.poses import PoseSet
-from ns_abstract.sets.twin import pose_twin
-from ns_abstract.verify.soundness import bound_cells, equal_cells
+from ns_abstract.perturbation.specification import parse_perturbation
+from ns_abstract.verify.attack.soundness import bound_cells, equal_cells
 
 #: Parameter values [d] and a member of the set to a picture [H, W, 3].
 Show = Callable[[Float64Array, Splats], np.ndarray]
@@ -164,7 +164,7 @@ class _Slopes:
         self, scene: SplatScene, poses: PoseSet, rasteriser: Rasteriser, varied: VariedSplats, box: ParameterBox
     ) -> None:
         self.reference, self.poses = Reference(scene, rasteriser), poses
-        self.varied, self.box, self.pose = varied, box, pose_twin(poses)
+        self.varied, self.box, self.pose = varied, box, differentiable_pose(poses)
 
     def push(
         self, values: Float64Array, member: Splats, place: tuple[int, int, int], sign: float, size: float
@@ -244,7 +244,7 @@ def check_varied(
     splats = activate(scene, rasteriser)
     varied = vary(scene, splats, perturbation.scene)
     boxes = equal_cells(poses.box, cells) if poses.box.dimensions else [poses.box]
-    order = 2 if poses.box.dimensions <= 1 else 1
+    order = 2 if poses.box.dimensions == 1 else 1
     bounds, _ = bound_cells(
         scene, poses, boxes, rasteriser=rasteriser, arithmetic=arithmetic, order=order, varied=varied
     )

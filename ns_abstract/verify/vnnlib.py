@@ -2,7 +2,8 @@
 
 Only what the format's users write is read: ``declare-const``, and ``assert`` of ``<=``, ``>=``, ``and``,
 ``or`` over linear expressions of the outputs. Bounds of the inputs are set aside: the images of the scene
-take their place.
+take their place. Numbers that overflow or vanish on the way are refused, and constraints with huge or tiny
+factors are multiplied by powers of two, which changes no sign: no overflow may become a verdict.
 """
 
 from __future__ import annotations
@@ -14,15 +15,22 @@ from typing import Any
 
 import numpy as np
 
-from ns_abstract.errors import InputError
-from ns_abstract.jsonio import read_text
+from ns_abstract.io.errors import InputError
+from ns_abstract.io.jsonio import read_text
 
 _LIMIT = 64 << 20
 _TOKEN = re.compile(r'\s+|;[^\n]*|(?P<text>[()]|"[^"]*"|[^\s();"]+)|(?P<bad>.)', re.DOTALL)
-_VARIABLE = re.compile(r"([XY])_(\d+)")
+_NUMBER = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?", re.ASCII)
+_VARIABLE = re.compile(r"([XY])_(\d{1,9})", re.ASCII)
 #: Most conjunctions that a file's assertions may multiply out to.
 _CONJUNCTIONS = 10_000
 _DEPTH = 200
+#: Exponents of two that the largest factor of a constraint may have before the constraint is rescaled, that any
+#: factor may have below the largest, and that the constant may have above it.
+_PLAIN, _SPREAD, _FAR = 30, 90, 120
+
+#: Least size at which a product of numbers keeps all of its digits.
+_SMALLEST = float(np.finfo(np.float64).tiny)
 
 #: Coefficients of outputs by number, and a constant.
 _Linear = tuple[dict[int, float], float]
@@ -132,14 +140,38 @@ def _parse(expressions: list[Any], output_size: int) -> UnsafeSet:
             key = (tuple(sorted(coefficients.items())), constant)
             if key not in known:
                 known[key] = len(rows)
-                row = np.zeros(output_size)
-                for index, value in coefficients.items():
-                    row[index] = value
+                row, offset = _scaled(coefficients, constant, output_size)
                 rows.append(row)
-                offsets.append(constant)
+                offsets.append(offset)
             group.append(known[key])
         groups.append(tuple(group))
     return UnsafeSet(np.array(rows), np.array(offsets), tuple(groups), inputs)
+
+
+def _scaled(coefficients: dict[int, float], constant: float, size: int) -> tuple[np.ndarray, float]:
+    """A constraint as a row and an offset, multiplied by a power of two where its factors are huge or tiny.
+
+    Raises:
+        InputError: Its numbers are too far apart for arithmetic that says which side of it an output is on.
+    """
+    row = np.zeros(size)
+    for index, value in coefficients.items():
+        row[index] = value
+    used = np.abs(row[row != 0.0])
+    if not used.size:
+        return row, constant
+    exponents = np.frexp(used)[1]
+    largest = int(exponents.max())
+    if largest - int(exponents.min()) > _SPREAD:
+        problem = f"factors {used.min():g} and {used.max():g} of outputs in one constraint"
+        raise InputError(problem, fix=f"stay within a ratio of 2^{_SPREAD}")
+    shift = -largest if abs(largest) > _PLAIN else 0
+    with np.errstate(over="ignore", under="ignore"):
+        moved = float(np.ldexp(constant, shift))
+    if np.frexp(constant)[1] + shift > _FAR or float(np.ldexp(moved, -shift)) != constant:
+        problem = f"the constant {constant:g} beside factors of {used.max():g}"
+        raise InputError(problem, fix=f"stay within a ratio of 2^{_FAR}")
+    return np.ldexp(row, shift), moved
 
 
 def _names(expression: Any) -> set[str]:
@@ -172,8 +204,21 @@ def _ways(expression: Any, declared: set[str], size: int) -> list[_Conjunction]:
 def _sum(first: _Linear, second: _Linear, factor: float) -> _Linear:
     coefficients = dict(first[0])
     for index, value in second[0].items():
-        coefficients[index] = coefficients.get(index, 0.0) + factor * value
-    return coefficients, first[1] + factor * second[1]
+        coefficients[index] = _added(coefficients.get(index, 0.0), factor, value)
+    return coefficients, _added(first[1], factor, second[1])
+
+
+def _added(total: float, factor: float, value: float) -> float:
+    """``total + factor * value``.
+
+    Raises:
+        InputError: It overflows, or the product vanishes.
+    """
+    product = factor * value
+    found = total + product
+    if not np.isfinite(found) or (factor and value and abs(product) < _SMALLEST):
+        raise InputError(f"numbers overflow or vanish at {factor:g} times {value:g}", fix="use factors nearer to 1")
+    return found
 
 
 def _linear(expression: Any, declared: set[str], size: int) -> _Linear:
@@ -202,12 +247,12 @@ def _linear(expression: Any, declared: set[str], size: int) -> _Linear:
 def _atom(text: str, declared: set[str], size: int) -> _Linear:
     match = _VARIABLE.fullmatch(text)
     if match is None:
-        try:
-            value = float(text)
-        except ValueError:
-            raise _fail(text, "write a number or a variable such as Y_0") from None
-        if not np.isfinite(value):
-            raise _fail(text, "write a finite number")
+        number = _NUMBER.fullmatch(text)
+        if number is None:
+            raise _fail(text, "write a number or a variable such as Y_0")
+        value = float(text)
+        if not np.isfinite(value) or (re.search("[1-9]", number[1]) and abs(value) < _SMALLEST):
+            raise _fail(text, "write a number that float64 can hold")
         return {}, value
     if text not in declared:
         raise InputError(f"{text} is not declared", fix=f"add (declare-const {text} Real)")

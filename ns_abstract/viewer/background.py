@@ -1,4 +1,4 @@
-"""Abstract images for a viewer: asked for at any time, answered at once with what is known so far.
+"""Abstract images for a viewer: asked for at any time, answered at once with what is known so far (design.md, W2).
 
 The bounding itself runs in worker processes (`ns_abstract.viewer.worker`). One works, one is kept
 ready in reserve: a worker that is still busy with what nobody wants any more is ended and the other

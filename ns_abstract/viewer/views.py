@@ -1,4 +1,4 @@
-"""What is looked at, what is known about it, and where bounds come from."""
+"""What is looked at, what is known about it, and where bounds come from (design.md, W1, W3, W6)."""
 
 from __future__ import annotations
 
@@ -9,24 +9,24 @@ from typing import Any, ClassVar, Protocol
 
 import numpy as np
 
-from ns_abstract.arithmetic.units import arithmetic as arithmetic_named
-from ns_abstract.jsonio import parse_json
+from ns_abstract.arithmetic.rounding import arithmetic as arithmetic_named
+from ns_abstract.geometry.camera_path import Camera
+from ns_abstract.geometry.poses import PoseSet
+from ns_abstract.io.jsonio import parse_json
 from ns_abstract.methods.nerf.frame import NerfFrame
 from ns_abstract.methods.nerf.method import NerfMethod
 from ns_abstract.methods.nerf.scene import NerfScene
 from ns_abstract.methods.splat.activate import Splats
-from ns_abstract.methods.splat.constants import RASTERISERS
+from ns_abstract.methods.splat.constants import rasteriser_named
 from ns_abstract.methods.splat.frame import SplatFrame
 from ns_abstract.methods.splat.scene import SplatScene
 from ns_abstract.methods.splat.variations import VariedSplats, vary
+from ns_abstract.perturbation.specification import ROTATIONS, TRANSLATIONS, Perturbation, parse_perturbation
+from ns_abstract.perturbation.variations import VARIATIONS, SceneVariation
 from ns_abstract.refine.engine import Frame
 from ns_abstract.refine.result import FrameResult
 from ns_abstract.report.figures import metrics
 from ns_abstract.report.files import check_frame
-from ns_abstract.sets.path import Camera
-from ns_abstract.sets.perturbation import ROTATIONS, TRANSLATIONS, Perturbation, parse_perturbation
-from ns_abstract.sets.poses import PoseSet
-from ns_abstract.sets.variations import VARIATIONS, SceneVariation
 
 #: Longest sides of the pictures that come before the one asked for, and the seconds that each may take: of splats,
 #: and of NeRFs, whose rays are bounded one after the other.
@@ -214,20 +214,26 @@ class SplatSource:
     Attributes:
         splats: The activated Gaussians, with the background that is shown.
         scene: The same Gaussians as stored, which selections look at.
-        renderer: Name in `RASTERISERS`.
+        renderer: "gsplat" or "paper".
+        version: gsplat's; None: 1.4.0.
         arithmetic: "float32" or "real".
     """
 
     splats: Splats
     scene: SplatScene
     renderer: str = "gsplat"
+    version: str | None = None
     arithmetic: str = "float32"
     _kept: dict[tuple[SceneVariation, ...], VariedSplats] = field(default_factory=dict, init=False, repr=False)
 
     ladder: ClassVar[Mapping[int, float]] = SPLAT_LADDER
     most: ClassVar[int | None] = None
     patience: ClassVar[float] = 0.4
-    about: ClassVar[str] = ""
+
+    @property
+    def about(self) -> str:
+        """Whose pictures are bounded, where the version was asked for."""
+        return "" if self.version is None else f"Bounds of the pictures of gsplat {self.version}."
 
     @property
     def guarantee(self) -> str:
@@ -242,7 +248,7 @@ class SplatSource:
         """
         return SplatFrame(
             self.splats,
-            RASTERISERS[self.renderer],
+            rasteriser_named(self.renderer, self.version),
             arithmetic_named(self.arithmetic),
             PoseSet.around(camera, perturbation),
             varied=self._varied(perturbation),

@@ -12,14 +12,16 @@ from __future__ import annotations
 import os
 import sys
 import time
+from contextlib import suppress
 from multiprocessing.connection import Connection
 from typing import Any
 
 from ns_abstract.arithmetic.selfcheck import check_functions
-from ns_abstract.errors import InputError
+from ns_abstract.execution.ending import AbandonedError
+from ns_abstract.geometry.camera_path import Camera
+from ns_abstract.io.errors import InputError
 from ns_abstract.refine.engine import Goal, Refinement
 from ns_abstract.refine.result import TracePoint
-from ns_abstract.sets.path import Camera
 from ns_abstract.viewer.views import Snapshot, Source, View
 
 #: Seconds that a request waits for a newer one: the camera may still be moving.
@@ -99,7 +101,8 @@ class Worker:
         refinement = Refinement(frame, 0, self._goal(seconds), stopped=self._stopped, members=frame.members(0))
         refinement.progress = _Teller(self, number, refinement)
         self.refinement, self.about = refinement, about
-        refinement.run()
+        with suppress(AbandonedError):
+            refinement.run()
         stopped = self._stopped()
         if refinement.covered:
             self.tell(number, refinement, final=not stopped)

@@ -17,14 +17,15 @@ import torch
 from torch import Tensor
 
 from ns_abstract.arithmetic.chebyshev import ROUNDING, ChebyshevBasis
+from ns_abstract.arithmetic.rounding import UNIT64
 from ns_abstract.arithmetic.taylor import TaylorArray
-from ns_abstract.arithmetic.units import UNIT64
+from ns_abstract.execution.ending import checkpoint
+from ns_abstract.geometry.box import ParameterBox
+from ns_abstract.geometry.poses import PoseSet
 from ns_abstract.methods.nerf.hsv import Range, shifted_bounds
 from ns_abstract.methods.nerf.render import Sampling, camera_rays
 from ns_abstract.methods.nerf.scene import NerfScene
 from ns_abstract.methods.nerf.zonotope import Affine, FieldBounds, Pieces
-from ns_abstract.sets.box import ParameterBox
-from ns_abstract.sets.poses import PoseSet
 
 #: (degree, grid) of the polynomials by number of parameters.
 _DEGREES = {0: (1, 2), 1: (28, 112), 2: (6, 20), 3: (4, 10)}
@@ -166,7 +167,7 @@ def join_items(parts: list[_Items]) -> _Items:
 
 
 class Pencil:
-    """The rays of some pixels over one box of poses, as polynomials of the pose.
+    """The rays of some pixels over one box of poses, as polynomials of the pose (design.md, F10).
 
     Args:
         pose_set, box: The poses.
@@ -382,6 +383,7 @@ class _Work:
             color = self.color_low, self.color_high
             found = []
             for shift in shifts:
+                checkpoint()
                 self.color_low, self.color_high = self._shifted(color, shift)
                 found.append(self._composite())
             lower, upper = np.min([low for low, _ in found], axis=0), np.max([high for _, high in found], axis=0)
@@ -539,6 +541,7 @@ class _Work:
 
         Returns [k] which leave more light open than ``coarse``, which leave all of it, and which needed the network.
         """
+        checkpoint()
         halve, lost, tried = (np.zeros(len(items), bool) for _ in range(3))
         lines, radius = self.pencil.points(
             items.ray, self.owner.distances[items.sample], 0.5 * self.owner.lengths[items.sample]

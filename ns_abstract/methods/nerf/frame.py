@@ -1,9 +1,10 @@
-"""One frame of a NeRF, ready for refinement: bounds, renders and motion of its set of poses."""
+"""One frame of a NeRF, ready for refinement: bounds, renders and motion of its set of poses (design.md, R5)."""
 
 from __future__ import annotations
 
 import itertools
 import secrets
+import time
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
@@ -12,14 +13,16 @@ from typing import Any
 import numpy as np
 
 from ns_abstract.arithmetic.outward import outward
-from ns_abstract.engines import Processes
+from ns_abstract.execution.ending import AbandonedError, is_over
+from ns_abstract.execution.engines import Processes
+from ns_abstract.geometry.box import ParameterBox
+from ns_abstract.geometry.poses import COLOR_SHIFTS, PoseSet
+from ns_abstract.geometry.tiles import tile_grid
 from ns_abstract.methods.nerf.bounds import NerfBounds, RayBounds, Shifts, typical_reach
 from ns_abstract.methods.nerf.hsv import color_shift
 from ns_abstract.methods.nerf.render import NerfRenderer, Sampling
 from ns_abstract.methods.nerf.scene import NerfScene
-from ns_abstract.sets.box import ParameterBox
-from ns_abstract.sets.poses import COLOR_SHIFTS, PoseSet
-from ns_abstract.sets.tiles import tile_grid
+from ns_abstract.refine.protocol import LinearSets, Render
 
 #: What an open sample may move a pixel by on boxes a quarter as wide as the set, as a part of the pixels' mean
 #: variation over the set; less on narrower boxes.
@@ -33,8 +36,8 @@ _LOOK_SHARES = np.linspace(0.0, 1.0, 9)
 _SHIFT_PARTS, _SHIFT_MOTION = 12, 6.0
 #: Weights that a worker multiplies between two looks at the clock, in units of rays times weights.
 _WORK = 1_250_000
-#: Seconds between looks at results of other processes.
-_PATIENCE = 60.0
+#: Seconds between looks at results of other processes, and those that they get to end when the time is over.
+_PATIENCE, _GRACE = 0.2, 3.0
 
 
 @dataclass(frozen=True)
@@ -49,16 +52,26 @@ class RayContext:
     tiles: np.ndarray
     alpha: np.ndarray
 
+    @property
+    def nbytes(self) -> int:
+        """Memory that it holds."""
+        return self.tiles.nbytes + self.alpha.nbytes
+
+    @property
+    def shown(self) -> None:
+        """A field has no elements."""
+        return None
+
 
 @dataclass(frozen=True)
 class RayBox:
-    """Bounds of some rays over one cell; see `ns_abstract.refine.engine.Bounds`."""
+    """Bounds of some rays over one cell; see `ns_abstract.refine.protocol.Bounds`."""
 
     lower: np.ndarray
     upper: np.ndarray
     slopes: np.ndarray
     context: RayContext | None
-    linear: tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray] | None
+    linear: LinearSets | None
 
 
 @lru_cache(maxsize=1)
@@ -94,6 +107,8 @@ class NerfFrame:
             among cores. Results do not depend on where a ray is bounded, but on what is bounded together.
     """
 
+    #: Every ray is work of its own.
+    tilewise = True
     #: Poses rendered in every part of a cell that is split.
     witnesses = 8
 
@@ -110,7 +125,7 @@ class NerfFrame:
         self.bounds = NerfBounds(*self._recipe)
         weights = sum(array.size for array in scene.fine.arrays())
         self.workers = workers
-        self.batch = workers * int(np.clip(_WORK // weights, 1, 32))
+        self.tiles_at_once = workers * int(np.clip(_WORK // weights, 1, 32))
         self._witness: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None
 
     @property
@@ -118,7 +133,7 @@ class NerfFrame:
         """Number of rays, row by row."""
         return self.across * self.down
 
-    def members(self, seed: int) -> Iterator[Any]:
+    def members(self, seed: int) -> Iterator[Render]:
         """Other scenes of the set: none, only poses vary."""
         return iter(())
 
@@ -167,7 +182,10 @@ class NerfFrame:
     def bound(
         self, box: ParameterBox, tiles: np.ndarray, within: RayContext | None = None, keep_linear: bool = False
     ) -> RayBox:
-        """Bounds of the rays ``tiles`` over ``box``; ``within`` is the context of these rays and a box around it."""
+        """Bounds of the rays ``tiles`` over ``box``; ``within`` is the context of these rays and a box around it.
+
+        Rays that there is no time for any more (`ns_abstract.execution.ending`) are bounded by [0, 1].
+        """
         tiles = np.asarray(tiles)
         d = box.dimensions
         whole = d > 0 and box == self.box
@@ -178,9 +196,12 @@ class NerfFrame:
             if within is not None:
                 known = within.alpha[np.searchsorted(within.tiles, tiles)]
             parts = []
-            for i in range(0, tiles.size, self.batch):
-                mine = slice(i, i + self.batch)
-                parts += self._batch(box, tiles[mine], None if known is None else known[mine])
+            try:
+                for i in range(0, tiles.size, self.tiles_at_once):
+                    mine = slice(i, i + self.tiles_at_once)
+                    parts += self._batch(box, tiles[mine], None if known is None else known[mine])
+            except AbandonedError:
+                parts.append(self._unknown(tiles.size - sum(len(part.lower) for part in parts)))
             lower, upper, alpha = (
                 np.concatenate([getattr(part, name) for part in parts]) for name in ("lower", "upper", "alpha")
             )
@@ -194,6 +215,11 @@ class NerfFrame:
             flat = np.zeros((*shape, d), np.float32)
             linear = flat, low, flat, high
         return RayBox(low, high, np.zeros(d), context, linear)
+
+    def _unknown(self, count: int) -> RayBounds:
+        """What holds of any ``count`` rays."""
+        alpha = np.ones((count, self.bounds.distances.size), np.float32)
+        return RayBounds(np.zeros((count, 3)), np.ones((count, 3)), alpha, 0, self.bounds.reach)
 
     def _batch(self, box: ParameterBox, tiles: np.ndarray, known: np.ndarray | None) -> list[RayBounds]:
         """Bounds of rays that are worked on together, in one share for every worker."""
@@ -218,12 +244,22 @@ class NerfFrame:
             for number, share in enumerate(shares):
                 engine.submit(number, _bound_share, self._token, self._recipe, self.bounds.reach, share)
             done: dict[int, RayBounds] = {}
+            patience = None
             try:
                 while len(done) < len(shares):
-                    done.update(engine.collect(_PATIENCE))
+                    for number, answer in engine.collect(_PATIENCE):
+                        if not isinstance(answer, AbandonedError):
+                            done[number] = answer
+                    if patience is None and is_over():
+                        patience = time.monotonic() + _GRACE
+                        engine.abandon()
+                    if patience is not None and (not engine.unfinished or time.monotonic() > patience):
+                        raise AbandonedError
             except BaseException:
-                _processes.cache_clear()
-                engine.close()
+                # what is still at work would answer those who ask next
+                if engine.unfinished:
+                    _processes.cache_clear()
+                    engine.close()
                 raise
             found = [done[number] for number in range(len(shares))]
         self.bounds.reach = typical_reach(found)
@@ -234,6 +270,16 @@ class NerfFrame:
         places = np.full(self.tile_count, -1)
         places[tiles] = np.arange(tiles.size)
         self._witness = places, lower, upper
+
+    def allow(self, excess: float) -> float:
+        """Nothing is left out of first cells, which cost nothing."""
+        return 0.0
+
+    def plan(self, shown: int | None, lower: np.ndarray, upper: np.ndarray) -> list[str]:
+        """What was left out for this frame, given what refinement found."""
+        untreated = int(((lower == 0.0) & (upper == 1.0)).all(axis=-1).sum())
+        total = lower.shape[0] * lower.shape[1]
+        return [f"{untreated:,} of {total:,} rays left at [0, 1]: the time was over before them"] if untreated else []
 
     def _reached(self, box: ParameterBox, tiles: np.ndarray, shifted: bool) -> tuple[np.ndarray, np.ndarray]:
         """Ends [n, 3] of the colours reached over the box or, where a refinement is watched, the set.

@@ -9,7 +9,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ns_abstract.sets.poses import COLOR_SHIFTS, PoseSet
+from ns_abstract.geometry.poses import COLOR_SHIFTS, PoseSet
 
 Float64Array = NDArray[np.float64]
 Range = tuple[float, float]

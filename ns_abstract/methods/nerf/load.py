@@ -11,8 +11,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from ns_abstract.errors import InputError
-from ns_abstract.jsonio import is_number, show
+from ns_abstract.io.errors import InputError
+from ns_abstract.io.jsonio import is_number, show
 from ns_abstract.methods import runs
 from ns_abstract.methods.nerf.scene import Encoding, FieldWeights, Layer, NerfScene
 
@@ -170,9 +170,7 @@ def field_weights(
             )
 
     base = layers("mlp_base")
-    position = _encoding(
-        base[0].weight.shape[1], exponents[0], counts[0], file, f"pipeline._model.{name}.mlp_base"
-    )
+    position = _encoding(base[0].weight.shape[1], exponents[0], counts[0], file, f"pipeline._model.{name}.mlp_base")
     for i in range(1, len(base)):
         width, inputs = base[i - 1].weight.shape[0], base[i].weight.shape[1]
         fits(f"mlp_base.layers.{i}", inputs, (width, width + position.size))

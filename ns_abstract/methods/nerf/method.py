@@ -1,21 +1,28 @@
-"""Vanilla-NeRF runs as the command lines see them; see `ns_abstract.pipeline.Method`."""
+"""Vanilla-NeRF runs as the command lines see them; see `ns_abstract.refine.protocol.Method`."""
 
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import Any
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ns_abstract.errors import InputError
+from ns_abstract.geometry.poses import PoseSet
+from ns_abstract.io.errors import InputError
 from ns_abstract.methods.nerf.frame import NerfFrame
-from ns_abstract.methods.nerf.occupancy import OccupancyGrid
+from ns_abstract.methods.nerf.load import holds_nerf, load_nerf
+from ns_abstract.methods.nerf.occupancy import VOXEL_BYTES, OccupancyGrid, load_grid
 from ns_abstract.methods.nerf.render import Sampling
 from ns_abstract.methods.nerf.scene import NerfScene
-from ns_abstract.sets.perturbation import Perturbation
-from ns_abstract.sets.poses import PoseSet
+from ns_abstract.methods.representation import ProgramOptions, Representation
+from ns_abstract.methods.runs import RunConfig
+from ns_abstract.perturbation.specification import Perturbation
+
+if TYPE_CHECKING:
+    import torch
 
 #: Samples by ray where nothing is said: those of Nerfstudio's coarse pass.
 _SAMPLES = 64
@@ -86,6 +93,21 @@ class NerfMethod:
             self.sampling = Sampling("hierarchical", near, scene.far, bins, importance, (red, green, blue))
 
     @property
+    def name(self) -> str:
+        """The scene's name."""
+        return self.scene.name
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What was assumed on reading the scene."""
+        return tuple(self.scene.notes)
+
+    @property
+    def dataset_scale(self) -> float:
+        """Normalised units per unit of the data set."""
+        return self.scene.dataparser.scale
+
+    @property
     def program(self) -> dict[str, Any]:
         """Name and version of the bounded program."""
         s = self.sampling
@@ -126,13 +148,8 @@ class NerfMethod:
     def memory(self, pixels: int) -> int:
         """Bytes that bounding pictures of ``pixels`` needs beside the leaves."""
         weights = sum(array.nbytes for array in self.scene.fine.arrays())
-        return 8 * weights + pixels * (400 + 4 * self.sampling.samples) + (1 << 30)
-
-    def frame_plan(self, frame: NerfFrame, shown: int | None, lower: np.ndarray, upper: np.ndarray) -> list[str]:
-        """What was left out for one frame, given what refinement found."""
-        untreated = int(((lower == 0.0) & (upper == 1.0)).all(axis=-1).sum())
-        total = lower.shape[0] * lower.shape[1]
-        return [f"{untreated:,} of {total:,} rays left at [0, 1]: the time was over before them"] if untreated else []
+        voxels = 0 if self.scene.occupancy is None else self.scene.occupancy.occupied.size
+        return 8 * weights + VOXEL_BYTES * voxels + pixels * (400 + 4 * self.sampling.samples) + (1 << 30)
 
     @property
     def plan(self) -> tuple[str, ...]:
@@ -182,3 +199,23 @@ class NerfMethod:
             "background": list(s.background),
             "notes": list(scene.notes),
         }
+
+    def differentiable(self, poses: PoseSet) -> Callable[[torch.Tensor], torch.Tensor] | None:
+        """None: linear bounds of rays are flat, so certificates are not made of NeRFs."""
+        return None
+
+
+def _load(source: RunConfig | Path) -> NerfScene:
+    assert isinstance(source, RunConfig)
+    return load_nerf(source)
+
+
+def _method(scene: NerfScene, options: ProgramOptions, arithmetic: str | None, workers: int) -> NerfMethod:
+    options.refuse(("gsplat_version",), "is for splats, this run is a NeRF")
+    grid = None if options.occupancy_grid is None else load_grid(options.occupancy_grid)
+    return NerfMethod(
+        scene, options.renderer, arithmetic, options.sampling, options.num_samples, options.near_plane, grid, workers
+    )
+
+
+NERF = Representation(lambda source: isinstance(source, RunConfig) and holds_nerf(source), _load, _method)

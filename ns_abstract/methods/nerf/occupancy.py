@@ -7,7 +7,7 @@ is 0 whatever the networks say. Renderer, attacks and bounds all take the same d
 from __future__ import annotations
 
 import hashlib
-import zipfile
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -17,12 +17,16 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ns_abstract.arithmetic.units import UNIT64
-from ns_abstract.atomic import write_atomic
-from ns_abstract.errors import InputError
+from ns_abstract.arithmetic.rounding import UNIT64
+from ns_abstract.io.arrays import open_archive
+from ns_abstract.io.atomic import write_atomic
+from ns_abstract.io.errors import InputError
+from ns_abstract.methods.runs import check_memory
 
 #: Most voxels of a grid.
 _MOST = 1 << 27
+#: Memory for a voxel: as read, packed, and numbers of occupied voxels while they are summed.
+VOXEL_BYTES = 12
 #: Points that are looked at together.
 _POINTS = 1 << 17
 
@@ -117,21 +121,19 @@ def load_grid(path: Path) -> OccupancyGrid:
     Raises:
         InputError: The file cannot be read or does not hold a grid.
     """
-    try:
-        with np.load(path, allow_pickle=False) as file:
-            missing = {"occupied", "aabb"} - set(file.files)
-            if missing:
-                raise InputError("missing", file=path, field=sorted(missing)[0], fix="give occupied and aabb")
-            occupied, aabb = file["occupied"], file["aabb"]
-    except InputError:
-        raise
-    except (OSError, ValueError, EOFError, zipfile.BadZipFile, MemoryError) as error:
-        raise InputError(f"cannot be read ({error})", file=path, fix="give an .npz with occupied and aabb") from None
-    if occupied.ndim != 3 or occupied.dtype != np.bool_ or not 0 < occupied.size <= _MOST:
-        found = f"found {occupied.dtype} {occupied.shape}"
-        raise InputError(found, file=path, field="occupied", fix=f"give [X, Y, Z] bool of at most {_MOST} voxels")
-    if aabb.shape != (2, 3) or aabb.dtype.kind not in "fiu":
-        raise InputError(f"found {aabb.dtype} {aabb.shape}", file=path, field="aabb", fix="give [2, 3] numbers")
+    with open_archive(path, "occupancy grid", "give an .npz with occupied and aabb") as file:
+        for name in ("occupied", "aabb"):
+            if name not in file.declared:
+                raise InputError("missing", field=name, fix="give occupied and aabb")
+        shape, kind = file.declared["occupied"]
+        if len(shape) != 3 or kind != np.bool_ or not 0 < math.prod(shape) <= _MOST:
+            fix = f"give [X, Y, Z] bool of at most {_MOST} voxels"
+            raise InputError(f"found {kind} {shape}", field="occupied", fix=fix)
+        check_memory(VOXEL_BYTES * math.prod(shape), path, "the grid")
+        shape, kind = file.declared["aabb"]
+        if shape != (2, 3) or kind.kind not in "fiu":
+            raise InputError(f"found {kind} {shape}", field="aabb", fix="give [2, 3] numbers")
+        occupied, aabb = file.read("occupied"), file.read("aabb")
     aabb = aabb.astype(np.float64)
     with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
         grid = OccupancyGrid.of_box(aabb[0], aabb[1], occupied)

@@ -9,7 +9,7 @@ import numpy as np
 from numba import njit
 
 from ns_abstract.arithmetic.chebyshev import ROUNDING
-from ns_abstract.arithmetic.units import UNIT64
+from ns_abstract.arithmetic.rounding import UNIT64
 
 _UP = 1.0 + 2.0**-40
 

@@ -14,10 +14,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from ns_abstract.execution.ending import checkpoint
+from ns_abstract.geometry.camera_path import Camera
 from ns_abstract.methods.nerf.field import Field
 from ns_abstract.methods.nerf.hsv import shifted
 from ns_abstract.methods.nerf.scene import NerfScene
-from ns_abstract.sets.path import Camera
 
 #: nerfstudio/model_components/ray_samplers.py, ``PDFSampler``.
 HISTOGRAM_PADDING = 0.01
@@ -116,7 +117,10 @@ class NerfRenderer:
         count = self.sampling.samples + (self.sampling.importance if self.sampling.kind == "hierarchical" else 0)
         step = max(1, _CHUNK // count)
         with torch.inference_mode():
-            parts = [self.rays(matrix, part, shift) for part in directions.split(step)]
+            parts = []
+            for part in directions.split(step):
+                checkpoint()
+                parts.append(self.rays(matrix, part, shift))
         return torch.cat(parts).double().cpu().numpy() if parts else np.zeros((0, 3))
 
     def image(self, camera: Camera, pose: np.ndarray, shift: Shift | None = None) -> np.ndarray:

@@ -20,7 +20,7 @@ from numba import njit
 from torch import Tensor
 
 from ns_abstract.arithmetic.chebyshev import ROUNDING, ChebyshevBasis
-from ns_abstract.arithmetic.units import UNIT64, gamma
+from ns_abstract.arithmetic.rounding import UNIT64, gamma
 from ns_abstract.methods.nerf.relu_kernel import relu
 from ns_abstract.methods.nerf.scene import Encoding, FieldWeights, Layer
 
@@ -162,9 +162,9 @@ class FieldBounds:
         degrees = torch.from_numpy(basis.indices).to(device, torch.float64)
         ellipses = torch.tensor(_ELLIPSES, dtype=torch.float64, device=device)
         # [ellipses, d, m]: bound of |Im T_k| on the ellipse of one variable, rounded up
-        self._imaginary = (
-            0.5 * (ellipses[:, None, None] ** degrees.T - ellipses[:, None, None] ** -degrees.T)
-        ) * (1.0 + 2.0**-30)
+        self._imaginary = (0.5 * (ellipses[:, None, None] ** degrees.T - ellipses[:, None, None] ** -degrees.T)) * (
+            1.0 + 2.0**-30
+        )
         self._decay = 4.0 * ellipses**-basis.degree / (ellipses - 1.0) * (1.0 + 2.0**-30)
 
     def _put(self, layer: Layer) -> tuple[Tensor, Tensor, Tensor]:
@@ -205,9 +205,7 @@ class FieldBounds:
             remainder = remainder + lebesgue**j * error
         # the vector's own radius; the argument's and the functions' rounding, seen through the interpolation
         largest = nodes.abs().amax(dim=1)
-        rounding = lebesgue**self.basis.dimensions * (
-            16.0 * UNIT64 * (omega * (largest[..., None] + 1.0)) + 2.0**-44
-        )
+        rounding = lebesgue**self.basis.dimensions * (16.0 * UNIT64 * (omega * (largest[..., None] + 1.0)) + 2.0**-44)
         waves = (remainder + omega * radius[..., None] + rounding).flatten(-2)
         plain = radius + rest + 2.0**-44 * (1.0 + largest) * lebesgue**self.basis.dimensions
         return poly, (torch.cat([waves, waves, plain], dim=-1) + dropped) * _UP

@@ -1,16 +1,18 @@
-"""Blending of a pixel's layers back to front, as forms and as intervals (design.md, B7-B9, O2-O4).
+"""Blending of a pixel's fragments back to front, as forms and as intervals (design.md, B7-B9, O2-O4).
 
-Lanes are the three channels, and a fourth one of nothing.
+SIMD lanes are the three channels, and a fourth one of nothing.
 """
 
 from __future__ import annotations
 
+from typing import Any, NamedTuple
+
 from numba import njit
 
-from ns_abstract.arithmetic.compiled import advanced, lowest_bit, pointer
 from ns_abstract.arithmetic.elementary import fma
-from ns_abstract.arithmetic.lanes import bits, load4, load8, maximum, minimum, store, where
-from ns_abstract.arithmetic.units import UNIT64
+from ns_abstract.arithmetic.rounding import UNIT64
+from ns_abstract.arithmetic.simd.intrinsics import advanced, lowest_bit
+from ns_abstract.arithmetic.simd.lanes import bits, load4, load8, maximum, minimum, store, where
 from ns_abstract.methods.splat.block import (
     ALPHA_HIGH,
     ALPHA_LOW,
@@ -23,7 +25,7 @@ from ns_abstract.methods.splat.block import (
     UP,
     color_ends,
     color_size,
-    listed_layer,
+    listed_fragment,
     parabola,
 )
 from ns_abstract.methods.splat.lists import BLOCK, PIXELS
@@ -32,61 +34,77 @@ from ns_abstract.methods.splat.lists import BLOCK, PIXELS
 _REORDERING_MATTERS = 1e-4
 
 
-@njit(cache=True, error_model="numpy")
-def swap_bounds(
-    pairs_, pair_count, slots_, slot_count, drawn_, places_, layers_, width, lists_, palette_, forms, moves_
-):  # fmt: skip
-    """Bound what reordering may change when a layer joins the layers behind it (design.md, O2).
+class _Ends(NamedTuple):
+    """Bounds of a blend, and of the colours in it; lanes are channels."""
 
-    The first half of its row of ``moves`` becomes how much three channels, and one of none, may fall, then rise.
+    low: Any
+    high: Any
+    darkest: Any
+    brightest: Any
+
+
+class _Scratch(NamedTuple):
+    """Memory for `_interval_group`: 16 numbers, then keys and places by list position."""
+
+    numbers: Any
+    keys: Any
+    order: Any
+
+
+@njit(cache=True, error_model="numpy")
+def swap_bounds(pairs, slots, block):
+    """Bound what reordering may change when a fragment joins those behind it (design.md, O2).
+
+    ``pairs`` and ``slots`` are the numbers of these. The first half of a fragment's row of ``moves`` becomes how much
+    three channels, and one of none, may fall, then rise.
     """
-    pairs, slots, drawn, places = pointer(pairs_), pointer(slots_), pointer(drawn_), pointer(places_)
-    layers, lists, palette, moves = pointer(layers_), pointer(lists_), pointer(palette_), pointer(moves_)
-    deepest = lists_.shape[1]
-    for p in range(pair_count):
-        k, other = pairs[2 * p], pairs[2 * p + 1]
-        front, back = slots[k], slots[other]
+    fragments, palette, reordering = block.fragments, block.palette, block.reordering
+    colors, forms, moves = palette.values, palette.forms, reordering.moves
+    values, capacity, places = fragments.values, fragments.capacity, reordering.places
+    for p in range(pairs):
+        k, other = reordering.pairs[2 * p], reordering.pairs[2 * p + 1]
+        front, back = reordering.slots[k], reordering.slots[other]
         if front < 0 or back < 0:
             continue
-        both = drawn[front] & drawn[back]
+        both = reordering.drawn[front] & reordering.drawn[back]
         if both == 0:
             continue
         # bounds of the colours
         e, f = k * color_size(forms) + color_ends(forms), other * color_size(forms) + color_ends(forms)
-        falls = maximum(0.0, load4(palette, e + 4) - load4(palette, f))
-        rises = maximum(0.0, load4(palette, f + 4) - load4(palette, e))
+        falls = maximum(0.0, load4(colors, e + 4) - load4(colors, f))
+        rises = maximum(0.0, load4(colors, f + 4) - load4(colors, e))
         while both != 0:
             q = lowest_bit(both)
             both &= both - 1
-            at, _, _ = listed_layer(lists, q * deepest + int(places[back * PIXELS + q]), width, forms)
-            _, _, move = listed_layer(lists, q * deepest + int(places[front * PIXELS + q]), width, forms)
-            alpha = layers[at + ALPHA_HIGH]
+            at, _, _ = listed_fragment(fragments, q * capacity + int(places[back * PIXELS + q]), forms)
+            _, _, move = listed_fragment(fragments, q * capacity + int(places[front * PIXELS + q]), forms)
+            alpha = values[at + ALPHA_HIGH]
             store(moves, move, fma(alpha, falls, load4(moves, move)))
             store(moves, move + 4, fma(alpha, rises, load4(moves, move + 4)))
             store(moves, move + 8, maximum(load4(moves, move + 8), falls))
             store(moves, move + 12, maximum(load4(moves, move + 12), rises))
     # one rounding by pair
-    up = UP + 2.0 * UNIT64 * pair_count
-    for slot in range(slot_count):
-        some = drawn[slot]
+    up = UP + 2.0 * UNIT64 * pairs
+    for slot in range(slots):
+        some = reordering.drawn[slot]
         while some != 0:
             q = lowest_bit(some)
             some &= some - 1
-            at, _, move = listed_layer(lists, q * deepest + int(places[slot * PIXELS + q]), width, forms)
-            # the weights of the layers it may move behind add up to at most one
-            store(moves, move, layers[at + ALPHA_HIGH] * minimum(load8(moves, move), load8(moves, move + 8)) * up)
+            at, _, move = listed_fragment(fragments, q * capacity + int(places[slot * PIXELS + q]), forms)
+            # the weights of the fragments it may move behind add up to at most one
+            store(moves, move, values[at + ALPHA_HIGH] * minimum(load8(moves, move), load8(moves, move + 8)) * up)
 
 
 @njit(cache=True, error_model="numpy", forceinline=True)
-def _blend_interval(low, high, darkest, brightest, layers, at, palette, ends):
-    """One layer over the interval [low, high] (design.md, B7); also the range of the colours so far."""
-    a_low, a_high = layers[at + ALPHA_LOW], layers[at + ALPHA_HIGH]
-    c_low, c_high = load4(palette, ends), load4(palette, ends + 4)
-    v = c_low - low
-    low = fma(where(v < 0.0, a_high, a_low), v, low)
-    v = c_high - high
-    high = fma(where(v > 0.0, a_high, a_low), v, high)
-    return low, high, minimum(darkest, c_low), maximum(brightest, c_high)
+def _blend_interval(behind, values, at, colors, ends):
+    """One fragment over what is ``behind`` (design.md, B7); its colour's bounds stand at ``ends``."""
+    a_low, a_high = values[at + ALPHA_LOW], values[at + ALPHA_HIGH]
+    c_low, c_high = load4(colors, ends), load4(colors, ends + 4)
+    v = c_low - behind.low
+    low = fma(where(v < 0.0, a_high, a_low), v, behind.low)
+    v = c_high - behind.high
+    high = fma(where(v > 0.0, a_high, a_low), v, behind.high)
+    return _Ends(low, high, minimum(behind.darkest, c_low), maximum(behind.brightest, c_high))
 
 
 @njit(cache=True, error_model="numpy")
@@ -110,128 +128,122 @@ def _sort(keys, order, count):
 
 
 @njit(cache=True, error_model="numpy")
-def _interval_chain(
-    layers, width, lists, palette, forms, moves, low, high, darkest, brightest, start, stop, t, keys, order
-):
+def _interval_group(start, stop, behind, fragments, palette, moves, scratch):
     """One step of the interval blend for list entries [start, stop) whose order is uncertain (design.md, O2-O4).
 
-    Returns the tighter of the swap, hull and antichain bounds, and the range of the colours so far; ``t``, ``keys`` and
-    ``order`` are scratch.
+    Returns the tighter of the swap, hull and antichain bounds.
     """
-    store(t, 8, low)
-    store(t, 12, high)
+    values, colors, forms = fragments.values, palette.values, palette.forms
+    t, keys, order = scratch.numbers, scratch.keys, scratch.order
+    store(t, 8, behind.low)
+    store(t, 12, behind.high)
     for entry in range(stop - 1, start - 1, -1):
-        at, key, move = listed_layer(lists, entry, width, forms)
+        at, key, move = listed_fragment(fragments, entry, forms)
         ends = key + color_ends(forms)
-        a_high = layers[at + ALPHA_HIGH]
-        # wherever it goes among the layers behind, it moves the colour by at most its alpha times
+        a_high = values[at + ALPHA_HIGH]
+        # wherever it goes among the fragments behind, it moves the colour by at most its alpha times
         # the distance to the darkest or brightest of what lies behind
-        hull_low = fma(a_high, minimum(0.0, load4(palette, ends) - brightest), low)
-        hull_high = fma(a_high, maximum(0.0, load4(palette, ends + 4) - darkest), high)
-        low, high, darkest, brightest = _blend_interval(low, high, darkest, brightest, layers, at, palette, ends)
-        hull_low, hull_high = minimum(low, hull_low), maximum(high, hull_high)
-        low = maximum(low - load4(moves, move), hull_low)
-        high = minimum(high + load4(moves, move + 4), hull_high)
-    store(t, 0, low)
-    store(t, 4, high)
+        hull_low = fma(a_high, minimum(0.0, load4(colors, ends) - behind.brightest), behind.low)
+        hull_high = fma(a_high, maximum(0.0, load4(colors, ends + 4) - behind.darkest), behind.high)
+        front = _blend_interval(behind, values, at, colors, ends)
+        hull_low, hull_high = minimum(front.low, hull_low), maximum(front.high, hull_high)
+        low = maximum(front.low - load4(moves, move), hull_low)
+        high = minimum(front.high + load4(moves, move + 4), hull_high)
+        behind = _Ends(low, high, front.darkest, front.brightest)
+    store(t, 0, behind.low)
+    store(t, 4, behind.high)
     count = stop - start
     for channel in range(3):
         for side in range(2):
             for e in range(count):
-                _, key, _ = listed_layer(lists, start + e, width, forms)
+                _, key, _ = listed_fragment(fragments, start + e, forms)
                 ends = key + color_ends(forms) + channel
-                keys[e] = palette[ends] if side == 0 else -palette[ends + 4]
+                keys[e] = colors[ends] if side == 0 else -colors[ends + 4]
             _sort(keys, order, count)
             value = t[8 + 4 * side + channel]
             # nearest first: darkest for the lower bound, brightest for the upper one
             for position in range(count - 1, -1, -1):
-                at, _, _ = listed_layer(lists, start + order[position], width, forms)
+                at, _, _ = listed_fragment(fragments, start + order[position], forms)
                 color = keys[position] if side == 0 else -keys[position]
                 v = color - value
                 grows = v < 0.0 if side == 0 else v > 0.0
-                value += layers[at + (ALPHA_HIGH if grows else ALPHA_LOW)] * v
+                value += values[at + (ALPHA_HIGH if grows else ALPHA_LOW)] * v
             if side == 0:
                 t[channel] = max(t[channel], value)
             else:
                 t[4 + channel] = min(t[4 + channel], value)
-    return load4(t, 0), load4(t, 4), darkest, brightest
-
-
-@njit(cache=True, error_model="numpy")
-def _sharpened(
-    low, high, form_low, form_high, layers, width, lists, palette, forms, begin, end, moves, chain, background, t, keys,
-    order,
-):  # fmt: skip
-    """Interval [low, high] of a pixel whose layers' depth orders are uncertain, sharpened where that may pay (O4).
-
-    The list entries of the pixel are [begin, end); ``form_low`` and ``form_high`` are its bounds by the forms;
-    ``chain[k]`` numbers the groups; ``t``, ``keys`` and ``order`` are scratch.
-    """
-    falls = 0.0 * low
-    rises = falls
-    for entry in range(begin, end):
-        at, _, move = listed_layer(lists, entry, width, forms)
-        if move != 0:
-            light = layers[at + LIGHT]
-            falls = fma(light, load4(moves, move), falls)
-            rises = fma(light, load4(moves, move + 4), rises)
-    # how much of what reordering moves may be won back, where the forms are not tighter anyhow
-    gain = maximum(minimum(falls, low + falls - form_low), minimum(rises, form_high - (high - rises)))
-    if bits(gain > _REORDERING_MATTERS) == 0:
-        return low, high
-    value_low = load4(background, 0)
-    value_high = value_low
-    darkest = value_low
-    brightest = value_low
-    stop = end
-    while stop > begin:
-        start = stop - 1
-        group = chain[int(lists[LISTED * start + 1])]
-        while start > begin and chain[int(lists[LISTED * (start - 1) + 1])] == group:
-            start -= 1
-        if stop - start == 1:
-            at, key, _ = listed_layer(lists, start, width, forms)
-            value_low, value_high, darkest, brightest = _blend_interval(
-                value_low, value_high, darkest, brightest, layers, at, palette, key + color_ends(forms)
-            )
-        else:
-            value_low, value_high, darkest, brightest = _interval_chain(
-                layers, width, lists, palette, forms, moves, value_low, value_high, darkest, brightest, start, stop, t,
-                keys, order,
-            )  # fmt: skip
-        stop = start
-    return maximum(low, value_low), minimum(high, value_high)
+    return _Ends(load4(t, 0), load4(t, 4), behind.darkest, behind.brightest)
 
 
 @njit(cache=True, error_model="numpy", forceinline=True)
-def _blend_line(layers, width, lists, palette, forms, begin, end, moves, background, t):
+def _worth_reordering(begin, end, ends, form_low, form_high, fragments, forms, moves):
+    """Whether O3 and O4 may win more than hardly anything where the forms are not tighter anyhow."""
+    falls = 0.0 * ends.low
+    rises = falls
+    for entry in range(begin, end):
+        at, _, move = listed_fragment(fragments, entry, forms)
+        if move != 0:
+            light = fragments.values[at + LIGHT]
+            falls = fma(light, load4(moves, move), falls)
+            rises = fma(light, load4(moves, move + 4), rises)
+    gain = maximum(minimum(falls, ends.low + falls - form_low), minimum(rises, form_high - (ends.high - rises)))
+    return bits(gain > _REORDERING_MATTERS) != 0
+
+
+@njit(cache=True, error_model="numpy", forceinline=True)
+def _sharpened(begin, end, ends, form_low, form_high, block, scratch):
+    """Bounds ``ends`` of a pixel whose fragments' depth orders are uncertain, sharpened where that may pay (O4).
+
+    The list entries of the pixel are [begin, end); ``form_low`` and ``form_high`` are its bounds by the forms.
+    """
+    fragments, palette, moves, group = block.fragments, block.palette, block.reordering.moves, block.entries.far
+    lists, forms = fragments.lists, palette.forms
+    low, high = ends.low, ends.high
+    if not _worth_reordering(begin, end, ends, form_low, form_high, fragments, forms, moves):
+        return low, high
+    background = load4(palette.background, 0)
+    value = _Ends(background, background, background, background)
+    stop = end
+    while stop > begin:
+        start = stop - 1
+        number = group[int(lists[LISTED * start + 1])]
+        while start > begin and group[int(lists[LISTED * (start - 1) + 1])] == number:
+            start -= 1
+        if stop - start == 1:
+            at, key, _ = listed_fragment(fragments, start, forms)
+            value = _blend_interval(value, fragments.values, at, palette.values, key + color_ends(forms))
+        else:
+            value = _interval_group(start, stop, value, fragments, palette, moves, scratch)
+        stop = start
+    return maximum(low, value.low), minimum(high, value.high)
+
+
+@njit(cache=True, error_model="numpy", forceinline=True)
+def _blend_quadratic(begin, end, fragments, palette, moves, t):
     """Blend the list entries [begin, end) of a pixel back to front, as forms and as intervals (design.md, B7).
 
-    For one parameter and order 2. Lanes are the channels; ``background`` [4] and ``palette`` (`layers._set_colors`,
-    ``forms`` rows before the radius) have a fourth one of zeros. ``t`` [m, 4] receives the polynomials; returns their
-    radii, not yet rounded up, the intervals' ends, and the range of all colours.
+    For one parameter and order 2. ``t`` [m, 4] receives the polynomials; returns their radii, not yet rounded up, and
+    the intervals.
     """
+    values, colors, forms = fragments.values, palette.values, palette.forms
     moving = forms > 1
-    p0 = load4(background, 0)
+    p0 = load4(palette.background, 0)
     p1 = 0.0 * p0
     p2 = 0.0 * p0
     r = 0.0 * p0
-    bottom = p0
-    top = p0
-    darkest = p0
-    brightest = p0
+    ends = _Ends(p0, p0, p0, p0)
     for entry in range(end - 1, begin - 1, -1):
-        at, key, move = listed_layer(lists, entry, width, forms)
-        a0, a1, a2 = layers[at + FORM], layers[at + FORM + 1], layers[at + FORM + 2]
+        at, key, move = listed_fragment(fragments, entry, forms)
+        a0, a1, a2 = values[at + FORM], values[at + FORM + 1], values[at + FORM + 2]
         # colour - P, a form without radius
-        v0 = load4(palette, key) - p0
+        v0 = load4(colors, key) - p0
         if moving:
-            v1 = load4(palette, key + 4) - p1
-            v2 = load4(palette, key + 8) - p2
+            v1 = load4(colors, key + 4) - p1
+            v2 = load4(colors, key + 8) - p2
         else:
             v1 = -p1
             v2 = -p2
-        # sums in the order that leaves short chains from layer to layer
+        # sums in the order that leaves short chains from fragment to fragment
         p0 = fma(a0, v0, p0)
         p1 = fma(a0, v1, fma(a1, v0, p1))
         p2 = fma(a0, v2, fma(a2, v0, fma(a1, v1, p2)))
@@ -241,44 +253,39 @@ def _blend_line(layers, width, lists, palette, forms, begin, end, moves, backgro
         v2 = abs(v2)
         v1 = v1 + v2
         size = abs(v0) + v1
-        added = fma(layers[at + ALPHA_HIGH], load4(palette, key + 4 * forms), fma(a1, v2, a2 * v1))
-        added = fma(layers[at + FORM + 3], size, fma(ROUND, fma(1.0 + a1 + a2, size, abs(p0)), added))
-        r = fma(1.0 - layers[at + ALPHA_LOW], r, added)
-        bottom, top, darkest, brightest = _blend_interval(
-            bottom, top, darkest, brightest, layers, at, palette, key + color_ends(forms)
-        )
+        added = fma(values[at + ALPHA_HIGH], load4(colors, key + 4 * forms), fma(a1, v2, a2 * v1))
+        added = fma(values[at + FORM + 3], size, fma(ROUND, fma(1.0 + a1 + a2, size, abs(p0)), added))
+        r = fma(1.0 - values[at + ALPHA_LOW], r, added)
+        ends = _blend_interval(ends, values, at, colors, key + color_ends(forms))
         if move != 0:
             falls, rises = load4(moves, move), load4(moves, move + 4)
             p0 = p0 + 0.5 * (rises - falls)
             r = r + 0.5 * (rises + falls)
-            bottom = bottom - falls
-            top = top + rises
+            ends = _Ends(ends.low - falls, ends.high + rises, ends.darkest, ends.brightest)
     store(t, 0, p0)
     store(t, 4, p1)
     store(t, 8, p2)
-    return r, bottom, top, darkest, brightest
+    return r, ends
 
 
 @njit(cache=True, error_model="numpy", forceinline=True)
-def _step_affine(r, layers, at, palette, key, forms, t, m):
-    """One layer over the polynomials ``t`` [m, 4], flat, of order 1 and radius ``r`` (design.md, B7); the new radius.
-
-    Lanes are the channels.
-    """
+def _step_affine(r, at, key, fragments, palette, t, m):
+    """One fragment over the polynomials ``t`` [m, 4] of order 1 and radius ``r`` (design.md, B7); the new radius."""
+    values, colors, forms = fragments.values, palette.values, palette.forms
     moving = forms > 1
-    a0 = layers[at + FORM]
+    a0 = values[at + FORM]
     p0 = load4(t, 0)
-    value = load4(palette, key) - p0
+    value = load4(colors, key) - p0
     middle = fma(a0, value, p0)
     steep = 0.0
     change_size = 0.0 * p0
     curves = 0.0 * p0
     for k in range(1, m):
         slope = load4(t, 4 * k)
-        alpha = layers[at + FORM + k]
+        alpha = values[at + FORM + k]
         change = -slope
         if moving:
-            change = load4(palette, key + 4 * k) - slope
+            change = load4(colors, key + 4 * k) - slope
         # half of a product of two slopes goes to the centre, half to the radius
         curve = 0.5 * (alpha * change)
         store(t, 4 * k, fma(a0, change, fma(alpha, value, slope)))
@@ -288,82 +295,35 @@ def _step_affine(r, layers, at, palette, key, forms, t, m):
         change_size = change_size + abs(change)
     store(t, 0, middle)
     size = abs(value) + change_size
-    added = fma(layers[at + ALPHA_HIGH], load4(palette, key + 4 * forms), fma(steep, change_size, -curves))
-    added = fma(layers[at + FORM + m], size, fma(ROUND, fma(1.0 + steep, size, abs(middle)), added))
-    return fma(1.0 - layers[at + ALPHA_LOW], r, added)
+    added = fma(values[at + ALPHA_HIGH], load4(colors, key + 4 * forms), fma(steep, change_size, -curves))
+    added = fma(values[at + FORM + m], size, fma(ROUND, fma(1.0 + steep, size, abs(middle)), added))
+    return fma(1.0 - values[at + ALPHA_LOW], r, added)
 
 
 @njit(cache=True, error_model="numpy", forceinline=True)
-def _step_curved(r, layers, at, palette, key, forms, t, value, d, m):
-    """`_step_affine` for order 2; ``value`` [m, 4], flat, is scratch."""
-    moving = forms > 1
-    a0 = layers[at + FORM]
-    # value = colour - P, a form without radius
-    v0 = load4(palette, key) - load4(t, 0)
-    slopes = 0.0 * v0
-    bends = 0.0 * v0
-    steep, bent = 0.0, 0.0
-    for k in range(1, m):
-        v = -load4(t, 4 * k)
-        if moving:
-            v = load4(palette, key + 4 * k) + v
-        store(value, 4 * k, v)
-        alpha = layers[at + FORM + k]
-        store(t, 4 * k, load4(t, 4 * k) + (a0 * v + alpha * v0))
-        if k <= d:
-            slopes = slopes + abs(v)
-            steep += abs(alpha)
-        else:
-            bends = bends + abs(v)
-            bent += abs(alpha)
-    p0 = load4(t, 0) + a0 * v0
+def _blend_affine(begin, end, fragments, palette, moves, t, m):
+    """`_blend_quadratic` for order 1 and any number of parameters."""
+    values, colors, forms = fragments.values, palette.values, palette.forms
+    p0 = load4(palette.background, 0)
+    r = 0.0 * p0
     store(t, 0, p0)
-    row = 1 + d
-    for k in range(1, d + 1):
-        alpha, v = layers[at + FORM + k], load4(value, 4 * k)
-        store(t, 4 * row, load4(t, 4 * row) + alpha * v)
-        row += 1
-        for l in range(k + 1, d + 1):
-            product = alpha * load4(value, 4 * l) + layers[at + FORM + l] * v
-            store(t, 4 * row, load4(t, 4 * row) + product)
-            row += 1
-    size = abs(v0) + (slopes + bends)
-    added = fma(layers[at + ALPHA_HIGH], load4(palette, key + 4 * forms), fma(steep, bends, bent * (slopes + bends)))
-    added = fma(layers[at + FORM + m], size, fma(ROUND, fma(1.0 + steep + bent, size, abs(p0)), added))
-    return fma(1.0 - layers[at + ALPHA_LOW], r, added)
-
-
-@njit(cache=True, error_model="numpy", forceinline=True)
-def _blend(layers, width, lists, palette, forms, begin, end, moves, background, d, order, m, t, value):
-    """`_blend_line` for any number of parameters and order; ``value`` is scratch."""
-    bottom = load4(background, 0)
-    r = 0.0 * bottom
-    store(t, 0, bottom)
     for k in range(1, m):
         store(t, 4 * k, r)
-    top = bottom
-    darkest = bottom
-    brightest = bottom
+    ends = _Ends(p0, p0, p0, p0)
     for entry in range(end - 1, begin - 1, -1):
-        at, key, move = listed_layer(lists, entry, width, forms)
-        if order == 1:
-            r = _step_affine(r, layers, at, palette, key, forms, t, m)
-        else:
-            r = _step_curved(r, layers, at, palette, key, forms, t, value, d, m)
-        bottom, top, darkest, brightest = _blend_interval(
-            bottom, top, darkest, brightest, layers, at, palette, key + color_ends(forms)
-        )
+        at, key, move = listed_fragment(fragments, entry, forms)
+        r = _step_affine(r, at, key, fragments, palette, t, m)
+        ends = _blend_interval(ends, values, at, colors, key + color_ends(forms))
         if move != 0:
             falls, rises = load4(moves, move), load4(moves, move + 4)
             store(t, 0, load4(t, 0) + 0.5 * (rises - falls))
             r = r + 0.5 * (rises + falls)
-            bottom = bottom - falls
-            top = top + rises
-    return r, bottom, top, darkest, brightest
+            ends = _Ends(ends.low - falls, ends.high + rises, ends.darkest, ends.brightest)
+    return r, ends
 
 
 @njit(cache=True, error_model="numpy", forceinline=True)
-def _form_range(t, r, d, order, m):
+def _form_range(t, r, order, m):
     """Range over the box of the polynomials ``t`` [m, 4] of radii ``r``, rounded outward (design.md, A4)."""
     middle = load4(t, 0)
     bottom, top = middle, middle
@@ -373,82 +333,74 @@ def _form_range(t, r, d, order, m):
     if order == 1:
         bottom, top = middle - size, middle + size
     else:
-        row = 1 + d
-        for k in range(1, d + 1):
-            low, high = parabola(abs(load4(t, 4 * k)), load4(t, 4 * row))
-            bottom, top = bottom + low, top + high
-            row += 1
-            for _ in range(k + 1, d + 1):
-                mixed = abs(load4(t, 4 * row))
-                bottom, top = bottom - mixed, top + mixed
-                row += 1
+        low, high = parabola(abs(load4(t, 4)), load4(t, 8))
+        bottom, top = bottom + low, top + high
     room = 8.0 * ROUND * (abs(middle) + size) + r * UP
     return bottom - room, top + room
 
 
-@njit(cache=True, error_model="numpy")
-def shade(
-    layers_, width, lists_, palette_, forms, lengths, moves_, chain, reordered, background_, unseen_, fade,
-    color_radius, negligible, unit, left, top_row, d, order, m, s_, t_, value_, keys_, order_, lower, upper, linear,
-    slopes, statistics,
-):  # fmt: skip
-    """Blend every pixel's layers and write its bounds; lanes are the channels, a fourth one holds nothing.
+@njit(cache=True, error_model="numpy", forceinline=True)
+def _slack(q, ends, block, inputs, u):
+    """By how much the bounds of pixel q are widened below and above beside what blending knows (design.md, B6, B8).
 
-    The block begins at column ``left`` and row ``top_row`` of its tile; ``reordered`` tells whether layers may move.
-    Row OPEN of ``s`` bounds the light that comes to layers that are missing and have colours between the two that
-    ``unseen`` [8] names; the program adds these up with an error of at most ``fade``.
+    ``u`` is scratch for 8 numbers.
     """
-    layers, lists, palette, moves = pointer(layers_), pointer(lists_), pointer(palette_), pointer(moves_)
-    background, s, t, value = pointer(background_), pointer(s_), pointer(t_), pointer(value_)
-    unseen, keys, order_of = pointer(unseen_), pointer(keys_), pointer(order_)
-    deepest = lists_.shape[1]
+    lanes, palette, cutoffs, charges = block.fragments.lanes, block.palette, inputs.cutoffs, inputs.charges
+    unseen = palette.unseen
+    behind = load4(palette.background, 0)
+    store(u, 0, ends.darkest)
+    store(u, 4, ends.brightest)
+    dark, light = min(u[0], u[1], u[2]), max(u[4], u[5], u[6])
+    # rounding of the program's own sums and products
+    bright = max(1.0, light, -dark)
+    rounding = charges.blend_fragment * block.fragments.lengths[q] + charges.blend_pixel
+    slack = rounding * bright * 1.01 + inputs.colors.error + cutoffs.negligible * bright
+    # a stop that was ignored shows the background in place of what lies behind
+    rho = lanes[RHO + q] * (1.0 + charges.lost_light)
+    fall = rho * maximum(0.0, light - behind)
+    rise = rho * maximum(0.0, behind - dark)
+    # or else fragments that are missing show in place of the background
+    passed = lanes[OPEN + q] * (1.0 + charges.lost_light)
+    if passed > 0.0:
+        faded = cutoffs.fade * max(bright, unseen[4], unseen[5], unseen[6])
+        fall = maximum(fall, fma(passed, behind - load4(unseen, 0), faded))
+        rise = maximum(rise, fma(passed, load4(unseen, 4) - behind, faded))
+    return slack + fall, slack + rise
+
+
+@njit(cache=True, error_model="numpy")
+def shade(left, above, reordered, block, inputs, bounds):
+    """Blend every pixel's fragments and write its bounds (design.md, B7-B9).
+
+    The block begins at column ``left`` and row ``above`` of its tile, whose parts of `PixelBounds` are ``bounds``;
+    ``reordered`` tells whether fragments may move. Row OPEN of the lanes bounds the light that comes to fragments that
+    are missing and have colours between the two of `Palette.unseen`.
+    """
+    fragments, palette, moves, t = block.fragments, block.palette, block.reordering.moves, block.sums
+    lower, upper, linear, slopes = bounds.lower, bounds.upper, bounds.linear, bounds.slopes
+    d, order, m = inputs.shape.dimensions, inputs.shape.order, inputs.shape.monomials
     # behind the polynomials: scratch, then sums of absolute linear coefficients
     u = advanced(t, 4 * m)
     sums = advanced(t, 4 * m + 16)
-    behind = load4(background, 0)
+    scratch = _Scratch(u, block.entries.reach, block.entries.first)
     for k in range(d):
-        store(sums, 4 * k, 0.0 * behind)
+        store(sums, 4 * k, 0.0 * load4(palette.background, 0))
     for q in range(PIXELS):
-        begin = q * deepest
-        end = begin + int(lengths[q])
-        if d == 1 and order == 2:
-            r, low, high, darkest, brightest = _blend_line(
-                layers, width, lists, palette, forms, begin, end, moves, background, t
-            )
+        begin = q * fragments.capacity
+        end = begin + int(fragments.lengths[q])
+        if order == 2:
+            r, ends = _blend_quadratic(begin, end, fragments, palette, moves, t)
         else:
-            r, low, high, darkest, brightest = _blend(
-                layers, width, lists, palette, forms, begin, end, moves, background, d, order, m, t, value
-            )
-        # the radius' own rounding: three for every layer
-        r = r * (UP + 4.0 * UNIT64 * lengths[q])
-        form_low, form_high = _form_range(t, r, d, order, m)
+            r, ends = _blend_affine(begin, end, fragments, palette, moves, t, m)
+        # the radius' own rounding: three for every fragment
+        r = r * (UP + 4.0 * UNIT64 * fragments.lengths[q])
+        form_low, form_high = _form_range(t, r, order, m)
+        low, high = ends.low, ends.high
         if reordered:
-            low, high = _sharpened(
-                low, high, form_low, form_high, layers, width, lists, palette, forms, begin, end, moves, chain,
-                background, u, keys, order_of,
-            )  # fmt: skip
+            low, high = _sharpened(begin, end, ends, form_low, form_high, block, scratch)
         for k in range(d):
             store(sums, 4 * k, load4(sums, 4 * k) + abs(load4(t, 4 + 4 * k)))
-        store(u, 0, darkest)
-        store(u, 4, brightest)
-        dark, light = min(u[0], u[1], u[2]), max(u[4], u[5], u[6])
-        # rounding of the program's own sums and products (design.md, B8)
-        bright = max(1.0, light, -dark)
-        slack = (
-            (3.0 * lengths[q] + 16.0) * (unit + 8.0 * UNIT64) * bright * 1.01 + color_radius + negligible * bright
-        )
-        # a stop that was ignored shows the background in place of what lies behind (B6)
-        rho = s[RHO + q] * (1.0 + 16.0 * unit)
-        fall = rho * maximum(0.0, light - behind)
-        rise = rho * maximum(0.0, behind - dark)
-        # or else layers that are missing show in place of the background
-        passed = s[OPEN + q] * (1.0 + 16.0 * unit)
-        if passed > 0.0:
-            faded = fade * max(bright, unseen[4], unseen[5], unseen[6])
-            fall = maximum(fall, fma(passed, behind - load4(unseen, 0), faded))
-            rise = maximum(rise, fma(passed, load4(unseen, 4) - behind, faded))
-        fall = slack + fall
-        rise = slack + rise
+        fall, rise = _slack(q, ends, block, inputs, u)
         bottom = maximum(low, form_low) - fall
         top = minimum(high, form_high) + rise
         # crossed or not a number: nothing is known
@@ -456,8 +408,8 @@ def shade(
         store(u, 0, minimum(1.0, maximum(0.0, where(known, bottom, 0.0))))
         store(u, 4, maximum(0.0, minimum(1.0, where(known, top, 1.0))))
         if bits(known) != 15:
-            statistics[4] += 1
-        row, column = top_row + q // BLOCK, left + q % BLOCK
+            bounds.statistics[4] += 1
+        row, column = above + q // BLOCK, left + q % BLOCK
         for channel in range(3):
             lower[row, column, channel] = u[channel]
             upper[row, column, channel] = u[4 + channel]

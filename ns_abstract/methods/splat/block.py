@@ -1,16 +1,22 @@
 """What the pixel stage keeps of a block of pixels, and where (design.md, B1-B9).
 
-A layer is one Gaussian on one pixel: what is known of its alpha, and of the light before and behind it. Layers lie one
-after the other; each pixel lists those that may contribute to it, nearest first, with the places of their colours in a
-palette and of the rows that tell how far reordering may move them.
+A fragment is one Gaussian on one pixel: what is known of its alpha, and of the light before and behind it. Fragments
+lie one after the other; each pixel lists those that may contribute to it, nearest first, with the places of their
+colours in a palette and of the rows that tell how far reordering may move them.
+
+`Buffers` own the memory; a `Block` is what kernels are given, with pointers to it in place of arrays.
 """
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
+import numpy as np
 from numba import njit
 
-from ns_abstract.arithmetic.lanes import bits, maximum, minimum, where
-from ns_abstract.arithmetic.units import UNIT64
+from ns_abstract.arithmetic.rounding import UNIT64
+from ns_abstract.arithmetic.simd.intrinsics import pointer
+from ns_abstract.arithmetic.simd.lanes import bits, maximum, minimum, where
 from ns_abstract.methods.splat.lists import BLOCK, PIXELS
 
 assert PIXELS == 64 and BLOCK == 8
@@ -18,19 +24,298 @@ assert PIXELS == 64 and BLOCK == 8
 ROUND = 16.0 * UNIT64
 UP = 1.0 + 128.0 * UNIT64
 
-# Scratch is flat: row r holds its lanes at r * PIXELS .. r * PIXELS + PIXELS - 1, one by pixel.
-(
-    C1, C2, L1, L2, B1, B2, S0, SR, SL, SB, SLO, SHI, WEIGHT, CURVE,
-    TLO, THI, REACH, RHO, LOST, OPEN, MIN, MAX, NUMBERS,
-) = range(0, 23 * PIXELS, PIXELS)  # fmt: skip
-ROWS = 23
-#: Columns of a layer: bounds of alpha, transmittance behind it at its least and before it at its most, alpha's
+#: List entries that are looked at together: no step waits for the one before.
+BATCH = 8
+
+# What is known of each pixel lies in flat rows: row r holds its lanes at r * PIXELS .. r * PIXELS + PIXELS - 1. Light
+# that passes the fragments listed so far at its least and most; last list position that may still change places; what
+# a stop that is ignored may hide, and what any stop so far may leave; light that comes to what is missing; what stops
+# at fragments of uncertain order may leave; 0, 1, 2, ...
+TLO, THI, REACH, RHO, LOST, OPEN, HIDDEN, NUMBERS = range(0, 8 * PIXELS, PIXELS)
+ROWS = 8
+#: Columns of a fragment: bounds of alpha, transmittance behind it at its least and before it at its most, alpha's
 #: coefficients and then its radius.
 ALPHA_LOW, ALPHA_HIGH, LEFT, LIGHT, FORM = range(5)
-#: Columns of an entry of a pixel's list: the layer's number, its list position, its row of moves; one is spare.
+#: Columns of an entry of a pixel's list: the fragment's number, its list position, its row of moves; one is spare.
 LISTED = 4
 #: Columns of a row of moves: by how much reordering may lower and raise the pixel, found from sums and from maxima.
 MOVES = 16
+#: Fragments that each pixel's list has room for at first.
+_CAPACITY = 256
+#: Room for list positions at first.
+_POSITIONS = 1024
+
+
+class Place(NamedTuple):
+    """A block's first pixel in the picture, and its tile's column and row."""
+
+    x0: int
+    y0: int
+    tile_x: int
+    tile_y: int
+
+
+class Fragments(NamedTuple):
+    """The fragments of a block's pixels.
+
+    Attributes:
+        values: [PIXELS capacity, width] fragments; the columns are ALPHA_LOW .. FORM + m.
+        width: Numbers of a fragment.
+        lists: [PIXELS, capacity, LISTED] each pixel's fragments, nearest first.
+        lengths: [PIXELS] of the lists.
+        capacity: Fragments that each list has room for.
+        lanes: [ROWS, PIXELS] what is known of each pixel.
+    """
+
+    values: np.ndarray
+    width: int
+    lists: np.ndarray
+    lengths: np.ndarray
+    capacity: int
+    lanes: np.ndarray
+
+
+class Palette(NamedTuple):
+    """Colours of a block's list; each is rows of three channels and one of none.
+
+    Attributes:
+        values: [entries, forms + 3, 4] coefficients, radius, lower and upper bound over the cell.
+        forms: Coefficients of a colour.
+        background: [4].
+        unseen: [2, 4] darkest and brightest of what fragments that were left out show.
+    """
+
+    values: np.ndarray
+    forms: int
+    background: np.ndarray
+    unseen: np.ndarray
+
+
+class Entries(NamedTuple):
+    """What is known of each position of a block's list; [entries] all.
+
+    Attributes:
+        pixels: The set of the block's pixels that may be reached; valid where ``asked`` is 1.
+        asked: Whether ``pixels`` was found.
+        reach: How far in depth the Gaussian may move against the block's central ray (O1).
+        depth: At the cell's middle.
+        far: Positions that reach further than most, in order; later the group that a position belongs to (O4).
+        first, last: Nearest and farthest position whose depth order against this one is uncertain, or itself.
+    """
+
+    pixels: np.ndarray
+    asked: np.ndarray
+    reach: np.ndarray
+    depth: np.ndarray
+    far: np.ndarray
+    first: np.ndarray
+    last: np.ndarray
+
+
+class Reordering(NamedTuple):
+    """Which fragments of a block may change places. A list position that takes part in that has a slot.
+
+    Attributes:
+        pairs: [pair_limit, 2] list positions of uncertain order, the nearer at the middle first.
+        pair_limit: Room for pairs.
+        slots: [entries] number of a position's slot; -1: its order is certain.
+        owners: [slots] list positions.
+        drawn: [2 capacity] the set of pixels that a slot is drawn on.
+        places: [2 capacity, PIXELS] a slot's place in their lists.
+        moves: [32 capacity, MOVES] see `MOVES`; row 0 is for fragments that do not move.
+    """
+
+    pairs: np.ndarray
+    pair_limit: int
+    slots: np.ndarray
+    owners: np.ndarray
+    drawn: np.ndarray
+    places: np.ndarray
+    moves: np.ndarray
+
+
+class Batch(NamedTuple):
+    """Scratch for `BATCH` list positions on the pixels that they may reach, one after the other.
+
+    Attributes:
+        offset_x, offset_y: [BATCH PIXELS] pixel centre minus mean, pixels.
+        pixels: [BATCH PIXELS] numbers of the pixels.
+        begins: [BATCH + 1] where the pixels of each begin.
+        found: [BATCH] the set of those of its pixels on which alpha may reach the threshold.
+        rows: [width, 8] columns of eight fragments.
+    """
+
+    offset_x: np.ndarray
+    offset_y: np.ndarray
+    pixels: np.ndarray
+    begins: np.ndarray
+    found: np.ndarray
+    rows: np.ndarray
+
+
+class Block(NamedTuple):
+    """A block as kernels take it: pointers to `Buffers`.
+
+    Attributes:
+        sums: [2 m + 4, 4] scratch by channel: polynomials, then what `blend` needs beside them.
+        ray: [3] the block's central ray at the cell's middle, world axes, of unit depth.
+    """
+
+    fragments: Fragments
+    palette: Palette
+    entries: Entries
+    reordering: Reordering
+    batch: Batch
+    sums: np.ndarray
+    ray: np.ndarray
+
+
+class Buffers(NamedTuple):
+    """Memory of a thread's blocks; the fields are those of `Block` and its parts."""
+
+    lanes: np.ndarray
+    offsets: np.ndarray
+    pixels: np.ndarray
+    batch: np.ndarray
+    rows: np.ndarray
+    lengths: np.ndarray
+    background: np.ndarray
+    unseen: np.ndarray
+    sums: np.ndarray
+    ray: np.ndarray
+    positions: np.ndarray
+    depths: np.ndarray
+    palette: np.ndarray
+    values: np.ndarray
+    lists: np.ndarray
+    drawn: np.ndarray
+    places: np.ndarray
+    moves: np.ndarray
+    pairs: np.ndarray
+
+
+@njit(cache=True, error_model="numpy")
+def fragment_width(m):
+    """Numbers of a fragment of ``m`` coefficients: whole cache lines."""
+    return -(-(FORM + m + 1) // 8) * 8
+
+
+@njit(cache=True, error_model="numpy")
+def _aligned(size):
+    """Uninitialised doubles that begin with a cache line."""
+    memory = np.empty(size + 7)
+    start = -(memory.ctypes.data // 8) % 8
+    return memory[start : start + size]
+
+
+@njit(cache=True, error_model="numpy")
+def new_buffers(m, forms, pair_limit, background):
+    """Memory for fragments of ``m`` coefficients, colours of ``forms`` and ``pair_limit`` pairs."""
+    lanes = np.zeros(ROWS * PIXELS)
+    lanes[NUMBERS : NUMBERS + BLOCK] = np.arange(BLOCK)
+    behind = np.zeros(4)
+    behind[:3] = background
+    width = fragment_width(m)
+    return Buffers(
+        lanes=lanes,
+        offsets=np.zeros((2, BATCH * PIXELS + 8)),
+        pixels=np.empty(BATCH * PIXELS, np.uint8),
+        batch=np.empty((2, BATCH + 1), np.int64),
+        rows=np.zeros((width, 8)),
+        lengths=np.empty(PIXELS, np.uint32),
+        background=behind,
+        unseen=np.zeros(8),
+        sums=np.zeros(4 * (2 * m + 4)),
+        ray=np.empty(3),
+        positions=np.empty((7, _POSITIONS), np.int64),
+        depths=np.empty((2, _POSITIONS)),
+        palette=np.zeros(_POSITIONS * color_size(forms)),
+        values=_aligned(_CAPACITY * PIXELS * width),
+        lists=np.empty((PIXELS, _CAPACITY, LISTED), np.uint32),
+        drawn=np.empty(2 * _CAPACITY, np.int64),
+        places=np.empty((2 * _CAPACITY, PIXELS), np.uint32),
+        moves=np.empty((32 * _CAPACITY, MOVES)),
+        pairs=np.empty((pair_limit, 2), np.int64),
+    )
+
+
+@njit(cache=True, error_model="numpy")
+def resized(old, positions, capacity, m, forms):
+    """``old`` buffers with room for lists of ``positions`` and ``capacity`` fragments by pixel, where that is more."""
+    places, depths, palette = old.positions, old.depths, old.palette
+    if positions > places.shape[1]:
+        places, depths = np.empty((7, positions), np.int64), np.empty((2, positions))
+        palette = np.zeros(positions * color_size(forms))
+    values, lists, drawn, of_slots, moves = old.values, old.lists, old.drawn, old.places, old.moves
+    if capacity > lists.shape[1]:
+        values = _aligned(capacity * PIXELS * fragment_width(m))
+        lists = np.empty((PIXELS, capacity, LISTED), np.uint32)
+        drawn = np.empty(2 * capacity, np.int64)
+        of_slots = np.empty((2 * capacity, PIXELS), np.uint32)
+        moves = np.empty((32 * capacity, MOVES))
+    return Buffers(
+        lanes=old.lanes,
+        offsets=old.offsets,
+        pixels=old.pixels,
+        batch=old.batch,
+        rows=old.rows,
+        lengths=old.lengths,
+        background=old.background,
+        unseen=old.unseen,
+        sums=old.sums,
+        ray=old.ray,
+        positions=places,
+        depths=depths,
+        palette=palette,
+        values=values,
+        lists=lists,
+        drawn=drawn,
+        places=of_slots,
+        moves=moves,
+        pairs=old.pairs,
+    )
+
+
+@njit(cache=True, error_model="numpy")
+def block_of(buffers, m, forms):
+    """The block that lies in ``buffers``, which the caller keeps alive for as long as it is used."""
+    positions, depths = buffers.positions, buffers.depths
+    fragments = Fragments(
+        pointer(buffers.values),
+        fragment_width(m),
+        pointer(buffers.lists),
+        pointer(buffers.lengths),
+        buffers.lists.shape[1],
+        pointer(buffers.lanes),
+    )
+    palette = Palette(pointer(buffers.palette), forms, pointer(buffers.background), pointer(buffers.unseen))
+    entries = Entries(
+        pointer(positions[0]),
+        pointer(positions[1]),
+        pointer(depths[0]),
+        pointer(depths[1]),
+        pointer(positions[2]),
+        pointer(positions[3]),
+        pointer(positions[4]),
+    )
+    reordering = Reordering(
+        pointer(buffers.pairs),
+        buffers.pairs.shape[0],
+        pointer(positions[5]),
+        pointer(positions[6]),
+        pointer(buffers.drawn),
+        pointer(buffers.places),
+        pointer(buffers.moves),
+    )
+    batch = Batch(
+        pointer(buffers.offsets[0]),
+        pointer(buffers.offsets[1]),
+        pointer(buffers.pixels),
+        pointer(buffers.batch[0]),
+        pointer(buffers.batch[1]),
+        pointer(buffers.rows),
+    )
+    return Block(fragments, palette, entries, reordering, batch, pointer(buffers.sums), pointer(buffers.ray))
 
 
 @njit(cache=True, error_model="numpy", forceinline=True)
@@ -56,14 +341,14 @@ def longest_list(lengths):
 
 
 @njit(cache=True, error_model="numpy", forceinline=True)
-def set_unknown(layers, at, high, m):
-    """Let the layer at ``at`` have any alpha from 0 to ``high``."""
-    layers[at + ALPHA_LOW] = 0.0
-    layers[at + ALPHA_HIGH] = high
-    layers[at + FORM] = 0.5 * high
+def set_unknown(values, at, high, m):
+    """Let the fragment at ``at`` have any alpha from 0 to ``high``."""
+    values[at + ALPHA_LOW] = 0.0
+    values[at + ALPHA_HIGH] = high
+    values[at + FORM] = 0.5 * high
     for k in range(1, m):
-        layers[at + FORM + k] = 0.0
-    layers[at + FORM + m] = 0.5 * high * UP
+        values[at + FORM + k] = 0.0
+    values[at + FORM + m] = 0.5 * high * UP
 
 
 @njit(cache=True, error_model="numpy", inline="always")
@@ -79,7 +364,11 @@ def color_ends(forms):
 
 
 @njit(cache=True, error_model="numpy", forceinline=True)
-def listed_layer(lists, entry, width, forms):
-    """Where a pixel's layer stands, its colour in the palette and its row of moves (0: none)."""
-    at = LISTED * entry
-    return int(lists[at]) * width, int(lists[at + 1]) * color_size(forms), MOVES * int(lists[at + 2])
+def listed_fragment(fragments, entry, forms):
+    """Where a pixel's fragment stands, its colour in the palette and its row of moves (0: none)."""
+    lists, at = fragments.lists, LISTED * entry
+    return (
+        int(lists[at]) * fragments.width,
+        int(lists[at + 1]) * color_size(forms),
+        MOVES * int(lists[at + 2]),
+    )

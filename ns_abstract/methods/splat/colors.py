@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit, prange
 
-from ns_abstract.arithmetic.compiled import advanced, borrowed, pointer
 from ns_abstract.arithmetic.forms import bounds, clamp_below, settle
-from ns_abstract.arithmetic.units import UNIT64
-from ns_abstract.arithmetic.wide_forms import size
+from ns_abstract.arithmetic.rounding import UNIT64
+from ns_abstract.arithmetic.simd.intrinsics import advanced, borrowed, pointer
+from ns_abstract.arithmetic.simd.wide_forms import size
 from ns_abstract.methods.splat.form_colors import WORKSPACE, form_colors
 from ns_abstract.methods.splat.line_colors import accumulate_line, basis_line, directions_line
 from ns_abstract.methods.splat.records import LANES
@@ -21,15 +22,29 @@ _CHUNK = 1024
 
 #: Largest change of each basis function per unit change of the direction, rounded up.
 _SLOPE = np.array(
-    [0.0]
-    + [0.489] * 3
-    + [1.093, 1.093, 1.893, 1.093, 1.093]
-    + [1.771, 2.891, 3.2, 3.8, 3.2, 2.891, 1.771]
+    [0.0] + [0.489] * 3 + [1.093, 1.093, 1.893, 1.093, 1.093] + [1.771, 2.891, 3.2, 3.8, 3.2, 2.891, 1.771]
 )
 #: Largest absolute value of each basis function, rounded up.
 _SIZE = np.array(
     [0.283] + [0.489] * 3 + [0.547, 0.547, 0.631, 0.547, 0.547] + [0.591, 0.557, 0.64, 0.747, 0.64, 0.557, 0.591]
 )
+
+
+class _Scratch(NamedTuple):
+    """Memory for a block of `LANES` Gaussians.
+
+    Attributes:
+        rows: [19 (m + 3) LANES] the forms, flat.
+        wide: Forms of eight, flat; see `form_colors`.
+        weights, low, high, angle: [LANES] coefficients, bounds, errors of directions.
+    """
+
+    rows: np.ndarray
+    wide: np.ndarray
+    weights: np.ndarray
+    low: np.ndarray
+    high: np.ndarray
+    angle: np.ndarray
 
 
 def color_reach(sh: np.ndarray, degree: int) -> np.ndarray:
@@ -76,9 +91,7 @@ def sh_basis(x, y, z, degree, out):
 @njit(cache=True, error_model="numpy")
 def sh_color(sh, direction, degree, basis, out):
     """``out[c] = max(0, 0.5 + sum_k basis_k sh[k, c])`` for an unnormalised ``direction`` [3]."""
-    length = math.sqrt(
-        direction[0] * direction[0] + direction[1] * direction[1] + direction[2] * direction[2]
-    )
+    length = math.sqrt(direction[0] * direction[0] + direction[1] * direction[1] + direction[2] * direction[2])
     sh_basis(direction[0] / length, direction[1] / length, direction[2] / length, degree, basis)
     for c in range(3):
         total = 0.0
@@ -88,14 +101,19 @@ def sh_color(sh, direction, degree, basis, out):
 
 
 @njit(cache=True, error_model="numpy")
-def _color_error(size, change, unit, direction_error):
+def _color_error(size, change, charges, direction_error):
     """Float error of one colour, see `color_reach` (design.md, C3)."""
-    return unit + 40.0 * unit * size + direction_error * change
+    return charges.color_sum + charges.harmonics * size + direction_error * change
 
 
 @njit(cache=True, error_model="numpy")
-def _direction_error(length, position_error, means, mean_radius, i, unit):
-    """Angle between the directions to a Gaussian at distance ``length`` and any that the program may use, at most 2."""
+def _direction_error(length, position_error, means, mean_radius, i, charges):
+    """Angle between the directions to a Gaussian at distance ``length`` and any that the program may use, at most 2.
+
+    See design.md, S4.
+
+    See design.md, C3.
+    """
     size = abs(means[i, 0]) + abs(means[i, 1]) + abs(means[i, 2])
     reach = 0.0
     if mean_radius.shape[0] > 0:
@@ -105,7 +123,7 @@ def _direction_error(length, position_error, means, mean_radius, i, unit):
     distance = length - position_error - reach
     if not distance > 0.0:
         return 2.0
-    error = (position_error + reach + 2.0 * unit * size) / distance + 16.0 * unit
+    error = (position_error + reach + charges.direction_mean * size) / distance + charges.direction
     if reach > 0.0:
         # from a chord to the arc, along which the basis functions' slopes hold (design.md, S4)
         error = 2.0 * math.asin(min(1.0, 0.5 * error)) * (1.0 + 2.0**-40)
@@ -113,19 +131,19 @@ def _direction_error(length, position_error, means, mean_radius, i, unit):
 
 
 @njit(cache=True, parallel=True, error_model="numpy")
-def fixed_colors(
-    means, mean_radius, color_low, color_high, sh, reach, degree, position, position_error, unit, colors,
-):  # fmt: skip
+def fixed_colors(scene, position, position_error, charges, colors):
     """Colours [N, 6] seen from one camera position: centre and radius by channel (design.md, C1, C3, S4).
 
     Args:
-        mean_radius: [N, 3] or [0, 3]; see `gaussians.gaussian_stage`.
-        color_low, color_high: [N, 3] ranges of what is added to the colours, or [0, 3].
-        reach: [N, 6] see `color_reach`.
-        position: [3]; ``position_error`` bounds what float evaluation and the set add to it.
+        scene: `SceneColors`.
+        position: [3] world; ``position_error`` bounds what float evaluation and the set add to it.
+        charges: `Charges` for the program's rounding.
+        colors: The output.
     """
-    count = means.shape[0]
+    count = scene.means.shape[0]
     for chunk in prange((count + _CHUNK - 1) // _CHUNK):
+        means, mean_radius, reach = borrowed(scene.means), borrowed(scene.mean_radius), borrowed(scene.reach)
+        color_low, color_high, sh = borrowed(scene.low), borrowed(scene.high), borrowed(scene.sh)
         basis = np.empty(16)
         color = np.empty(3)
         direction = np.empty(3)
@@ -133,12 +151,13 @@ def fixed_colors(
             for k in range(3):
                 direction[k] = means[i, k] - position[k]
             length = math.sqrt(direction[0] ** 2 + direction[1] ** 2 + direction[2] ** 2)
-            sh_color(sh[i], direction, degree, basis, color)
-            error = _direction_error(length, position_error, means, mean_radius, i, unit)
+            sh_color(sh[i], direction, scene.degree, basis, color)
+            error = _direction_error(length, position_error, means, mean_radius, i, charges)
             for c in range(3):
-                radius = _color_error(reach[i, c], reach[i, 3 + c], unit, error)
+                radius = _color_error(reach[i, c], reach[i, 3 + c], charges, error)
                 if color_low.shape[0] > 0 and (color_low[i, c] != 0.0 or color_high[i, c] != 0.0):
-                    rounding = 4.0 * unit * (color[c] + radius + max(abs(color_low[i, c]), abs(color_high[i, c])))
+                    size = color[c] + radius + max(abs(color_low[i, c]), abs(color_high[i, c]))
+                    rounding = charges.shifted_color * size
                     low = max(0.0, max(0.0, color[c] - radius) + color_low[i, c] - rounding)
                     high = max(0.0, color[c] + radius + color_high[i, c] + rounding)
                     color[c] = 0.5 * (low + high)
@@ -157,101 +176,134 @@ def gathered(colors, numbers, alive, out):
     return out
 
 
+@njit(cache=True, error_model="numpy")
+def _set_directions(work, numbers, scene, position, origin, m):
+    """Forms 0 to 2 of ``work``, but for the rows of sums: from the camera to the means of the Gaussians ``numbers``."""
+    means = borrowed(scene.means)
+    for axis in range(3):
+        form = work[axis]
+        for k in range(m):
+            for q in range(LANES):
+                form[k, q] = -position[k, axis]
+        for q in range(LANES):
+            i = numbers[q]
+            form[0, q] = (means[i, axis] - origin[axis]) + (origin[axis] - position[0, axis])
+            form[m, q] = position[m, axis] + _COEFFICIENT * (
+                abs(means[i, axis] - origin[axis]) + abs(origin[axis] - position[0, axis])
+            )
+
+
+@njit(cache=True, error_model="numpy")
+def _set_bands(work, numbers, lanes, scratch, scene, shape):
+    """Forms 16 to 18 of ``work``: the three channels, from the directions; ``scratch.low``: squared lengths."""
+    d, order, m = shape
+    sh, low, weights = borrowed(scene.sh), scratch.low, scratch.weights
+    for channel in range(3):
+        form = work[16 + channel]
+        for k in range(m + 3):
+            for q in range(LANES):
+                form[k, q] = 0.0
+        for q in range(LANES):
+            form[0, q] = 0.2820947917738781 * sh[numbers[q], 0, channel] + 0.5
+            form[m, q] = _COEFFICIENT * (abs(sh[numbers[q], 0, channel]) + 1.0)
+    if order == 2:
+        s = scratch.rows
+        directions_line(s, low.shape[0], scene.degree, low)
+        for k in range(1, (scene.degree + 1) * (scene.degree + 1)):
+            basis_line(s, low.shape[0], k)
+            for channel in range(3):
+                for q in range(LANES):
+                    weights[q] = sh[numbers[q], k, channel]
+                accumulate_line(s, low.shape[0], weights, channel)
+        return
+    for axis in range(3):
+        settle(work[axis], d, order, m)
+    for q in range(0, lanes, 8):
+        form_colors(
+            pointer(scratch.wide), advanced(pointer(scratch.rows), q), advanced(pointer(low), q), sh, pointer(weights),
+            advanced(pointer(numbers), q), scene.degree, d, order, m,
+        )  # fmt: skip
+
+
+@njit(cache=True, error_model="numpy")
+def _clamp_channel(form, channel, numbers, lanes, scratch, scene, charges, shape):
+    """Charge a channel's form for float evaluation, clamp it and add the scene's range (design.md, C3, S4)."""
+    d, order, m = shape
+    reach, least_of, most_of = borrowed(scene.reach), borrowed(scene.low), borrowed(scene.high)
+    low, high, angle = scratch.low, scratch.high, scratch.angle
+    settle(form, d, order, m)
+    for q in range(lanes):
+        most, change = reach[numbers[q], channel], reach[numbers[q], 3 + channel]
+        form[m, q] += _color_error(most, change, charges, angle[q])
+        # a camera that may stand in the Gaussian's centre: any direction
+        if not form[m, q] + form[m + 1, q] + form[m + 2, q] <= 2.0 * most + 1.0:
+            for r in range(1, m + 3):
+                form[r, q] = 0.0
+            form[0, q] = 0.5
+            form[m, q] = most * 1.01 + _color_error(most, change, charges, 2.0)
+    bounds(form, low, high, d, order, m)
+    clamp_below(form, 0.0, low, high, d, order, m)
+    if least_of.shape[0] == 0:
+        return
+    for q in range(lanes):
+        least, most = least_of[numbers[q], channel], most_of[numbers[q], channel]
+        if least != 0.0 or most != 0.0:
+            middle = 0.5 * (least + most)
+            total = abs(form[0, q]) + form[m + 1, q] + form[m + 2, q] + form[m, q]
+            form[0, q] += middle
+            form[m, q] += max(most - middle, middle - least) * _UP + (charges.shifted_color + _COEFFICIENT) * (
+                total + max(abs(least), abs(most))
+            )
+    bounds(form, low, high, d, order, m)
+    clamp_below(form, 0.0, low, high, d, order, m)
+
+
+@njit(cache=True, error_model="numpy")
+def _color_chunk(chunk, indices, scene, position, origin, position_error, charges, shape, colors):
+    """One chunk of Gaussians; see `moving_colors`."""
+    n, m = indices.shape[0], shape.monomials
+    # 0-2 direction, 16-18 channels; in between what `line_colors` keeps
+    work_ = np.empty((19, m + 3, LANES))
+    ends_ = np.empty((4, LANES))
+    wide_ = np.empty(WORKSPACE * size(m))
+    numbers_ = np.empty(LANES, np.int64)
+    work, numbers = borrowed(work_), borrowed(numbers_)
+    scratch = _Scratch(
+        borrowed(work_.reshape(-1)), borrowed(wide_), borrowed(ends_[0]), borrowed(ends_[1]), borrowed(ends_[2]),
+        borrowed(ends_[3]),
+    )  # fmt: skip
+    means, mean_radius, low = borrowed(scene.means), borrowed(scene.mean_radius), scratch.low
+    for first in range(chunk * _CHUNK, min(n, (chunk + 1) * _CHUNK), LANES):
+        lanes = min(LANES, min(n, (chunk + 1) * _CHUNK) - first)
+        for q in range(LANES):
+            numbers[q] = indices[first + min(q, lanes - 1), 1]
+        _set_directions(work, numbers, scene, position, origin, m)
+        _set_bands(work, numbers, lanes, scratch, scene, shape)
+        for q in range(lanes):
+            distance = math.sqrt(low[q]) * (1.0 - _COEFFICIENT) if low[q] > 0.0 else 0.0
+            scratch.angle[q] = _direction_error(distance, position_error, means, mean_radius, numbers[q], charges)
+        for channel in range(3):
+            form = work[16 + channel]
+            _clamp_channel(form, channel, numbers, lanes, scratch, scene, charges, shape)
+            for q in range(lanes):
+                for k in range(m + 1):
+                    colors[indices[first + q, 0], channel * (m + 1) + k] = form[k, q]
+    # the owners of the borrowed arrays live to here
+    return work_.size + ends_.size + wide_.size + numbers_.size
+
+
 @njit(cache=True, parallel=True, error_model="numpy")
-def moving_colors(
-    indices, means, mean_radius, color_low, color_high, sh, reach, degree, position, origin, position_error, unit,
-    d, order, m, colors,
-):  # fmt: skip
+def moving_colors(indices, scene, position, origin, position_error, charges, shape, colors):
     """Colours over a cell in which the camera moves, as forms (design.md, C2, C3, S4).
 
     Args:
         indices: [n, 2] row of ``colors`` and number of the Gaussian in the scene.
-        mean_radius, color_low, color_high, reach: See `fixed_colors`.
-        position: [rows, 3] forms of the camera position, centred at ``origin`` [3].
-        position_error: Bound of the float error of the camera position.
+        scene: `SceneColors`.
+        position: [rows, 3] forms of the camera position, world, centred at ``origin`` [3].
+        position_error: Bound of the float error of the camera position, world units.
+        charges: `Charges` for the program's rounding.
+        shape: `FormShape` of ``position``.
         colors: [., 3 (m + 1)] output: coefficients and radius by channel.
     """
-    n = indices.shape[0]
-    count = (degree + 1) * (degree + 1)
-    for chunk in prange((n + _CHUNK - 1) // _CHUNK):
-        # 0-2 direction, 16-18 channels; in between what `line_colors` keeps
-        work_ = np.empty((19, m + 3, LANES))
-        ends_ = np.empty((4, LANES))
-        wide_ = np.empty(WORKSPACE * size(m))
-        numbers_ = np.empty(LANES, np.int64)
-        work, numbers, wide = borrowed(work_), borrowed(numbers_), borrowed(wide_)
-        weights, low, high, angle = borrowed(ends_[0]), borrowed(ends_[1]), borrowed(ends_[2]), borrowed(ends_[3])
-        s = borrowed(work_.reshape(-1))
-        line = d == 1 and order == 2
-        for first in range(chunk * _CHUNK, min(n, (chunk + 1) * _CHUNK), LANES):
-            lanes = min(LANES, min(n, (chunk + 1) * _CHUNK) - first)
-            for q in range(LANES):
-                numbers[q] = indices[first + min(q, lanes - 1), 1]
-            for axis in range(3):
-                form = work[axis]
-                for k in range(m):
-                    for q in range(LANES):
-                        form[k, q] = -position[k, axis]
-                for q in range(LANES):
-                    i = numbers[q]
-                    form[0, q] = (means[i, axis] - origin[axis]) + (origin[axis] - position[0, axis])
-                    form[m, q] = position[m, axis] + _COEFFICIENT * (
-                        abs(means[i, axis] - origin[axis]) + abs(origin[axis] - position[0, axis])
-                    )
-                if not line:
-                    settle(form, d, order, m)
-            for channel in range(3):
-                form = work[16 + channel]
-                for k in range(m + 3):
-                    for q in range(LANES):
-                        form[k, q] = 0.0
-                for q in range(LANES):
-                    form[0, q] = 0.2820947917738781 * sh[numbers[q], 0, channel] + 0.5
-                    form[m, q] = _COEFFICIENT * (abs(sh[numbers[q], 0, channel]) + 1.0)
-            if line:
-                directions_line(s, low.shape[0], degree, low)
-                for k in range(1, count):
-                    basis_line(s, low.shape[0], k)
-                    for channel in range(3):
-                        for q in range(LANES):
-                            weights[q] = sh[numbers[q], k, channel]
-                        accumulate_line(s, low.shape[0], weights, channel)
-            else:
-                for q in range(0, lanes, 8):
-                    form_colors(
-                        pointer(wide), advanced(pointer(s), q), advanced(pointer(low), q), sh, pointer(weights),
-                        advanced(pointer(numbers), q), degree, d, order, m,
-                    )  # fmt: skip
-            for q in range(lanes):
-                distance = math.sqrt(low[q]) * (1.0 - _COEFFICIENT) if low[q] > 0.0 else 0.0
-                angle[q] = _direction_error(distance, position_error, means, mean_radius, numbers[q], unit)
-            for channel in range(3):
-                form = work[16 + channel]
-                settle(form, d, order, m)
-                for q in range(lanes):
-                    most, change = reach[numbers[q], channel], reach[numbers[q], 3 + channel]
-                    form[m, q] += _color_error(most, change, unit, angle[q])
-                    # a camera that may stand in the Gaussian's centre: any direction
-                    if not form[m, q] + form[m + 1, q] + form[m + 2, q] <= 2.0 * most + 1.0:
-                        for r in range(1, m + 3):
-                            form[r, q] = 0.0
-                        form[0, q] = 0.5
-                        form[m, q] = most * 1.01 + _color_error(most, change, unit, 2.0)
-                bounds(form, low, high, d, order, m)
-                clamp_below(form, 0.0, low, high, d, order, m)
-                if color_low.shape[0] > 0:
-                    for q in range(lanes):
-                        least, most = color_low[numbers[q], channel], color_high[numbers[q], channel]
-                        if least != 0.0 or most != 0.0:
-                            middle = 0.5 * (least + most)
-                            total = abs(form[0, q]) + form[m + 1, q] + form[m + 2, q] + form[m, q]
-                            form[0, q] += middle
-                            form[m, q] += max(most - middle, middle - least) * _UP + (4.0 * unit + _COEFFICIENT) * (
-                                total + max(abs(least), abs(most))
-                            )
-                    bounds(form, low, high, d, order, m)
-                    clamp_below(form, 0.0, low, high, d, order, m)
-                for q in range(lanes):
-                    row = indices[first + q, 0]
-                    for k in range(m + 1):
-                        colors[row, channel * (m + 1) + k] = form[k, q]
+    for chunk in prange((indices.shape[0] + _CHUNK - 1) // _CHUNK):
+        _color_chunk(chunk, indices, scene, position, origin, position_error, charges, shape, colors)

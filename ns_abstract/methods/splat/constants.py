@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import importlib.metadata
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -20,9 +22,17 @@ class Rasteriser:
         tile_size: Pixels on a tile's side; 0: every Gaussian reaches every pixel.
         radius_sigmas: Radius in standard deviations of the longest axis
             (fully_fused_projection_fwd.cu:165-167).
+        axis_sigmas: From 1.5 on: half-width and half-height of the box that meets tiles, at most this many standard
+            deviations along the image's axes, and no more than an opacity above ``alpha_min`` reaches
+            (ProjectionEWA3DGSFused.cu:164-184, IntersectTile.cu:55-77); 0: a square of the radius.
+        ellipse_tiles: From 1.6 on: tiles are those that the ellipse meets in which alpha reaches ``alpha_min``
+            (IntersectTile.cu:84-207, 288-373). In exact arithmetic that changes no picture.
         discriminant_min: Lower clamp under the root of the larger eigenvalue (same lines).
         view_margin: The Jacobian is evaluated at most this fraction of the half field of view
             outside the image (utils.cuh:267-277); negative: no clamp.
+        compensation_min: Least factor of the opacity in antialiased mode (Common.h:110).
+        eye_from_view: Colours are seen from -R^T t, with the view matrix (R, t), and not from the position that its
+            inverse holds (SphericalHarmonics.cuh:40-71).
         alpha_min: Smaller alphas are skipped (rasterize_to_pixels_fwd.cu).
         alpha_max: Larger alphas are lowered to it.
         transmittance_min: The Gaussian that would bring the transmittance to this or below is not
@@ -40,6 +50,10 @@ class Rasteriser:
     eps2d: float = 0.3
     tile_size: int = 16
     radius_sigmas: float = 3.0
+    axis_sigmas: float = 0.0
+    ellipse_tiles: bool = False
+    compensation_min: float = 0.0
+    eye_from_view: bool = False
     discriminant_min: float = 0.01
     view_margin: float = 0.3
     alpha_min: float = 1.0 / 255.0
@@ -54,9 +68,32 @@ class Rasteriser:
         """Side of the tiles that pictures are computed in."""
         return self.tile_size or WORK_TILE
 
+    @property
+    def tile_room(self) -> float:
+        """Roundings, in units, by which an alpha may exceed ``alpha_min`` and yet miss its tile (design.md, G12)."""
+        if not self.axis_sigmas:
+            return 0.0
+        return 2.0**18 if self.ellipse_tiles else 2.0**9
+
 
 #: What nerfstudio 1.1.5 pins (pyproject.toml, ``gsplat==1.4.0``).
 GSPLAT_1_4_0 = Rasteriser("gsplat", "1.4.0")
+
+GSPLAT_1_5_3 = Rasteriser("gsplat", "1.5.3", axis_sigmas=3.33)
+
+GSPLAT_1_6_0 = Rasteriser(
+    "gsplat",
+    "1.6.0",
+    axis_sigmas=3.33,
+    ellipse_tiles=True,
+    # a float32: two Gaussians of this alpha meet the stop
+    alpha_max=float(np.float32(0.99)),
+    compensation_min=float(np.float32(0.005)),
+    eye_from_view=True,
+)
+
+#: gsplat's rules by version.
+VERSIONS = {rules.version: rules for rules in (GSPLAT_1_4_0, GSPLAT_1_5_3, GSPLAT_1_6_0)}
 
 #: Algorithm 1 of "Abstract Rendering" (NeurIPS 2025): RGB colours, no blur, no thresholds, black behind.
 #: The paper leaves Gaussians behind the camera open; they are left out by the same near plane.
@@ -76,14 +113,72 @@ PAPER = Rasteriser(
 
 RASTERISERS = {"gsplat": GSPLAT_1_4_0, "paper": PAPER}
 
+_RELEASES = {(1, 4): GSPLAT_1_4_0, (1, 5): GSPLAT_1_5_3, (1, 6): GSPLAT_1_6_0}
 
-def rules_array(rasteriser: Rasteriser) -> np.ndarray:
-    """The rasteriser's constants in the order the kernels expect."""
+
+def rasteriser_named(renderer: str | None = None, version: str | None = None) -> Rasteriser:
+    """The rules of "gsplat" (None) in a version of `VERSIONS` (None: 1.4.0), or of "paper", which has none."""
+    if renderer in (None, "gsplat"):
+        return VERSIONS[version or GSPLAT_1_4_0.version]
+    return RASTERISERS[renderer]
+
+
+def installed_gsplat() -> Rasteriser:
+    """The rules of the gsplat that is installed; of 1.4.0 where none is, or one whose rules are not known."""
+    try:
+        numbers = importlib.metadata.version("gsplat").split(".")
+        return _RELEASES.get((int(numbers[0]), int(numbers[1])), GSPLAT_1_4_0)
+    except (importlib.metadata.PackageNotFoundError, ValueError, IndexError):
+        return GSPLAT_1_4_0
+
+
+class RasterRules(NamedTuple):
+    """A `Rasteriser` and a run's mode as kernels take them; lengths in pixels, depths in world units.
+
+    Attributes:
+        tile_size: 0: every Gaussian reaches every pixel.
+        alpha_min: The threshold, or the numerical cut-off where there is none.
+        work_tile: Side of the tiles that pictures are computed in.
+        compensation_min: Least factor of the opacity.
+        tile_room, ellipse_tiles: See `Rasteriser`.
+        antialiased: Whether opacity is compensated for the blur.
+    """
+
+    near: float
+    far: float
+    eps2d: float
+    tile_size: float
+    radius_sigmas: float
+    discriminant_min: float
+    view_margin: float
+    alpha_min: float
+    alpha_max: float
+    transmittance_min: float
+    work_tile: int
+    compensation_min: float
+    tile_room: float
+    ellipse_tiles: bool
+    antialiased: bool
+
+
+def raster_rules(rasteriser: Rasteriser, antialiased: bool) -> RasterRules:
+    """The rasteriser's constants for kernels."""
     r = rasteriser
     alpha_min = r.alpha_min if r.alpha_min > 0.0 else r.alpha_negligible
-    return np.array(
-        [
-            r.near, r.far, r.eps2d, float(r.tile_size), r.radius_sigmas, r.discriminant_min, r.view_margin,
-            alpha_min, r.alpha_max, r.transmittance_min, float(r.work_tile),
-        ]
-    )  # fmt: skip
+    return RasterRules(
+        near=r.near,
+        far=r.far,
+        eps2d=r.eps2d,
+        tile_size=0.0 if r.axis_sigmas else float(r.tile_size),
+        radius_sigmas=r.axis_sigmas or r.radius_sigmas,
+        discriminant_min=r.discriminant_min,
+        view_margin=r.view_margin,
+        alpha_min=alpha_min,
+        alpha_max=r.alpha_max,
+        transmittance_min=r.transmittance_min,
+        work_tile=r.work_tile,
+        compensation_min=r.compensation_min,
+        tile_room=r.tile_room,
+        ellipse_tiles=r.ellipse_tiles,
+        antialiased=bool(antialiased),
+    )

@@ -5,9 +5,9 @@ from __future__ import annotations
 from numba import njit
 
 from ns_abstract.arithmetic.elementary import fma
-from ns_abstract.arithmetic.lanes import load8, store
-from ns_abstract.arithmetic.units import UNIT64
-from ns_abstract.arithmetic.wide_forms import (
+from ns_abstract.arithmetic.rounding import UNIT64
+from ns_abstract.arithmetic.simd.lanes import load8, store
+from ns_abstract.arithmetic.simd.wide_forms import (
     bounds,
     multiply,
     reach,

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from numba import njit
 
-from ns_abstract.arithmetic.lanes import load8, store
-from ns_abstract.arithmetic.units import UNIT64
-from ns_abstract.arithmetic.wide_forms import (
+from ns_abstract.arithmetic.rounding import UNIT64
+from ns_abstract.arithmetic.simd.lanes import load8, store
+from ns_abstract.arithmetic.simd.wide_forms import (
     add_product,
     add_square,
     bounds,
@@ -37,11 +37,13 @@ WORKSPACE = 30
 
 
 @njit(cache=True, error_model="numpy")
-def rotate(w, rotation, r, x, y, z, offset, shifted, spread, out, d, order, m):
-    """Row ``r`` of the rotation times exact (x, y, z), plus the offset's if ``shifted``, widened by ``spread``.
+def rotate(w, rotation, r, v, offset, shifted, spread, out, shape):
+    """Row ``r`` of the rotation times exact ``v`` (three), plus the offset's if ``shifted``, widened by ``spread``.
 
     ``rotation`` [rows, 9] and ``offset`` [rows, 3], both flat, are the pose's forms.
     """
+    d, order, m = shape
+    x, y, z = v
     a, b, c = 3 * r, 3 * r + 1, 3 * r + 2
     for k in range(m):
         total = rotation[9 * k + a] * x + rotation[9 * k + b] * y + rotation[9 * k + c] * z
@@ -105,23 +107,26 @@ def _keep(w, a, s, f, q, m):
 
 
 @njit(cache=True, error_model="numpy")
-def project_forms(w, s, rotation, offset, camera, rules, d, order, m, antialiased):
+def project_forms(w, s, rotation, offset, camera, rules, shape):
     """`line_projection.project_line` for any number of parameters and order, and its `compensate_line`.
+
+    See design.md, G1, G4.
 
     ``w`` is scratch for `WORKSPACE` forms; the forms of a record go to the rows from FP, m + 1 each.
     """
+    d, order, m = shape
     one = size(m)
     x, y, z, inverse, u, v = _X * one, _Y * one, _Z * one, _RZ * one, _U * one, _V * one
     dx, dy, deep = _DX * one, _DY * one, _W2 * one
     a, b, c, det, k, z2 = _A * one, _B * one, _C * one, _DET * one, _K * one, _T2 * one
     t0, t1, p, across, root = _T0 * one, _T1 * one, _P * one, _Q * one, _S * one
-    eps2d, margin = rules[2], rules[6]
-    fx, fy, cx, cy, width, height = camera[0], camera[1], camera[2], camera[3], camera[4], camera[5]
+    eps2d, margin = rules.eps2d, rules.view_margin
+    fx, fy, cx, cy, width, height = camera
     for q in range(0, LANES, 8):
-        v0, v1, v2 = load8(s, row.V0 + q), load8(s, row.V1 + q), load8(s, row.V2 + q)
-        rotate(w, rotation, 0, v0, v1, v2, offset, True, load8(s, row.SX + q), x, d, order, m)
-        rotate(w, rotation, 1, v0, v1, v2, offset, True, load8(s, row.SY + q), y, d, order, m)
-        rotate(w, rotation, 2, v0, v1, v2, offset, True, load8(s, row.SZ + q), z, d, order, m)
+        mean = load8(s, row.V0 + q), load8(s, row.V1 + q), load8(s, row.V2 + q)
+        rotate(w, rotation, 0, mean, offset, True, load8(s, row.SX + q), x, shape)
+        rotate(w, rotation, 1, mean, offset, True, load8(s, row.SY + q), y, shape)
+        rotate(w, rotation, 2, mean, offset, True, load8(s, row.SZ + q), z, shape)
         _keep_bounds(w, z, s, row.ZLO, row.ZHI, q, d, order, m)
         store(s, row.Z0 + q, load8(w, z))
         # u = x / z, v = y / z
@@ -139,14 +144,14 @@ def project_forms(w, s, rotation, offset, camera, rules, d, order, m, antialiase
             extra = margin * 0.5 * height / fy
             clamp(w, v, -(cy / fy + extra), (height - cy) / fy + extra, v_low, v_high, order, m)
         # w = R B, then n0 = w0 - u w2, n1 = w1 - v w2
-        none = 0.0 * v0
+        none = 0.0 * mean[0]
         for column in range(3):
             at = row.B00 + 3 * column * LANES + q
-            b0, b1, b2 = load8(s, at), load8(s, at + LANES), load8(s, at + 2 * LANES)
+            axis = load8(s, at), load8(s, at + LANES), load8(s, at + 2 * LANES)
             n0, n1 = (_N0 + column) * one, (_N3 + column) * one
-            rotate(w, rotation, 0, b0, b1, b2, offset, False, none, n0, d, order, m)
-            rotate(w, rotation, 1, b0, b1, b2, offset, False, none, n1, d, order, m)
-            rotate(w, rotation, 2, b0, b1, b2, offset, False, none, deep, d, order, m)
+            rotate(w, rotation, 0, axis, offset, False, none, n0, shape)
+            rotate(w, rotation, 1, axis, offset, False, none, n1, shape)
+            rotate(w, rotation, 2, axis, offset, False, none, deep, shape)
             store(s, row.DEEP0 + column * LANES + q, reach(w, deep, order, m) + load8(w, deep + 8 * m))
             _lower(w, u, deep, n0, d, order, m)
             _lower(w, v, deep, n1, d, order, m)
@@ -197,12 +202,11 @@ def project_forms(w, s, rotation, offset, camera, rules, d, order, m, antialiase
         multiply(w, b, root, t0, d, order, m)
         multiply(w, t0, root, t1, d, order, m)
         multiply(w, p, t1, across, d, order, m)
-        if antialiased:
+        if rules.antialiased:
             # K = -log(compensation), compensation^2 = |n0 x n1|^2 / det'
             reciprocal(w, det, t0, d, order, m)
             multiply(w, k, t0, t1, d, order, m)
-            low, _ = bounds(w, t1, d, order, m)
-            store(s, row.DISC + q, low)
+            _keep_bounds(w, t1, s, row.SQLO, row.SQHI, q, d, order, m)
             logarithm(w, t1, _LOG * one, d, order, m)
             scale_add(w, _LOG * one, -0.5, _LOG * one, 0.0, 0.0, k, d, order, m)
             _keep(w, k, s, 5, q, m)

@@ -3,26 +3,25 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
 
 from ns_abstract.arithmetic.outward import outward
-from ns_abstract.arithmetic.units import Arithmetic
+from ns_abstract.arithmetic.rounding import Arithmetic
+from ns_abstract.execution.ending import checkpoint
+from ns_abstract.geometry.box import ParameterBox
+from ns_abstract.geometry.poses import PoseSet, translation_only
+from ns_abstract.geometry.tiles import tile_grid
 from ns_abstract.methods.splat.activate import Splats
 from ns_abstract.methods.splat.bounds import SplatBounds
 from ns_abstract.methods.splat.constants import Rasteriser
 from ns_abstract.methods.splat.lists import tile_mask, touching
 from ns_abstract.methods.splat.render import Renderer
 from ns_abstract.methods.splat.variations import VariedSplats
-from ns_abstract.sets.box import ParameterBox
-from ns_abstract.sets.perturbation import ROTATIONS
-from ns_abstract.sets.poses import PoseSet
-from ns_abstract.sets.tiles import tile_grid
-
-#: Parameter values [d] and tile numbers to the tiles of a picture; see `SplatFrame.render`.
-Render = Callable[[np.ndarray, np.ndarray | None], np.ndarray]
+from ns_abstract.perturbation.specification import ROTATIONS
+from ns_abstract.refine.protocol import LinearSets, Render
 
 #: Gaussians and poses looked at to estimate how far the picture moves.
 _MOTION_GAUSSIANS = 2000
@@ -50,6 +49,16 @@ class Context:
     visible: np.ndarray
     reach: np.ndarray
 
+    @property
+    def nbytes(self) -> int:
+        """Memory that it holds."""
+        return self.visible.nbytes + self.reach.nbytes
+
+    @property
+    def shown(self) -> np.ndarray:
+        """Numbers [n] of the Gaussians that the cell may show."""
+        return self.visible
+
 
 @dataclass(frozen=True)
 class TileBounds:
@@ -67,7 +76,7 @@ class TileBounds:
     upper: np.ndarray
     slopes: np.ndarray
     context: Context
-    linear: tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray] | None
+    linear: LinearSets | None
     trivial: int
 
 
@@ -78,14 +87,15 @@ class SplatFrame:
         splats: The activated scene.
         rasteriser, arithmetic: What is bounded.
         pose_set: The poses.
-        order: Order of the forms; by default 2 for one parameter and 1 for more.
+        order: Order of the forms: 1, or 2 for one parameter, which is the default for it.
         varied: The scenes of the set; None: ``splats`` alone.
         slanted: Whether cells may be slanted, so that rotations make up for what other parameters move (P2). Their
             parameters are then not those of ``pose_set``.
     """
 
-    #: Every call bounds as many tiles as it is given.
-    batch: int | None = None
+    #: What tiles share is most of the work: every call bounds as many as it is given.
+    tilewise = False
+    tiles_at_once: int | None = None
     #: Poses rendered in every part of a cell that is split.
     witnesses = 1
 
@@ -102,7 +112,7 @@ class SplatFrame:
         self.pose_set = pose_set
         self.camera = pose_set.camera
         self.box = pose_set.box
-        self.order = order or (2 if self.box.dimensions <= 1 else 1)
+        self.order = order or (2 if self.box.dimensions == 1 else 1)
         self.bounds = SplatBounds(splats, rasteriser, arithmetic, varied)
         self.varied = self.bounds.varied
         self.renderer = Renderer(self.varied.nearest, rasteriser)
@@ -129,6 +139,7 @@ class SplatFrame:
 
     def render(self, values: np.ndarray, tiles: np.ndarray | None = None) -> np.ndarray:
         """Tiles [t, side, side, 3] float32 of the concrete image at parameter values [d]."""
+        checkpoint()
         return self.renderer.tiles(self.camera, *self.pose_set.world_to_camera(values), tiles).astype(np.float32)
 
     def members(self, seed: int) -> Iterator[Render]:
@@ -153,6 +164,27 @@ class SplatFrame:
         self._floor = floor if floor > _WORTH_IT * self._stop > 0.0 else -1.0
         return max(self._floor, 0.0)
 
+    def watch(self, tiles: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> None:
+        """Bounds do not depend on what was rendered."""
+
+    def plan(self, shown: int | None, lower: np.ndarray, upper: np.ndarray) -> list[str]:
+        """What was left out for this frame, given what refinement found."""
+        varied = self.varied
+        total, plan = varied.nearest.count, []
+        if shown is not None and shown < total:
+            plan.append(
+                f"{total - shown:,} of {total:,} Gaussians left out: no pose of the set shows them "
+                "(behind, beside, hidden by others or below the alpha threshold)"
+            )
+        for quantity, name in (("mean", "mean"), ("opacity", "opacity"), ("color", "colour")):
+            if count := varied.counts[quantity]:
+                plan.append(f"scene variations: the {name} of {count:,} of {total:,} Gaussians varies")
+            elif varied.varies:
+                plan.append(f"ranges of the {name} left out: none varies")
+        if not varied.counts["mean"] and translation_only(self.pose_set.enclosure(self.box, 1)):
+            plan.append("depth-order rules left out but for near-ties: translations never change the order")
+        return plan
+
     def feasible(self, box: ParameterBox) -> ParameterBox | None:
         """See `PoseSet.feasible`."""
         return self.pose_set.feasible(box)
@@ -161,6 +193,7 @@ class SplatFrame:
         self, box: ParameterBox, tiles: np.ndarray, within: Context | None = None, keep_linear: bool = False
     ) -> TileBounds:
         """Bounds of ``tiles`` over ``box``; ``within`` is the context of these tiles and a box around it."""
+        checkpoint()
         forms = self.pose_set.enclosure(box, self.order)
         candidates = self._candidates(tiles, within)
         cell = self.bounds.cell(self.camera, forms, tiles, candidates, keep_linear, self._floor)
@@ -253,9 +286,7 @@ class SplatFrame:
         return np.where(np.isfinite(pixels), pixels, 0.0), z
 
 
-def linear_sets(
-    forms: np.ndarray, lower: np.ndarray, upper: np.ndarray, d: int
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+def linear_sets(forms: np.ndarray, lower: np.ndarray, upper: np.ndarray, d: int) -> LinearSets:
     """Linear lower and upper bounds of clamped pixels from their forms (design.md, B9).
 
     Args:

@@ -1,4 +1,4 @@
-"""Per-Gaussian stage of the bounds: from pose forms to what a pixel needs (design.md, G1-G10).
+"""Per-Gaussian stage of the bounds: from pose forms to what a pixel needs (design.md, G1-G11).
 
 Gaussians that no pose of the cell shows are dropped, the others projected in blocks: by `line_projection` for one
 parameter and order 2, by `form_projection` otherwise. `records` tells what is left of each.
@@ -7,38 +7,42 @@ parameter and order 2, by `form_projection` otherwise. `records` tells what is l
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit, prange
 
-from ns_abstract.arithmetic.compiled import borrowed, pointer
-from ns_abstract.arithmetic.lanes import bits, load8, scatter_columns, store, where
-from ns_abstract.arithmetic.units import UNIT64
-from ns_abstract.arithmetic.wide_forms import bounds, reach, size
+from ns_abstract.arithmetic.rounding import UNIT64, Charges
+from ns_abstract.arithmetic.simd.intrinsics import borrowed, pointer
+from ns_abstract.arithmetic.simd.lanes import bits, load8, scatter_columns, store, where
+from ns_abstract.arithmetic.simd.wide_forms import bounds, reach, size
 from ns_abstract.methods.splat import records as row
 from ns_abstract.methods.splat.form_projection import WORKSPACE, project_forms, rotate
 from ns_abstract.methods.splat.line_projection import compensate_line, project_line
 from ns_abstract.methods.splat.records import (
     LANES,
     REGION,
+    compensations,
     coordinate_errors,
     float_errors,
     gather,
     gather_means,
+    projected_stretch,
     regions,
 )
+from ns_abstract.methods.splat.stage_data import CellPoses, ProjectedGaussians, ProjectionInputs, SceneGaussians
 
 _CHUNK = 1024
 _COEFFICIENT = 8.0 * UNIT64
 _UP = 1.0 + 128.0 * UNIT64
 
 
-def covariance_noise(axes: np.ndarray, unit: float, flush: float) -> np.ndarray:
+def covariance_noise(axes: np.ndarray, charges: Charges) -> np.ndarray:
     """Float error of each world covariance and of the products made with it (design.md, G6).
 
     Args:
         axes: [N, 3, 3] scaled principal axes.
-        unit, flush: The arithmetic.
+        charges: For the program's rounding.
 
     Returns:
         [N, 12]: the error bounds and the absolute values of the entries 00, 11, 22, 01, 02, 12.
@@ -46,141 +50,117 @@ def covariance_noise(axes: np.ndarray, unit: float, flush: float) -> np.ndarray:
     size = np.abs(axes)
     scale = np.sqrt(np.sum(axes * axes, axis=1))  # [N, 3]
     out = np.empty((axes.shape[0], 12))
-    # entries of R(q) carry 52 units: normalisation, products and sums of a quaternion
-    entry = 52.0 * unit
+    entry = charges.rotation_entry
     squares = np.sum(scale * scale, axis=1)
     for k, (r, c) in enumerate(((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))):
         covariance = np.abs(np.sum(axes[:, r] * axes[:, c], axis=1))
         products = np.sum(size[:, r] * size[:, c], axis=1)
         spread = np.sum(scale * (size[:, r] + size[:, c]), axis=1)
-        out[:, k] = (
-            entry * spread + entry * entry * squares + 5.0 * unit * products + 20.5 * unit * covariance + flush
-        )
-        out[:, 6 + k] = covariance * (1.0 + 64.0 * unit) + 8.0 * unit * products
+        out[:, k] = entry * spread + entry * entry * squares + charges.covariance_products * products
+        out[:, k] = out[:, k] + charges.covariance * covariance + charges.flush
+        out[:, 6 + k] = covariance * (1.0 + charges.covariance_size) + charges.covariance_size_products * products
     return out
 
 
+class _Scratch(NamedTuple):
+    """Memory for a block of `LANES` Gaussians.
+
+    Attributes:
+        work: Forms of eight, flat; see `form_projection`.
+        rows: Rows of lanes, flat; see `records`.
+        lanes: [17, LANES] for `line_projection.compensate_line`.
+        places: [LANES] where records go.
+    """
+
+    work: np.ndarray
+    rows: np.ndarray
+    lanes: np.ndarray
+    places: np.ndarray
+
+
 @njit(cache=True, error_model="numpy")
-def _stage_chunk(
-    chunk, candidates_, means_, axes_, extents_, noise_, opacity_low_, opacity_high_, faint_, mean_radius_,
-    rotation_, offset_, origin_, camera_reach_, rotation_reach_, camera_, rules_, errors_,
-    d, order, m, antialiased,
-    record_, box_, tiles_, depth_, delta_, depth_error_, state_,
-):  # fmt: skip
+def _borrowed_inputs(scene, poses, camera, rules, charges, shape):
+    """The `ProjectionInputs` without references to the arrays' owners."""
+    scene = SceneGaussians(
+        borrowed(scene.means), borrowed(scene.mean_radius), borrowed(scene.axes), borrowed(scene.extents),
+        borrowed(scene.noise), borrowed(scene.opacity_low), borrowed(scene.opacity_high), borrowed(scene.faint),
+    )  # fmt: skip
+    poses = CellPoses(
+        borrowed(poses.rotation), borrowed(poses.offset), borrowed(poses.origin), borrowed(poses.camera_reach),
+        borrowed(poses.rotation_reach),
+    )  # fmt: skip
+    return ProjectionInputs(scene, poses, camera, rules, charges, shape)
+
+
+@njit(cache=True, error_model="numpy")
+def _stage_chunk(chunk, candidates_, inputs, out, state_):
     """One chunk of candidates; see `gaussian_stage`."""
-    candidates = borrowed(candidates_)
-    means = borrowed(means_)
-    axes = borrowed(axes_)
-    extents = borrowed(extents_)
-    noise = borrowed(noise_)
-    opacity_low = borrowed(opacity_low_)
-    opacity_high = borrowed(opacity_high_)
-    faint = borrowed(faint_)
-    mean_radius = borrowed(mean_radius_)
-    rotation = borrowed(rotation_)
-    offset = borrowed(offset_)
-    origin = borrowed(origin_)
-    camera_reach = borrowed(camera_reach_)
-    rotation_reach = borrowed(rotation_reach_)
-    camera = borrowed(camera_)
-    rules = borrowed(rules_)
-    errors = borrowed(errors_)
-    record = borrowed(record_)
-    box = borrowed(box_)
-    tiles = borrowed(tiles_)
-    depth = borrowed(depth_)
-    delta = borrowed(delta_)
-    depth_error = borrowed(depth_error_)
-    state = borrowed(state_)
-    n = candidates.shape[0]
-    work_ = np.empty(WORKSPACE * size(m))
-    work = borrowed(work_)
-    table_ = np.empty((row.table_rows(record_.shape[1]), LANES))
-    s = borrowed(table_.reshape(-1))
-    scratch_ = np.empty((17, LANES))
-    scratch = borrowed(scratch_)
-    places_ = np.empty(LANES, np.int64)
-    places = borrowed(places_)
-    alive_ = np.empty(_CHUNK, np.int64)
-    alive = borrowed(alive_)
+    candidates, state = borrowed(candidates_), borrowed(state_)
+    out = ProjectedGaussians(
+        borrowed(out.record), borrowed(out.box), borrowed(out.tiles), borrowed(out.depth), borrowed(out.delta),
+        borrowed(out.depth_error),
+    )  # fmt: skip
+    owned = _Scratch(
+        np.empty(WORKSPACE * size(inputs.shape.monomials)),
+        np.empty(row.table_rows(out.record.shape[1]) * LANES),
+        np.empty((17, LANES)),
+        np.empty(LANES, np.int64),
+    )
+    scratch = _Scratch(borrowed(owned.work), borrowed(owned.rows), borrowed(owned.lanes), borrowed(owned.places))
     start = chunk * _CHUNK
-    stop = min(n, start + _CHUNK)
+    stop = min(candidates.shape[0], start + _CHUNK)
+    alive_ = np.empty(_CHUNK, np.int64)
     everyone_ = np.arange(start, stop)
-    everyone = borrowed(everyone_)
+    alive, everyone = borrowed(alive_), borrowed(everyone_)
     count = 0
     for first in range(start, stop, LANES):
         lanes = min(LANES, stop - first)
-        count = _cull_block(
-            candidates, everyone[first - start : first - start + lanes], means, extents, opacity_high, mean_radius,
-            rotation, offset, origin, camera_reach, rotation_reach, camera, rules, errors, d, order, m, antialiased,
-            work, s, state, alive, count,
-        )  # fmt: skip
+        block = everyone[first - start : first - start + lanes]
+        count = _cull_block(candidates, block, inputs, scratch, state, alive, count)
     for first in range(0, count, LANES):
         lanes = min(LANES, count - first)
-        _project_block(
-            candidates, alive[first : first + lanes], means, axes, noise, opacity_low, opacity_high, faint, mean_radius,
-            rotation, offset, origin, camera_reach, rotation_reach, camera, rules, errors,
-            d, order, m, antialiased, work, s, scratch, places, record, box, tiles, depth, delta, depth_error, state,
-        )  # fmt: skip
+        _project_block(candidates, alive[first : first + lanes], inputs, scratch, out, state)
     # the owners of the borrowed arrays live to here
-    return work_.size + table_.size + scratch_.size + places_.size + alive_.size + everyone_.size
+    return len(owned) + alive_.size + everyone_.size
 
 
 @njit(cache=True, parallel=True, error_model="numpy")
-def gaussian_stage(
-    candidates, means, axes, extents, noise, opacity_low, opacity_high, faint, mean_radius,
-    rotation, offset, origin, camera_reach, rotation_reach, camera, rules, errors,
-    d, order, m, antialiased,
-    record, box, tiles, depth, delta, depth_error, state,
-):  # fmt: skip
-    """Fill the records of ``candidates`` [n] (indices into the scene's arrays).
+def gaussian_stage(candidates, scene, poses, camera, rules, charges, shape, out, state):
+    """Project the ``candidates`` over a cell (design.md, G).
 
     Args:
-        candidates: [n] int32.
-        means, axes: [N, 3], [N, 3, 3] of the scene; means in the middle of their ranges.
-        extents: [N] largest standard deviations, up to rounding.
-        noise: [N, 12] see `covariance_noise`.
-        opacity_low, opacity_high: [N] ends of the opacities' ranges.
-        faint: [N] see `records.faint_exponents`.
-        mean_radius: [N, 3] half-widths of independent mean ranges, world axes, or [0, 3].
-        rotation, offset: [rows, 9], [rows, 3] pose forms; see `PoseForms`.
-        origin: [3].
-        camera_reach: [3] upper bounds of the camera's coordinates.
-        rotation_reach: [9] upper bounds of the rotation's absolute entries.
-        camera: fx, fy, cx, cy, width, height.
-        rules: See `ns_abstract.methods.splat.constants.rules_array`.
-        errors: unit, flush, division, sqrt, rsqrt, exp errors in units, largest product.
-        record, box, tiles, depth, delta, depth_error, state: outputs, one row per candidate; ``record`` has
-            `records.columns`;
-            ``box`` [n, 4] pixels x0, x1, y0, y1; ``tiles`` [n, 8] outer then inner tile ranges;
-            ``depth`` [n] at the middle; ``delta`` [n, 3] mean minus origin; ``state`` [n] 1 if visible.
+        candidates: [n] int32 indices into the scene's arrays.
+        scene: `SceneGaussians`.
+        poses: `CellPoses`.
+        camera: `Intrinsics`.
+        rules: `RasterRules`.
+        charges: `Charges` for the program's rounding.
+        shape: `FormShape` of the poses' forms.
+        out: `ProjectedGaussians`, the output; ``out.record`` has `records.columns`.
+        state: [n] uint8 output: 1 if visible; else the candidate's row of ``out`` is not set.
     """
     for chunk in prange((candidates.shape[0] + _CHUNK - 1) // _CHUNK):
-        _stage_chunk(
-            chunk, candidates, means, axes, extents, noise, opacity_low, opacity_high, faint, mean_radius,
-            rotation, offset, origin, camera_reach, rotation_reach, camera, rules, errors,
-            d, order, m, antialiased,
-            record, box, tiles, depth, delta, depth_error, state,
-        )  # fmt: skip
+        _stage_chunk(chunk, candidates, _borrowed_inputs(scene, poses, camera, rules, charges, shape), out, state)
 
 
 @njit(cache=True, error_model="numpy")
-def _cull_block(
-    candidates, block, means, extents, opacity_high, mean_radius, rotation_, offset_, origin, camera_reach,
-    rotation_reach, camera, rules, errors, d, order, m, antialiased, work_, s_, state, alive, count,
-):  # fmt: skip
+def _cull_block(candidates, block, inputs, scratch, state, alive, count):
     """Drop the Gaussians of ``block`` that no pose of the cell shows (design.md, G3); others go to ``alive``."""
-    rotation, offset, work, s = pointer(rotation_), pointer(offset_), pointer(work_), pointer(s_)
-    near, far, alpha_min, margin = rules[0], rules[1], rules[7], rules[6]
-    fx, fy, cx, cy, width, height = camera[0], camera[1], camera[2], camera[3], camera[4], camera[5]
-    unit = errors[0]
-    gather_means(candidates, block, means, mean_radius, origin, s_)
+    scene, poses, rules, charges = inputs.scene, inputs.poses, inputs.rules, inputs.charges
+    rotation, offset = pointer(poses.rotation), pointer(poses.offset)
+    work, s_ = pointer(scratch.work), scratch.rows
+    s = pointer(s_)
+    d, order, m = inputs.shape
+    fx, fy, cx, cy, width, height = inputs.camera
+    margin = rules.view_margin
+    gather_means(candidates, block, scene, poses.origin, s_)
     lanes = block.shape[0]
+    extents, opacity_high = scene.extents, scene.opacity_high
     for q in range(LANES):
         i = candidates[block[min(q, lanes - 1)]]
         s[row.EXTENT + q] = extents[i]
         s[row.OPHIGH + q] = opacity_high[i]
-    coordinate_errors(s_, LANES, rotation_reach, camera_reach, unit)
+    coordinate_errors(s_, LANES, poses, charges)
     limit_x = max(cx, width - cx) / fx + margin * 0.5 * width / fx
     limit_y = max(cy, height - cy) / fy + margin * 0.5 * height / fy
     if margin >= 0.0:
@@ -188,29 +168,35 @@ def _cull_block(
     else:
         stretch = np.inf
     # radius <= 3 sqrt(lambda + 0.1) + 1 <= 3 |J| s + 3 sqrt(eps2d + 0.1) + 1, times z
-    blur = rules[4] * math.sqrt(rules[2] + math.sqrt(rules[5])) + 2.0
+    blur = rules.radius_sigmas * math.sqrt(rules.eps2d + math.sqrt(rules.discriminant_min)) + 2.0
+    # where products may overflow, anything may be shown (G9)
+    safe = rules.near * math.sqrt(math.sqrt(charges.overflow)) * 0.5
+    modelled = projected_stretch(rules, inputs.camera)
+    most = charges.overflow / max(1.0, modelled / rules.near)
     z = 2 * size(m)
     for first in range(0, lanes, 8):
-        v0, v1, v2 = load8(s, row.V0 + first), load8(s, row.V1 + first), load8(s, row.V2 + first)
-        rotate(work, rotation, 2, v0, v1, v2, offset, True, 0.0 * v0, z, d, order, m)
+        v = load8(s, row.V0 + first), load8(s, row.V1 + first), load8(s, row.V2 + first)
+        rotate(work, rotation, 2, v, offset, True, 0.0 * v[0], z, inputs.shape)
         nearest, farthest = bounds(work, z, d, order, m)
         spread_z = load8(s, row.SZ + first) + load8(s, row.EZ + first)
         # a bound that is not a number keeps the Gaussian
-        gone = (farthest + spread_z < near) | (nearest - spread_z > far)
+        gone = (farthest + spread_z < rules.near) | (nearest - spread_z > rules.far)
+        largest = load8(s, row.EXTENT + first)
+        tame = (largest * modelled < safe) & (largest * largest < most)
         # antialiased, rounding may raise it: see `regions`
-        if not antialiased:
-            gone = gone | (load8(s, row.OPHIGH + first) * (1.0 + 64.0 * unit) < alpha_min)
-        extent = rules[4] * stretch * load8(s, row.EXTENT + first) * REGION
+        if not rules.antialiased:
+            gone = gone | (tame & (load8(s, row.OPHIGH + first) * (1.0 + charges.faint) < rules.alpha_min))
+        extent = rules.radius_sigmas * stretch * largest * REGION
         for axis in range(2):
             a = axis * size(m)
             focal, center, length = (fx, cx, width) if axis == 0 else (fy, cy, height)
-            rotate(work, rotation, axis, v0, v1, v2, offset, True, 0.0 * v0, a, d, order, m)
+            rotate(work, rotation, axis, v, offset, True, 0.0 * v[0], a, inputs.shape)
             error = focal * (load8(s, row.EX + axis * LANES + first) + load8(s, row.SX + axis * LANES + first))
             error = extent + error + (max(length, abs(center), abs(length - center)) + blur) * spread_z
             # focal x + (center + blur) z + extent < 0: left of the image at every pose with z > 0
             before = _linear_top(work, a, focal, z, center + blur, order, m) + error
             behind = _linear_top(work, a, -focal, z, length - center + blur, order, m) + error
-            gone = gone | (before * REGION < 0.0) | (behind * REGION < 0.0)
+            gone = gone | (tame & ((before * REGION < 0.0) | (behind * REGION < 0.0)))
         hidden = bits(gone)
         for lane in range(min(8, lanes - first)):
             index = block[first + lane]
@@ -233,28 +219,34 @@ def _linear_top(w, a, s, b, t, order, m):
 
 
 @njit(cache=True, error_model="numpy")
-def _project_block(
-    candidates, block, means, axes, noise, opacity_low, opacity_high, faint, mean_radius,
-    rotation, offset, origin, camera_reach, rotation_reach, camera, rules, errors,
-    d, order, m, antialiased, work, s, scratch, places, record, box, tiles, depth, delta, depth_error, state,
-):  # fmt: skip
-    """Records of up to `LANES` Gaussians (design.md, G4-G10)."""
-    unit, cx, cy = errors[0], camera[2], camera[3]
+def _project_block(candidates, block, inputs, scratch, out, state):
+    """Records of up to `LANES` Gaussians (design.md, G4-G11)."""
+    scene, poses, camera, rules, charges, shape = inputs
+    s, lanes = scratch.rows, scratch.lanes
     # loops of a length that the compiler does not know become vector code
-    n = scratch.shape[1]
-    gather(candidates, block, means, axes, noise, mean_radius, opacity_low, opacity_high, faint, origin, s)
-    coordinate_errors(s, n, rotation_reach, camera_reach, unit)
-    if d == 1 and order == 2:
-        project_line(s, n, rotation, offset, camera, rules)
-        if antialiased:
-            compensate_line(s, n, scratch[:6], scratch[6:11], scratch[11:])
+    n = lanes.shape[1]
+    gather(candidates, block, scene, poses.origin, s)
+    coordinate_errors(s, n, poses, charges)
+    if shape.order == 2:
+        project_line(s, n, poses.rotation, poses.offset, camera, rules)
+        if rules.antialiased:
+            compensate_line(s, n, lanes[:6], lanes[6:11], lanes[11:])
     else:
         project_forms(
-            pointer(work), pointer(s), pointer(rotation), pointer(offset), camera, rules, d, order, m, antialiased
+            pointer(scratch.work), pointer(s), pointer(poses.rotation), pointer(poses.offset), camera, rules, shape
         )
-    float_errors(s, n, rules, camera, errors, rotation_reach)
-    regions(s, n, rules, camera, errors, antialiased)
-    _fill_records(pointer(s), cx, cy, 6 if antialiased else 5, m)
+    float_errors(s, n, rules, camera, charges, poses.rotation_reach)
+    if rules.antialiased:
+        compensations(s, n, rules, charges)
+    regions(s, n, rules, camera, charges)
+    _fill_records(pointer(s), camera.cx, camera.cy, 6 if rules.antialiased else 5, shape.monomials)
+    _scatter_records(block, s, scratch.places, out.record)
+    _set_outputs(block, s, poses.rotation_reach, charges, out, state)
+
+
+@njit(cache=True, error_model="numpy")
+def _scatter_records(block, s, places, record):
+    """Write the records in the rows ``s`` to those of ``record`` that ``block`` names."""
     last = block.shape[0] - 1
     for q in range(LANES):
         places[q] = block[min(q, last)]
@@ -269,23 +261,28 @@ def _project_block(
                 load8(lanes, at + 2 * LANES), load8(lanes, at + 3 * LANES), load8(lanes, at + 4 * LANES),
                 load8(lanes, at + 5 * LANES), load8(lanes, at + 6 * LANES), load8(lanes, at + 7 * LANES),
             )  # fmt: skip
-    reach0, reach1, reach2 = rotation_reach[6], rotation_reach[7], rotation_reach[8]
+
+
+@njit(cache=True, error_model="numpy")
+def _set_outputs(block, s, rotation_reach, charges, out, state):
+    """Write what `ProjectedGaussians` hold beside records, and the state (design.md, G10, S3)."""
+    depth, depth_error, delta, box, tiles = out.depth, out.depth_error, out.delta, out.box, out.tiles
+    r0, r1, r2 = rotation_reach[6], rotation_reach[7], rotation_reach[8]
     for q in range(block.shape[0]):
         index = block[q]
         if s[row.GONE + q] != 0.0:
             state[index] = 0
             continue
         depth[index] = s[row.Z0 + q]
-        # G10: rounding of the depth against that of another Gaussian; what both share is in the slope, whose own
+        # rounding of the depth against that of another Gaussian; what both share is in the slope, whose own
         # rounding is charged for the means in the middle of their ranges (S3), hence twice
         products = (
-            reach0 * (s[row.M0 + q] + 2.0 * s[row.R0 + q])
-            + reach1 * (s[row.M1 + q] + 2.0 * s[row.R1 + q])
-            + reach2 * (s[row.M2 + q] + 2.0 * s[row.R2 + q])
+            r0 * (s[row.M0 + q] + 2.0 * s[row.R0 + q])
+            + r1 * (s[row.M1 + q] + 2.0 * s[row.R1 + q])
+            + r2 * (s[row.M2 + q] + 2.0 * s[row.R2 + q])
         )
-        depth_error[index] = (
-            unit * (4.2 * products + 1.1 * max(abs(s[row.ZLO + q]), abs(s[row.ZHI + q]))) + s[row.SZ + q]
-        )
+        farthest = max(abs(s[row.ZLO + q]), abs(s[row.ZHI + q]))
+        depth_error[index] = charges.depth_products * products + charges.depth * farthest + s[row.SZ + q]
         for k in range(3):
             delta[index, k] = s[row.V0 + k * LANES + q]
         for k in range(4):
@@ -304,6 +301,10 @@ def _fill_records(s, cx, cy, count, m):
         # in units of y
         mean_error = load8(s, row.EW + q)
         total = mean_error
+        if count > 5:
+            formless = load8(s, row.FORMLESS + q) != 0.0
+            for at in range(row.FP + 5 * stride * LANES + q, row.FP + 6 * stride * LANES + q, LANES):
+                store(s, at, where(formless, 0.0, load8(s, at)))
         for f in range(count):
             start = row.FP + f * stride * LANES + q
             first = abs(load8(s, start))

@@ -5,7 +5,7 @@ from __future__ import annotations
 from numba import njit
 
 from ns_abstract.arithmetic.line_forms import combined, ends, inverse_root, load, multiplied, scaled, size, store
-from ns_abstract.arithmetic.units import UNIT64
+from ns_abstract.arithmetic.rounding import UNIT64
 from ns_abstract.methods.splat.records import LANES
 
 _COEFFICIENT = 8.0 * UNIT64

@@ -18,7 +18,7 @@ from ns_abstract.arithmetic.line_forms import (
     size,
     store,
 )
-from ns_abstract.arithmetic.units import UNIT64
+from ns_abstract.arithmetic.rounding import UNIT64
 from ns_abstract.methods.splat import records as row
 from ns_abstract.methods.splat.records import LANES
 
@@ -95,11 +95,13 @@ def _crossed(a, b, c, d):
 def project_line(s, n, rotation, offset, camera, rules):
     """Bounds and forms of ``n`` Gaussians from the rows that `records.gather` filled (design.md, G4-G9).
 
+    See design.md, G1.
+
     ``rotation`` [6, 9] and ``offset`` [6, 3] are the pose's forms. Fills the rows ZLO .. HI, DEEP0 .. Y0, and the forms
     FP .. FW2, of K before the logarithm and of the determinant.
     """
-    eps2d, margin = rules[2], rules[6]
-    fx, fy, cx, cy, width, height = camera[0], camera[1], camera[2], camera[3], camera[4], camera[5]
+    eps2d, margin = rules.eps2d, rules.view_margin
+    fx, fy, cx, cy, width, height = camera
     r0, r1, r2 = _rotation_row(rotation, 0), _rotation_row(rotation, 1), _rotation_row(rotation, 2)
     offset_x = (offset[0, 0], offset[1, 0], offset[2, 0], offset[3, 0])
     offset_y = (offset[0, 1], offset[1, 1], offset[2, 1], offset[3, 1])
@@ -178,13 +180,13 @@ def project_line(s, n, rotation, offset, camera, rules):
 
 @njit(cache=True, error_model="numpy")
 def compensate_line(s, n, ratios, scratch, out):
-    """K = -log(compensation) into the rows FK, a lower bound of compensation^2 = |n0 x n1|^2 / det' into DISC.
+    """K = -log(compensation) into the rows FK, bounds of compensation^2 = |n0 x n1|^2 / det' into SQLO and SQHI.
 
     ``ratios``, ``out`` [6, lanes] and ``scratch`` [5, lanes] are scratch: the logarithm is no vector code.
     """
     for q in range(n):
         ratio = multiplied(load(s, row.FK, LANES, q), inverse(load(s, row.FD, LANES, q)))
-        s[row.DISC + q], _ = ends(ratio)
+        s[row.SQLO + q], s[row.SQHI + q] = ends(ratio)
         for r in range(4):
             ratios[r, q] = ratio[r]
         ratios[4, q] = abs(ratio[1])

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 from numba import njit
 
-from ns_abstract.arithmetic.compiled import prefetch
+from ns_abstract.arithmetic.simd.intrinsics import prefetch
 
 #: Side of a block in pixels; a block is what one pass of the compiled pixel stages works on.
 BLOCK = 8
@@ -13,6 +15,20 @@ BLOCK = 8
 PIXELS = BLOCK * BLOCK
 #: How many entries ahead memory is asked for: lists name Gaussians in depth order, which is no order in memory.
 AHEAD = 8
+
+
+class TileLists(NamedTuple):
+    """Gaussians of the tiles of an image, nearest first.
+
+    Attributes:
+        wanted: [t] int64 numbers of the tiles to be drawn, row-major.
+        offsets: [T + 1] where the list of each of all T tiles begins in ``entries``; those not wanted are empty.
+        entries: uint32 rows of the Gaussians.
+    """
+
+    wanted: np.ndarray
+    offsets: np.ndarray
+    entries: np.ndarray
 
 
 def depth_order(visible, depth):

@@ -16,8 +16,8 @@ from typing import Any, Literal, cast
 
 import numpy as np
 
-from ns_abstract.errors import InputError
-from ns_abstract.jsonio import file_size, show
+from ns_abstract.io.errors import InputError, visible
+from ns_abstract.io.jsonio import file_size, show
 from ns_abstract.methods import runs
 from ns_abstract.methods.splat.scene import DataparserTransform, Float32Array, SplatScene
 
@@ -141,9 +141,7 @@ def _load_run(run: runs.RunConfig) -> SplatScene:
     degree_stored = run.integer("sh_degree", _MODEL_DEFAULTS["sh_degree"], 0, _MAX_DEGREE_STORED)
     interval = run.integer("sh_degree_interval", _MODEL_DEFAULTS["sh_degree_interval"], 1)
     mode = run.choice("rasterize_mode", _MODEL_DEFAULTS["rasterize_mode"], ("classic", "antialiased"))
-    background = run.color(
-        "background_color", _MODEL_DEFAULTS["background_color"], {"random": _RANDOM_BACKGROUND}
-    )
+    background = run.color("background_color", _MODEL_DEFAULTS["background_color"], {"random": _RANDOM_BACKGROUND})
     degree = min(_STEP_AFTER_LOADING // interval, degree_stored)
     if degree > _MAX_DEGREE:
         raise InputError(
@@ -334,7 +332,7 @@ def _load_ply(path: Path) -> SplatScene:
         color_model="sh",
         sh_degree=_PLY_BANDS[3 * (bands - 1)],
         dataparser=DataparserTransform(),
-        name=path.stem,
+        name=visible(path.stem),
         source=str(path),
         **dropped,
     )

@@ -1,24 +1,33 @@
-"""Splatfacto runs as the command lines see them; see `ns_abstract.pipeline.Method`."""
+"""Splatfacto runs as the command lines see them; see `ns_abstract.refine.protocol.Method`."""
 
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ns_abstract.arithmetic.units import Arithmetic
-from ns_abstract.arithmetic.units import arithmetic as arithmetic_named
-from ns_abstract.errors import InputError
+from ns_abstract.arithmetic.rounding import Arithmetic
+from ns_abstract.arithmetic.rounding import arithmetic as arithmetic_named
+from ns_abstract.geometry.poses import COLOR_SHIFTS, PoseSet
+from ns_abstract.io.errors import InputError
+from ns_abstract.methods.representation import ProgramOptions, Representation
+from ns_abstract.methods.runs import RunConfig
 from ns_abstract.methods.splat.activate import Splats, activate
-from ns_abstract.methods.splat.constants import RASTERISERS, Rasteriser
+from ns_abstract.methods.splat.constants import VERSIONS, Rasteriser, rasteriser_named
 from ns_abstract.methods.splat.frame import SplatFrame
+from ns_abstract.methods.splat.load import load_scene
 from ns_abstract.methods.splat.scene import SplatScene
 from ns_abstract.methods.splat.variations import VariedSplats, vary
-from ns_abstract.sets.perturbation import Perturbation
-from ns_abstract.sets.poses import COLOR_SHIFTS, PoseSet, translation_only
-from ns_abstract.sets.variations import SceneVariation
+from ns_abstract.perturbation.specification import Perturbation
+from ns_abstract.perturbation.variations import SceneVariation
+
+if TYPE_CHECKING:
+    import torch
+
+    from ns_abstract.methods.splat.reference import Reference
 
 #: Bytes that the kernels need by Gaussian, beside the scene itself (record, boxes, colours, buffers).
 _BYTES_BY_GAUSSIAN = 1200
@@ -32,15 +41,34 @@ class SplatMethod:
     Args:
         scene: The scene.
         renderer: "gsplat" or "paper"; None: gsplat.
+        version: gsplat's, of `VERSIONS`; None: 1.4.0.
         arithmetic: "float32" or "real"; None: float32.
     """
 
-    def __init__(self, scene: SplatScene, renderer: str | None, arithmetic: str | None) -> None:
+    def __init__(
+        self, scene: SplatScene, renderer: str | None, arithmetic: str | None, version: str | None = None
+    ) -> None:
         self.scene = scene
-        self.rasteriser: Rasteriser = RASTERISERS[renderer or "gsplat"]
+        self.rasteriser: Rasteriser = rasteriser_named(renderer, version)
         self.arithmetic: Arithmetic = arithmetic_named(arithmetic or "float32")
         self.splats: Splats = activate(scene, self.rasteriser)
         self._varied: dict[tuple[SceneVariation, ...], VariedSplats] = {}
+        self._reference: Reference | None = None
+
+    @property
+    def name(self) -> str:
+        """The scene's name."""
+        return self.scene.name
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What was assumed on reading the scene."""
+        return tuple(self.scene.notes)
+
+    @property
+    def dataset_scale(self) -> float:
+        """Normalised units per unit of the data set."""
+        return self.scene.dataparser.scale
 
     @property
     def program(self) -> dict[str, Any]:
@@ -88,25 +116,6 @@ class SplatMethod:
         by_gaussian = self.splats.count * (_BYTES_BY_GAUSSIAN + ranges)
         return 2 * sum(a.nbytes for a in arrays) + by_gaussian + pixels * 400 + (256 << 20)
 
-    def frame_plan(self, frame: SplatFrame, shown: int | None, lower: np.ndarray, upper: np.ndarray) -> list[str]:
-        """What was left out for one frame, given what refinement found."""
-        total = self.splats.count
-        plan = []
-        if shown is not None and shown < total:
-            plan.append(
-                f"{total - shown:,} of {total:,} Gaussians left out: no pose of the set shows them "
-                "(behind, beside, hidden by others or below the alpha threshold)"
-            )
-        varied = frame.varied
-        for quantity, name in (("mean", "mean"), ("opacity", "opacity"), ("color", "colour")):
-            if count := varied.counts[quantity]:
-                plan.append(f"scene variations: the {name} of {count:,} of {total:,} Gaussians varies")
-            elif varied.varies:
-                plan.append(f"ranges of the {name} left out: none varies")
-        if not varied.counts["mean"] and translation_only(frame.pose_set.enclosure(frame.box, 1)):
-            plan.append("depth-order rules left out but for near-ties: translations never change the order")
-        return plan
-
     @property
     def plan(self) -> tuple[str, ...]:
         """What is left out for this scene, whatever the frame."""
@@ -134,6 +143,7 @@ class SplatMethod:
         return {
             "scene": digest.hexdigest(),
             "renderer": self.rasteriser.name,
+            "version": self.rasteriser.version,
             "arithmetic": self.arithmetic.name,
         }
 
@@ -150,3 +160,33 @@ class SplatMethod:
             "background": [float(v) for v in scene.background],
             "notes": list(scene.notes),
         }
+
+    def differentiable(self, poses: PoseSet) -> Callable[[torch.Tensor], torch.Tensor]:
+        """Parameter values [d] to the picture [H, W, 3], by the reference renderer."""
+        from ns_abstract.geometry.differentiable_pose import differentiable_pose
+        from ns_abstract.methods.splat.reference import Reference
+
+        if self._reference is None:
+            self._reference = Reference(self.scene, self.rasteriser)
+        reference, pose = self._reference, differentiable_pose(poses)
+        return lambda values: reference.image(poses.camera, pose(values))
+
+
+def _load(source: RunConfig | Path) -> SplatScene:
+    return load_scene(source.file if isinstance(source, RunConfig) else source)
+
+
+def _method(scene: SplatScene, options: ProgramOptions, arithmetic: str | None, workers: int) -> SplatMethod:
+    nerf = ("sampling", "num_samples", "near_plane", "occupancy_grid")
+    options.refuse(nerf, "is for runs of vanilla-nerf, this run is a splat")
+    if options.renderer == "paper":
+        options.refuse(("gsplat_version",), "the paper's renderer is not gsplat")
+    if options.gsplat_version not in (None, *VERSIONS):
+        raise InputError(
+            f"found {options.gsplat_version}", field="--gsplat-version", fix=f"use one of {', '.join(VERSIONS)}"
+        )
+    return SplatMethod(scene, options.renderer, arithmetic, options.gsplat_version)
+
+
+# what no other representation reads is a splat's
+SPLAT = Representation(lambda source: True, _load, _method)

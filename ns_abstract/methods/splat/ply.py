@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ns_abstract.atomic import write_atomic
+from ns_abstract.io.atomic import write_atomic
 from ns_abstract.methods.splat.activate import SH_C0
 from ns_abstract.methods.splat.scene import SplatScene
 

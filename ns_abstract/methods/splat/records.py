@@ -1,4 +1,4 @@
-"""What the per-Gaussian stage leaves for the pixels: float errors, pixel regions and tile ranges (design.md, G5-G9).
+"""What the per-Gaussian stage leaves for the pixels: float errors, pixel regions and tile ranges (design.md, G5-G12).
 
 For every Gaussian that some pose of the cell may show, one record is written:
 
@@ -8,7 +8,8 @@ For every Gaussian that some pose of the cell may show, one record is written:
     5      1 where nothing but the opacity is known ("wild"), else 0
     6      exponent from which on alpha is below the threshold, however it is evaluated (B4); -1 if wild
     7 ..   of the forms P, Q, S, W1, W2: how far each may be from its centre, for pixels that surely see nothing
-    12 ..  forms P, Q, S, W1, W2 (and K if antialiased), each m coefficients and a radius
+    12 ..  forms P, Q, S, W1, W2 (and K if antialiased; 0 where the opacity is compensated), each m coefficients and
+           a radius
 
 so that for a pixel at offset (ax, ay) from the mean
 
@@ -20,13 +21,13 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from ns_abstract.arithmetic.units import UNIT64
+from ns_abstract.arithmetic.rounding import UNIT64, Charges
 
 #: Lanes of one block of the compiled stage.
 LANES = 32
 _UP = 1.0 + 128.0 * UNIT64
-#: Rounding of the opacity in units: a sigmoid is two exponentials or divisions and an addition.
-_SIGMOID = 12.0
+#: The squared compensation from which on its logarithm is used.
+_LEAST_SQUARE = 1e-60
 #: Room for rounding where a region of pixels or tiles is computed from bounds.
 REGION = 1.0 + 2.0**-30
 
@@ -55,16 +56,20 @@ def columns(count, m):
     EXTENT,
     # bounds that the projection leaves: depth, ratios, scaled covariance entries, determinant, half difference,
     # squared compensation, reach of the third row of rotation times axes
-    ZLO, ZHI, ULO, UHI, VLO, VHI, ALO, AHI, CLO, CHI, BLO, BHI, DLO, DHI, LO, HI, DISC, DEEP0, DEEP1, DEEP2,
+    ZLO, ZHI, ULO, UHI, VLO, VHI, ALO, AHI, CLO, CHI, BLO, BHI, DLO, DHI, LO, HI, SQLO, SQHI, DEEP0, DEEP1, DEEP2,
     # depth and mean in pixels from the middle of the view, at the cell's middle
     Z0, X0, Y0,
     # float errors of the coordinates, what a range of means adds to them
     EX, EY, EZ, SX, SY, SZ,
-    # what `float_errors` leaves
-    ZLOW, ZHIGH, MXLO, MXHI, MYLO, MYHI, A, C, DET, EDET, SHARP, RHIGH, RLOW, ETA, EW, TAME,
+    # what `float_errors` leaves; of G = J R M by row: squared sizes, errors of the factors; errors in G G^T
+    ZLOW, ZHIGH, MXLO, MXHI, MYLO, MYHI, A, C, DET, EDET, RHIGH, RLOW, ETA, EW, TAME,
+    ROWX, ROWY, MOVEX, MOVEY, GRAMA, GRAMB, GRAMC,
+    # what `compensations` leaves: bound of the compensation, bounds of the factor beside its form, whether there is no
+    # form, logarithms of the upper bounds
+    CTOP, CLOW, CHIGH, FORMLESS, CTOPLOG, CHIGHLOG,
     # what `regions` leaves beside columns of the record: state, box and tiles
     GONE, KNOWN, BOX0, BOX1, BOX2, BOX3, T0, T1, T2, T3, T4, T5, T6, T7,
-) = range(0, 93 * LANES, LANES)  # fmt: skip
+) = range(0, 106 * LANES, LANES)  # fmt: skip
 # a record, column by column
 RECORD = T7 + LANES
 R_MEAN_X, R_MEAN_Y, R_OPACITY_LOW, R_OPACITY_HIGH, R_KAPPA, R_WILD, R_FAINT, R_SPREAD = (
@@ -81,8 +86,9 @@ def table_rows(width):
 
 
 @njit(cache=True, error_model="numpy")
-def gather_means(candidates, block, means, mean_radius, origin, s):
+def gather_means(candidates, block, scene, origin, s):
     """Copy the means of the Gaussians ``block`` to the rows V0 .. V2, M0 .. R2; lanes in excess repeat the last one."""
+    means, mean_radius = scene.means, scene.mean_radius
     lanes = block.shape[0]
     for q in range(LANES):
         i = candidates[block[min(q, lanes - 1)]]
@@ -93,9 +99,12 @@ def gather_means(candidates, block, means, mean_radius, origin, s):
 
 
 @njit(cache=True, error_model="numpy")
-def gather(candidates, block, means, axes, noise, mean_radius, opacity_low, opacity_high, faint, origin, s):
+def gather(candidates, block, scene, origin, s):
     """Copy what the Gaussians ``block`` are made of to the rows V0 .. OPFAINT; lanes in excess repeat the last one."""
-    gather_means(candidates, block, means, mean_radius, origin, s)
+    gather_means(candidates, block, scene, origin, s)
+    axes, noise, opacity_low, opacity_high, faint = (
+        scene.axes, scene.noise, scene.opacity_low, scene.opacity_high, scene.faint,
+    )  # fmt: skip
     lanes = block.shape[0]
     for q in range(LANES):
         i = candidates[block[min(q, lanes - 1)]]
@@ -110,39 +119,65 @@ def gather(candidates, block, means, axes, noise, mean_radius, opacity_low, opac
 
 
 @njit(cache=True, error_model="numpy")
-def coordinate_errors(s, n, rotation_reach, camera_reach, unit):
+def coordinate_errors(s, n, poses, charges):
     """Float errors of the camera coordinates and what ranges of means add to them (G2, S2): rows EX .. SZ."""
+    rotation_reach, camera_reach = poses.rotation_reach, poses.camera_reach
     c0, c1, c2 = camera_reach[0], camera_reach[1], camera_reach[2]
     for row in range(3):
         r0, r1, r2 = rotation_reach[3 * row], rotation_reach[3 * row + 1], rotation_reach[3 * row + 2]
         error, spread = EX + row * LANES, SX + row * LANES
         for q in range(n):
-            # ten units of the sum of absolute products
-            total = r0 * (s[M0 + q] + s[R0 + q] + c0) + r1 * (s[M1 + q] + s[R1 + q] + c1) + r2 * (
-                s[M2 + q] + s[R2 + q] + c2
+            total = (
+                r0 * (s[M0 + q] + s[R0 + q] + c0)
+                + r1 * (s[M1 + q] + s[R1 + q] + c1)
+                + r2 * (s[M2 + q] + s[R2 + q] + c2)
             )
-            s[error + q] = 10.0 * unit * total * _UP
+            s[error + q] = charges.camera_coordinate * total * _UP
         for q in range(n):
             s[spread + q] = (r0 * s[R0 + q] + r1 * s[R1 + q] + r2 * s[R2 + q]) * _UP
 
 
+@njit(cache=True, error_model="numpy", inline="always")
+def _rotation_row(reach, k):
+    """Upper bounds of the absolute entries of row ``k`` of the rotation."""
+    return reach[3 * k], reach[3 * k + 1], reach[3 * k + 2]
+
+
+@njit(cache=True, error_model="numpy", inline="always")
+def _scaled_row(j, ratio, r, r2):
+    """Upper bounds of the absolute entries of a row of J R, from those of the rotation's row ``r`` and third row."""
+    return j * (r[0] + ratio * r2[0]), j * (r[1] + ratio * r2[1]), j * (r[2] + ratio * r2[2])
+
+
+@njit(cache=True, error_model="numpy", inline="always")
+def _applied(f00, f11, f22, f01, f02, f12, g):
+    """A symmetric matrix times a vector."""
+    return (
+        f00 * g[0] + f01 * g[1] + f02 * g[2],
+        f01 * g[0] + f11 * g[1] + f12 * g[2],
+        f02 * g[0] + f12 * g[1] + f22 * g[2],
+    )
+
+
+@njit(cache=True, error_model="numpy", inline="always")
+def _dot(a, b):
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
 @njit(cache=True, error_model="numpy")
-def float_errors(s, n, rules, camera, errors, rotation_reach):
+def float_errors(s, n, rules, camera, charges, rotation_reach):
     """Float errors of mean, covariance and exponent, and the radius' range (design.md, G5-G8): rows ZLOW .. TAME.
 
-    Numbers of Gaussians that may come too near are of no use; `regions` does not look at them.
+    Numbers of Gaussians that may come too near are of no use; `regions` does not look at them. One loop, because the
+    compiler makes vector code of it as it stands: lanes are Gaussians.
     """
-    sigmas, discriminant_min, margin = rules[4], rules[5], rules[6]
-    fx, fy, cx, cy, width, height = camera[0], camera[1], camera[2], camera[3], camera[4], camera[5]
-    unit, division, root = errors[0], errors[2], errors[3]
-    rr0, rr1, rr2 = rotation_reach[0], rotation_reach[1], rotation_reach[2]
-    rr3, rr4, rr5 = rotation_reach[3], rotation_reach[4], rotation_reach[5]
-    rr6, rr7, rr8 = rotation_reach[6], rotation_reach[7], rotation_reach[8]
+    fx, fy, cx, cy, width, height = camera
+    r0, r1, r2 = _rotation_row(rotation_reach, 0), _rotation_row(rotation_reach, 1), _rotation_row(rotation_reach, 2)
     limit_x, limit_y, clamp_x, clamp_y = np.inf, np.inf, 0.0, 0.0
-    if margin >= 0.0:
-        limit_x = max(cx, width - cx) / fx + margin * 0.5 * width / fx
-        limit_y = max(cy, height - cy) / fy + margin * 0.5 * height / fy
-        clamp_x, clamp_y = 8.0 * unit * limit_x, 8.0 * unit * limit_y
+    if rules.view_margin >= 0.0:
+        limit_x = max(cx, width - cx) / fx + rules.view_margin * 0.5 * width / fx
+        limit_y = max(cy, height - cy) / fy + rules.view_margin * 0.5 * height / fy
+        clamp_x, clamp_y = charges.clamp * limit_x, charges.clamp * limit_y
     for q in range(n):
         error_z = s[EZ + q]
         z_low = s[ZLO + q] - error_z
@@ -153,11 +188,11 @@ def float_errors(s, n, rules, camera, errors, rotation_reach):
         ratio_y = max(abs(s[VLO + q]), abs(s[VHI + q]))
         # G5: reciprocal of depth, means
         relative_z = error_z / z_low
-        relative_rz = relative_z + (division + 1.0) * unit
-        error_u = s[EX + q] / z_low + ratio_x * (relative_rz + 2.0 * unit)
-        error_v = s[EY + q] / z_low + ratio_y * (relative_rz + 2.0 * unit)
-        error_mean_x = fx * error_u + 8.0 * unit * (fx * ratio_x + abs(cx))
-        error_mean_y = fy * error_v + 8.0 * unit * (fy * ratio_y + abs(cy))
+        relative_rz = relative_z + charges.reciprocal_depth
+        error_u = s[EX + q] / z_low + ratio_x * (relative_rz + charges.ratio)
+        error_v = s[EY + q] / z_low + ratio_y * (relative_rz + charges.ratio)
+        error_mean_x = fx * error_u + charges.mean * (fx * ratio_x + abs(cx))
+        error_mean_y = fy * error_v + charges.mean * (fy * ratio_y + abs(cy))
         s[MXLO + q] = fx * s[ULO + q] + cx - error_mean_x * REGION
         s[MXHI + q] = fx * s[UHI + q] + cx + error_mean_x * REGION
         s[MYLO + q] = fy * s[VLO + q] + cy - error_mean_y * REGION
@@ -168,17 +203,10 @@ def float_errors(s, n, rules, camera, errors, rotation_reach):
         error_u = min(error_u, 2.0 * limit_x) + clamp_x
         error_v = min(error_v, 2.0 * limit_y) + clamp_y
         # G6: covariance. F bounds the error of the world covariance and all later roundings
-        relative_j = relative_z + 2.0 * relative_rz + 8.0 * unit
+        relative_j = relative_z + 2.0 * relative_rz + charges.jacobian
         jx = fx / z_low
         jy = fy / z_low
-        deep0, deep1, deep2 = s[DEEP0 + q], s[DEEP1 + q], s[DEEP2 + q]
-        depth_variance = deep0 * deep0 + deep1 * deep1 + deep2 * deep2
-        gx0 = jx * (rr0 + ratio_x * rr6)
-        gx1 = jx * (rr1 + ratio_x * rr7)
-        gx2 = jx * (rr2 + ratio_x * rr8)
-        gy0 = jy * (rr3 + ratio_y * rr6)
-        gy1 = jy * (rr4 + ratio_y * rr7)
-        gy2 = jy * (rr5 + ratio_y * rr8)
+        g_x, g_y = _scaled_row(jx, ratio_x, r0, r2), _scaled_row(jy, ratio_y, r1, r2)
         grow = relative_j * (2.0 + relative_j)
         f00 = s[N0 + q] + grow * s[N6 + q]
         f11 = s[N1 + q] + grow * s[N7 + q]
@@ -186,18 +214,12 @@ def float_errors(s, n, rules, camera, errors, rotation_reach):
         f01 = s[N3 + q] + grow * s[N9 + q]
         f02 = s[N4 + q] + grow * s[N10 + q]
         f12 = s[N5 + q] + grow * s[N11 + q]
-        depth_variance += f00 * rr6 * rr6 + f11 * rr7 * rr7 + f22 * rr8 * rr8
-        depth_variance += 2.0 * (f01 * rr6 * rr7 + f02 * rr6 * rr8 + f12 * rr7 * rr8)
-        error_a = (
-            gx0 * (f00 * gx0 + f01 * gx1 + f02 * gx2)
-            + gx1 * (f01 * gx0 + f11 * gx1 + f12 * gx2)
-            + gx2 * (f02 * gx0 + f12 * gx1 + f22 * gx2)
-        )
-        h0 = f00 * gy0 + f01 * gy1 + f02 * gy2
-        h1 = f01 * gy0 + f11 * gy1 + f12 * gy2
-        h2 = f02 * gy0 + f12 * gy1 + f22 * gy2
-        error_b = gx0 * h0 + gx1 * h1 + gx2 * h2
-        error_c = gy0 * h0 + gy1 * h1 + gy2 * h2
+        deep0, deep1, deep2 = s[DEEP0 + q], s[DEEP1 + q], s[DEEP2 + q]
+        variance = deep0 * deep0 + deep1 * deep1 + deep2 * deep2
+        variance += f00 * r2[0] * r2[0] + f11 * r2[1] * r2[1] + f22 * r2[2] * r2[2]
+        variance += 2.0 * (f01 * r2[0] * r2[1] + f02 * r2[0] * r2[2] + f12 * r2[1] * r2[2])
+        h_x = _applied(f00, f11, f22, f01, f02, f12, g_x)
+        h_y = _applied(f00, f11, f22, f01, f02, f12, g_y)
         z2_low = z_low * z_low
         z2_high = z_high * z_high
         a = s[AHI + q] / z2_low
@@ -206,58 +228,128 @@ def float_errors(s, n, rules, camera, errors, rotation_reach):
         det = s[DLO + q] / (z2_high * z2_high)
         jump_x = jx * error_u
         jump_y = jy * error_v
-        deep = np.sqrt(depth_variance)
+        # G7: errors of the factors of G = J R M, row by row, and of the products in G G^T
+        relative = 1.01 * (relative_j + charges.rotation)
+        more = 1.0 + relative
+        sum_x = (g_x[0] + g_x[1] + g_x[2] + jump_x * (r2[0] + r2[1] + r2[2])) * more
+        sum_y = (g_y[0] + g_y[1] + g_y[2] + jump_y * (r2[0] + r2[1] + r2[2])) * more
+        move_x, move_y, gram_a, gram_b, gram_c, row_x, row_y = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+        for k in range(3):
+            at = B00 + 3 * k * LANES + q
+            b0, b1, b2 = abs(s[at]), abs(s[at + LANES]), abs(s[at + 2 * LANES])
+            axis = b0, b1, b2
+            entry = charges.rotation_entry * np.sqrt(b0 * b0 + b1 * b1 + b2 * b2)
+            size_x, size_y = _dot(g_x, axis), _dot(g_y, axis)
+            near = s[DEEP0 + k * LANES + q] * more
+            whole = _dot(r2, axis) * more
+            e_x = relative * size_x + sum_x * entry + jump_x * near
+            e_y = relative * size_y + sum_y * entry + jump_y * near
+            t_x = more * size_x + sum_x * entry + jump_x * whole
+            t_y = more * size_y + sum_y * entry + jump_y * whole
+            move_x, move_y = move_x + e_x * e_x, move_y + e_y * e_y
+            row_x, row_y = row_x + size_x * size_x, row_y + size_y * size_y
+            gram_a, gram_b, gram_c = gram_a + t_x * t_x, gram_b + t_x * t_y, gram_c + t_y * t_y
+        move_x, move_y = np.sqrt(move_x), np.sqrt(move_y)
+        gram_a = charges.gram * gram_a + charges.flush * (sum_x * sum_x + 1.0)
+        gram_b = charges.gram * gram_b + charges.flush * (sum_x * sum_y + 1.0)
+        gram_c = charges.gram * gram_c + charges.flush * (sum_y * sum_y + 1.0)
+        s[ROWX + q], s[ROWY + q], s[MOVEX + q], s[MOVEY + q] = row_x, row_y, move_x, move_y
+        s[GRAMA + q], s[GRAMB + q], s[GRAMC + q] = gram_a, gram_b, gram_c
+        deep = np.sqrt(variance)
         root_a = np.sqrt(a)
         root_c = np.sqrt(c)
-        error_a = (
-            error_a + 2.0 * jump_x * deep * root_a + jump_x * jump_x * depth_variance + 2.0 * unit * a
-        ) * 1.01
-        error_c = (
-            error_c + 2.0 * jump_y * deep * root_c + jump_y * jump_y * depth_variance + 2.0 * unit * c
-        ) * 1.01
-        error_b = (
-            error_b + deep * (jump_x * root_c + jump_y * root_a) + jump_x * jump_y * depth_variance + 2.0 * unit * b
-        ) * 1.01
+        # of what an entry is made of, of the ratios in J, of its last sum
+        error_a = _dot(g_x, h_x) + 2.0 * jump_x * deep * root_a + jump_x * jump_x * variance + charges.blur * a
+        error_c = _dot(g_y, h_y) + 2.0 * jump_y * deep * root_c + jump_y * jump_y * variance + charges.blur * c
+        error_b = _dot(g_x, h_y) + deep * (jump_x * root_c + jump_y * root_a) + jump_x * jump_y * variance
+        error_a, error_c, error_b = error_a * 1.01, error_c * 1.01, (error_b + charges.blur * b) * 1.01
         # G8: lambda_max = (a + c)/2 + sqrt(max(floor, ((a - c)/2)^2 + b^2))
         difference = max(abs(s[LO + q]), abs(s[HI + q])) / z2_low
         nearest = max(0.0, s[LO + q], -s[HI + q]) / z2_high
         b_nearest = max(0.0, s[BLO + q], -s[BHI + q]) / z2_high
         half_high = 0.5 * (a + c)
         half_low = 0.5 * (max(s[ALO + q], 0.0) + max(s[CLO + q], 0.0)) / z2_high
-        error_half = 0.5 * (error_a + error_c) + 4.0 * unit * half_high
-        products = 6.0 * unit * (a * c + b * b)
+        error_half = 0.5 * (error_a + error_c) + charges.half_trace * half_high
+        products = charges.determinant * (a * c + b * b)
         error_det = (
             c * error_a + a * error_c + 2.0 * b * error_b + error_a * error_c + error_b * error_b + products
         ) * 1.01
-        error_disc = (
-            2.0 * half_high * error_half + error_half * error_half + error_det + 4.0 * unit * half_high * half_high
-        )
-        disc_high = max(discriminant_min, difference * difference + b * b + error_disc)
-        disc_low = max(discriminant_min, nearest * nearest + b_nearest * b_nearest - error_disc)
-        top_high = (half_high + error_half + np.sqrt(disc_high)) * (1.0 + 2.0 * root * unit)
-        top_low = max(0.0, half_low - error_half + np.sqrt(disc_low)) * (1.0 - 2.0 * root * unit)
+        error_disc = 2.0 * half_high * error_half + error_half * error_half + error_det
+        error_disc += charges.discriminant * half_high * half_high
+        disc_high = max(rules.discriminant_min, difference * difference + b * b + error_disc)
+        disc_low = max(rules.discriminant_min, nearest * nearest + b_nearest * b_nearest - error_disc)
+        top_high = (half_high + error_half + np.sqrt(disc_high)) * (1.0 + charges.radius)
+        top_low = max(0.0, half_low - error_half + np.sqrt(disc_low)) * (1.0 - charges.radius)
         # np.ceil: math.ceil is an int64, which a huge Gaussian overflows
-        s[RHIGH + q] = np.ceil(sigmas * np.sqrt(top_high) * (1.0 + 2.0 * root * unit) * REGION)
-        s[RLOW + q] = np.ceil(sigmas * np.sqrt(top_low) * (1.0 - 2.0 * root * unit) / REGION)
+        s[RHIGH + q] = np.ceil(rules.radius_sigmas * np.sqrt(top_high) * (1.0 + charges.radius) * REGION)
+        s[RLOW + q] = np.ceil(rules.radius_sigmas * np.sqrt(top_low) * (1.0 - charges.radius) / REGION)
         # what is not finite, or not a number, in any of them is not so in the sum
         s[TAME + q] = a + c + error_a + error_b + error_c
         s[A + q] = a
         s[C + q] = c
         s[DET + q] = det
-        s[EDET + q] = error_det
-        s[SHARP + q] = (error_det + products) / det
-        # G7: relative error of the exponent
-        s[ETA + q] = (
-            (c * error_a + 2.0 * (root_a * root_c) * error_b + a * error_c) / det + 80.0 * unit * (a * c) / det
-        ) * 1.01
+        # G7: relative errors of the covariance, of its determinant and of the exponent
+        moved = np.sqrt(c / det) * move_x + np.sqrt(a / det) * move_y
+        gram = c * (gram_a + charges.blur * a) + 2.0 * (root_a * root_c) * gram_b + a * (gram_c + charges.blur * c)
+        eta = min(
+            (c * error_a + 2.0 * (root_a * root_c) * error_b + a * error_c) / det,
+            (moved * (2.0 + moved) + gram / det) * 1.01,
+        )
+        s[EDET + q] = min(error_det, (eta * (2.0 + eta) * det + products) * 1.01)
+        s[ETA + q] = (eta + charges.conic * (a * c) / det) * 1.01
         # float error of the mean, in units of y
         s[EW + q] = (np.sqrt(c / det) * error_mean_x + np.sqrt(a / det) * error_mean_y) * 1.01
 
 
-def faint_exponents(opacity_high: np.ndarray, alpha_min: float, unit: float) -> np.ndarray:
+@njit(cache=True, error_model="numpy")
+def compensations(s, n, rules, charges):
+    """Bounds of the compensation as it is computed (design.md, G11, G12): rows CTOP .. CHIGHLOG, from `float_errors`.
+
+    CTOP bounds it over the cell. Its form leaves a factor between CLOW and CHIGH; where FORMLESS is 1 that is the
+    compensation itself, because its logarithm is not known well enough.
+    """
+    eps2d, least, flush = rules.eps2d, rules.compensation_min, charges.flush
+    # and the rounding below
+    shrink = 1.0 - charges.compensation - 64.0 * UNIT64
+    grow = 1.0 + charges.compensation + 64.0 * UNIT64
+    for q in range(n):
+        move_x, move_y = s[MOVEX + q], s[MOVEY + q]
+        error_a, error_b, error_c = s[GRAMA + q], s[GRAMB + q], s[GRAMC + q]
+        # the covariance before the blur
+        a = np.sqrt(min(s[ROWX + q], max(0.0, s[A + q] * REGION - eps2d)))
+        c = np.sqrt(min(s[ROWY + q], max(0.0, s[C + q] * REGION - eps2d)))
+        det, spread = s[DET + q], s[EDET + q] / s[DET + q]
+        moved = 1.01 * (move_x * c + a * move_y + move_x * move_y) / np.sqrt(det)
+        a, c = (a + move_x) * (a + move_x), (c + move_y) * (c + move_y)
+        error = c * error_a + a * error_c + 2.0 * np.sqrt(a * c) * error_b + error_a * error_c + error_b * error_b
+        error = 1.01 * (error + charges.determinant * (a + error_a) * (c + error_c) + flush) / det
+        # the square of the compensation lies in [0, 1]; bounds that are no numbers say nothing
+        low = s[SQLO + q] if s[SQLO + q] > 0.0 else 0.0
+        high = s[SQHI + q] if s[SQHI + q] < 1.0 else 1.0
+        low_root, high_root = np.sqrt(low), np.sqrt(high)
+        bottom = max(0.0, low_root * (1.0 - 16.0 * UNIT64) - moved)
+        bottom = np.sqrt(max(0.0, bottom * bottom - error) / (1.0 + spread)) * shrink
+        top = high_root * (1.0 + 16.0 * UNIT64) + moved
+        top = np.sqrt((top * top + error) / (1.0 - spread)) * grow
+        change = (moved * (2.0 * low_root + moved) + error) / low
+        # 1.6.0 has a least factor
+        formed = (low > _LEAST_SQUARE) & (change < 0.25) & (0.45 * low > least * least)
+        bottom = max(bottom, least * (1.0 - charges.compensation))
+        top = max(top, least * (1.0 + charges.compensation))
+        s[CTOP + q] = top if top < np.inf else np.inf
+        s[CLOW + q] = np.sqrt((1.0 - change) / (1.0 + spread)) * shrink if formed else bottom
+        s[CHIGH + q] = np.sqrt((1.0 + change) / (1.0 - spread)) * grow if formed else top
+        s[FORMLESS + q] = 0.0 if formed else 1.0
+    # the logarithm is no vector code
+    for q in range(n):
+        s[CTOPLOG + q] = np.log(s[CTOP + q] * REGION)
+        s[CHIGHLOG + q] = np.log(s[CHIGH + q] * REGION)
+
+
+def faint_exponents(opacity_high: np.ndarray, alpha_min: float, charges: Charges) -> np.ndarray:
     """Exponents [N] from which on opacities [N] leave less than ``alpha_min``, however they are evaluated (B4)."""
     with np.errstate(divide="ignore"):
-        exponent = np.log(opacity_high * (1.0 + _SIGMOID * unit) * (1.0 + 64.0 * unit) / alpha_min)
+        exponent = np.log(opacity_high * (1.0 + charges.opacity) * (1.0 + charges.faint) / alpha_min)
     # room for the rounding of the exponential, which grows more slowly than the exponent's own error
     return exponent * REGION + 2.0**-30
 
@@ -267,47 +359,96 @@ def _within(x, most):
     return min(max(x, 0.0), most)
 
 
+@njit(cache=True, error_model="numpy", inline="always")
+def ellipse_is_met(sharpness, widest, thinnest, eta, span, charges):
+    """Whether a Gaussian shows hardly anything in tiles that rounding may miss (design.md, G12), by its covariance.
+
+    ``sharpness`` is det / (a c), ``widest`` and ``thinnest`` bound a and c, ``span`` the coordinates in pixels.
+    """
+    unit = 0.125 * charges.tile
+    steep = 16.0 * unit * span * np.sqrt(widest / thinnest) < 0.25
+    tips = (sharpness * sharpness > 256.0 * unit) & (sharpness * np.sqrt(thinnest) > 512.0 * unit * span)
+    return steep & tips & (eta < 2.0**-9) & (span < 4096.0)
+
+
+@njit(cache=True, error_model="numpy", inline="always")
+def largest_extent(s, q):
+    """Upper bound of the largest standard deviation of one lane's Gaussian, up to rounding."""
+    total = 0.0
+    for k in range(9):
+        entry = s[B00 + k * LANES + q]
+        total += entry * entry
+    return np.sqrt(total)
+
+
+@njit(cache=True, error_model="numpy", inline="always")
+def projected_stretch(rules, camera):
+    """Upper bound of the norm of z J, up to rounding; 0 where no float32 program is modelled (the paper's rules)."""
+    fx, fy, cx, cy, width, height = camera
+    margin = rules.view_margin
+    if margin < 0.0:
+        return 0.0
+    limit_x = max(cx, width - cx) / fx + margin * 0.5 * width / fx
+    limit_y = max(cy, height - cy) / fy + margin * 0.5 * height / fy
+    return np.sqrt(fx * fx * (1.0 + limit_x * limit_x) + fy * fy * (1.0 + limit_y * limit_y)) * REGION
+
+
 @njit(cache=True, error_model="numpy")
-def regions(s, n, rules, camera, errors, antialiased):
-    """What is known of each Gaussian, from the rows of `float_errors` (design.md, G5-G9): rows GONE .. T7.
+def regions(s, n, rules, camera, charges):
+    """What is known of each Gaussian, from the rows of `float_errors` (design.md, G5-G12): rows GONE .. T7.
 
     GONE is 1 where no pose shows it, KNOWN where its forms may be relied on. The others may cover every pixel. Of a
     record: the opacities, kappa and the exponent from which on alpha is below the threshold.
     """
-    near, far, tile, alpha_min, work_tile = rules[0], rules[1], rules[3], rules[7], rules[10]
-    width, height = camera[4], camera[5]
-    unit, division, root, overflow = errors[0], errors[2], errors[3], errors[6]
-    cut = tile > 0.0
-    side = tile if cut else work_tile
+    near, far, alpha_min, antialiased = rules.near, rules.far, rules.alpha_min, rules.antialiased
+    width, height = camera.width, camera.height
+    room, ellipse = rules.tile_room, rules.ellipse_tiles
+    cut = rules.tile_size > 0.0
+    side = rules.tile_size if cut else float(rules.work_tile)
     across, down = np.ceil(width / side), np.ceil(height / side)
-    # the compensation's own division and root
-    above = (0.5 * division + root + 2.0) * unit if antialiased else 0.0
+    # below it no product of entries of a covariance overflows (G9)
+    safe = near * np.sqrt(np.sqrt(charges.overflow)) * 0.5
+    stretch = projected_stretch(rules, camera)
     for q in range(n):
         a, c, det, error_det = s[A + q], s[C + q], s[DET + q], s[EDET + q]
         mean_x_low, mean_x_high, mean_y_low, mean_y_high = s[MXLO + q], s[MXHI + q], s[MYLO + q], s[MYHI + q]
         z_high = s[ZHIGH + q]
         # in front of the camera; products of covariances that may overflow leave nothing known
-        front = (s[ZLOW + q] >= near * (1.0 + 4.0 * unit)) & (z_high < np.inf)
-        front = front & (a * c < overflow) & (s[TAME + q] < np.inf)
+        front = (s[ZLOW + q] >= near * (1.0 + charges.near)) & (z_high < np.inf)
+        front = front & (a * c < charges.overflow) & (s[TAME + q] < np.inf)
+        largest = largest_extent(s, q)
+        finite = (front | (largest * stretch < safe)) & (
+            largest * largest * max(1.0, stretch / near) < charges.overflow
+        )
+        front = front & finite
         radius_high, radius_low = s[RHIGH + q], s[RLOW + q]
-        snap_x = 8.0 * unit * (abs(mean_x_low) + abs(mean_x_high) + radius_high)
-        snap_y = 8.0 * unit * (abs(mean_y_low) + abs(mean_y_high) + radius_high)
+        snap_x = charges.tile * (abs(mean_x_low) + abs(mean_x_high) + radius_high)
+        snap_y = charges.tile * (abs(mean_y_low) + abs(mean_y_high) + radius_high)
         left, right = mean_x_low - radius_high - snap_x, mean_x_high + radius_high + snap_x
         top, bottom = mean_y_low - radius_high - snap_y, mean_y_high + radius_high + snap_y
         # a place that is not finite is no number in some of these
         placed = front & (right - left < np.inf) & (bottom - top < np.inf)
-        bounded = placed & cut
+        bounded = placed & (cut | (room > 0.0))
         # image-border culls of fully_fused_projection_fwd.cu:171-180
         gone = bounded & ((right <= 0.0) | (left >= width) | (bottom <= 0.0) | (top >= height))
-        s[T0 + q] = np.floor(_within(left / side, across)) if bounded else 0.0
-        s[T1 + q] = np.ceil(_within(right / side, across)) if bounded else across
-        s[T2 + q] = np.floor(_within(top / side, down)) if bounded else 0.0
-        s[T3 + q] = np.ceil(_within(bottom / side, down)) if bounded else down
+        # the tiles of an ellipse come from the conic, which may be wrong by any amount
+        boxed = bounded & (not ellipse)
+        s[T0 + q] = np.floor(_within(left / side, across)) if boxed else 0.0
+        s[T1 + q] = np.ceil(_within(right / side, across)) if boxed else across
+        s[T2 + q] = np.floor(_within(top / side, down)) if boxed else 0.0
+        s[T3 + q] = np.ceil(_within(bottom / side, down)) if boxed else down
         # surely hit: the tile range of every mean and radius contains it
         left, right = mean_x_high - radius_low + snap_x, mean_x_low + radius_low - snap_x
         top, bottom = mean_y_high - radius_low + snap_y, mean_y_low + radius_low - snap_y
-        sure = bounded & (left < width) & (top < height) & (right > 0.0) & (bottom > 0.0)
+        sure = placed & cut & (left < width) & (top < height) & (right > 0.0) & (bottom > 0.0)
         whole = front & (not cut)
+        if room > 0.0:
+            # G12: where rounding moves a box or an ellipse by less than half a pixel
+            span = radius_high + max(abs(mean_x_low), abs(mean_x_high)) + max(abs(mean_y_low), abs(mean_y_high))
+            whole = whole & (s[ETA + q] * (1.0 + 4.0 * s[ETA + q]) < 0.05) & (8.0 * charges.tile * span < 1.0)
+            if ellipse:
+                thinnest = max(min(s[ALO + q], s[CLO + q]), 0.0) / (z_high * z_high)
+                whole = whole & ellipse_is_met(det / (a * c), max(a, c), thinnest, s[ETA + q], span, charges)
         s[T4 + q] = np.floor(_within(left / side, across)) if sure else 0.0
         last = np.ceil(_within(right / side, across)) if sure else (across if whole else 0.0)
         s[T5 + q] = s[T4 + q] if z_high > far else last
@@ -318,40 +459,35 @@ def regions(s, n, rules, camera, errors, antialiased):
         kappa = s[ETA + q]
         known = placed & sharp_enough & (kappa < 0.25)
         kappa = kappa * (1.0 + 4.0 * kappa)
-        # sigmoid: two exponentials or divisions and an addition
-        lower = s[OPLOW + q] * (1.0 - _SIGMOID * unit)
-        opacity = s[OPHIGH + q] * (1.0 + _SIGMOID * unit) * (1.0 + above)
-        upper = opacity
+        lower = s[OPLOW + q] * (1.0 - charges.opacity)
+        upper = s[OPHIGH + q] * (1.0 + charges.opacity)
         faint = s[OPFAINT + q]
+        reached = faint
         if antialiased:
-            # det0/det exceeds 1 where rounding lowers det: nothing is known before its error is.
-            # compensation_fl^2 <= (det + e0)/(det - e), which falls in det
-            excess = np.sqrt((1.0 + s[SHARP + q]) / (1.0 - error_det / det)) * REGION
-            upper = min(1.0, opacity * excess) if sharp_enough else 1.0
-            gone = gone | (sharp_enough & (upper * (1.0 + 64.0 * unit) < alpha_min))
-            # compensation_fl^2 = max(0, (det0 + e)/(det + e)) may vanish
-            ratio_low = s[DISC + q]
-            relative = s[SHARP + q] / ratio_low + s[SHARP + q] + (division + 2.0) * unit
-            known = known & (ratio_low > 0.0) & (relative < 0.25)
-            slack = 0.51 * relative * (1.0 + relative) + (root + 1.0) * unit
-            lower = lower * (1.0 - slack) if known else lower
-            upper = opacity * (1.0 + slack) if known else upper
-            faint = (faint + (above + slack) * REGION) if known else faint
+            # G11; where the determinant may vanish, nothing is known of the compensation
+            known = known & (s[CTOP + q] < np.inf)
+            reached = faint + s[CTOPLOG + q]
+            faint = faint + s[CHIGHLOG + q]
+            all_of_it = min(1.0, upper * s[CTOP + q]) if sharp_enough & (s[CTOP + q] < np.inf) else 1.0
+            gone = gone | (all_of_it * (1.0 + charges.faint) < alpha_min)
+            lower = lower * s[CLOW + q] if known else lower
+            upper = upper * s[CHIGH + q] if known else all_of_it
+        # a minimum with a number is a number: an exponent that is none leaves the largest alpha
+        upper = upper if finite else max(1.0, upper)
+        gone = gone & finite
         s[R_OPACITY_LOW + q] = lower
         s[R_OPACITY_HIGH + q] = upper
         s[R_KAPPA + q] = kappa if known else 0.0
         # pixels where alpha may reach the threshold
-        gone = gone | (known & (faint < 0.0))
-        faint = faint / (1.0 - kappa)
-        s[R_FAINT + q] = faint if known else -1.0
-        extent_x = np.sqrt(2.0 * faint * a) * REGION
-        extent_y = np.sqrt(2.0 * faint * c) * REGION
+        gone = gone | (known & (reached < 0.0))
+        s[R_FAINT + q] = faint / (1.0 - kappa) if known else -1.0
+        reached = reached / (1.0 - kappa)
+        extent_x = np.sqrt(2.0 * reached * a) * REGION
+        extent_y = np.sqrt(2.0 * reached * c) * REGION
         left, right = mean_x_low - extent_x, mean_x_high + extent_x
         top, bottom = mean_y_low - extent_y, mean_y_high + extent_y
         # no pixel centre inside
-        gone = gone | (
-            known & ((right < 0.5) | (left > width - 0.5) | (bottom < 0.5) | (top > height - 0.5))
-        )
+        gone = gone | (known & ((right < 0.5) | (left > width - 0.5) | (bottom < 0.5) | (top > height - 0.5)))
         s[BOX0 + q] = left if known else -np.inf
         s[BOX1 + q] = right if known else np.inf
         s[BOX2 + q] = top if known else -np.inf

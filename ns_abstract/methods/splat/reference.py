@@ -17,9 +17,9 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from ns_abstract.geometry.camera_path import Camera
 from ns_abstract.methods.splat.constants import GSPLAT_1_4_0, Rasteriser
 from ns_abstract.methods.splat.scene import SplatScene
-from ns_abstract.sets.path import Camera
 
 #: Gaussians blended at a time: bounds the memory, and is how often a finished region is noticed.
 _LAYERS = 128
@@ -155,7 +155,9 @@ class Reference:
         translation = -(rotation @ pose[:, 3])
         indices = torch.arange(self.scene.count) if subset is None else subset
         means = self._means if subset is None else self._means[subset]
-        points = means @ rotation.T + translation
+        # entry by entry, so that equal means have equal depths
+        x, y, z = means.unbind(1)
+        points = torch.stack([a * x + b * y + c * z for a, b, c in rotation], dim=1) + translation
         if subset is None:
             kept = torch.nonzero((points[:, 2] >= r.near) & (points[:, 2] <= r.far)).squeeze(1)
             indices, points = indices[kept], points[kept]
@@ -165,21 +167,22 @@ class Reference:
         opacities = self._opacities[indices]
         if self.scene.rasterize_mode == "antialiased":
             # max(0, .) may hold exactly; the root has no slope there
-            ratio = flat / det
-            positive = ratio > 0.0
-            opacities = opacities * torch.where(positive, torch.where(positive, ratio, 1.0).sqrt(), 0.0)
+            ratio, least = flat / det, r.compensation_min
+            positive = ratio > least * least
+            opacities = opacities * torch.where(positive, torch.where(positive, ratio, 1.0).sqrt(), least)
         with torch.no_grad():
-            radii, tiles, visible = self._reach(camera, means2d, xx, yy, det)
+            radii, tiles, visible = self._reach(camera, means2d, xx, yy, det, opacities)
             extents = self._extents(xx, yy, opacities)
         kept = torch.nonzero(visible).squeeze(1) if subset is None else torch.arange(len(indices))
         return Projection(
             indices=indices[kept],
             means2d=means2d[kept],
             conics=torch.stack([yy / det, -xy / det, xx / det], dim=1)[kept],
-            radii=radii[kept],
+            radii=radii[kept].amax(dim=1),
             depths=points[kept, 2],
             tiles=tiles[kept],
-            colors=self._colors(indices[kept], pose[:, 3]),
+            # the inverse of the view matrix holds the position, also where it is no rotation
+            colors=self._colors(indices[kept], -(rotation.T @ translation) if r.eye_from_view else pose[:, 3]),
             opacities=opacities[kept],
             extents=extents[kept],
         )
@@ -205,27 +208,35 @@ class Reference:
         return means2d, covariance, flat
 
     def _reach(
-        self, camera: Camera, means2d: Tensor, xx: Tensor, yy: Tensor, det: Tensor
+        self, camera: Camera, means2d: Tensor, xx: Tensor, yy: Tensor, det: Tensor, opacities: Tensor
     ) -> tuple[Tensor, Tensor, Tensor]:
-        """Radii [n], tile ranges [n, 4] and whether the Gaussian is drawn [n]."""
+        """Radii [n, 2], tile ranges [n, 4] and whether the Gaussian is drawn [n].
+
+        Ellipses are enclosed in boxes: the tiles of a box that the ellipse does not meet show nothing of it.
+        """
         r = self.rules
         visible = det > 0.0
         side = r.work_tile
         limits = torch.tensor([-(-camera.width // side), -(-camera.height // side)])
         if not r.tile_size:
-            radii = torch.full_like(det, torch.inf)
+            radii = torch.full((len(det), 2), torch.inf, dtype=self.dtype)
             first = torch.zeros(len(det), 2, dtype=torch.int64)
             past = limits.expand(len(det), 2)
         else:
-            half = 0.5 * (xx + yy)
-            larger = half + torch.sqrt((half * half - det).clamp(min=r.discriminant_min))
-            radii = torch.ceil(r.radius_sigmas * torch.sqrt(larger))
+            if r.axis_sigmas:
+                visible &= opacities >= r.alpha_min
+                extent = torch.sqrt(2.0 * torch.log(opacities / r.alpha_min).clamp(min=0.0)).clamp(max=r.axis_sigmas)
+                radii = torch.ceil(extent[:, None] * torch.sqrt(torch.stack([xx, yy], dim=1)))
+            else:
+                half = 0.5 * (xx + yy)
+                larger = half + torch.sqrt((half * half - det).clamp(min=r.discriminant_min))
+                radii = torch.ceil(r.radius_sigmas * torch.sqrt(larger))[:, None].expand(len(det), 2)
             size = torch.tensor([camera.width, camera.height], dtype=self.dtype)
-            inside = (means2d + radii[:, None] > 0.0) & (means2d - radii[:, None] < size)
-            visible &= (radii > 0.0) & inside.all(dim=1)
+            inside = (radii > 0.0) & (means2d + radii > 0.0) & (means2d - radii < size)
+            visible &= inside.all(dim=1)
             # a radius that is not finite covers everything
-            first = torch.floor(means2d / side - radii[:, None] / side)
-            past = torch.ceil(means2d / side + radii[:, None] / side)
+            first = torch.floor(means2d / side - radii / side)
+            past = torch.ceil(means2d / side + radii / side)
             first = torch.minimum(first.clamp(min=0.0), limits).long()
             past = torch.minimum(past.clamp(min=0.0), limits).long()
         return radii, torch.stack([first[:, 0], past[:, 0], first[:, 1], past[:, 1]], dim=1), visible

@@ -9,11 +9,11 @@ from functools import cached_property
 
 import numpy as np
 
-from ns_abstract.arithmetic.units import UNIT64
-from ns_abstract.errors import InputError
+from ns_abstract.arithmetic.rounding import UNIT64
+from ns_abstract.io.errors import InputError
 from ns_abstract.methods.splat.activate import SH_C0, Splats
 from ns_abstract.methods.splat.scene import Float64Array, SplatScene
-from ns_abstract.sets.variations import SceneVariation, Selection
+from ns_abstract.perturbation.variations import SceneVariation, Selection
 
 _NONE = np.empty((0, 3))
 
@@ -72,9 +72,7 @@ class VariedSplats:
         """Whether there is more than one member."""
         return any(self.counts.values())
 
-    def member(
-        self, mean: Float64Array | float, opacity: Float64Array | float, color: Float64Array | float
-    ) -> Splats:
+    def member(self, mean: Float64Array | float, opacity: Float64Array | float, color: Float64Array | float) -> Splats:
         """One scene of the set, at positions in [-1, 1] between the ranges' ends, broadcast to [N, 3], [N], [N, 3]."""
         return self.at(
             _between(self.mean_low, self.mean_high, mean) if self.mean_low.size else self.stored.means,
@@ -100,6 +98,8 @@ class VariedSplats:
 
     def members(self, generator: np.random.Generator) -> Iterator[Splats]:
         """Members without end: first all at the ends that make pictures bright or dark or shift them, then random.
+
+        See design.md, S5.
 
         Where a Gaussian is brighter than most, more opacity tends to brighten the picture.
         """

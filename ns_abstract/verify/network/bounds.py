@@ -1,7 +1,8 @@
-"""Bounds of a network's outputs over sets of images (docs/design.md, N)."""
+"""Bounds of a network's outputs over sets of images (docs/design.md, N, N1, N2, N6, N0)."""
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass
 from typing import Any, Literal, NamedTuple
 
@@ -10,8 +11,9 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ns_abstract.verify.network.graph import Network
-from ns_abstract.verify.network.layers import Activation, LeakyRelu, Linear, Sum
+from ns_abstract.verify.network.graph import Network, NetworkArithmetic
+from ns_abstract.verify.network.layers import Activation, LeakyRelu, Linear, Scale, Sum
+from ns_abstract.verify.network.products import Product
 from ns_abstract.verify.network.rows import Rows, charge, full, grid, join, pass_activation, reach
 
 Float64 = NDArray[np.float64]
@@ -20,13 +22,18 @@ Substitution = Literal["everywhere", "end", "box"]
 
 #: Unit roundoff of float32: of the bounded evaluation, and of rows.
 UNIT = 2.0**-24
-#: Roundings that are charged beside those of a layer's sums: folding of scales into weights, own float64
-#: arithmetic, sums of rows where branches meet.
+#: Roundings of rows beside those of their sums: stored weights and slopes, products with them.
 _SPARE = 24
+#: Roundings of the network beside those of a layer's sums: a batch normalisation's factor (sum, root, quotient),
+#: its product with a weight, and as many again.
+_FOLDING = 8
 #: Smallest normal number of float32: what a flush to zero may lose.
 _FLUSH = 2.0**-126
 #: Past this a float32 evaluation may overflow.
 _OVERFLOW = 2.0**126
+#: So many open numbers of a node are tightened only if some of them gain by it: if not so large a part of these
+#: keeps so large a part of its width.
+_MANY, _SOME, _GAIN = 1024, 64, 0.95
 #: Bytes of rows that are worked on at a time: they should stay in a processor's cache.
 _ROWS_AT_ONCE = 24 << 20
 
@@ -94,6 +101,7 @@ def bound_outputs(
     *,
     substitution: Substitution = "everywhere",
     memory: int = 1 << 30,
+    arithmetic: NetworkArithmetic = "float32",
 ) -> OutputBounds:
     """Lower bounds of ``rows @ network(x) + offset`` over every image set.
 
@@ -105,6 +113,7 @@ def bound_outputs(
         substitution: Where the parameters' correlation is used: in every intermediate bound
             ("everywhere"), only in the result ("end"), or not at all ("box").
         memory: Bytes to stay within, roughly; cells and rows are worked on in parts.
+        arithmetic: Whether the bounds hold for every float32 evaluation and the exact network, or for that alone.
     """
     offset = np.asarray(offset, np.float64)
     if images.a_lower.shape[1] != network.input_size:
@@ -117,7 +126,7 @@ def bound_outputs(
     step = max(1, int(0.5 * memory) // by_cell)
     parts = []
     for first in range(0, images.count, step):
-        cells = _Cells(network, images[first : first + step], substitution, memory)
+        cells = _Cells(network, images[first : first + step], substitution, memory, arithmetic)
         parts.append(cells.outputs(rows, offset))
     if not parts:
         d = images.dimensions
@@ -125,18 +134,9 @@ def bound_outputs(
     return OutputBounds(*(np.concatenate([getattr(part, name) for part in parts]) for name in ("lower", "a", "b")))
 
 
-@dataclass
-class _Form:
-    """``c + a p + e`` with |e| <= r, and lower, upper: what is known of a node in every cell (N1).
+class _Interval(NamedTuple):
+    """What a node's numbers are at least and at most, [m, *shape]."""
 
-    Attributes:
-        c, r, lower, upper: [m, *shape].
-        a: [m, d, *shape].
-    """
-
-    c: Tensor
-    a: Tensor
-    r: Tensor
     lower: Tensor
     upper: Tensor
 
@@ -144,46 +144,101 @@ class _Form:
     def size(self) -> Tensor:
         return torch.maximum(self.lower.abs(), self.upper.abs())
 
+
+@dataclass
+class _Form:
+    """``z = reference + c + a p + e`` with |e| <= r: what is known of a node in every cell (N1).
+
+    Attributes:
+        reference: [m, *shape]: the node's exact values are near it; all that follows is relative to it.
+        c, r: [m, *shape].
+        a: [m, d, *shape].
+        lower, upper: [m, *shape]; what ``z - reference`` is at least and at most.
+        active: [m, *shape]; False where z is exactly zero.
+    """
+
+    reference: Tensor
+    c: Tensor
+    a: Tensor
+    r: Tensor
+    lower: Tensor
+    upper: Tensor
+    active: Tensor
+
+    @property
+    def width(self) -> Tensor:
+        """How far z may be from the reference."""
+        return torch.maximum(self.lower.abs(), self.upper.abs())
+
+    @property
+    def interval(self) -> _Interval:
+        """What z is at least and at most."""
+        room = 2.0**-50 * self.reference.abs()
+        low = self.reference + self.lower - room - 2.0**-50 * self.lower.abs()
+        return _Interval(low, self.reference + self.upper + room + 2.0**-50 * self.upper.abs())
+
     @staticmethod
-    def ranged(c: Tensor, a: Tensor, r: Tensor) -> _Form:
+    def ranged(reference: Tensor, c: Tensor, a: Tensor, r: Tensor, active: Tensor | None = None) -> _Form:
         """With the range of the form itself."""
         reach = (a.abs().sum(1) + r) * (1.0 + 2.0**-40) + c.abs() * 2.0**-50
-        return _Form(c, a, r, c - reach, c + reach)
+        active = torch.ones_like(c, dtype=torch.bool) if active is None else active
+        return _Form(reference, c, a, r, c - reach, c + reach, active)
 
 
 class _Cells:
     """Bounds of one network over some cells."""
 
-    def __init__(self, network: Network, images: ImageSets, substitution: Substitution, memory: int) -> None:
+    def __init__(
+        self,
+        network: Network,
+        images: ImageSets,
+        substitution: Substitution,
+        memory: int,
+        arithmetic: NetworkArithmetic = "float32",
+    ) -> None:
         self.network = network
         self.count, self.d = images.count, images.dimensions
         self.memory = memory
+        self.single = arithmetic == "float32"
         self.good = np.ones(self.count, bool)
         self.flush = np.zeros(self.count)
-        self._planes(images, substitution)
+        fields = self._fields(images)
+        self._planes(fields, substitution)
         self.lines: dict[int, np.ndarray] = {}
+        #: what rows on a product become on its first and its second factor
+        self.products: dict[int, tuple[np.ndarray, ...]] = {}
+        #: rounding of the network and of rows
         self.noise: dict[int, Tensor] = {}
-        self.biases: dict[int, Tensor] = {}
-        #: nodes whose bias and rounding are in those of their only reader
+        #: roundings of sums
+        self.terms: dict[int, Tensor | int] = {}
+        #: nodes whose rounding is in that of their only reader
         self.folded: set[int] = set()
         #: what rows may stop at
         self.stops: dict[int, _Planes] = {}
         self.last = self._forward()
         if substitution == "end":
-            self._planes(images, "everywhere")
+            self._planes(fields, "everywhere")
 
-    def _planes(self, images: ImageSets, substitution: Substitution) -> None:
-        """Image sets as rows want them; a cell with a number that is not finite is given up."""
-        shape = grid(self.network.input_shape)
+    def _fields(self, images: ImageSets) -> list[np.ndarray]:
+        """Image sets without numbers that are not finite: such a cell is given up."""
         fields = [np.asarray(getattr(images, name), np.float64) for name in images.__dataclass_fields__]
         finite = np.logical_and.reduce([np.isfinite(f).reshape(self.count, -1).all(axis=1) for f in fields])
         finite &= (fields[4] <= fields[5]).all(axis=1)
         self.good &= finite
-        a_lower, b_lower, a_upper, b_upper, lower, upper = (
-            np.where(finite.reshape(-1, *[1] * (f.ndim - 1)), f, 0.0) for f in fields
-        )
+        fields = [np.where(finite.reshape(-1, *[1] * (f.ndim - 1)), f, 0.0) for f in fields]
+        #: the images' reference
+        self.middle = 0.5 * (np.maximum(fields[1], fields[4]) + np.minimum(fields[3], fields[5]))
+        return fields
+
+    def _planes(self, fields: list[np.ndarray], substitution: Substitution) -> None:
+        """Image sets as rows want them, relative to the reference."""
+        shape = grid(self.network.input_shape)
+        a_lower, b_lower, a_upper, b_upper, lower, upper = fields
         if substitution != "everywhere":
             a_lower, b_lower, a_upper, b_upper = np.zeros_like(a_lower), lower, np.zeros_like(a_upper), upper
+        c = self.middle
+        b_lower, lower = (v - c - 2.0**-51 * (np.abs(v) + np.abs(c)) for v in (b_lower, lower))
+        b_upper, upper = (v - c + 2.0**-51 * (np.abs(v) + np.abs(c)) for v in (b_upper, upper))
         self.image = _Planes(
             np.stack([a_lower, a_upper], 1).reshape(self.count, 2, *shape, self.d),
             np.stack([b_lower, b_upper], 1).reshape(self.count, 2, *shape),
@@ -195,28 +250,32 @@ class _Cells:
         """The image as a form: the middle of its planes."""
         shape = self.network.input_shape
         slopes, offsets = torch.from_numpy(self.image.slopes), torch.from_numpy(self.image.offsets)
-        a = slopes.mean(1).movedim(-1, 1)
+        a = slopes.mean(1).movedim(-1, 1).reshape(self.count, self.d, *shape)
         c = offsets.mean(1)
         spread = 0.5 * (offsets[:, 1] - offsets[:, 0]) + 0.5 * (slopes[:, 1] - slopes[:, 0]).abs().sum(-1)
         spread = spread.clamp(min=0.0) + 2.0**-50 * (offsets.abs().amax(1) + slopes.abs().amax(1).sum(-1))
-        form = _Form.ranged(c.reshape(-1, *shape), a.reshape(self.count, self.d, *shape), spread.reshape(-1, *shape))
+        c, spread = c.reshape(-1, *shape), spread.reshape(-1, *shape)
+        reference = torch.from_numpy(self.middle).reshape(-1, *shape)
+        form = _Form.ranged(reference, c, a, spread)
         lower, upper = torch.from_numpy(self.image.lower), torch.from_numpy(self.image.upper)
         return self._within(form, lower.reshape(-1, *shape), upper.reshape(-1, *shape))
 
     def _within(self, form: _Form, lower: Tensor, upper: Tensor) -> _Form:
         """The form with bounds that are known besides; a cell without values in it is given up."""
         low, high = torch.maximum(form.lower, lower), torch.minimum(form.upper, upper)
-        fine = (low <= high) & torch.isfinite(form.c) & torch.isfinite(form.r) & torch.isfinite(form.a).all(1)
+        fine = (low <= high) & torch.isfinite(form.reference) & torch.isfinite(form.c) & torch.isfinite(form.r)
+        fine &= torch.isfinite(form.a).all(1)
         good = fine.reshape(self.count, -1).all(1)
         self.good &= good.numpy()
+        found = _Form(form.reference, form.c, form.a, form.r, low, high, form.active)
         if bool(good.all()):
-            return _Form(form.c, form.a, form.r, low, high)
+            return found
 
         # what is given up must not slow the others down with NaN
         def clear(t: Tensor) -> Tensor:
             return torch.where(good.reshape(-1, *[1] * (t.ndim - 1)), t, torch.zeros_like(t))
 
-        return _Form(clear(form.c), clear(form.a), clear(form.r), clear(low), clear(high))
+        return _Form(*(clear(getattr(found, name)) for name in _Form.__dataclass_fields__))
 
     # ------------------------------------------------------------ forwards
 
@@ -234,10 +293,17 @@ class _Cells:
             if isinstance(node.layer, Activation):
                 # what is known better of the input is also known to its other readers
                 source = node.inputs[0]
-                forms[source] = inputs[0] = self._tighten(source, inputs[0], node.layer)
+                open_ = node.layer.open(*inputs[0].interval)
+                decides = isinstance(node.layer, LeakyRelu)
+                forms[source] = inputs[0] = self._tighten(source, inputs[0], open_, decides)
                 forms.append(self._activate(k, source, node.layer, inputs[0]))
                 if self.network.depth[source] > 1:
                     self.stops[source] = self._stop(source, inputs[0])
+            elif isinstance(node.layer, Product):
+                open_ = node.layer.open(inputs[0].interval, inputs[1].interval)
+                for position, source in enumerate(node.inputs):
+                    forms[source] = inputs[position] = self._tighten(source, inputs[position], open_)
+                forms.append(self._multiply(k, node.inputs, node.layer, inputs[0], inputs[1]))
             else:
                 forms.append(self._combine(k, node.inputs, node.layer, inputs))
             for index in node.inputs:
@@ -251,44 +317,77 @@ class _Cells:
     def _combine(self, k: int, sources: tuple[int, ...], layer: Linear, inputs: list[_Form]) -> _Form:
         """A linear layer (N1, N2)."""
         m, d = self.count, self.d
+        reference = layer([f.reference for f in inputs])
         stacks = [torch.cat([f.c[:, None], f.a], 1).flatten(0, 1) for f in inputs]
         moved = layer.apply(stacks).reshape(m, 1 + d, *layer.shape)
-        # own float64 rounding is relative to the form, that of the network to its values
-        radii = [torch.cat([f.r + 2.0**-28 * (f.c.abs() + f.a.abs().sum(1)), f.size]) for f in inputs]
-        magnitude = layer.magnitude(radii).reshape(2, m, *layer.shape)
-        bias = layer.bias
-        c, size = moved[:, 0], magnitude[1]
-        if bias is not None:
-            c, size = c + bias, size + bias.abs()
-        count = layer.terms + layer.row_terms + _SPARE + max(self.network.readers[i] for i in sources)
-        noise = size * (count * UNIT / (1.0 - count * UNIT)) + (layer.terms + 1) * _FLUSH
-        form = _Form.ranged(c, moved[:, 1:], magnitude[0] * (1.0 + 2.0**-28) + noise)
+        # float64's rounding is relative to forms and references, float32's of rows to distances from
+        # references, that of the network to its values
+        own = (layer.terms + len(inputs) + 8) * 2.0**-52
+        radii, sizes = [], []
+        for f in inputs:
+            size = torch.maximum(f.interval.size, f.reference.abs())
+            sizes.append(size)
+            radii.append(torch.cat([f.r + own * (f.c.abs() + f.a.abs().sum(1)), f.width, size]))
+        radius, width, size = layer.magnitude(radii).reshape(3, m, *layer.shape) * (1.0 + 2.0**-28)
+        if layer.bias is not None:
+            size = size + layer.bias.abs()
+        moves = own * size + (layer.terms + 1) * _FLUSH
+        active = None
+        if not layer.terms:
+            active = layer.magnitude([f.active.double() for f in inputs]) != 0.0
+            if layer.bias is not None:
+                active = active | (layer.bias != 0.0)
+        elif self.single:
+            count = self._roundings(sources, layer, inputs)
+            self.terms[k] = count
+            moves = moves + _gamma(count + _FOLDING) * size + layer.spare(sizes)
+        rows = _gamma(layer.row_terms + _SPARE + max(self.network.readers[i] for i in sources))
+        noise = (moves + rows * width) * (1.0 + 2.0**-40)
+        form = _Form.ranged(reference, moved[:, 0], moved[:, 1:], radius + moves, active)
         if float(size.amax()) >= _OVERFLOW:
             self.good &= (size.reshape(m, -1).amax(1) < _OVERFLOW).numpy()
         for f, shape in zip(inputs, layer.input_shapes, strict=True):
             lost = int(np.prod(shape)) * (layer.row_terms + 2) * _FLUSH
-            self.flush += lost * f.size.reshape(m, -1).amax(1).numpy()
-        total = torch.zeros(layer.shape, dtype=torch.float64) if bias is None else bias.expand(layer.shape)
+            self.flush += lost * f.width.reshape(m, -1).amax(1).numpy()
         if isinstance(layer, Sum):
             # one charge instead of several
-            for source, sign in zip(sources, layer.signs, strict=True):
+            for source in sources:
                 if source in self.noise and self.network.readers[source] == 1:
-                    total = total + sign * self.biases[source]
                     noise = noise + self.noise[source]
                     self.folded.add(source)
-        self.noise[k], self.biases[k] = noise * (1.0 + 2.0**-40), total
+        self.noise[k] = noise * (1.0 + 2.0**-40)
         return self._within(form, form.lower, form.upper)
+
+    def _roundings(self, sources: tuple[int, ...], layer: Linear, inputs: list[_Form]) -> Tensor | int:
+        """Roundings that a layer's sums may suffer; what is added behind sums may be added within them (N2)."""
+        if not isinstance(layer, (Scale, Sum)):
+            return layer.roundings([f.active for f in inputs])
+        before = [self.network.nodes[i - 1].layer for i in sources if i]
+        most = max((b.terms for b in before if isinstance(b, Linear)), default=0)
+        counts = [torch.as_tensor(self.terms[i], dtype=torch.float64) for i in sources if i in self.terms]
+        found = torch.as_tensor(float(layer.terms - most), dtype=torch.float64)
+        return found + functools.reduce(torch.maximum, counts) if counts else found
 
     def _activate(self, k: int, source: int, layer: Activation, z: _Form) -> _Form:
         """An activation (N3, N4)."""
-        size = z.size
-        room = layer.error(size) + 2.0**-40 * size
-        band = layer.band(z.lower, z.upper)
+        lower, upper = z.interval
+        size = z.interval.size
+        reference = layer.function(z.reference)
+        room = layer.room + 2.0**-48 * reference.abs()
+        if self.single:
+            room = room + layer.error(lower, upper)
+        band = layer.band(lower, upper)
         s = band.lower_slope
-        middle, half = 0.5 * (band.lower_offset + band.upper_offset), 0.5 * (band.upper_offset - band.lower_offset)
-        half = half + 2.0**-50 * middle.abs() + room + 2.0**-48 * s * (z.c.abs() + z.a.abs().sum(1))
-        form = _Form.ranged(s * z.c + middle, s[:, None] * z.a, s * z.r * (1.0 + 2.0**-40) + half)
-        lines = layer.lines(z.lower, z.upper)
+        base = s * z.reference - reference
+        middle = 0.5 * (band.lower_offset + band.upper_offset) + base
+        half = 0.5 * (band.upper_offset - band.lower_offset) + 2.0**-50 * middle.abs() + room
+        half = half + 2.0**-50 * (band.lower_offset.abs() + band.upper_offset.abs() + s.abs() * z.reference.abs())
+        half = half + 2.0**-48 * s.abs() * (z.c.abs() + z.a.abs().sum(1))
+        radius = s.abs() * z.r * (1.0 + 2.0**-40) + half
+        form = _Form.ranged(reference, s * z.c + middle, s[:, None] * z.a, radius)
+        if isinstance(layer, LeakyRelu) and layer.alpha == 0.0:
+            form.active = upper > 0.0
+        lines = layer.lines(lower, upper)
         # the slope as stored, rows' products with it and sums where branches meet
         unit = (_SPARE + self.network.readers[source]) * UNIT
         fold = source in self.noise and self.network.readers[source] == 1
@@ -300,64 +399,113 @@ class _Cells:
             rounded = slope.float().double()
             # the other side of a line with this slope, from the band
             apart = band.lower_slope - slope
-            ends = apart * z.lower, apart * z.upper
+            ends = apart * lower, apart * upper
             if side < 0.0:
                 other = torch.maximum(*ends) + band.upper_offset
             else:
                 other = torch.minimum(*ends) + band.lower_offset
-            give = ((rounded - slope).abs() + unit * slope + 2.0**-48 * apart.abs()) * size + room
-            give, move = give + 2.0**-48 * (offset.abs() + other.abs()), torch.zeros((), dtype=torch.float64)
+            base = slope * z.reference - reference
+            give = ((rounded - slope).abs() + unit * slope.abs()) * z.width + 2.0**-48 * apart.abs() * size + room
+            give = give + 2.0**-48 * (offset.abs() + other.abs() + slope.abs() * z.reference.abs())
             if fold:
-                bias, noise = self.biases[source], self.noise[source]
-                give, move = give + rounded * (noise + 2.0**-48 * bias.abs()), rounded * bias
+                give = give + rounded.abs() * self.noise[source]
             stored.append(rounded.float())
-            stored += [_outward(offset + side * give + move, side), _outward(other - side * give + move, -side)]
+            stored += [_outward(offset + base + side * give, side), _outward(other + base - side * give, -side)]
         if fold:
             self.folded.add(source)
         self.lines[k] = torch.stack(stored).reshape(6, self.count, *grid(layer.shape)).numpy()
-        self.flush += int(np.prod(layer.shape)) * 2 * _FLUSH * size.reshape(self.count, -1).amax(1).numpy()
-        return self._within(form, layer.function(z.lower) - room, layer.function(z.upper) + room)
+        lost = int(np.prod(layer.shape)) * 2 * _FLUSH
+        self.flush += lost * z.width.reshape(self.count, -1).amax(1).numpy()
+        ends = layer.range(lower, upper)
+        room = room + 2.0**-48 * (ends[0].abs() + ends[1].abs())
+        return self._within(form, ends[0] - reference - room, ends[1] - reference + room)
+
+    def _multiply(self, k: int, sources: tuple[int, ...], layer: Product, x: _Form, y: _Form) -> _Form:
+        """A product of two nodes (N9)."""
+        m, first, second = self.count, x.interval, y.interval
+        size = first.size * second.size
+        reference = x.reference * y.reference
+        plane = layer.plane(first, second)
+        alpha, beta = plane.first, plane.second
+        base = alpha * x.reference + beta * y.reference - reference
+        # roundings of the plane relative to the references, and the network's
+        own = alpha.abs() * x.reference.abs() + beta.abs() * y.reference.abs() + reference.abs()
+        room = 2.0**-48 * (own + plane.low.abs() + plane.high.abs()) + 2 * _FLUSH
+        if self.single:
+            room = room + 2 * UNIT * size
+        # rows' products with the slopes and sums where branches meet
+        unit = (_SPARE + max(self.network.readers[i] for i in sources)) * UNIT
+        give = room + unit * (alpha.abs() * x.width + beta.abs() * y.width)
+        low, high = _outward(plane.low + base - give, -1.0), _outward(plane.high + base + give, 1.0)
+        none = torch.zeros_like(low)
+        shape = (6, m, *grid(layer.shape))
+        self.products[k] = tuple(
+            torch.stack([slope, *ends, slope, *reversed(ends)]).reshape(shape).numpy()
+            for slope, ends in ((alpha.float(), (low, high)), (beta.float(), (none, none)))
+        )
+        middle, half = 0.5 * (plane.low + plane.high) + base, 0.5 * (plane.high - plane.low)
+        moved = alpha.abs() * (x.c.abs() + x.a.abs().sum(1)) + beta.abs() * (y.c.abs() + y.a.abs().sum(1))
+        half = half + room + 2.0**-50 * middle.abs() + 2.0**-44 * moved
+        radius = (alpha.abs() * x.r + beta.abs() * y.r) * (1.0 + 2.0**-40) + half
+        c, a = alpha * x.c + beta * y.c + middle, alpha[:, None] * x.a + beta[:, None] * y.a
+        form = _Form.ranged(reference, c, a, radius, x.active & y.active)
+        for f in (x, y):
+            lost = int(np.prod(layer.shape)) * 2 * _FLUSH
+            self.flush += lost * f.width.reshape(m, -1).amax(1).numpy()
+        if float(size.amax()) >= _OVERFLOW:
+            self.good &= (size.reshape(m, -1).amax(1) < _OVERFLOW).numpy()
+        ends = torch.stack([u * v for u in first for v in second]) - reference
+        room = room + 2.0**-50 * (size + reference.abs())
+        return self._within(form, ends.amin(0) - room, ends.amax(0) + room)
 
     def _stop(self, index: int, form: _Form) -> _Planes:
         """What is known of node ``index``, for rows that arrive there."""
         m, d, shape = self.count, self.d, grid(self.network.shape(index))
-        bias = noise = torch.zeros((), dtype=torch.float64)
-        if index in self.folded:
-            # such rows have gathered bias and rounding already
-            bias, noise = self.biases[index], self.noise[index]
-        room = 2.0**-48 * (form.c.abs() + form.r + form.size + bias.abs() + noise) - noise
+        room = 2.0**-48 * (form.c.abs() + form.r)
         slopes = form.a.movedim(1, -1).reshape(m, 1, *shape, d).expand(m, 2, *shape, d)
-        offsets = torch.stack([form.c - bias - form.r - room, form.c - bias + form.r + room], 1)
-        lower, upper = form.lower - bias - room, form.upper - bias + room
+        offsets = torch.stack([form.c - form.r - room, form.c + form.r + room], 1)
         sizes = (m, 2, *shape, d), (m, 2, *shape), (m, *shape), (m, *shape)
-        found = zip((slopes, offsets, lower, upper), sizes, strict=True)
+        found = zip((slopes, offsets, form.lower, form.upper), sizes, strict=True)
         return _Planes(*(t.reshape(size).contiguous().numpy() for t, size in found))
 
-    def _tighten(self, index: int, form: _Form, layer: Activation) -> _Form:
-        """Better bounds of the numbers of node ``index`` where they would give better lines (N6)."""
+    def _tighten(self, index: int, form: _Form, open_: Tensor, decides: bool = False) -> _Form:
+        """Better bounds of the numbers of node ``index`` that are open; a sign may be all that is asked (N6)."""
         if self.network.depth[index] < 2:
             return form
-        shape = grid(layer.shape)
-        open_ = layer.open(form.lower, form.upper).reshape(self.count, *shape)
-        open_ &= torch.from_numpy(self.good).reshape(-1, 1, 1, 1)
+        item = self.network.shape(index)
+        shape = grid(item)
+        open_ = open_.reshape(self.count, *shape) & torch.from_numpy(self.good).reshape(-1, 1, 1, 1)
         where = open_.nonzero().numpy()
         if not len(where):
             return form
-        # the likelier side first; what it decides needs no other
-        center = form.c.reshape(self.count, *shape).numpy()[tuple(where.T)]
-        decides = isinstance(layer, LeakyRelu)
-        sign = np.where(center >= 0.0, 1.0, -1.0)
-        found = self._one_hot(index, where, sign, decides)
-        found.turn(sign < 0.0)
-        left = np.flatnonzero((found.lower < 0.0) & (found.upper > 0.0)) if decides else np.arange(len(where))
-        again = self._one_hot(index, where[left], -sign[left], decides)
-        again.turn(sign[left] > 0.0)
-        found.meet(left, again, sign[left] < 0.0)
+        if len(where) >= _MANY:
+            # some first: where they gain nothing, the others are not worth their rows
+            some = tuple(torch.from_numpy(where[:: len(where) // _SOME].T))
+            first = torch.zeros_like(open_)
+            first[some] = True
+            before, found = form, self._tighten(index, form, first, decides)
+            widths = [(f.upper - f.lower).reshape(open_.shape)[some] for f in (before, found)]
+            if bool((widths[1] > _GAIN * widths[0]).double().mean() > _GAIN):
+                return found
+            form, open_ = found, open_ & ~first
+            where = open_.nonzero().numpy()
         cell, flat = where[:, 0], np.ravel_multi_index(tuple(where[:, 1:].T), shape)
         at = torch.from_numpy(cell), torch.from_numpy(flat)
+        # the likelier side first; what it decides needs no other
+        reference = form.reference.flatten(1)[at].numpy()
+        sign = np.where(reference + form.c.flatten(1)[at].numpy() >= 0.0, 1.0, -1.0)
+        found = self._one_hot(index, where, sign, -sign * reference if decides else None)
+        found.turn(sign < 0.0)
+        lower, upper = form.lower.flatten(1).clone(), form.upper.flatten(1).clone()
+        low = np.maximum(lower[at].numpy(), found.lower) + reference
+        high = np.minimum(upper[at].numpy(), found.upper) + reference
+        left = np.flatnonzero((low < 0.0) & (high > 0.0)) if decides else np.arange(len(where))
+        need = sign[left] * reference[left] if decides else None
+        again = self._one_hot(index, where[left], -sign[left], need)
+        again.turn(sign[left] > 0.0)
+        found.meet(left, again, sign[left] < 0.0)
         c, r = form.c.flatten(1).clone(), form.r.flatten(1).clone()
         a = form.a.flatten(2).movedim(1, -1).clone()
-        lower, upper = form.lower.flatten(1).clone(), form.upper.flatten(1).clone()
         center, radius = found.middle()
         better = radius < r[at]
         c[at] = torch.where(better, center[:, -1], c[at])
@@ -365,19 +513,20 @@ class _Cells:
         r[at] = torch.where(better, radius, r[at])
         lower[at] = torch.maximum(lower[at], torch.from_numpy(found.lower))
         upper[at] = torch.minimum(upper[at], torch.from_numpy(found.upper))
-        item = layer.shape
         tight = _Form(
+            form.reference,
             c.reshape(-1, *item),
             a.movedim(-1, 1).reshape(self.count, self.d, *item),
             r.reshape(-1, *item),
             lower.reshape(-1, *item),
             upper.reshape(-1, *item),
+            form.active,
         )
         return self._within(tight, tight.lower, tight.upper)
 
     # ------------------------------------------------------------ backwards
 
-    def _one_hot(self, index: int, where: Int64, sign: Float64, decides: bool) -> _Reached:
+    def _one_hot(self, index: int, where: Int64, sign: Float64, need: Float64 | None) -> _Reached:
         """Bounds of ``sign`` [R] times single numbers [R, (cell, channel, row, column)] of node ``index``."""
         channels = grid(self.network.shape(index))[0]
         found = _Reached.unknown(len(where), self.d)
@@ -387,17 +536,20 @@ class _Cells:
             cell, channel, y, x = (np.ascontiguousarray(v) for v in where[number].T)
             value = np.zeros((len(cell), channels, 1, 1), np.float32)
             value[np.arange(len(cell)), channel, 0, 0] = sign[number]
-            found.put(number, self._backward(index, Rows(value, y, x), cell, decides))
+            found.put(number, self._backward(index, Rows(value, y, x), cell, None if need is None else need[number]))
         return found
 
-    def _backward(self, index: int, rows: Rows, cell: Int64, decides: bool = False) -> _Reached:
-        """Bounds of rows on node ``index``; those that are not negative for certain may stop before the image."""
+    def _backward(self, index: int, rows: Rows, cell: Int64, need: Float64 | None = None) -> _Reached:
+        """Bounds of rows on node ``index``, relative to the reference.
+
+        Those that are at least ``need`` [R] for certain may stop before the image.
+        """
         found = _Reached.unknown(len(cell), self.d)
         batch = _Batch({index: rows}, cell, np.zeros((len(cell), 2)), np.arange(len(cell)))
-        self._descend(index, index, batch, found, decides)
+        self._descend(index, index, batch, found, need)
         return found
 
-    def _descend(self, start: int, at: int, batch: _Batch, found: _Reached, decides: bool) -> None:
+    def _descend(self, start: int, at: int, batch: _Batch, found: _Reached, need: Float64 | None) -> None:
         """Pass a batch from node ``at`` on to the image."""
         while at > 0:
             if at not in batch.waiting:
@@ -406,11 +558,11 @@ class _Cells:
             if batch.bytes > min(_ROWS_AT_ONCE, self.memory // 16) and len(batch.cell) > 1:
                 half = len(batch.cell) // 2
                 for part in (slice(0, half), slice(half, None)):
-                    self._descend(start, at, batch[part], found, decides)
+                    self._descend(start, at, batch[part], found, need)
                 return
-            if decides and at != start and at in self.stops and len(batch.waiting) == 1:
+            if need is not None and at != start and at in self.stops and len(batch.waiting) == 1:
                 self._settle(at, batch, self.stops[at], found)
-                going_on = found.lower[batch.number] < 0.0
+                going_on = found.lower[batch.number] < need[batch.number]
                 if going_on.mean() < 0.75:
                     batch = batch[going_on]
                 if not len(batch.cell):
@@ -420,12 +572,16 @@ class _Cells:
             if isinstance(node.layer, Activation):
                 pass_activation(here.value, here.y, here.x, batch.cell, self.lines[at], batch.total)
                 parts = [here]
+            elif isinstance(node.layer, Product):
+                # every reader changes its rows in place
+                parts = [here, Rows(here.value.copy(), here.y, here.x)]
+                for part, lines in zip(parts, self.products[at], strict=True):
+                    pass_activation(part.value, part.y, part.x, batch.cell, lines, batch.total)
             else:
                 if at == start or at not in self.folded:
                     shape = grid(node.layer.shape)
-                    bias = self.biases[at].reshape(shape).contiguous().numpy()
                     noise = self.noise[at].reshape(self.count, *shape).numpy()
-                    charge(here.value, here.y, here.x, batch.cell, bias, noise, batch.total)
+                    charge(here.value, here.y, here.x, batch.cell, noise, batch.total)
                 parts = node.layer.backward(here)
             for source, part in zip(node.inputs, parts, strict=True):
                 known = batch.waiting.get(source)
@@ -453,10 +609,13 @@ class _Cells:
         m, k = self.count, len(offset)
         plane, lower = np.zeros((m, k, self.d + 1)), np.zeros((m, k))
         shape = grid(self.network.shape(index))
-        size = self.last.size.reshape(m, -1).numpy()
         dense = np.asarray(rows.toarray() if hasattr(rows, "toarray") else rows, np.float64)
         single = dense.astype(np.float32)
+        size = self.last.width.reshape(m, -1).numpy()
+        reference = self.last.reference.reshape(m, -1).numpy()
         missing = size @ np.abs(dense - single).T
+        missing += 2.0**-52 * (dense.shape[1] + 2) * (np.abs(reference) @ np.abs(dense).T)
+        offset = reference @ dense.T + offset
         for top, left, height, width, number in _windows(single.reshape(k, *shape)):
             part = single.reshape(k, *shape)[:, :, top : top + height, left : left + width]
             step = max(1, _ROWS_AT_ONCE // (4 * shape[0] * height * width))
@@ -576,6 +735,11 @@ class _Reached:
         most = np.fmin(plane[:, 1, -1] + slopes[:, 1] + room[:, 1], box[:, 1])
         self.lower[number] = np.fmax(self.lower[number], least)
         self.upper[number] = np.fmin(self.upper[number], most)
+
+
+def _gamma(count: Any) -> Any:
+    """What ``count`` roundings in float32 may change, relatively."""
+    return count * UNIT / (1.0 - count * UNIT)
 
 
 def _outward(value: Tensor, side: float) -> Tensor:

@@ -1,4 +1,4 @@
-"""Layers from checked weights and attributes, whatever the file they come from."""
+"""Layers from checked weights and attributes, whatever the file they come from (design.md, N7)."""
 
 from __future__ import annotations
 
@@ -11,12 +11,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ns_abstract.errors import InputError
-from ns_abstract.verify.network.graph import Network, Node, as_double, item
+from ns_abstract.io.errors import InputError
+from ns_abstract.verify.network.graph import Layer, Network, Node, as_double, item
 from ns_abstract.verify.network.layers import (
     Convolution,
     Gather,
-    Layer,
     LeakyRelu,
     Linear,
     Matrix,
@@ -30,6 +29,8 @@ from ns_abstract.verify.network.layers import (
 
 #: Numbers that one item of a layer may have.
 _LARGEST = 1 << 26
+#: Numbers that all items and all constants made while reading may have together.
+_LARGEST_TOTAL = 1 << 29
 _ONE = (1, 1)
 
 
@@ -44,6 +45,7 @@ class Builder:
         self._check_size(input_shape)
         self.input_shape = input_shape
         self.nodes: list[Node] = []
+        self.spent = 0.0
 
     def shape(self, index: int) -> Shape:
         """One item of node ``index``."""
@@ -81,8 +83,17 @@ class Builder:
         if any(v < 1 for v in shape) or int(np.prod([float(v) for v in shape])) > _LARGEST:
             raise InputError(f"an item of {item(shape)} numbers", fix=f"between 1 and {_LARGEST:,} are supported")
 
+    def reserve(self, count: float) -> None:
+        """Refuse what would take too much memory before any of it is taken."""
+        self.spent += count
+        if self.spent > _LARGEST_TOTAL:
+            raise InputError(
+                f"needs more than {_LARGEST_TOTAL:,} numbers up to here", fix="use a smaller input or fewer channels"
+            )
+
     def _add(self, layer: Layer, *inputs: int) -> int:
         self._check_size(layer.shape)
+        self.reserve(float(np.prod(layer.shape)))
         for name in ("weight", "offset", "factor"):
             value = getattr(layer, name, None)
             if isinstance(value, Tensor) and not bool(torch.isfinite(value).all()):
@@ -94,9 +105,7 @@ class Builder:
 
     # ------------------------------------------------------------ windows
 
-    def check_window(
-        self, x: int, kernel: Any, stride: Any, dilation: Any, pads: Any, ceil: bool = False
-    ) -> tuple[int, int]:
+    def check_window(self, x: int, kernel: Any, stride: Any, dilation: Any, pads: Any) -> tuple[int, int]:
         """Rows and columns of the result of a window operator."""
         sizes = []
         for axis, name in enumerate(("rows", "columns")):
@@ -110,8 +119,6 @@ class Builder:
             free = n + pads[axis] + pads[axis + 2] - (k - 1) * d - 1
             if free < 0:
                 raise InputError(f"kernel_shape {list(kernel)} is larger than the {n} {name} with pads {list(pads)}")
-            if ceil and free % s:
-                raise InputError("attribute ceil_mode = 1 is not supported here", fix="choose sizes that divide")
             sizes.append(free // s + 1)
         return sizes[0], sizes[1]
 
@@ -210,16 +217,16 @@ class Builder:
     def matrix(self, x: int, weight: np.ndarray, bias: np.ndarray | None) -> int:
         """A fully connected layer with weights [out, in]."""
         shape = self.shape(x)
-        if len(shape) != 1 or weight.shape[1] != shape[0]:
+        if weight.shape[1] != shape[-1]:
             raise InputError(f"weights {item(weight.shape)} (out x in) on an item {item(shape)}", fix="flatten before")
         if bias is not None:
             try:
-                bias = np.broadcast_to(bias, (1, weight.shape[0]))[0]
+                bias = np.broadcast_to(bias, (1, weight.shape[0]))[0]  # the same for every row
             except ValueError:
                 raise InputError(f"bias {item(bias.shape)} of {weight.shape[0]} outputs") from None
         layer = Matrix(
             (shape,),
-            (weight.shape[0],),
+            (*shape[:-1], weight.shape[0]),
             weight.shape[1] + 3,
             weight.shape[0],
             as_double(weight),
@@ -230,6 +237,7 @@ class Builder:
     def scale(self, x: int, factor: np.ndarray, offset: np.ndarray | None) -> int:
         """``factor * x + offset`` with constants that are spread over a batch of items."""
         shape = self.shape(x)
+        self.reserve(2.0 * float(np.prod(shape)))
         spread = []
         for constant in (factor, offset):
             if constant is None:
@@ -294,7 +302,8 @@ class Builder:
         index = np.arange(int(np.prod(shape))).reshape(shape)[tuple(chosen)]
         if index.size == 0:
             raise InputError(f"nothing is left of an item {item(shape)}")
-        return x if index.shape == shape else self._gather(x, index, 0.0)
+        same = index.shape == shape and bool((index.reshape(-1) == np.arange(index.size)).all())
+        return x if same else self._gather(x, index, 0.0)
 
     def pad(self, x: int, before: Sequence[int], after: Sequence[int], mode: str, value: float) -> int:
         """Numbers around the item."""
@@ -333,6 +342,8 @@ class Builder:
         total, parts, done = sum(s[axis] for s in shapes), [], 0
         for source, shape in zip(sources, shapes, strict=True):
             if axis == 0 and len(shape) == 3:
+                self._check_size((total, *shape[1:]))
+                self.reserve(2.0 * total * shape[0])
                 place = np.zeros((total, shape[0], 1, 1))
                 place[done + np.arange(shape[0]), np.arange(shape[0])] = 1.0
                 parts.append(self.convolution(source, place, None, _ONE, _ONE, (0, 0, 0, 0), 1, exact=True))

@@ -6,21 +6,35 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from ns_abstract.verify.network.layers import Layer, Linear, Shape, Sigmoid, Tanh
+from ns_abstract.verify.network.curves import Assumed
+from ns_abstract.verify.network.layers import Activation, Linear, Shape, Sigmoid, Tanh
+from ns_abstract.verify.network.products import Product
 
+Layer = Linear | Activation | Product
+
+#: Whether bounds hold for every float32 evaluation and the exact network, or for that alone.
+NetworkArithmetic = Literal["float32", "real"]
+_EXACT = "the network as the exact function of its stored weights"
 #: What a certificate about a network covers, whatever the network.
 GUARANTEE = (
-    "the network as the exact function of its stored weights",
+    _EXACT,
     "every float32 (or more precise) evaluation that computes each layer as sums of products in any order, "
     "with or without fused multiply-add and with batch normalisation and scales folded or not: "
-    "rounding is bounded a priori and charged to the result",
+    "rounding is bounded and charged to the result",
     "not covered: evaluation in reduced precision (TF32, float16, bfloat16, int8), Winograd or FFT convolution",
+)
+_REAL = (
+    f"{_EXACT}, and that alone (network arithmetic real)",
+    "not covered: what float32 or any other rounding evaluation of the network computes",
+)
+_ELEMENTARY = (
+    "exponentials, logarithms and error functions are taken to be evaluated within 2^-20 (assumed, not proved)"
 )
 _SIGMOIDAL = "sigmoid and tanh are taken to be evaluated within 2^-20 of the exact value (assumed, not proved)"
 
@@ -72,11 +86,13 @@ class Network:
         """Numbers of one output."""
         return int(np.prod(self.output_shape))
 
-    @property
-    def guarantee(self) -> tuple[str, ...]:
+    def guarantee(self, arithmetic: NetworkArithmetic = "float32") -> tuple[str, ...]:
         """What certificates about this network cover, and what they do not."""
+        if arithmetic == "real":
+            return _REAL
         sigmoidal = any(isinstance(node.layer, (Sigmoid, Tanh)) for node in self.nodes)
-        return (*GUARANTEE, _SIGMOIDAL) if sigmoidal else GUARANTEE
+        elementary = any(isinstance(node.layer, Assumed) for node in self.nodes)
+        return (*GUARANTEE, *[_SIGMOIDAL] * sigmoidal, *[_ELEMENTARY] * elementary)
 
     def shape(self, index: int) -> Shape:
         """One item of node ``index``."""
@@ -96,7 +112,7 @@ class Network:
         """Layers that mix numbers on the longest way from the image to each node."""
         depths = [0]
         for node in self.nodes:
-            mixes = isinstance(node.layer, Linear) and node.layer.mixes
+            mixes = not isinstance(node.layer, Activation) and node.layer.mixes
             depths.append(max(depths[index] for index in node.inputs) + mixes)
         return tuple(depths)
 

@@ -1,5 +1,7 @@
 """One table of layer rules: what a layer computes, what it does to forms, and how rows pass it backwards.
 
+See design.md, N3, N4.
+
 A layer is linear (`Linear` and the classes built on it) or acts on every number by itself (`Activation`).
 A linear layer has three faces that share one matrix W: the concrete ``W x + bias``, its magnitude
 ``|W| x`` (for radii and for rounding), and its transpose ``rows W`` on windows of rows
@@ -50,6 +52,10 @@ class Linear:
         """[*shape] or broadcastable to it; None: zero."""
         return None
 
+    def roundings(self, active: Sequence[Tensor]) -> Tensor | int:
+        """`terms` of sums in which inputs that are not ``active`` [B, *input_shapes[i]] are exactly zero (N2)."""
+        return self.terms
+
     def apply(self, inputs: Sequence[Tensor]) -> Tensor:
         """``W x`` for inputs [B, *input_shapes[i]]."""
         return inputs[0].reshape(-1, *self.shape)
@@ -57,6 +63,10 @@ class Linear:
     def magnitude(self, inputs: Sequence[Tensor]) -> Tensor:
         """``|W| x``."""
         return self.apply(inputs)
+
+    def spare(self, sizes: Sequence[Tensor]) -> Tensor | float:
+        """What a float32 evaluation may be off besides, for inputs of at most ``sizes`` [m, *input_shapes[i]]."""
+        return 0.0
 
     def backward(self, rows: Rows) -> list[Rows]:
         """Rows on every input for rows on the output; may reuse their memory."""
@@ -95,6 +105,13 @@ class Convolution(Linear):
     def _single(self) -> Tensor:
         return self.weight.float()
 
+    def roundings(self, active: Sequence[Tensor]) -> Tensor | int:
+        out, taps = self.weight.shape[0] // self.groups, self.weight[0].numel()
+        number = active[0].float().unflatten(1, (self.groups, -1)).sum(2)
+        ones = torch.ones((1, 1, *self.weight.shape[2:])).expand(self.groups, -1, -1, -1)
+        count = self._convolve(number, ones).repeat_interleave(out, 1).double()
+        return count + (self.terms - taps)
+
     def _convolve(self, x: Tensor, weight: Tensor) -> Tensor:
         top, left, bottom, right = self.pads
         padding: tuple[int, int] = (top, left)
@@ -122,7 +139,7 @@ class Convolution(Linear):
 
 @dataclass(frozen=True, eq=False)
 class Matrix(Linear):
-    """A fully connected layer on a vector; ``weight`` [out, in], ``offset`` [out] or None, float64."""
+    """A fully connected layer along the last axis; ``weight`` [out, in], ``offset`` [out] or None, float64."""
 
     weight: Tensor = field(default_factory=lambda: torch.zeros(0))
     offset: Tensor | None = None
@@ -136,6 +153,9 @@ class Matrix(Linear):
     def _single(self) -> Tensor:
         return self.weight.float()
 
+    def roundings(self, active: Sequence[Tensor]) -> Tensor | int:
+        return active[0].sum(-1, keepdim=True).double() + (self.terms - self.weight.shape[1])
+
     def apply(self, inputs: Sequence[Tensor]) -> Tensor:
         return inputs[0] @ self.weight.to(inputs[0].dtype).T
 
@@ -145,7 +165,7 @@ class Matrix(Linear):
     def backward(self, rows: Rows) -> list[Rows]:
         whole = full(rows, self.shape, force=True)
         count = whole.value.shape[0]
-        value = torch.from_numpy(whole.value).reshape(count, -1) @ self._single
+        value = torch.from_numpy(whole.value).reshape(count, *self.shape) @ self._single
         return [Rows.whole(value.numpy().reshape(count, *grid(self.input_shapes[0])))]
 
 
@@ -263,13 +283,19 @@ class Lines:
 
 @dataclass(frozen=True, eq=False)
 class Activation:
-    """A monotone function of every number by itself; ``shape`` is one item."""
+    """A function of every number by itself; ``shape`` is one item."""
 
     shape: Shape
+    #: `function` in float64 is within this of the true one, beside roundings relative to its value.
+    room: ClassVar[float] = 0.0
 
-    def error(self, size: Tensor) -> Tensor | float:
-        """How far a float32 evaluation may be from the function of a number of at most ``size``."""
+    def error(self, lower: Tensor, upper: Tensor) -> Tensor | float:
+        """How far a float32 evaluation may be from the function of a number between."""
         return 0.0
+
+    def range(self, lower: Tensor, upper: Tensor) -> tuple[Tensor, Tensor]:
+        """Least and greatest value; a monotone function's are those of the ends."""
+        return self.function(lower), self.function(upper)
 
     def function(self, z: Tensor) -> Tensor:
         """The concrete value."""
@@ -300,9 +326,9 @@ class LeakyRelu(Activation):
     def function(self, z: Tensor) -> Tensor:
         return torch.relu(z) if self.alpha == 0.0 else torch.where(z >= 0.0, z, z * self.alpha)
 
-    def error(self, size: Tensor) -> Tensor | float:
+    def error(self, lower: Tensor, upper: Tensor) -> Tensor | float:
         # the constant and the product are rounded
-        return 2.0**-22 * self.alpha * size if self.alpha else 0.0
+        return 2.0**-22 * self.alpha * torch.maximum(lower.abs(), upper.abs()) if self.alpha else 0.0
 
     def open(self, lower: Tensor, upper: Tensor) -> Tensor:
         return (lower < 0.0) & (upper > 0.0)
@@ -333,10 +359,9 @@ class LeakyRelu(Activation):
 class _Sigmoidal(Activation):
     """An increasing function that is convex below 0 and concave above, with a slope that falls away from 0."""
 
-    #: torch's float64 function is within this of the true one.
     room: ClassVar[float] = 2.0**-46
 
-    def error(self, size: Tensor) -> Tensor | float:
+    def error(self, lower: Tensor, upper: Tensor) -> Tensor | float:
         return 2.0**-20
 
     def slope(self, z: Tensor) -> Tensor:
@@ -397,6 +422,3 @@ class Tanh(_Sigmoidal):
 
     def slope(self, z: Tensor) -> Tensor:
         return 1.0 / torch.cosh(z).square()
-
-
-Layer = Linear | Activation

@@ -8,7 +8,8 @@ import numpy as np
 import onnxruntime
 import torch
 
-from ns_abstract.errors import InputError
+from ns_abstract.io.errors import InputError
+from ns_abstract.io.jsonio import file_size
 from ns_abstract.verify.network.exported import read_exported
 from ns_abstract.verify.network.graph import Network
 from ns_abstract.verify.network.onnx_file import read_onnx
@@ -25,8 +26,7 @@ def load_network(path: Path) -> Network:
         InputError: The file cannot be read, uses what is not supported, or computes something else elsewhere.
     """
     path = Path(path)
-    if not path.is_file():
-        raise InputError("does not exist", file=path, fix="check the path")
+    file_size(path, "network")
     if path.suffix == ".onnx":
         network = read_onnx(path)
         run = _onnxruntime(path)
@@ -71,6 +71,7 @@ def _onnxruntime(path: Path):
     double = session.get_inputs()[0].type == "tensor(double)"
 
     def run(image: np.ndarray) -> np.ndarray:
-        return np.asarray(session.run(None, {name: image.astype(np.float64) if double else image})[0])
+        found = session.run(None, {name: image.astype(np.float64) if double else image})
+        return np.concatenate([np.asarray(output).reshape(-1) for output in found])
 
     return run

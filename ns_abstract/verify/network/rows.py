@@ -1,4 +1,4 @@
-"""Rows of coefficients on windows of a map: what passes backwards through a network.
+"""Rows of coefficients on windows of a map: what passes backwards through a network (design.md, N5).
 
 A row is one linear function of the numbers at a node. In a convolutional network it depends on a window of
 the map only, its receptive field, so that is what is stored: ``value`` [R, C, h, w] float32 and the window's
@@ -167,15 +167,14 @@ def pass_activation(value, y, x, cell, lines, total):
 
 
 @njit(cache=True, error_model="numpy")
-def charge(value, y, x, cell, bias, noise, total):
-    """Add what a linear layer's bias [C, H, W] gives to rows on its output, and its rounding [m, C, H, W] (N2)."""
+def charge(value, y, x, cell, noise, total):
+    """Charge rows on a linear layer's output with its rounding and their own, ``noise`` [m, C, H, W] (N2)."""
     count, channels, h, w = value.shape
     H, W = noise.shape[2:]
-    moved, shaken = np.empty(w), np.empty(w)
+    shaken = np.empty(w)
     for r in range(count):
         k, shift = cell[r], x[r]
         first, past = min(w, max(0, -shift)), max(0, min(w, W - shift))
-        moved[:] = 0.0
         shaken[:] = 0.0
         for c in range(channels):
             for i in range(h):
@@ -186,15 +185,12 @@ def charge(value, y, x, cell, bias, noise, total):
                     continue
                 row[:first] = 0.0
                 row[past:] = 0.0
-                X = first + shift
-                bias_here, noise_here = bias[c, Y, X:], noise[k, c, Y, X:]
-                part, move, shake = row[first:past], moved[first:past], shaken[first:past]
+                noise_here = noise[k, c, Y, first + shift :]
+                part, shake = row[first:past], shaken[first:past]
                 for j in range(past - first):
-                    a = np.float64(part[j])
-                    move[j] += a * bias_here[j]
-                    shake[j] += abs(a) * noise_here[j]
-        total[r, 0] += moved.sum() - shaken.sum()
-        total[r, 1] += moved.sum() + shaken.sum()
+                    shake[j] += abs(np.float64(part[j])) * noise_here[j]
+        total[r, 0] -= shaken.sum()
+        total[r, 1] += shaken.sum()
 
 
 @njit(cache=True, error_model="numpy")

@@ -1,0 +1,483 @@
+"""Which exported networks are read, and what one cell of them costs: both exporters of torch, random weights.
+
+Each network is exported, loaded, bounded over one set of images, and attacked by float32 runs of onnxruntime in
+the set and at its corners, in a process of its own. Run ``python benchmarks/exported_networks.py --help``.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+import warnings
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import nn
+from torch.nn import functional
+
+ROWS = 10
+
+
+# ---------------------------------------------------------------- own shapes
+
+
+class Conv(nn.Sequential):
+    """Convolution, batch norm and an activation."""
+
+    def __init__(self, cin: int, cout: int, k: int = 3, stride: int = 1, act: type[nn.Module] = nn.SiLU) -> None:
+        super().__init__(nn.Conv2d(cin, cout, k, stride, k // 2, bias=False), nn.BatchNorm2d(cout), act())
+
+
+class Block(nn.Module):
+    """YOLOv8's C2f: a split, bottlenecks, and everything joined."""
+
+    def __init__(self, cin: int, cout: int, short: bool) -> None:
+        super().__init__()
+        self.half, self.short = cout // 2, short
+        self.first = Conv(cin, cout, 1)
+        self.inner = nn.Sequential(Conv(self.half, self.half), Conv(self.half, self.half))
+        self.last = Conv(3 * self.half, cout, 1)
+
+    def forward(self, x: torch.Tensor) -> torch.Tensor:
+        parts = list(self.first(x).chunk(2, 1))
+        inner = self.inner(parts[1])
+        parts.append(parts[1] + inner if self.short else inner)
+        return self.last(torch.cat(parts, 1))
+
+
+class Pyramid(nn.Module):
+    """YOLOv8's pooling pyramid."""
+
+    def __init__(self, channels: int) -> None:
+        super().__init__()
+        self.first, self.last = Conv(channels, channels // 2, 1), Conv(channels * 2, channels, 1)
+        self.pool = nn.MaxPool2d(3, 1, 1)
+
+    def forward(self, x: torch.Tensor) -> torch.Tensor:
+        parts = [self.first(x)]
+        for _ in range(3):
+            parts.append(self.pool(parts[-1]))
+        return self.last(torch.cat(parts, 1))
+
+
+class Yolo(nn.Module):
+    """Backbone, upsampled neck and two heads, flattened and joined."""
+
+    def __init__(self, width: int = 8, outputs: int = 6) -> None:
+        super().__init__()
+        w = width
+        self.stem = nn.Sequential(Conv(3, w, 3, 2), Conv(w, 2 * w, 3, 2), Block(2 * w, 2 * w, True))
+        self.deep = nn.Sequential(Conv(2 * w, 4 * w, 3, 2), Block(4 * w, 4 * w, True), Pyramid(4 * w))
+        self.up = nn.Upsample(scale_factor=2, mode="nearest")
+        self.neck = Block(6 * w, 2 * w, False)
+        self.heads = nn.ModuleList([nn.Conv2d(2 * w, outputs, 1), nn.Conv2d(4 * w, outputs, 1)])
+
+    def forward(self, x: torch.Tensor) -> torch.Tensor:
+        one = self.stem(x)
+        two = self.deep(one)
+        one = self.neck(torch.cat([self.up(two), one], 1))
+        found = [head(v) for head, v in zip(self.heads, (one, two), strict=True)]
+        return torch.cat([v.flatten(2) for v in found], 2).sigmoid()
+
+
+class YoloTwo(Yolo):
+    """The same with both heads as outputs."""
+
+    def forward(self, x: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:  # type: ignore[override]
+        one = self.stem(x)
+        two = self.deep(one)
+        return self.heads[0](self.neck(torch.cat([self.up(two), one], 1))), self.heads[1](two)
+
+
+class UNet(nn.Module):
+    """Two levels down and up again."""
+
+    def __init__(self, up: str = "transposed", act: type[nn.Module] = nn.ReLU, norm: str = "batch") -> None:
+        super().__init__()
+
+        def block(cin: int, cout: int) -> nn.Sequential:
+            layer: nn.Module = nn.BatchNorm2d(cout)
+            if norm == "group":
+                layer = nn.GroupNorm(2, cout)
+            elif norm == "instance":
+                layer = nn.InstanceNorm2d(cout, affine=True)
+            return nn.Sequential(nn.Conv2d(cin, cout, 3, padding=1), layer, act())
+
+        self.down = nn.ModuleList([block(3, 4), block(4, 8)])
+        self.pool, self.middle = nn.MaxPool2d(2), block(8, 8)
+
+        def grow(cin: int, cout: int) -> nn.Module:
+            if up == "transposed":
+                return nn.ConvTranspose2d(cin, cout, 2, 2)
+            return nn.Sequential(
+                nn.Upsample(scale_factor=2, mode=up, align_corners=False if up == "bilinear" else None),
+                nn.Conv2d(cin, cout, 1),
+            )
+
+        self.grow = nn.ModuleList([grow(8, 8), grow(8, 4)])
+        self.up = nn.ModuleList([block(16, 8), block(8, 4)])
+        self.head = nn.Conv2d(4, 2, 1)
+
+    def forward(self, x: torch.Tensor) -> torch.Tensor:
+        kept = []
+        for layer in self.down:
+            x = layer(x)
+            kept.append(x)
+            x = self.pool(x)
+        x = self.middle(x)
+        for grow, layer, skip in zip(self.grow, self.up, reversed(kept), strict=True):
+            x = layer(torch.cat([grow(x), skip], 1))
+        return self.head(x)
+
+
+class Attention(nn.Module):
+    """Self-attention as in timm: one product for queries, keys and values."""
+
+    def __init__(self, dim: int, heads: int, fused: bool) -> None:
+        super().__init__()
+        self.heads, self.fused = heads, fused
+        self.qkv, self.out = nn.Linear(dim, 3 * dim), nn.Linear(dim, dim)
+
+    def forward(self, x: torch.Tensor) -> torch.Tensor:
+        b, n, c = x.shape
+        q, k, v = self.qkv(x).reshape(b, n, 3, self.heads, c // self.heads).permute(2, 0, 3, 1, 4).unbind(0)
+        if self.fused:
+            x = functional.scaled_dot_product_attention(q, k, v)
+        else:
+            x = ((q * (c // self.heads) ** -0.5) @ k.transpose(-2, -1)).softmax(-1) @ v
+        return self.out(x.transpose(1, 2).reshape(b, n, c))
+
+
+class Vit(nn.Module):
+    """A vision transformer with a class token."""
+
+    def __init__(
+        self, size: int = 16, patch: int = 8, dim: int = 8, heads: int = 2, fused: bool = False, depth: int = 1
+    ):
+        super().__init__()
+        self.patch = nn.Conv2d(3, dim, patch, patch)
+        self.token = nn.Parameter(torch.randn(1, 1, dim))
+        self.position = nn.Parameter(0.1 * torch.randn(1, (size // patch) ** 2 + 1, dim))
+        self.layers = nn.ModuleList()
+        for _ in range(depth):
+            mlp = nn.Sequential(nn.Linear(dim, 2 * dim), nn.GELU(), nn.Linear(2 * dim, dim))
+            self.layers.append(nn.ModuleList([nn.LayerNorm(dim), Attention(dim, heads, fused), nn.LayerNorm(dim), mlp]))
+        self.norm, self.head = nn.LayerNorm(dim), nn.Linear(dim, 4)
+
+    def forward(self, x: torch.Tensor) -> torch.Tensor:
+        x = self.patch(x).flatten(2).transpose(1, 2)
+        x = torch.cat([self.token.expand(x.shape[0], -1, -1), x], 1) + self.position
+        for one, attend, two, mlp in self.layers:  # type: ignore[misc]
+            x = x + attend(one(x))
+            x = x + mlp(two(x))
+        return self.head(self.norm(x)[:, 0])
+
+
+class Mixer(nn.Module):
+    """An MLP mixer with one layer."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.patch = nn.Conv2d(3, 8, 8, 8)
+        self.one, self.two = nn.LayerNorm(8), nn.LayerNorm(8)
+        self.tokens = nn.Sequential(nn.Linear(4, 8), nn.GELU(), nn.Linear(8, 4))
+        self.channels = nn.Sequential(nn.Linear(8, 16), nn.GELU(), nn.Linear(16, 8))
+        self.head = nn.Linear(8, 4)
+
+    def forward(self, x: torch.Tensor) -> torch.Tensor:
+        x = self.patch(x).flatten(2).transpose(1, 2)
+        x = x + self.tokens(self.one(x).transpose(1, 2)).transpose(1, 2)
+        x = x + self.channels(self.two(x))
+        return self.head(x.mean(1))
+
+
+class PixelShuffled(nn.Module):
+    """A super-resolution network."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.layers = nn.Sequential(
+            nn.Conv2d(3, 8, 3, padding=1), nn.PReLU(8), nn.Conv2d(8, 12, 3, padding=1), nn.PixelShuffle(2)
+        )
+
+    def forward(self, x: torch.Tensor) -> torch.Tensor:
+        return self.layers(x).clamp(0, 1)
+
+
+class Odds(nn.Module):
+    """What small scripts use: flips, ranges of axes, extremes, padding by a number."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.conv, self.line = nn.Conv2d(3, 4, 3), nn.Linear(8, 3)
+
+    def forward(self, x: torch.Tensor) -> torch.Tensor:
+        x = functional.pad(self.conv(x.flip(3)), (1, 1, 1, 1), value=0.5)
+        x = torch.maximum(x, 0.1 * x - 0.2).abs()
+        x = x[:, :, ::2, ::2] - x.mean(1, keepdim=True)[:, :, 1::2, 1::2]
+        return functional.log_softmax(self.line(torch.cat([x.amax((2, 3)), x.sum((2, 3)) / 64], 1)), 1)
+
+
+class Plain(nn.Module):
+    """Two convolutions and an activation between."""
+
+    def __init__(self, act: nn.Module) -> None:
+        super().__init__()
+        self.layers = nn.Sequential(
+            nn.Conv2d(3, 6, 3, 2), nn.BatchNorm2d(6), act, nn.Conv2d(6, 6, 3, 2), act, nn.Flatten(), nn.Linear(54, 5)
+        )
+
+    def forward(self, x: torch.Tensor) -> torch.Tensor:
+        return self.layers(x)
+
+
+class Excited(nn.Module):
+    """A squeeze-and-excite block of EfficientNet."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.stem, self.wide, self.last = Conv(3, 8, 3, 2), Conv(8, 16, 1), nn.Conv2d(16, 8, 1)
+        self.one, self.two, self.head = nn.Conv2d(16, 4, 1), nn.Conv2d(4, 16, 1), nn.Linear(8, 4)
+
+    def forward(self, x: torch.Tensor) -> torch.Tensor:
+        x = self.wide(self.stem(x))
+        gate = torch.sigmoid(self.two(functional.silu(self.one(x.mean((2, 3), keepdim=True)))))
+        return self.head(self.last(x * gate).mean((2, 3)))
+
+
+def _torchvision(name: str, **settings: Any) -> Callable[[], nn.Module]:
+    def make() -> nn.Module:
+        import torchvision
+
+        return getattr(torchvision.models, name)(weights=None, num_classes=10, **settings)
+
+    return make
+
+
+def _features(name: str, channels: int) -> Callable[[], nn.Module]:
+    """Without the classifier, which wants larger images."""
+
+    def make() -> nn.Module:
+        import torchvision
+
+        features = getattr(torchvision.models, name)(weights=None).features
+        return nn.Sequential(features, nn.Flatten(), nn.Linear(channels, 10))
+
+    return make
+
+
+#: Name: how to make it, and the side of its images.
+NETWORKS: dict[str, tuple[Callable[[], nn.Module], int]] = {
+    **{
+        f"plain {name}": (lambda act=act: Plain(act()), 16)
+        for name, act in {
+            "ReLU": nn.ReLU,
+            "ReLU6": nn.ReLU6,
+            "LeakyReLU": nn.LeakyReLU,
+            "SiLU": nn.SiLU,
+            "GELU": nn.GELU,
+            "GELU tanh": lambda: nn.GELU("tanh"),
+            "Hardswish": nn.Hardswish,
+            "Hardsigmoid": nn.Hardsigmoid,
+            "Hardtanh": nn.Hardtanh,
+            "Mish": nn.Mish,
+            "ELU": nn.ELU,
+            "SELU": nn.SELU,
+            "CELU": nn.CELU,
+            "Softplus": nn.Softplus,
+            "PReLU": nn.PReLU,
+            "Tanh": nn.Tanh,
+            "Sigmoid": nn.Sigmoid,
+            "Softsign": nn.Softsign,
+            "LogSigmoid": nn.LogSigmoid,
+        }.items()
+    },
+    "YOLO shape": (Yolo, 32),
+    "YOLO shape, two outputs": (YoloTwo, 32),
+    "U-Net transposed": (UNet, 16),
+    "U-Net bilinear": (lambda: UNet("bilinear", nn.SiLU), 16),
+    "U-Net nearest, group norm": (lambda: UNet("nearest", nn.SiLU, "group"), 16),
+    "U-Net instance norm": (lambda: UNet("nearest", nn.LeakyReLU, "instance"), 16),
+    "ViT": (Vit, 16),
+    "ViT fused attention": (lambda: Vit(fused=True), 16),
+    "ViT two layers": (lambda: Vit(depth=2), 16),
+    "MLP mixer": (Mixer, 16),
+    "pixel shuffle": (PixelShuffled, 12),
+    "odds": (Odds, 12),
+    "squeeze and excite": (Excited, 16),
+    "alexnet's features": (_features("alexnet", 256), 64),
+    "vgg11's features": (_features("vgg11", 512), 32),
+    "resnet18": (_torchvision("resnet18"), 32),
+    "squeezenet1_1": (_torchvision("squeezenet1_1"), 32),
+    "mobilenet_v2 x0.25": (_torchvision("mobilenet_v2", width_mult=0.25), 32),
+    "mobilenet_v3_small x0.25": (_torchvision("mobilenet_v3_small", width_mult=0.25), 32),
+    "mnasnet0_5": (_torchvision("mnasnet0_5"), 32),
+    "shufflenet_v2_x0_5": (_torchvision("shufflenet_v2_x0_5"), 32),
+    "efficientnet_b0": (_torchvision("efficientnet_b0"), 32),
+    "densenet121": (_torchvision("densenet121"), 32),
+    "googlenet": (_torchvision("googlenet", aux_logits=False, init_weights=False), 32),
+    "regnet_y_400mf": (_torchvision("regnet_y_400mf"), 32),
+    "convnext_tiny": (_torchvision("convnext_tiny"), 32),
+    "swin_t": (_torchvision("swin_t"), 32),
+    "vit_b_32": (_torchvision("vit_b_32", image_size=64), 64),
+    "inception_v3": (_torchvision("inception_v3", aux_logits=False, init_weights=False), 75),
+}
+
+
+# ---------------------------------------------------------------- one network
+
+
+def export(name: str, exporter: str, file: Path) -> tuple[int, ...]:
+    torch.manual_seed(0)
+    make, side = NETWORKS[name]
+    module = make().eval()
+    for layer in module.modules():
+        if isinstance(layer, nn.BatchNorm2d):
+            assert layer.running_mean is not None and layer.running_var is not None
+            layer.running_mean.normal_(0.0, 0.1)
+            layer.running_var.uniform_(0.5, 1.5)
+    image = torch.randn(1, 3, side, side)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        if exporter == "pt2":
+            torch.export.save(torch.export.export(module, (image,)), file)
+        elif exporter == "dynamo":
+            torch.onnx.export(module, (image,), str(file), dynamo=True, verbose=False)
+        else:
+            torch.onnx.export(module, (image,), str(file), dynamo=False, opset_version=int(exporter))
+    return 3, side, side
+
+
+def measure(name: str, exporter: str, runs: int, width: float) -> dict[str, Any]:
+    """Everything about one network; runs in a process of its own."""
+    import onnxruntime
+
+    from ns_abstract.io.errors import InputError
+    from ns_abstract.verify.network import ImageSets, bound_outputs, load_network
+
+    torch.set_num_threads(1)
+    with tempfile.TemporaryDirectory() as folder:
+        file = Path(folder) / ("net.pt2" if exporter == "pt2" else "net.onnx")
+        found: dict[str, Any] = {"name": name, "exporter": exporter}
+        try:
+            shape = export(name, exporter, file)
+        except TimeoutError:
+            raise
+        except Exception as error:
+            return {**found, "status": "not exported", "why": repr(error).splitlines()[0][:120]}
+        start = time.perf_counter()
+        try:
+            network = load_network(file)
+        except InputError as error:
+            return {**found, "status": "refused", "why": f"{error.field or ''}: {error.problem}; {error.fix}"[:200]}
+        found.update(status="loaded", layers=len(network.nodes), load=round(time.perf_counter() - start, 2))
+        print(json.dumps(found), flush=True)
+        rng = np.random.default_rng(0)
+        n, d = network.input_size, 2
+        c = np.repeat(np.repeat(rng.normal(size=(3, 4, 4)), -(-shape[1] // 4), 1), -(-shape[2] // 4), 2)
+        c = c[:, : shape[1], : shape[2]].reshape(1, n)
+        a = width * rng.normal(size=(1, n, d))
+        slack = 0.1 * width
+        reach = np.abs(a).sum(-1) + slack
+        images = ImageSets(a, c - slack, a, c + slack, c - reach, c + reach)
+        k = min(ROWS, network.output_size)
+        rows = np.concatenate([np.eye(k, network.output_size), -np.eye(k, network.output_size)])
+        # the process's peak from here on
+        Path("/proc/self/clear_refs").write_text("5")
+        start = time.process_time()
+        bounds = bound_outputs(network, images, rows, np.zeros(2 * k))
+        found["seconds"] = round(time.process_time() - start, 2)
+        peak = next(v for v in Path("/proc/self/status").read_text().splitlines() if v.startswith("VmHWM"))
+        found["GiB"] = round(int(peak.split()[1]) / 2**20, 2)
+        lower = bounds.lower[0]
+        found["bounded"] = bool(np.isfinite(lower).all())
+        if exporter == "pt2":
+            found["runs"] = 0
+            return found
+        session = onnxruntime.InferenceSession(str(file), providers=["CPUExecutionProvider"])
+        entry = session.get_inputs()[0].name
+        outside, least, done = 0, np.full(2 * k, np.inf), 0
+        ends = [np.float32(np.nextafter(np.float32(v), np.float32(0))) for v in (slack,)]
+        while done < runs:
+            p = rng.uniform(-1, 1, d) if done % 2 else rng.choice([-1.0, 1.0], d)
+            t = rng.uniform(-1, 1, n) if done % 3 else rng.choice([-1.0, 1.0], n)
+            middle = a[0] @ p + c[0]
+            x = (middle + 0.999 * float(ends[0]) * t).astype(np.float32)
+            done += 1
+            outputs = session.run(None, {entry: x.reshape(1, *shape)})
+            y = rows @ np.concatenate([np.asarray(v).reshape(-1) for v in outputs]).astype(np.float64)
+            least = np.minimum(least, y)
+            outside += int((y < lower).sum() + (y < bounds.a[0] @ p + bounds.b[0]).sum())
+        spread = (least[:k] + least[k:]) * -0.5
+        found.update(runs=done, outside=outside)
+        found["ratio"] = round(float(np.median((lower[:k] + lower[k:]) * -0.5 / np.maximum(spread, 1e-12))), 2)
+        return found
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--only", nargs="*", default=None, help="parts of names")
+    parser.add_argument("--exporters", nargs="*", default=["dynamo", "17"], help="dynamo, pt2 or operator sets")
+    parser.add_argument("--runs", type=int, default=2000)
+    parser.add_argument("--width", type=float, default=2e-3, help="how far an image moves with one parameter")
+    parser.add_argument("--limit", type=float, default=300.0, help="seconds a network may take")
+    parser.add_argument("--output", type=Path, default=None, help="JSON lines")
+    parser.add_argument("--together", action="store_true", help="in one process: quicker, and an end ends all")
+    parser.add_argument("--one", nargs=2, default=None, help=argparse.SUPPRESS)
+    arguments = parser.parse_args()
+    if arguments.one:
+        print(json.dumps(measure(*arguments.one, arguments.runs, arguments.width)), flush=True)
+        return
+    signal.signal(signal.SIGALRM, _late)
+    for name in NETWORKS:
+        if arguments.only and not any(part in name for part in arguments.only):
+            continue
+        for exporter in arguments.exporters:
+            if arguments.together:
+                signal.alarm(int(arguments.limit))
+                try:
+                    found = measure(name, exporter, arguments.runs, arguments.width)
+                except TimeoutError:
+                    found = {"name": name, "exporter": exporter, "why": f"more than {arguments.limit:.0f} s"}
+                signal.alarm(0)
+                _report(found, arguments.output)
+                continue
+            command = [sys.executable, __file__, "--one", name, exporter]
+            command += ["--runs", str(arguments.runs), "--width", str(arguments.width)]
+            try:
+                done = subprocess.run(
+                    command, capture_output=True, text=True, timeout=arguments.limit, env=os.environ, check=False
+                )
+                text, end = done.stdout, done.stderr.strip().splitlines()[-1:] if done.returncode else []
+            except subprocess.TimeoutExpired as error:
+                text = (error.stdout or b"").decode() if isinstance(error.stdout, bytes) else error.stdout or ""
+                end = [f"more than {arguments.limit:.0f} s"]
+            lines = [line for line in text.splitlines() if line.startswith("{")]
+            found = json.loads(lines[-1]) if lines else {"name": name, "exporter": exporter, "status": "failed"}
+            if end:
+                found["why"] = end[0][:160]
+            _report(found, arguments.output)
+
+
+def _report(found: dict[str, Any], output: Path | None) -> None:
+    print(json.dumps(found), flush=True)
+    if output:
+        with output.open("a") as stream:
+            stream.write(json.dumps(found) + "\n")
+
+
+def _late(*_: Any) -> None:
+    raise TimeoutError
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,10 @@
+"""Planted faults, by the part of the package that they lie in."""
+
+from planted.certificates import CERTIFICATES
+from planted.fault import Fault, apply
+from planted.fields import FIELDS
+from planted.polynomials import POLYNOMIALS
+
+FAULTS = (*POLYNOMIALS, *FIELDS, *CERTIFICATES)
+
+__all__ = ["FAULTS", "Fault", "apply"]

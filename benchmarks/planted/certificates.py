@@ -1,0 +1,201 @@
+"""Faults in what comes before and behind a network: preprocessing, properties, the search, the store."""
+
+from planted.fault import Fault
+
+_PREPROCESS, _PROPERTIES, _VNNLIB = "verify/preprocess.py", "verify/properties.py", "verify/vnnlib.py"
+_SEARCH, _STORE, _CELLS = "verify/search.py", "verify/store.py", "verify/cells.py"
+_SETS = "test_certify_properties.py::test_sets_contain_what_float32_preprocessing_gives"
+_TIGHT = "test_certify_properties.py::test_sets_are_tight_and_contain_rounding"
+_LINEAR = "test_certify_properties.py::test_classification"
+_UNSAFE = "test_certify_properties.py::test_vnnlib"
+_REGRESSION = "test_certify_properties.py::test_regression"
+_FOLLOWS = "test_certify_properties.py::test_regression_uses_correlation"
+_TRUTH = "test_certify_properties.py::test_truth_forms_contain_the_truth"
+_DETECTION = "test_certify_properties.py::test_detection"
+_OVERLAP = "test_certify_properties.py::test_overlap_against_sampling"
+_VERDICTS = "test_certify_search.py::test_verdicts_are_the_truth"
+_IMAGES = "test_certify_search.py::test_bad_image_bounds_certify_nothing"
+_NETWORKS = "test_certify_search.py::test_bad_network_bounds_certify_nothing"
+_IMPOSSIBLE = "test_certify_search.py::test_impossible_leaves_are_refused_and_nothing_is_stored"
+_RESUMED = "test_certify_search.py::test_resumed_store_equals_an_uninterrupted_one"
+
+CERTIFICATES = (
+    Fault(
+        "preprocessing: rounding is not charged",
+        _PREPROCESS, "Preprocess.sets.move", "_ROUNDINGS * _UNIT32 * size + 8.0 * UNIT64 * np.abs(b * factor)",
+        "0.0 * np.abs(b * factor)", _TIGHT,
+    ),
+    Fault(
+        "preprocessing: the upper set is moved down",
+        _PREPROCESS, "Preprocess.sets", "move(b_upper, slopes[1], 1.0)", "move(b_upper, slopes[1], -1.0)", _TIGHT,
+    ),
+    Fault(
+        "preprocessing: slopes forget the range",
+        _PREPROCESS, "Preprocess.sets", "self._ordered(a, 1) * factor[:, None]", "self._ordered(a, 1) / std[:, None]",
+        _SETS,
+    ),
+    Fault(
+        "preprocessing: channels are not turned round",
+        _PREPROCESS, "Preprocess._ordered", "np.flip(array, array.ndim - 1 - after)", "array", _SETS + "[NCHW-BGR]",
+    ),
+    Fault(
+        "preprocessing: layouts are mixed up",
+        _PREPROCESS, "Preprocess._flat", "np.moveaxis(array, array.ndim - 1 - after, 1)", "array",
+        _SETS + "[NCHW-RGB]",
+    ),
+    Fault(
+        "classification: a margin counts for the other class",
+        _PROPERTIES, "Classification.bind", "rows[:, self.label] = 1.0", "rows[:, self.label] = 2.0", _LINEAR,
+    ),
+    Fault(
+        "linear claims: one group is enough",
+        _PROPERTIES, "LinearClaim.proved",
+        "np.min([lower[:, list(group)].max(axis=1) for group in self.groups], axis=0)",
+        "np.max([lower[:, list(group)].max(axis=1) for group in self.groups], axis=0)", _LINEAR,
+    ),
+    Fault(
+        "linear claims: bounds that are no numbers are left in",
+        _PROPERTIES, "LinearClaim.proved", "np.where(np.isnan(bounds.lower), -np.inf, bounds.lower)",
+        "np.where(np.isnan(bounds.lower), np.inf, bounds.lower)", _LINEAR,
+    ),
+    Fault(
+        "regression: the error's lower side is forgotten",
+        _PROPERTIES, "RegressionClaim._cell", "np.maximum(-sides[0], -sides[1])", "-sides[0]", _REGRESSION,
+    ),
+    Fault(
+        "regression: ranges take the near end of the truth",
+        _PROPERTIES, "RegressionClaim._cell", "np.stack([high, -low])", "np.stack([low, -high])", _REGRESSION,
+    ),
+    Fault(
+        "regression: lines forget their slope",
+        _PROPERTIES, "RegressionClaim._cell",
+        "b - signs * truth.center - truth.radius - np.abs(slope).sum(axis=-1) - _CHARGE * size",
+        "b - signs * truth.center - truth.radius - _CHARGE * size", _FOLLOWS,
+    ),
+    Fault(
+        "regression: the tolerance is relative to the farthest truth",
+        _PROPERTIES, "RegressionClaim._cell", "np.minimum(np.abs(low), np.abs(high))",
+        "np.maximum(np.abs(low), np.abs(high))", _REGRESSION,
+    ),
+    Fault(
+        "regression: bounds that are no numbers prove",
+        _PROPERTIES, "RegressionClaim.proved", "margin if math.isfinite(margin) else -np.inf", "abs(margin)",
+        _FOLLOWS,
+    ),
+    Fault(
+        "truth: the object is seen in OpenCV's axes",
+        _PROPERTIES, "Truth.forms", "np.array([1.0, -1.0, -1.0])", "np.array([1.0, 1.0, 1.0])", _TRUTH,
+    ),
+    Fault(
+        "truth: the distance is squared",
+        _PROPERTIES, "Truth.forms", "camera.square().sum(0).sqrt()", "camera.square().sum(0)", _TRUTH,
+    ),
+    Fault(
+        "detection: other classes are left out of the score",
+        _PROPERTIES, "DetectionClaim._candidate",
+        "score / (1.0 + np.exp(-lower[:, 1:count]).sum(axis=1)) * (1.0 - _CHARGE)", "score * (1.0 - _CHARGE)",
+        _DETECTION + "[None-7]",
+    ),
+    Fault(
+        "detection: the overlap is not asked for",
+        _PROPERTIES, "DetectionClaim._candidate",
+        "np.minimum(margin, self._overlap(lower[:, count : count + 4], -lower[:, count + 4 :], number))", "margin",
+        _DETECTION + "[0.2-None]",
+    ),
+    Fault(
+        "overlap: the box's own side does not cut it",
+        _PROPERTIES, "DetectionClaim._overlap", "last - centre_high + 0.5 * side_low",
+        "last - centre_low + 0.5 * side_low", _OVERLAP,
+    ),
+    Fault(
+        "overlap: the union takes the smaller area",
+        _PROPERTIES, "DetectionClaim._overlap", "area_high * (side_high + charge)", "area_high * side_low", _OVERLAP,
+    ),
+    Fault(
+        "overlap: rows and columns change places",
+        _PROPERTIES, "DetectionClaim._overlap", "((0, column), (1, row))", "((0, row), (1, column))", _OVERLAP,
+    ),
+    Fault(
+        "unsafe sets: at least is read as at most",
+        _VNNLIB, "_ways", "(left, right) if head == '<=' else (right, left)", "(left, right)", _UNSAFE,
+    ),
+    Fault(
+        "unsafe sets: differences are sums",
+        _VNNLIB, "_ways", "_sum(low, high, -1.0)", "_sum(low, high, 1.0)", _UNSAFE,
+    ),
+    Fault(
+        "unsafe sets: of joined assertions the last counts",
+        _VNNLIB, "_ways", "[[*old, *new] for old in ways for new in more]", "[[*new] for old in ways for new in more]",
+        _UNSAFE,
+    ),
+    Fault(
+        "search: a bound below 0 is a proof",
+        _SEARCH, "Search._settle", "bound is not None and bound > 0.0", "bound is not None and bound > -0.05",
+        _VERDICTS + "[1-0.43]",
+    ),
+    Fault(
+        "search: a proof need not survive an attack",
+        _SEARCH, "Search.examine", "self._sample([seen[k] for k in sorted(proved)], self._attack)", "pass",
+        "test_certify_search.py::test_number_that_is_lost_after_a_proof_takes_it_back[nan]",
+    ),
+    Fault(
+        "search: bounds that cross are taken",
+        _SEARCH, "_sane", "(lower <= upper).all()", "True", _IMAGES + "[crossed]",
+    ),
+    Fault(
+        "search: linear sets that are no numbers are taken",
+        _SEARCH, "_sane", "(*linear, lower, upper)", "(lower, upper)", _IMAGES,
+    ),
+    Fault(
+        "search: infinite bounds of the network prove",
+        _SEARCH, "Search._bound", "math.isfinite(margin)", "margin == margin", _NETWORKS + "[infinity]",
+    ),
+    Fault(
+        "search: a swallowed error proves",
+        _SEARCH, "Search._bound", "reasons.update(dict.fromkeys(kept, _told(error)))",
+        "bounded.update(dict.fromkeys(kept, 1.0))", _NETWORKS + "[exception]",
+    ),
+    Fault(
+        "search: counterexamples are not rendered again",
+        _SEARCH, "Search._counterexample", "not -math.inf < margin <= 0.0 or not cell.box.contains(values)", "False",
+        "test_certify_search.py::test_unconfirmed_counterexample_is_unknown",
+    ),
+    Fault(
+        "search: what is broken is counted from the margins above 0",
+        _SEARCH, "_Seen.broken", "margin <= 0.0", "margin < -1.0",
+        "test_certify_search.py::test_fixed_partition_gives_every_part_that_fails_its_own_verdict",
+    ),
+    Fault(
+        "cells: parts of a cut leave a gap",
+        _CELLS, "Grid.split", "first + size * i // parts", "first + (size - 1) * i // parts",
+        "test_certify_search.py::test_grid",
+    ),
+    Fault(
+        "cells: the last line of the grid is not the set's end",
+        _CELLS, "Grid.end", "high if position == self.units[axis] else low + (high - low) * (position / self.units[axis])",  # noqa: E501
+        "low + 0.99 * (high - low) * (position / self.units[axis])",
+        "test_certify_search.py::test_cells_share_ends_and_cover_the_set",
+    ),
+    Fault(
+        "store: cells are certified without a margin",
+        _STORE, "Store._add", "margin is None or not margin > 0.0", "False", _IMPOSSIBLE,
+    ),
+    Fault(
+        "store: cells are falsified without a counterexample",
+        _STORE, "Store._add", "leaf.verdict == 'falsified' and leaf.counterexample is None", "False", _IMPOSSIBLE,
+    ),
+    Fault(
+        "store: what comes twice counts twice",
+        _STORE, "Store.settle", "if gone is None:\n    return False", "pass",
+        "test_certify_search.py::test_result_that_comes_twice_counts_once",
+    ),
+    Fault(
+        "store: what an ended run left open stays unknown",
+        _STORE, "Store._open_base", "self._put('open_rows', [])", "pass", _RESUMED,
+    ),
+    Fault(
+        "store: another search is continued",
+        _STORE, "Store._check", "stored.get(key) != asked.get(key)", "False",
+        "test_certify_search.py::test_another_search_is_not_continued",
+    ),
+)  # fmt: skip

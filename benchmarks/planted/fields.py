@@ -1,0 +1,165 @@
+"""Faults in the bounds of NeRF fields."""
+
+from planted.fault import Fault
+
+_ZONOTOPE, _BOUNDS = "methods/nerf/zonotope.py", "methods/nerf/bounds.py"
+_HSV, _OCCUPANCY, _RELU = "methods/nerf/hsv.py", "methods/nerf/occupancy.py", "methods/nerf/relu_kernel.py"
+_FIELDS = "test_nerf_zonotope.py::test_fields_are_enclosed"
+_SEVERAL = "test_nerf_zonotope.py::test_several_parameters"
+_OPACITY = "test_nerf_zonotope.py::test_opacities_are_monotone_bounds"
+_SETS = "test_nerf_frame.py::test_sets_of_poses_are_enclosed"
+_STIFF = "test_nerf_frame.py::test_stiff_fields_are_enclosed"
+_COLORS = "test_nerf_hsv.py::test_bounds_contain_every_shifted_colour"
+_VOXELS = "test_nerf_occupancy.py::test_boxes_of_points_are_enclosed"
+_POINTS = "test_nerf_occupancy.py::test_ranges_of_points_are_enclosed_and_tight"
+
+FIELDS = (
+    Fault(
+        "fields: the encoding's interpolation error is not charged",
+        _ZONOTOPE, "FieldBounds.encode", "remainder + lebesgue**j * error", "remainder", _FIELDS, True,
+    ),
+    Fault(
+        "fields: a layer forgets the box before it",
+        _ZONOTOPE, "FieldBounds._linear", "radius @ right_absolute", "0.0 * radius @ right_absolute",
+        _SEVERAL, True,
+    ),
+    Fault(
+        "fields: a layer forgets its bias",
+        _ZONOTOPE, "FieldBounds._linear", "poly[:, 0] += bias", "pass", _FIELDS + "[0.003-smooth]", True,
+    ),
+    Fault(
+        "fields: error terms of one neuron lose their size",
+        _ZONOTOPE, "FieldBounds._linear", "right[pieces.new_neuron] * pieces.new_size[:, None]",
+        "0.1 * right[pieces.new_neuron] * pieces.new_size[:, None]", _SEVERAL, True,
+    ),
+    Fault(
+        "fields: an open unit counts as active",
+        _ZONOTOPE, "FieldBounds._relu_torch", "low >= e + r", "high >= e + r", _SEVERAL, True,
+    ),
+    Fault(
+        "fields: a unit that may be active counts as dead",
+        _ZONOTOPE, "FieldBounds._relu_torch", "high <= -(e + r)", "low <= -(e + r)", _SEVERAL, True,
+    ),
+    Fault(
+        "fields: the reach of a unit forgets its columns",
+        _ZONOTOPE, "FieldBounds._relu_torch", "spread + rho + box", "0.2 * spread + 0.0 * rho + box", _SEVERAL, True,
+    ),
+    Fault(
+        "fields: the line's error is a quarter of what it is",
+        _ZONOTOPE, "FieldBounds._relu_torch", "(0.5 * line * -bottom + 4.0 * slack) * _UP",
+        "(0.25 * line * -bottom + 4.0 * slack) * _UP", _SEVERAL, True,
+    ),
+    Fault(
+        "fields: the fit is not shifted to its middle",
+        _ZONOTOPE, "FieldBounds._fitted", "q[:, 0] += shift", "pass", _SEVERAL, True,
+    ),
+    Fault(
+        "fields: the distance between grid and polynomial is not charged",
+        _ZONOTOPE, "FieldBounds._fitted", "(positive - fitted).amax(dim=1) + torch.maximum(above, below)",
+        "0.5 * (positive - fitted).amax(dim=1)", _SEVERAL, True,
+    ),
+    Fault(
+        "fields: what is no number does not fail",
+        _ZONOTOPE, "FieldBounds._relu", "z.failed | (count > self.limit) | ~torch.isfinite(size).all(dim=1)",
+        "z.failed | (count > self.limit)", "test_nerf_zonotope.py::test_numbers_that_are_none_fail", True,
+    ),
+    Fault(
+        "compiled units: the line's error is a quarter of what it is",
+        _RELU, "relu", "line_error = (0.5 * line * -bottom + 4.0 * slack) * _UP",
+        "line_error = (0.25 * line * -bottom + 4.0 * slack) * _UP", _FIELDS, True,
+    ),
+    Fault(
+        "compiled units: the fit is not shifted to its middle",
+        _RELU, "relu", "q[0] += 0.5 * (most + least)", "q[0] += 0.0", _FIELDS, True,
+    ),
+    Fault(
+        "compiled units: columns are halved without their error",
+        _RELU, "relu", "(0.5 * (most - least) + ROUNDING * (sum_q + absolute) + 0.5 * e + 2.0 * slack) * _UP",
+        "(0.5 * (most - least) + ROUNDING * (sum_q + absolute) + 2.0 * slack) * _UP", _FIELDS, True,
+    ),
+    Fault(
+        "compiled units: an open unit counts as dead",
+        _RELU, "relu", "high <= -(e + r)", "low <= -(e + r)", _FIELDS, True,
+    ),
+    Fault(
+        "opacity: an upper bound is rounded down",
+        _BOUNDS, "opacity", "-torch.expm1(-length * density) * (1.0 + 2.0**-46) + 2.0**-1000",
+        "-torch.expm1(-length * density) * (1.0 - 2.0**-40) + 2.0**-1000", _OPACITY,
+    ),
+    Fault(
+        "opacity: torch's threshold of softplus is forgotten",
+        _BOUNDS, "opacity", "z > 19.0", "z > 1e9", _OPACITY,
+    ),
+    Fault(
+        "rays: the error of the pose is not charged to the direction",
+        _BOUNDS, "Pencil.points", "self.origin_radius + far[:, None] * self.direction_radius[ray]",
+        "0.0 * self.origin_radius + 0.0 * far[:, None] * self.direction_radius[ray]", _SETS + "[six]", True,
+    ),
+    Fault(
+        "rays: ranges on a part forget half of its width",
+        _BOUNDS, "Pencil.ranges", "0.5 * (high - low)", "0.25 * (high - low)", _POINTS,
+    ),
+    Fault(
+        "rays: parts of a cell change places",
+        _BOUNDS, "Division.members", "range(1, 2 * self.dimensions, 2)", "range(2 * self.dimensions - 1, 0, -2)",
+        "test_nerf_frame.py::test_divisions_are_nested_covers",
+    ),
+    Fault(
+        "compositing: brighter colours take the lower opacity",
+        _BOUNDS, "_Work._composited", "np.where(rise > 0.0, most, least)", "np.where(rise > 0.0, least, least)",
+        _SETS + "[plain]", True,
+    ),
+    Fault(
+        "compositing: darker colours take the lower opacity",
+        _BOUNDS, "_Work._composited", "np.where(fall < 0.0, most, least)", "least", _SETS + "[plain]", True,
+    ),
+    Fault(
+        "colours: a batch that was given up keeps its numbers",
+        _BOUNDS, "_Work._bound_field", "density.failed[:, None]", "density.failed[:, None] & False",
+        _STIFF, True,
+    ),
+    Fault(
+        "bounds of parts: the network's own error is left out",
+        _BOUNDS, "_parts", "(error + ROUNDING * (value.poly.abs().sum(dim=1) * bernstein.abs().amax()))[:, None]",
+        "(0.0 * error)[:, None]", _STIFF, True,
+    ),
+    Fault(
+        "known bounds: what is no number replaces what is known",
+        _BOUNDS, "_Work._keep", "(low <= high) & np.isfinite(low) & np.isfinite(high)", "low == low",
+        "test_nerf_frame.py::test_bounds_that_are_no_numbers_are_not_kept", True,
+    ),
+    Fault(
+        "voxels: the room for rounding is forgotten",
+        _OCCUPANCY, "OccupancyGrid.look",
+        "8.0 * UNIT64 * (np.maximum(np.abs(lower), np.abs(upper)) + np.abs(self.lower)) * self.scale",
+        "0.0 * lower", _VOXELS,
+    ),
+    Fault(
+        "voxels: boxes that reach beyond the grid are surely occupied",
+        _OCCUPANCY, "OccupancyGrid.look", "(first >= 0) & (last < size)", "(last >= 0) & (first < size)", _VOXELS,
+    ),
+    Fault(
+        "voxels: the sums of corners have a sign wrong",
+        _OCCUPANCY, "OccupancyGrid.look",
+        "s[x1, y1, z1] - s[x0, y1, z1]", "s[x1, y1, z1] - s[x0, y1, z0]", _VOXELS,
+    ),
+    Fault(
+        "hue: all of the circle is missed where the order of channels is open",
+        _HSV, "_hues", "np.full(len(low), 6.0)", "np.full(len(low), 3.0)", _COLORS + "[0.3-0.4]",
+    ),
+    Fault(
+        "hue: the wrap at half a turn is forgotten",
+        _HSV, "shifted_bounds", "np.where(end >= 3.0, 3.0, np.maximum(np.abs(start), np.abs(end)))",
+        "np.maximum(np.abs(start), np.abs(end))", _COLORS,
+    ),
+    Fault(
+        "saturation: the least channel takes the other end of the shift",
+        _HSV, "shifted_bounds", "low.min(axis=1)[:, None] - np.maximum(*taken)",
+        "low.min(axis=1)[:, None] - np.minimum(*taken)", _COLORS,
+    ),
+    Fault(
+        "hue: rounding is not charged",
+        _HSV, "shifted_bounds", "least + (value_low - least) * share_low - _ROUNDING",
+        "least + (value_low - least) * share_low + 0.0", _COLORS,
+    ),
+)  # fmt: skip

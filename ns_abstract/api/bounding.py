@@ -1,0 +1,396 @@
+"""Abstract images: `bound`, its result, and the frames of a path one after the other or side by side."""
+
+from __future__ import annotations
+
+import os
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field, fields, replace
+from time import perf_counter
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from ns_abstract.api.job import Job
+from ns_abstract.api.poses import PoseSet
+from ns_abstract.api.scenes import Scene, platform_problems
+from ns_abstract.execution.ending import AbandonedError
+from ns_abstract.execution.engines import Engine, Here
+from ns_abstract.execution.opening import Recipe, opened
+from ns_abstract.execution.scheduler import Task, work
+from ns_abstract.execution.stopping import StopRequest, interruptible
+from ns_abstract.geometry.box import ParameterBox
+from ns_abstract.io.errors import InputError
+from ns_abstract.refine.engine import Goal, groups, shared_goal
+from ns_abstract.refine.result import FrameResult, Leaves, PartResult, TracePoint
+from ns_abstract.report.figures import metrics
+from ns_abstract.report.files import save_frame
+
+#: Shortest time that a frame is given once it is begun.
+LEAST_SECONDS = 0.01
+#: Groups of tiles by thread of an engine: their costs differ.
+_GROUPS_BY_THREAD = 2
+
+
+@dataclass(frozen=True)
+class Progress:
+    """Where the work on a frame stands.
+
+    Attributes:
+        frame: Number of the frame.
+        frames_done: Frames finished before it.
+        seconds: Time spent on it.
+        budget: Time that it may take.
+        cells: Cells bounded.
+        covered: Part of the first cover that is done; nothing but [0, 1] is known below 1.
+        mpg, mpg_witness: Mean pixel gap of the bounds and of what was really rendered.
+    """
+
+    frame: int
+    frames_done: int
+    seconds: float
+    budget: float
+    cells: int
+    covered: float
+    mpg: float
+    mpg_witness: float
+
+    @property
+    def ratio(self) -> float:
+        """How loose the bounds can be at most."""
+        return self.mpg / self.mpg_witness if self.mpg_witness > 0.0 else float("inf")
+
+
+#: Told where the work stands; returning False ends it with what is known.
+OnProgress = Callable[[Progress], object]
+
+
+class Part(NamedTuple):
+    """One task.
+
+    Attributes:
+        index: The frame.
+        tiles: Numbers of its tiles; None: all.
+    """
+
+    index: int
+    tiles: np.ndarray | None
+
+
+def bound_part(recipe: Recipe[Job], part: Part, goal: Goal, keep_leaves: bool, neighbours: int = 1) -> PartResult:
+    """One task on a worker, which opens the scene once and keeps it.
+
+    Args:
+        recipe: Of the job.
+        part: What to bound.
+        goal: When to stop.
+        keep_leaves: Whether the result carries linear sets.
+        neighbours: Tasks that share this machine's cores.
+
+    Raises:
+        InputError: The worker reads other files under the same names than the command did.
+    """
+    import numba
+
+    most: int = numba.config.NUMBA_NUM_THREADS  # pyright: ignore[reportPrivateImportUsage, reportAttributeAccessIssue]
+    numba.set_num_threads(max(1, min(len(os.sched_getaffinity(0)) // neighbours, most)))
+    job = opened(recipe)
+    job.warm_up(part.index)
+    return job.bound_part(part.index, goal, part.tiles, keep_leaves=keep_leaves)
+
+
+def local_workers(job: Job) -> int:
+    """Processes of a cluster on this machine: as many as there are cores and the scene fits into memory."""
+    return max(1, min(len(os.sched_getaffinity(0)), job.memory // (2 * job.base_memory)))
+
+
+def bound_frames(
+    job: Job,
+    frames: Sequence[int],
+    *,
+    engine: Engine,
+    budget: float,
+    target_ratio: float = 1.05,
+    keep_leaves: bool = False,
+    stop: StopRequest | None = None,
+    on_progress: Callable[[Progress], object] = lambda progress: None,
+) -> Iterator[FrameResult]:
+    """Frames as they are finished, each once, whatever workers come and go.
+
+    Where the engine has more threads than there are frames, each frame is divided into groups of tiles, and is there
+    when all its groups are. What a task leaves of the time budget is shared by those that are still to be begun; the
+    first frame is always begun, and a frame that is begun is finished.
+
+    Args:
+        job: What is bounded.
+        frames: Their numbers.
+        engine: Where; closed at the end.
+        budget: Seconds for all of them, compiling not counted.
+        target_ratio: Where a frame is good enough.
+        keep_leaves: Whether results carry linear sets.
+        stop: Asked between cells in this process, and twice a second while others work.
+        on_progress: Told where the work of this process stands.
+
+    Raises:
+        InputError: The scene does not fit into the memory as often as there are workers on a machine.
+    """
+    if not frames:
+        engine.close()
+        return
+    machine = engine.machine()
+    leaf_bytes = _leaf_bytes(job, machine.processes) // machine.threads
+    count = -(-_GROUPS_BY_THREAD * engine.threads // len(frames)) if engine.threads > len(frames) else 1
+    queue = [
+        Part(index, tiles) for index in frames for tiles in ([None] if count == 1 else groups(job.frame(index), count))
+    ]
+    expected = Counter(part.index for part in queue)
+    goals: dict[int, Goal] = {}
+    found: dict[int, list[PartResult]] = {}
+    flying = done = number = 0
+    recipe = None if engine.shares else job.recipe
+    request = StopRequest() if stop is None else stop
+    if recipe is None:
+        with request.at_once():
+            job.warm_up(frames[0])
+    deadline = perf_counter() + budget
+
+    def here(part: Part, goal: Goal) -> PartResult | None:
+        def told(point: TracePoint, covered: float) -> None:
+            on_progress(
+                Progress(
+                    part.index, done, point.seconds, goal.seconds, point.cells, covered, point.mpg, point.mpg_witness
+                )
+            )
+
+        try:
+            return job.bound_part(part.index, goal, part.tiles, keep_leaves=keep_leaves, stopped=request, progress=told)
+        except AbandonedError:
+            # stopped before there was anything to keep
+            return None
+
+    def offer(room: int) -> Iterator[Task]:
+        nonlocal flying, number
+        # no more than can be worked on, so that later ones know how much time is left
+        while queue and flying < engine.threads:
+            left = deadline - perf_counter()
+            if left <= 0.0 and goals and queue[0].index not in goals:
+                queue.clear()
+                return
+            part = queue.pop(0)
+            if part.index not in goals:
+                goals[part.index] = _goal(job, part, target_ratio, leaf_bytes)
+            share = max(LEAST_SECONDS, left / -(-(len(queue) + 1) // engine.threads))
+            goal = replace(goals[part.index], seconds=share)
+            flying, number = flying + 1, number + 1
+            if recipe is None:
+                yield Task((number, part.index), here, (part, goal))
+            else:
+                yield Task((number, part.index), bound_part, (recipe, part, goal, keep_leaves, machine.threads))
+
+    for results in work(engine, offer, request):
+        for (_, index), result in results:
+            flying -= 1
+            if result is None:
+                return
+            found.setdefault(index, []).append(result)
+            if len(found[index]) == expected[index]:
+                done += 1
+                yield job.joined(found.pop(index))
+
+
+def _goal(job: Job, part: Part, target_ratio: float, leaf_bytes: int) -> Goal:
+    goal = replace(job.goal(target_ratio, 0.0), leaf_bytes=leaf_bytes)
+    return goal if part.tiles is None else shared_goal(job.frame(part.index), part.index, goal, job.seed)
+
+
+def _leaf_bytes(job: Job, processes: int) -> int:
+    """Bytes for the leaves of all processes on one machine together."""
+    if job.memory_limit is not None and processes * job.base_memory > job.memory:
+        raise InputError(
+            f"{processes} workers on one machine need {processes * job.base_memory / 2**30:.1f} GiB, "
+            f"{job.memory / 2**30:.1f} GiB may be used",
+            field="--memory-limit",
+            fix="raise it, or start fewer workers",
+        )
+    return job.leaf_bytes(processes)
+
+
+@dataclass(frozen=True, eq=False)
+class BoundResult:
+    """An abstract image: what holds for every picture of a set of poses.
+
+    Attributes:
+        lower, upper: [H, W, 3] float32, rounded outward: every picture of the set lies between them, after background
+            and clamp to [0, 1].
+        witness_lower, witness_upper: [H, W, 3] float32, least and largest values of pictures of the set that were
+            really rendered.
+        image: [H, W, 3] float32, the picture at the middle of the set.
+        parameters: Names, units and ranges of what varies.
+        guarantee: "float32-sound", "real-sound", or "sampled" (this machine's arithmetic failed its self-check).
+        seconds: Time spent.
+        trace: Error over time.
+        cell_count: Cells that were bounded.
+        plan: What was left out and why, one sentence each.
+        bounded: False while no bound but [0, 1] is known.
+        interrupted: Whether the work was ended by Ctrl-C or by ``on_progress``.
+        cells: Linear sets of the cells, if they were kept.
+    """
+
+    lower: np.ndarray
+    upper: np.ndarray
+    witness_lower: np.ndarray
+    witness_upper: np.ndarray
+    image: np.ndarray
+    parameters: ParameterBox
+    guarantee: str
+    seconds: float
+    trace: tuple[TracePoint, ...]
+    cell_count: int
+    plan: tuple[str, ...]
+    bounded: bool
+    interrupted: bool
+    cells: Leaves | None = field(default=None, repr=False)
+    target_ratio: float = 1.05
+    about: dict[str, Any] = field(default_factory=dict, repr=False)
+
+    @classmethod
+    def of(cls, frame: FrameResult, **more: Any) -> BoundResult:
+        """The result of one frame; ``more`` are the attributes that a frame does not have."""
+        same = {f.name for f in fields(cls)} & {f.name for f in fields(FrameResult)} - {"cells"}
+        return cls(
+            **{name: getattr(frame, name) for name in same},
+            parameters=frame.box,
+            cell_count=frame.cells,
+            cells=frame.leaves,
+            **more,
+        )
+
+    @property
+    def _figures(self) -> dict[str, float | None]:
+        return metrics(self.frame)
+
+    @property
+    def mpg(self) -> float:
+        """Mean pixel gap: mean over the pixels of the Euclidean length over RGB of upper - lower."""
+        return self._figures["mpg"] or 0.0
+
+    @property
+    def xpg(self) -> float:
+        """Largest pixel gap."""
+        return self._figures["xpg"] or 0.0
+
+    @property
+    def mpg_witness(self) -> float:
+        """Mean pixel gap of what was really rendered."""
+        return self._figures["mpg_witness"] or 0.0
+
+    @property
+    def xpg_witness(self) -> float:
+        """Largest pixel gap of what was really rendered."""
+        return self._figures["xpg_witness"] or 0.0
+
+    @property
+    def ratio(self) -> float | None:
+        """``mpg / mpg_witness``: how loose the bounds can be at most; None where nothing that was rendered differs."""
+        return self._figures["ratio"]
+
+    @property
+    def frame(self) -> FrameResult:
+        """The same as refinement gives it, for `ns_abstract.report`."""
+        same = {f.name for f in fields(self)} & {f.name for f in fields(FrameResult)} - {"cells"}
+        return FrameResult(
+            index=0,
+            box=self.parameters,
+            cells=self.cell_count,
+            leaves=self.cells,
+            **{name: getattr(self, name) for name in same},
+        )
+
+    @property
+    def status(self) -> str:
+        """One of "done", "partial" (the time was over before the target) and "missing" (nothing is known)."""
+        if not self.bounded:
+            return "missing"
+        reached = self.mpg == 0.0 or (self.ratio is not None and self.ratio <= self.target_ratio)
+        return "done" if reached or not self.parameters.dimensions else "partial"
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write an npz with the names of the files of ns-abstract-render.
+
+        Raises:
+            OSError: The file cannot be written.
+        """
+        save_frame(path, self.frame, status=self.status, about=self.about)
+
+    def _repr_html_(self) -> str:
+        from ns_abstract.api.notebook import bound_html
+
+        return bound_html(self)
+
+
+def bound(
+    scene: Scene,
+    poses: PoseSet,
+    *,
+    target_ratio: float = 1.05,
+    time_budget: float = 60.0,
+    arithmetic: str | None = None,
+    keep_cells: bool = False,
+    on_progress: OnProgress | None = None,
+    seed: int = 0,
+    memory_limit: float | None = None,
+    workers: int = 1,
+) -> BoundResult:
+    """Bound every picture that a scene shows over a set of poses; sound whenever it ends.
+
+    Ctrl-C and ``on_progress`` returning False end the work between two cells, with what is known.
+
+    Args:
+        scene: The scene.
+        poses: The set.
+        target_ratio: The work is done when the mean gap is at most this many times the one of real renders.
+        time_budget: Seconds, compiling at first use not counted.
+        arithmetic: "float32": enclose every float32 evaluation of the renderer; "real": the real-number renderer and
+            its float64 evaluation; None: float32 for splats, real for NeRFs.
+        keep_cells: Whether to keep the linear sets of every cell.
+        on_progress: Told after every cell of the first cover and after every round.
+        seed: Of the random pictures that are rendered.
+        memory_limit: GiB; None: 80 % of what is free.
+        workers: NeRF: processes that bound rays. With more than one, a script needs ``if __name__ == "__main__":``.
+
+    Raises:
+        InputError: An argument cannot be used.
+        KeyboardInterrupt: Ctrl-C came before the first render, or twice.
+    """
+    for name, value in (("target_ratio", target_ratio), ("time_budget", time_budget)):
+        if not 0.0 < value < float("inf"):
+            raise InputError(f"found {value}", field=name, fix="give a positive number")
+    if target_ratio < 1.0:
+        raise InputError(f"found {target_ratio}", field="target_ratio", fix="give a number of at least 1")
+    job = Job(scene, [poses.of(scene)], arithmetic=arithmetic, seed=seed, memory_limit=memory_limit, workers=workers)
+    guarantee = "sampled" if platform_problems() else job.method.guarantee
+    with interruptible() as stop:
+        results = bound_frames(
+            job, [0], engine=Here(), budget=time_budget, target_ratio=target_ratio, keep_leaves=keep_cells,
+            stop=stop, on_progress=listener(stop, on_progress),
+        )  # fmt: skip
+        frames = list(results)
+    if not frames:
+        raise KeyboardInterrupt
+    about = {"guarantee": guarantee, "renderer": job.method.program, "scene": job.describe()}
+    return BoundResult.of(frames[0], guarantee=guarantee, interrupted=stop(), target_ratio=target_ratio, about=about)
+
+
+def listener(stop: StopRequest, on_progress: Callable[[Any], object] | None) -> Callable[[Any], None]:
+    """``on_progress`` as the work calls it: where it returns False or is interrupted, the work is asked to stop."""
+
+    def told(progress: Any) -> None:
+        if on_progress is None:
+            return
+        try:
+            if on_progress(progress) is False:
+                stop.ask()
+        except KeyboardInterrupt:
+            stop.ask()
+
+    return told

@@ -1,0 +1,422 @@
+"""From a scene, sets of poses, a network and a property to examined cells."""
+
+from __future__ import annotations
+
+import hashlib
+import itertools
+import json
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import cached_property, partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+
+from ns_abstract.api.files import Settings, path_sets, resized
+from ns_abstract.api.job import Job
+from ns_abstract.api.scenes import platform_problems
+from ns_abstract.execution.opening import Recipe, opened
+from ns_abstract.geometry.box import ParameterBox
+from ns_abstract.geometry.camera_path import load_camera_path
+from ns_abstract.geometry.poses import PoseSet
+from ns_abstract.geometry.tiles import assemble
+from ns_abstract.io.errors import InputError
+from ns_abstract.io.jsonio import load_json
+from ns_abstract.perturbation.specification import Perturbation
+from ns_abstract.refine.protocol import Frame, Method
+from ns_abstract.report.record import file_stamp
+from ns_abstract.verify.cells import Cell, Grid, coarse_parts
+from ns_abstract.verify.model import NetworkModel, parametric
+from ns_abstract.verify.network import NetworkArithmetic, load_network
+from ns_abstract.verify.properties import Claim, LinearClaim, Property, parse_property
+from ns_abstract.verify.search import BLOCK, Findings, Search
+
+if TYPE_CHECKING:
+    from ns_abstract.verify.interop import Form
+
+#: Of the search's rules: results of different ones are not mixed.
+_RULES = 1
+#: Pixels that the picture moves by over a first cell: with one parameter, and with more.
+_MOTION_LINE, _MOTION = 0.08, 0.5
+#: Numbers that a network's layers may have together in a block's cells.
+_BLOCK_NUMBERS = 1 << 18
+#: Cells of the first blocks: early results, of which a kill leaves the more.
+_FIRST_BLOCKS = (1, 1, 1, 1, 2, 2, 4, 4)
+#: Frames whose bounds a process keeps at hand.
+_KEPT = 4
+#: Bytes for the bounds of one process, where nothing is said.
+MEMORY = 1 << 30
+
+
+@dataclass(frozen=True)
+class PropertySource:
+    """What is to hold, and where that is written.
+
+    Attributes:
+        value: Content of PROP.json.
+        file: The file, or None.
+    """
+
+    value: Any
+    file: Path | None = None
+
+    @classmethod
+    def of(cls, given: Mapping[str, Any] | str | Path) -> PropertySource:
+        """Of a mapping, or read from a file.
+
+        Raises:
+            InputError: The file cannot be read.
+        """
+        if isinstance(given, Mapping):
+            return cls(dict(given))
+        return cls(load_json(Path(given), "property file"), Path(given))
+
+    @property
+    def folder(self) -> Path:
+        """Where files that it names lie."""
+        return Path() if self.file is None else self.file.parent
+
+    def absolute(self) -> PropertySource:
+        """The same for a process with another working directory."""
+        return PropertySource(self.value, (self.file or Path("property")).absolute())
+
+    def within(self, error: InputError) -> InputError:
+        """The error with the file named."""
+        return error if self.file is None else error.within(self.file)
+
+
+class FramePictures:
+    """One frame's pictures, for `ns_abstract.verify.search.Search`.
+
+    Args:
+        method: The scene and its program.
+        poses: The frame's set.
+    """
+
+    def __init__(self, method: Method, poses: PoseSet) -> None:
+        self.frame: Frame = method.frame(poses)
+        self.box = self.frame.box
+        self._method = method
+        self._tiles = np.arange(self.frame.tile_count)
+
+    @property
+    def pose_set(self) -> PoseSet:
+        """The frame's poses."""
+        return self.frame.pose_set
+
+    def image(self, values: np.ndarray) -> np.ndarray:
+        return assemble(self.frame.render(np.asarray(values, np.float64)), self.frame.camera)
+
+    def sets(self, box: ParameterBox) -> tuple[tuple[np.ndarray, ...], np.ndarray, np.ndarray, np.ndarray]:
+        found = self.frame.bound(box, self._tiles, keep_linear=True)
+        assert found.linear is not None
+        whole = [assemble(part, self.frame.camera) for part in (*found.linear, found.lower, found.upper)]
+        return tuple(whole[:4]), whole[4], whole[5], found.slopes
+
+    @cached_property
+    def _differentiable(self) -> Callable[[torch.Tensor], torch.Tensor]:
+        found = self._method.differentiable(self.pose_set)
+        assert found is not None
+        return found
+
+    def differentiable(self, values: torch.Tensor) -> torch.Tensor:
+        return self._differentiable(values)
+
+
+class Question:
+    """A network and what is to hold of it.
+
+    Args:
+        model: Network, .onnx or .pt2.
+        source: What is to hold.
+
+    Raises:
+        InputError: A file or a field cannot be used.
+    """
+
+    def __init__(self, model: Path, source: PropertySource) -> None:
+        self.model, self.source = model, source
+        self.network = load_network(model)
+        shapes = self.network.input_shape, self.network.output_shape
+        try:
+            self.property: Property = parse_property(source.value, source.folder, *shapes)
+        except InputError as error:
+            raise source.within(error) from None
+        #: height and width of the network's pictures
+        self.size = self.property.preprocess.size(self.network.input_shape)
+
+    def drawn(self, poses: PoseSet) -> PoseSet:
+        """A set whose pictures have the size that the property asks for."""
+        return poses if self.property.preprocess.resize is None else resized(poses, *self.size)
+
+
+class Certification:
+    """An opened scene with sets of poses, a network and a property.
+
+    Args:
+        job: The scene and the sets, one by frame, as `Question.drawn` makes them.
+        question: The network and the property.
+        memory: Bytes for the network's bounds of one process.
+        origin: File that the sets come from, for errors.
+        network_arithmetic: Whether every float32 evaluation of the network is meant, or the exact one alone.
+
+    Raises:
+        InputError: The question does not go with the sets, or the platform's arithmetic is not sound.
+    """
+
+    def __init__(
+        self,
+        job: Job,
+        question: Question,
+        memory: int = MEMORY,
+        origin: Path | None = None,
+        network_arithmetic: NetworkArithmetic = "float32",
+    ) -> None:
+        self.job, self.question = job, question
+        self.network, self.property = question.network, question.property
+        if job.method.differentiable(job.pose_sets[0]) is None:
+            raise InputError(
+                f"certificates are for splats, this run is a {job.method.content}",
+                file=job.source.file,
+                fix="give a run of splatfacto or a .ply; ns-abstract-render bounds the pictures of a NeRF",
+            )
+        if any(poses.perturbation.scene for poses in job.pose_sets):
+            raise InputError("certificates are for sets of poses", file=origin, field="scene", fix="leave the key out")
+        camera, size = job.pose_sets[0].camera, question.size
+        if (camera.height, camera.width) != size:
+            raise InputError(
+                f"the camera path has {camera.width} x {camera.height} pixels, the network's input "
+                f"{size[1]} x {size[0]}",
+                file=question.source.file,
+                field="preprocess.resize",
+                fix=f"write [{size[0]}, {size[1]}]",
+            )
+        if problems := platform_problems():
+            raise InputError(
+                f"the platform's arithmetic failed the self-check ({problems[0]})",
+                fix="nothing can be certified here; use another machine",
+            )
+        self.model = NetworkModel(self.network, self.property.preprocess, memory, network_arithmetic)
+        self._searches: dict[tuple[int, Grid], Search] = {}
+
+    @property
+    def recipe(self) -> Recipe[Certification]:
+        """How another process opens it; files are looked for under the same paths."""
+        question = self.question
+        again = partial(
+            _open,
+            self.job.recipe.open,
+            question.model.absolute(),
+            question.source.absolute(),
+            self.model.memory,
+            self.model.arithmetic,
+        )
+        return Recipe(again, self.fingerprint, self.job.source.file)
+
+    @property
+    def parameters(self) -> list[tuple[str, str]]:
+        """Names and units of all frames' parameters, in the order of boxes."""
+        found: dict[str, str] = {}
+        for poses in sorted(self.job.pose_sets, key=lambda p: -p.box.dimensions):
+            found |= {n: u for n, u in zip(poses.box.names, poses.box.units, strict=True) if n not in found}
+        return list(found.items())
+
+    @property
+    def fixed(self) -> dict[int, dict[str, float]]:
+        """Values of parameters that do not vary, by frame."""
+        return {k: dict(poses.fixed) for k, poses in enumerate(self.job.pose_sets)}
+
+    @property
+    def fingerprint(self) -> dict[str, Any]:
+        """What a stored search must agree with to be continued."""
+        return self._fingerprint
+
+    @cached_property
+    def _fingerprint(self) -> dict[str, Any]:
+        prop = dict(self.question.source.value)
+        if "file" in prop:
+            prop["file"] = file_stamp(self.question.source.folder / prop["file"])["sha256"]
+        text = json.dumps(prop, sort_keys=True)
+        return {
+            **self.job.fingerprint,
+            "model": file_stamp(self.question.model)["sha256"],
+            "property": hashlib.sha256(text.encode()).hexdigest(),
+            "network_arithmetic": self.model.arithmetic,
+            "rules": _RULES,
+        }
+
+    def pictures(self, index: int) -> FramePictures:
+        """Frame ``index``, ready to be rendered and bounded."""
+        return FramePictures(self.job.method, self.job.pose_sets[index])
+
+    def claim(self, pictures: FramePictures) -> Claim:
+        """What is to hold in a frame.
+
+        Raises:
+            InputError: The property makes no sense there.
+        """
+
+        def nominal() -> np.ndarray:
+            return self.model.outputs(pictures.image(pictures.box.middle)[None])[0]
+
+        return self.property.bind(pictures.pose_set, nominal)
+
+    def grid(self, index: int) -> Grid:
+        """The cells of a frame whose search begins.
+
+        Raises:
+            InputError: The partition that was asked for does not fit the parameters.
+        """
+        pictures = self.pictures(index)
+        box = pictures.box
+        pixels = _MOTION_LINE if box.dimensions == 1 else _MOTION
+        coarse = coarse_parts(pictures.frame.motion(box), pixels)
+        if self.property.partitions is None:
+            return Grid.adaptive(box, coarse)
+        try:
+            return Grid.fixed(box, self.property.partitions, coarse)
+        except InputError as error:
+            raise self.question.source.within(error) from None
+
+    @cached_property
+    def block(self) -> int:
+        """Cells examined together: few where each takes long, so that little is lost and progress is seen."""
+        numbers = sum(math.prod(self.network.shape(k)) for k in range(len(self.network.nodes) + 1))
+        return max(1, min(BLOCK, _BLOCK_NUMBERS // numbers))
+
+    def first_blocks(self, grid: Grid) -> list[list[Cell]]:
+        """What a frame's search begins with."""
+        roots = grid.roots()
+        ends = [0, *itertools.accumulate(size for size in _FIRST_BLOCKS if size < self.block)]
+        ends += range(ends[-1] + self.block, len(roots) + self.block, self.block)
+        return [roots[a:b] for a, b in itertools.pairwise(ends) if a < len(roots)]
+
+    def search(self, index: int, grid: Grid) -> Search:
+        """The search of a frame; kept at hand."""
+        key = (index, grid)
+        if key not in self._searches:
+            while len(self._searches) >= _KEPT:
+                self._searches.pop(next(iter(self._searches)))
+            pictures = self.pictures(index)
+            every_unit = self.property.partitions is not None
+            self._searches[key] = Search(
+                pictures, self.model, self.claim(pictures), grid, every_unit=every_unit, block=self.block
+            )
+        return self._searches[key]
+
+    def write_vnnlib(self, index: int, box: ParameterBox, target: Path, form: Form) -> tuple[Path, Path]:
+        """Write the abstract image of a cell, the network and the property for other verifiers.
+
+        Args:
+            index: Entry of the camera path.
+            box: The cell.
+            target: Path without ending.
+            form: As in `ns_abstract.verify.interop.write_vnnlib`.
+
+        Returns:
+            The .onnx and the .vnnlib file.
+
+        Raises:
+            InputError: The property is not linear in the outputs, or the network cannot be extended.
+        """
+        from ns_abstract.verify.interop import write_vnnlib
+
+        pictures = self.pictures(index)
+        claim = self.claim(pictures)
+        if not isinstance(claim, LinearClaim):
+            raise InputError(
+                "is not linear in the network's outputs",
+                file=self.question.source.file,
+                field="type",
+                fix="give a property of type classification or vnnlib",
+            )
+        linear, lower, upper, _ = pictures.sets(box)
+        images = parametric(self.model.input_sets(tuple(part[None] for part in linear), lower[None], upper[None]))
+        return write_vnnlib(self.question.model, images, claim.rows, claim.offset, target, form, claim.groups)
+
+    def partitions(self, grid: Grid) -> int | None:
+        """Number of parts of the fixed partition, if there is one."""
+        return math.prod(grid.units) if self.property.partitions is not None else None
+
+
+def _open(
+    open_job: Callable[[], Job], model: Path, source: PropertySource, memory: int, arithmetic: NetworkArithmetic
+) -> Certification:
+    return Certification(open_job(), Question(model, source), memory, network_arithmetic=arithmetic)
+
+
+def examine_block(recipe: Recipe[Certification], index: int, grid: Grid, cells: tuple[Cell, ...]) -> Findings:
+    """Examine one block on a worker, which opens the files once and keeps them.
+
+    Raises:
+        InputError: The worker reads other files under the same names than the command did.
+    """
+    return examine_here(opened(recipe), index, grid, cells)
+
+
+def examine_here(job: Certification, index: int, grid: Grid, cells: tuple[Cell, ...]) -> Findings:
+    """Examine one block in this process."""
+    import numba
+
+    # as many workers as cores; more threads would only wait for each other
+    numba.set_num_threads(1)
+    torch.set_num_threads(1)
+    return job.search(index, grid).examine(cells)
+
+
+@dataclass(frozen=True)
+class CertifySettings:
+    """What to certify, as the command line says it.
+
+    Attributes:
+        load_config: config.yml of a Splatfacto run, or a standard 3DGS .ply.
+        camera_path_filename: Camera path JSON.
+        model: Network, .onnx or .pt2.
+        property: PROP.json.
+        perturbation_filename: Perturbation JSON; None: the camera path holds it.
+        renderer: "gsplat" or "paper"; None: gsplat.
+        gsplat_version: Of gsplat's rules; None: 1.4.0.
+        arithmetic: "float32" or "real"; None: float32.
+        network_arithmetic: The same of the network.
+        memory: Bytes for the bounds of one process.
+    """
+
+    load_config: Path
+    camera_path_filename: Path
+    model: Path
+    property: Path
+    perturbation_filename: Path | None = None
+    renderer: str | None = None
+    gsplat_version: str | None = None
+    arithmetic: str | None = None
+    network_arithmetic: NetworkArithmetic = "float32"
+    memory: int = MEMORY
+
+
+def open_certification(settings: CertifySettings) -> Certification:
+    """Open the files of a command line.
+
+    Raises:
+        InputError: A file or a field cannot be used.
+    """
+    question = Question(settings.model, PropertySource.of(settings.property))
+    files = Settings(
+        settings.load_config,
+        settings.camera_path_filename,
+        settings.perturbation_filename,
+        renderer=settings.renderer,
+        gsplat_version=settings.gsplat_version,
+        arithmetic=settings.arithmetic,
+    )
+    path = load_camera_path(files.camera_path_filename)
+    scene = files.scene.open()
+    sets = [question.drawn(poses) for poses in path_sets(files, scene, path, default=Perturbation())]
+    origin = settings.perturbation_filename or settings.camera_path_filename
+    try:
+        job = Job(scene, sets, arithmetic=settings.arithmetic)
+    except InputError as error:
+        raise error.within(origin) if error.field and not error.field.startswith("--") else error from None
+    return Certification(job, question, settings.memory, origin, settings.network_arithmetic)

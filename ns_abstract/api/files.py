@@ -1,0 +1,171 @@
+"""From the files that a command line names to a job."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from ns_abstract.api.job import Job
+from ns_abstract.api.scenes import Scene, SceneSource
+from ns_abstract.geometry.camera_path import CameraPath, load_camera_path
+from ns_abstract.geometry.poses import PoseSet
+from ns_abstract.io.errors import InputError
+from ns_abstract.methods.representation import ProgramOptions
+from ns_abstract.perturbation.specification import Perturbation, load_perturbation, parse_perturbation
+
+
+@dataclass(frozen=True)
+class Settings:
+    """What to bound, as the command line says it.
+
+    Attributes:
+        load_config: config.yml of a run, or a standard 3DGS .ply.
+        camera_path_filename: Camera path JSON.
+        perturbation_filename: Perturbation JSON; None: the camera path holds it.
+        downscale_factor: Pictures become this many times smaller.
+        renderer: "gsplat" or "paper"; None: what the method's own renderer is.
+        gsplat_version: Of the splats' rules; None: 1.4.0.
+        arithmetic: "float32" or "real"; None: the strongest that the method has.
+        seed: Of the random witnesses.
+        memory_limit: GiB.
+        workers: Processes that bound the rays of a NeRF.
+        occupancy_grid: File of a grid that is declared as part of a NeRF.
+        sampling, num_samples, near_plane: Of the rays of a NeRF; None: the method's own.
+    """
+
+    load_config: Path
+    camera_path_filename: Path
+    perturbation_filename: Path | None = None
+    downscale_factor: float = 1.0
+    renderer: str | None = None
+    gsplat_version: str | None = None
+    arithmetic: str | None = None
+    seed: int = 0
+    memory_limit: float | None = None
+    sampling: str | None = None
+    num_samples: int | None = None
+    near_plane: float | None = None
+    occupancy_grid: Path | None = None
+    workers: int = 1
+
+    @property
+    def scene(self) -> SceneSource:
+        """The scene and the program that draws it."""
+        options = ProgramOptions(
+            self.renderer, self.sampling, self.num_samples, self.near_plane, self.occupancy_grid, self.gsplat_version
+        )
+        return SceneSource(self.load_config, options)
+
+
+class PathJob(Job):
+    """The job of a camera path.
+
+    Attributes:
+        path: The camera path.
+        settings: The files and options.
+    """
+
+    def __init__(self, settings: Settings, scene: Scene, path: CameraPath, pose_sets: tuple[PoseSet, ...]) -> None:
+        self.settings, self.path = settings, path
+        try:
+            super().__init__(
+                scene,
+                pose_sets,
+                arithmetic=settings.arithmetic,
+                seed=settings.seed,
+                memory_limit=settings.memory_limit,
+                workers=settings.workers,
+            )
+        except InputError as error:
+            # options have no file
+            named = error.field is not None and not error.field.startswith("--")
+            raise error.within(settings.perturbation_filename or path.source) if named else error from None
+
+    def pose_set(self, index: int, perturbation: Perturbation) -> PoseSet:
+        """The poses of ``perturbation`` around entry ``index`` of the path.
+
+        Raises:
+            InputError: The path cannot be swept as asked.
+        """
+        return pose_set(self.path, index, perturbation)
+
+
+def pose_set(path: CameraPath, index: int, perturbation: Perturbation) -> PoseSet:
+    """The poses of ``perturbation`` around entry ``index`` of a path.
+
+    Raises:
+        InputError: The path cannot be swept as asked.
+    """
+    try:
+        return PoseSet.around(path.cameras[index], perturbation, path.following(index))
+    except InputError as error:
+        raise error.within(path.source) from None
+
+
+def open_job(
+    settings: Settings, perturbation: Perturbation | None = None, default: Perturbation | None = None
+) -> PathJob:
+    """Open the files of a command line.
+
+    Args:
+        settings: What to bound.
+        perturbation: For every entry of the path, in place of what the files say.
+        default: For entries of which the files say nothing; without it they are an error.
+
+    Raises:
+        InputError: A file, a field or an option cannot be used.
+    """
+    path = load_camera_path(settings.camera_path_filename, settings.downscale_factor)
+    scene = settings.scene.open()
+    # a set that cannot be made is found before hours of work
+    return PathJob(settings, scene, path, path_sets(settings, scene, path, perturbation, default))
+
+
+def path_sets(
+    settings: Settings,
+    scene: Scene,
+    path: CameraPath,
+    perturbation: Perturbation | None = None,
+    default: Perturbation | None = None,
+) -> tuple[PoseSet, ...]:
+    """The sets of poses of a path's entries; arguments and errors as for `open_job`."""
+    found = (perturbation,) * len(path.cameras)
+    if perturbation is None:
+        found = _perturbations(settings, scene.method(settings.arithmetic).dataset_scale, path, default)
+    return tuple(pose_set(path, k, entry) for k, entry in enumerate(found) if entry is not None)
+
+
+def _perturbations(
+    settings: Settings, scale: float, path: CameraPath, default: Perturbation | None
+) -> tuple[Perturbation, ...]:
+    file = settings.perturbation_filename
+    if file is not None:
+        return (load_perturbation(file, dataset_scale=scale),) * len(path.cameras)
+    found, folder = [], Path(path.source).parent
+    for k, value in enumerate(path.perturbations):
+        if value is None and default is not None:
+            found.append(default)
+            continue
+        if value is None:
+            raise InputError(
+                f"no perturbation for entry {k}",
+                file=path.source,
+                field="perturbation",
+                fix='add the key "perturbation" or give --perturbation-filename',
+            )
+        prefix = "perturbation." if path.overrides[k] is None else f"camera_path[{k}].perturbation."
+        try:
+            found.append(parse_perturbation(value, dataset_scale=scale, field_prefix=prefix, folder=folder))
+        except InputError as error:
+            raise error.within(path.source) from None
+    return tuple(found)
+
+
+def resized(poses: PoseSet, height: int, width: int) -> PoseSet:
+    """The same poses with pictures of another size; see `Camera.resized`."""
+    target = poses.target_camera
+    return replace(
+        poses,
+        camera=poses.camera.resized(height, width),
+        target_camera=None if target is None else target.resized(height, width),
+    )

@@ -1,0 +1,224 @@
+"""A scene with its sets of poses, ready to be bounded frame by frame."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from functools import cached_property, partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ns_abstract.api.scenes import Scene, SceneSource
+from ns_abstract.execution.opening import Recipe
+from ns_abstract.geometry.poses import PoseSet
+from ns_abstract.io.errors import InputError
+from ns_abstract.methods.runs import available_memory
+from ns_abstract.refine.engine import Goal, Refinement
+from ns_abstract.refine.protocol import Frame, Method
+from ns_abstract.refine.result import FrameResult, PartResult, TracePoint, joined
+
+#: GiB beyond which a limit is none.
+MOST_MEMORY = 2.0**20
+#: Bytes for leaves below which nothing can be done.
+_LEAST_LEAF_BYTES = 64 << 20
+
+
+class Job:
+    """A scene and its frames' sets of poses.
+
+    Args:
+        scene: The scene.
+        pose_sets: One by frame.
+        arithmetic: "float32" or "real"; None: the strongest that the scene has.
+        seed: Of the random witnesses.
+        memory_limit: GiB; None: 80 % of what is free.
+        workers: Processes that one frame may use.
+
+    Raises:
+        InputError: The scene does not vary as asked, or the memory does not do.
+    """
+
+    def __init__(
+        self,
+        scene: Scene,
+        pose_sets: Sequence[PoseSet],
+        *,
+        arithmetic: str | None = None,
+        seed: int = 0,
+        memory_limit: float | None = None,
+        workers: int = 1,
+    ) -> None:
+        self.source, self._arithmetic = scene.source, arithmetic
+        self.method: Method = scene.method(arithmetic, workers)
+        self.pose_sets, self.seed, self.memory_limit = tuple(pose_sets), seed, memory_limit
+        self._warm: set[int] = set()
+        self.method.prepare([poses.perturbation for poses in self.pose_sets])
+        self._check_memory()
+
+    @property
+    def frame_count(self) -> int:
+        """Number of sets."""
+        return len(self.pose_sets)
+
+    @property
+    def recipe(self) -> Recipe[Job]:
+        """How another process opens this job; files are looked for under the same paths."""
+        options = self.source.options
+        grid = None if options.occupancy_grid is None else options.occupancy_grid.absolute()
+        source = SceneSource(self.source.file.absolute(), replace(options, occupancy_grid=grid))
+        again = partial(_open, source, self.pose_sets, self._arithmetic, self.seed, self.memory_limit)
+        return Recipe(again, self.fingerprint, Path(self.source.file))
+
+    # ---------------------------------------------------------------- memory
+
+    @property
+    def memory(self) -> int:
+        """Bytes this job may use."""
+        if self.memory_limit is not None:
+            return int(min(self.memory_limit, MOST_MEMORY) * 2**30)
+        free = available_memory()
+        return int(0.8 * free) if free is not None else 8 << 30
+
+    @property
+    def base_memory(self) -> int:
+        """Bytes that a process needs beside the leaves."""
+        return self.method.memory(max(poses.camera.width * poses.camera.height for poses in self.pose_sets))
+
+    def _check_memory(self) -> None:
+        limit = self.memory_limit
+        if limit is not None and not 0.0 < limit < float("inf"):
+            raise InputError(f"found {limit}", field="--memory-limit", fix="give a positive number of GiB")
+        if self.base_memory > self.memory:
+            raise InputError(
+                f"{self.method.content} at this size needs {self.base_memory / 2**30:.1f} GiB, "
+                f"{self.memory / 2**30:.1f} GiB may be used",
+                field="--memory-limit",
+                fix="raise it, or raise --downscale-factor",
+            )
+
+    def leaf_bytes(self, processes: int) -> int:
+        """Bytes for the leaves that ``processes`` on one machine may have together."""
+        return max(processes * _LEAST_LEAF_BYTES, (self.memory - processes * self.base_memory) // 2)
+
+    # ---------------------------------------------------------------- frames
+
+    def goal(self, ratio: float, seconds: float, cells: int | None = None) -> Goal:
+        """The goal with the memory that is left for leaves."""
+        return Goal(ratio, seconds, cells, self.leaf_bytes(1))
+
+    def frame(self, index: int, slanted: bool = False) -> Frame:
+        """Frame ``index``, ready for refinement; see `Method.frame`."""
+        return self.method.frame(self.pose_sets[index], slanted)
+
+    def warm_up(self, index: int) -> None:
+        """Compile the kernels that frame ``index`` needs, so that its clock measures bounding alone."""
+        if index not in self._warm:
+            self.frame(index).warm_up()
+            self._warm.add(index)
+
+    def bound(
+        self,
+        index: int,
+        goal: Goal,
+        *,
+        keep_leaves: bool = False,
+        stopped: Callable[[], bool] = lambda: False,
+        progress: Callable[[TracePoint, float], None] = lambda point, share: None,
+    ) -> FrameResult:
+        """Refine frame ``index``."""
+        return self.joined([self.bound_part(index, goal, keep_leaves=keep_leaves, stopped=stopped, progress=progress)])
+
+    def bound_part(
+        self,
+        index: int,
+        goal: Goal,
+        tiles: np.ndarray | None = None,
+        *,
+        keep_leaves: bool = False,
+        stopped: Callable[[], bool] = lambda: False,
+        progress: Callable[[TracePoint, float], None] = lambda point, share: None,
+    ) -> PartResult:
+        """Refine some tiles of frame ``index``, or all of them."""
+        # kept leaves are boxes of the set's parameters
+        frame = self.frame(index, slanted=not keep_leaves)
+        refinement = Refinement(
+            frame, index, goal, seed=self.seed, keep_leaves=keep_leaves, stopped=stopped, progress=progress,
+            members=frame.members(self.seed), tiles=tiles,
+        )  # fmt: skip
+        return refinement.run_part()
+
+    def joined(self, parts: Sequence[PartResult]) -> FrameResult:
+        """The frame that parts make up, with what was left out for it.
+
+        Raises:
+            ValueError: Tiles are missing or there twice.
+        """
+        frame = self.frame(parts[0].index)
+        result = replace(joined(parts, frame.camera), box=self.pose_sets[parts[0].index].box)
+        shown = [part.shown for part in parts]
+        known = [numbers for numbers in shown if numbers is not None]
+        count = int(np.unique(np.concatenate(known)).size) if len(known) == len(shown) else None
+        plan = frame.plan(count, result.lower, result.upper)
+        floor = max(part.floor for part in parts)
+        if floor > 0.0:
+            plan.append(
+                f"dim light: layers that at most {floor:.2%} of the light comes to are left out of the first cells, "
+                "and bounded by the range of their colours"
+            )
+        if len(parts) > 1:
+            plan.append(
+                f"bounded in {len(parts)} groups of tiles side by side: cells are the sum of theirs, seconds those of "
+                "the slowest"
+            )
+        return replace(result, plan=tuple(plan))
+
+    # ---------------------------------------------------------------- reports
+
+    @property
+    def plan(self) -> tuple[str, ...]:
+        """What is left out for this scene, whatever the frame."""
+        return self.method.plan
+
+    @property
+    def fingerprint(self) -> dict[str, Any]:
+        """What a stored result must agree with to be continued."""
+        return self._fingerprint
+
+    @cached_property
+    def _fingerprint(self) -> dict[str, Any]:
+        sets = hashlib.sha256()
+        for poses in self.pose_sets:
+            camera = poses.camera
+            sets.update(np.ascontiguousarray(camera.camera_to_world).tobytes())
+            sets.update(repr((camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height)).encode())
+            sets.update(repr((poses.perturbation, poses.box, sorted(poses.fixed.items()))).encode())
+            if poses.perturbation.scene:
+                sets.update(repr(poses.perturbation.scene).encode())
+        return {**self.method.fingerprint, "poses": sets.hexdigest()}
+
+    def describe(self) -> dict[str, Any]:
+        """The scene for reports."""
+        return self.method.describe()
+
+
+def _open(
+    source: SceneSource, pose_sets: tuple[PoseSet, ...], arithmetic: str | None, seed: int, memory_limit: float | None
+) -> Job:
+    return Job(source.open(), pose_sets, arithmetic=arithmetic, seed=seed, memory_limit=memory_limit)
+
+
+def check_frames(frames: Sequence[int] | None, count: int) -> tuple[int, ...]:
+    """The frames asked for, each once, in order.
+
+    Raises:
+        InputError: A number is not an entry of the path.
+    """
+    if not frames:
+        return tuple(range(count))
+    for frame in frames:
+        if not 0 <= frame < count:
+            raise InputError(f"found {frame}", field="--frames", fix=f"the camera path has entries 0 to {count - 1}")
+    return tuple(sorted(set(frames)))

@@ -1,0 +1,170 @@
+"""Cameras and sets of poses, as the Python interface takes them."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from ns_abstract.api.scenes import Scene
+from ns_abstract.geometry import poses
+from ns_abstract.geometry.camera_path import Camera as PinholeCamera
+from ns_abstract.geometry.camera_path import checked_pose, checked_side, focal_length
+from ns_abstract.io.errors import InputError
+from ns_abstract.perturbation.specification import Perturbation, parse_perturbation
+
+Limit = float | Sequence[float]
+
+
+class Camera(PinholeCamera):
+    """A camera with square pixels that looks at the middle of its picture.
+
+    Args:
+        camera_to_world: [4, 4] or [3, 4], OpenGL axes (x right, y up, z back), in the normalised frame of the run.
+        fov: Vertical field of view, degrees.
+        width: Pixels.
+        height: Pixels.
+
+    Raises:
+        InputError: A value cannot be used.
+    """
+
+    def __init__(self, camera_to_world: ArrayLike, fov: float = 45.0, width: int = 100, height: int = 100) -> None:
+        matrix = np.asarray(camera_to_world, np.float64)
+        if matrix.shape == (3, 4):
+            matrix = np.concatenate([matrix, [[0.0, 0.0, 0.0, 1.0]]])
+        pose = checked_pose(matrix.tolist(), "camera_to_world")
+        across, down = checked_side(width, "width"), checked_side(height, "height")
+        focal = focal_length(fov, down, "fov")
+        super().__init__(pose, focal, focal, 0.5 * across, 0.5 * down, across, down)
+
+
+def _ranges(given: Mapping[str, Limit] | None) -> dict[str, Any]:
+    """Ranges as a perturbation file says them: numpy's numbers and tuples become JSON's."""
+    return {
+        name: [float(end) for end in limit] if isinstance(limit, (Sequence, np.ndarray)) else float(limit)
+        for name, limit in (given or {}).items()
+    }
+
+
+@dataclass(frozen=True, init=False, eq=False)
+class PoseSet:
+    """A camera and what may vary around it.
+
+    Args:
+        camera: The camera; the first keyframe of a segment.
+        translation: Ranges of x, y and z by name: a number r for [-r, r], or (low, high).
+        rotation: Ranges of yaw, pitch and roll in radians, likewise.
+        frame: Axes of the translation: "camera" (x right, y up, z back) or "world".
+        units: Of the translation: "normalised" (the run's frame) or "dataset" (those of transforms.json).
+        orbit: ``{"target": [x, y, z], "axis": [x, y, z], "azimuth": (low, high)}``.
+        following: The next keyframe: the pose also moves continuously from ``camera`` to it.
+
+    Attributes:
+        camera: The camera.
+        specification: All of it as the object of a perturbation file.
+        following: The next keyframe, or None.
+        folder: Where the specification's index files lie, or None.
+
+    Raises:
+        InputError: A key is unknown, an interval is reversed or a number is not finite.
+    """
+
+    camera: PinholeCamera
+    specification: Mapping[str, Any]
+    following: PinholeCamera | None
+    folder: Path | None
+
+    def __init__(
+        self,
+        camera: PinholeCamera,
+        translation: Mapping[str, Limit] | None = None,
+        rotation: Mapping[str, Limit] | None = None,
+        frame: str = "camera",
+        *,
+        units: str = "normalised",
+        orbit: Mapping[str, Any] | None = None,
+        following: PinholeCamera | None = None,
+    ) -> None:
+        value: dict[str, Any] = {
+            "version": 1,
+            "frame": frame,
+            "units": units,
+            "translation": _ranges(translation),
+            "rotation": _ranges(rotation),
+        }
+        if orbit is not None:
+            value["orbit"] = {key: np.asarray(entry, np.float64).tolist() for key, entry in orbit.items()}
+        if following is not None:
+            value["sweep"] = "segments"
+        self._fill(camera, value, following, None)
+
+    @classmethod
+    def from_json(
+        cls,
+        camera: PinholeCamera,
+        specification: Mapping[str, Any] | None,
+        *,
+        following: PinholeCamera | None = None,
+        folder: str | os.PathLike[str] | None = None,
+    ) -> PoseSet:
+        """The set of an object as it stands in a perturbation file; all that the file can say.
+
+        Args:
+            camera: The camera.
+            specification: The object; None: the camera's pose alone.
+            following: The next keyframe, for ``"sweep": "segments"``.
+            folder: Where index files of a selection lie; None: the working directory.
+
+        Raises:
+            InputError: The object cannot be used.
+        """
+        self = cls.__new__(cls)
+        self._fill(camera, {} if specification is None else specification, following, folder)
+        return self
+
+    def _fill(
+        self,
+        camera: PinholeCamera,
+        value: Mapping[str, Any],
+        following: PinholeCamera | None,
+        folder: str | os.PathLike[str] | None,
+    ) -> None:
+        if not isinstance(camera, PinholeCamera):
+            raise InputError(f"found {type(camera).__name__}", field="camera", fix="give an ns_abstract.Camera")
+        found = {
+            "camera": camera,
+            "specification": dict(value) if isinstance(value, Mapping) else value,
+            "following": following,
+            "folder": None if folder is None else Path(folder),
+        }
+        for name, entry in found.items():
+            object.__setattr__(self, name, entry)
+        # what is wrong is told where it is written
+        self.perturbation()
+
+    def perturbation(self, dataset_scale: float = 1.0) -> Perturbation:
+        """What varies, in normalised units.
+
+        Args:
+            dataset_scale: Normalised units per unit of the data set.
+        """
+        return parse_perturbation(self.specification, dataset_scale=dataset_scale, field_prefix="", folder=self.folder)
+
+    def of(self, scene: Scene) -> poses.PoseSet:
+        """The set for a scene, whose units it may be stated in.
+
+        Raises:
+            InputError: The set cannot be made.
+        """
+        return poses.PoseSet.around(self.camera, self.perturbation(scene.method().dataset_scale), self.following)
+
+    @property
+    def parameters(self) -> tuple[str, ...]:
+        """Names of what varies, in the order of cells; scene variations are not among them."""
+        return poses.PoseSet.around(self.camera, self.perturbation(), self.following).box.names

@@ -1,0 +1,138 @@
+"""Scenes, as the Python interface and the command lines open them."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass, field
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+
+from ns_abstract.arithmetic.selfcheck import check_functions
+from ns_abstract.geometry.camera_path import Camera
+from ns_abstract.geometry.poses import PoseSet
+from ns_abstract.geometry.tiles import assemble
+from ns_abstract.io.errors import InputError
+from ns_abstract.methods.load import open_scene
+from ns_abstract.methods.representation import ProgramOptions
+from ns_abstract.perturbation.specification import Perturbation
+from ns_abstract.refine.protocol import Method
+
+
+@cache
+def platform_problems() -> tuple[str, ...]:
+    """What is wrong with this machine's arithmetic, one sentence each; with any, nothing is guaranteed."""
+    return tuple(check_functions())
+
+
+@dataclass(frozen=True)
+class SceneSource:
+    """Where a scene is read from.
+
+    Attributes:
+        file: config.yml of a run, or a .ply.
+        options: Which program draws it.
+    """
+
+    file: Path
+    options: ProgramOptions = field(default_factory=ProgramOptions)
+
+    def open(self) -> Scene:
+        """Read it.
+
+        Raises:
+            InputError: A file or an option cannot be used.
+        """
+        return Scene(self)
+
+
+class Scene:
+    """A trained scene and the program that draws it.
+
+    Args:
+        source: Where it is read from.
+
+    Raises:
+        InputError: A file or an option cannot be used.
+    """
+
+    def __init__(self, source: SceneSource) -> None:
+        self.source = source
+        self._representation, self._content = open_scene(source.file)
+        self._methods: dict[tuple[str | None, int], Method] = {}
+
+    def method(self, arithmetic: str | None = None, workers: int = 1) -> Method:
+        """The bounded program.
+
+        Args:
+            arithmetic: "float32" or "real"; None: the strongest that the representation has.
+            workers: Processes that it may use.
+
+        Raises:
+            InputError: An option does not go with the scene.
+        """
+        if arithmetic not in (None, "float32", "real"):
+            raise InputError(f"found {arithmetic}", field="--arithmetic", fix="use float32 or real")
+        key = arithmetic, workers
+        if key not in self._methods:
+            self._methods[key] = self._representation.method(self._content, self.source.options, arithmetic, workers)
+        return self._methods[key]
+
+    @property
+    def name(self) -> str:
+        """The scene's name."""
+        return self.method().name
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What was assumed on reading it, one sentence each."""
+        return tuple(self.method().notes)
+
+    def __repr__(self) -> str:
+        method = self.method()
+        return f"<Scene {self.name}: {method.content}, {method.program['name']} {method.program['version']}>"
+
+
+def load_scene(
+    path: str | os.PathLike[str],
+    *,
+    renderer: str | None = None,
+    sampling: str | None = None,
+    num_samples: int | None = None,
+    near_plane: float | None = None,
+    occupancy_grid: str | os.PathLike[str] | None = None,
+    gsplat_version: str | None = None,
+) -> Scene:
+    """Read a scene; nothing in the files is executed.
+
+    Args:
+        path: ``config.yml`` of a Splatfacto or vanilla-nerf run, or a standard 3DGS ``.ply``.
+        renderer: "gsplat" (what Nerfstudio shows of splats; their default) or "paper" (Algorithm 1 or 2 of "Abstract
+            Rendering").
+        sampling: NeRF: "uniform" (default) or "hierarchical".
+        num_samples: NeRF: bins of every ray; 64.
+        near_plane: NeRF: start of the rays in normalised units; 0.
+        occupancy_grid: NeRF: a grid outside of which the field is declared empty.
+        gsplat_version: Splats: whose rules are bounded, "1.4.0" (default), "1.5.3" or "1.6.0".
+
+    Raises:
+        InputError: A file or an option cannot be used.
+    """
+    grid = None if occupancy_grid is None else Path(occupancy_grid)
+    scene = SceneSource(
+        Path(path), ProgramOptions(renderer, sampling, num_samples, near_plane, grid, gsplat_version)
+    ).open()
+    # options that do not go with the scene are told at once
+    scene.method()
+    return scene
+
+
+def render(scene: Scene, camera: Camera) -> np.ndarray:
+    """The picture of one camera, float64 [H, W, 3] in [0, 1], of float32 precision: what `bound` encloses.
+
+    Raises:
+        InputError: The camera cannot be used.
+    """
+    frame = scene.method().frame(PoseSet.around(camera, Perturbation()))
+    return assemble(frame.render(frame.box.middle), frame.camera).astype(np.float64)

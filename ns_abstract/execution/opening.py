@@ -1,0 +1,96 @@
+"""What worker processes keep open between tasks."""
+
+from __future__ import annotations
+
+import hashlib
+import pickle
+import threading
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any, Generic, Protocol, TypeVar
+
+from ns_abstract.io.errors import InputError
+
+
+class Fingerprinted(Protocol):
+    """What is opened from files."""
+
+    @property
+    def fingerprint(self) -> Mapping[str, Any]:
+        """What tells its content from any other."""
+        ...
+
+
+T = TypeVar("T")
+F = TypeVar("F", bound=Fingerprinted)
+
+
+class Kept(Generic[T]):
+    """The thing that was made last, for as long as the same one is asked for."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._held: tuple[object, T] | None = None
+
+    def get(self, key: object, make: Callable[[], T]) -> T:
+        """The thing of ``key``, made if it is not at hand; what was there before is given up first."""
+        with self._lock:
+            if self._held is None or self._held[0] != key:
+                self._held = None
+                self._held = key, make()
+            return self._held[1]
+
+    def clear(self) -> None:
+        """Give up what is kept."""
+        with self._lock:
+            self._held = None
+
+
+@dataclass(frozen=True)
+class Recipe(Generic[F]):
+    """How another process opens what this one has opened.
+
+    Attributes:
+        open: Opens it again; can be pickled.
+        fingerprint: Of what was opened here.
+        file: Named by the error where the other process finds something else.
+    """
+
+    open: Callable[[], F]
+    fingerprint: Mapping[str, Any]
+    file: Path
+
+    @cached_property
+    def key(self) -> bytes:
+        """Equal for equal recipes."""
+        return hashlib.sha256(pickle.dumps((self.open, self.fingerprint))).digest()
+
+
+_kept: Kept[Any] = Kept()
+
+
+def opened(recipe: Recipe[F]) -> F:
+    """What the recipe describes, opened once in this process.
+
+    Raises:
+        InputError: This process reads other files under the same names than the one that asks.
+    """
+
+    def make() -> F:
+        found = recipe.open()
+        if found.fingerprint != recipe.fingerprint:
+            raise InputError(
+                "the worker finds other content than this machine",
+                file=recipe.file,
+                fix="give the workers the same files under the same paths",
+            )
+        return found
+
+    return _kept.get(recipe.key, make)
+
+
+def forget() -> None:
+    """Close what this process keeps open."""
+    _kept.clear()

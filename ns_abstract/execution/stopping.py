@@ -1,0 +1,73 @@
+"""Requests to stop: by a signal, or by whoever started the work."""
+
+from __future__ import annotations
+
+import signal
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from types import FrameType
+
+
+class StopRequest:
+    """A request to stop that is asked for between pieces of work; a second signal stops at once."""
+
+    def __init__(self) -> None:
+        self.signal: int | None = None
+        self._asked = False
+        self._raising = 0
+
+    def __call__(self) -> bool:
+        return self._asked
+
+    def ask(self) -> None:
+        """Ask for it."""
+        self._asked = True
+
+    @contextmanager
+    def at_once(self) -> Iterator[None]:
+        """Inside the block there is nothing to save: the first signal ends it.
+
+        Raises:
+            KeyboardInterrupt: A signal came, or had come before.
+        """
+        self._raising += 1
+        try:
+            if self.signal is not None:
+                raise KeyboardInterrupt
+            yield
+        finally:
+            self._raising -= 1
+
+    def handle(self, number: int, frame: FrameType | None) -> None:
+        """Handle a signal: take it as a request, or end the work where it is."""
+        again, self.signal = self.signal is not None, number
+        self._asked = True
+        if again or self._raising:
+            raise KeyboardInterrupt
+
+    @contextmanager
+    def handling(self, *numbers: int) -> Iterator[None]:
+        """Handle the signals inside the block."""
+        before = {number: signal.signal(number, self.handle) for number in numbers}
+        try:
+            yield
+        finally:
+            for number, handler in before.items():
+                signal.signal(number, handler)
+
+
+@contextmanager
+def interruptible() -> Iterator[StopRequest]:
+    """A request that Ctrl-C makes where Python's own handler would raise KeyboardInterrupt.
+
+    So the work ends between two cells, with results that are whole. Elsewhere (other threads, programs that handle the
+    signal themselves) signals are left alone.
+    """
+    stop = StopRequest()
+    main = threading.current_thread() is threading.main_thread()
+    if main and signal.getsignal(signal.SIGINT) is signal.default_int_handler:
+        with stop.handling(signal.SIGINT):
+            yield stop
+    else:
+        yield stop

@@ -1,0 +1,324 @@
+"""Camera paths as Nerfstudio's viewer writes them."""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ns_abstract.io.errors import InputError
+from ns_abstract.io.jsonio import is_number, load_json, show
+
+SIDE_LIMIT = 16384
+_ROTATION_TOLERANCE = 1e-3
+_LAST_ROW_TOLERANCE = 1e-6
+_FIX_FILE = "give the camera path that Nerfstudio's viewer saved"
+
+
+class Intrinsics(NamedTuple):
+    """What kernels need of a camera: focal lengths, principal point and picture size, pixels."""
+
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    width: float
+    height: float
+
+
+@dataclass(frozen=True, eq=False)
+class Camera:
+    """A pinhole camera.
+
+    Attributes:
+        camera_to_world: [3, 4] float64, read-only, OpenGL axes (x right, y up, z back), in the
+            normalised frame of the run. The rotation is kept as written: it is orthonormal
+            within 1e-3.
+        fx: Focal length, pixels.
+        fy: Focal length, pixels.
+        cx: Principal point from the left edge, pixels.
+        cy: Principal point from the top edge, pixels.
+        width: Image width, pixels.
+        height: Image height, pixels.
+    """
+
+    camera_to_world: NDArray[np.float64]
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    width: int
+    height: int
+
+    @property
+    def intrinsics(self) -> Intrinsics:
+        """The camera without its pose."""
+        return Intrinsics(self.fx, self.fy, self.cx, self.cy, float(self.width), float(self.height))
+
+    def rescaled(self, downscale_factor: float) -> Camera:
+        """The camera of an image ``downscale_factor`` times smaller; sides are rounded down.
+
+        Uses the arithmetic of nerfstudio's ``Cameras.rescale_output_resolution``, which holds
+        the factor and the principal point in float32, so that sizes agree with ns-render.
+
+        Raises:
+            InputError: The factor is not a positive finite number, or a side leaves 1..16384.
+        """
+        field = "--downscale-factor"
+        if not is_number(downscale_factor) or not downscale_factor > 0:
+            raise InputError(f"found {show(downscale_factor)}", field=field, fix="give a number above 0")
+        if downscale_factor == 1:
+            return self
+        with np.errstate(over="ignore", under="ignore"):
+            scale = np.float32(1.0 / float(downscale_factor))
+            sides = [float(np.float32(side) * scale) for side in (self.width, self.height)]
+        if not all(1 <= side < SIDE_LIMIT + 1 for side in sides):
+            raise InputError(
+                f"factor {show(downscale_factor)} turns {self.width}x{self.height} pixels into an image"
+                f" outside 1..{SIDE_LIMIT}",
+                field=field,
+                fix=f"give a factor from {max(self.width, self.height) / SIDE_LIMIT:.3g}"
+                f" to {min(self.width, self.height)}",
+            )
+        return Camera(
+            camera_to_world=self.camera_to_world,
+            fx=self.fx * float(scale),
+            fy=self.fy * float(scale),
+            cx=float(np.float32(self.cx) * scale),
+            cy=float(np.float32(self.cy) * scale),
+            width=int(sides[0]),
+            height=int(sides[1]),
+        )
+
+    def resized(self, height: int, width: int) -> Camera:
+        """The camera that shows the same picture with other pixels, as if it had been resized.
+
+        Each direction has its own factor, so another aspect ratio squeezes the picture.
+        """
+        down, across = height / self.height, width / self.width
+        return Camera(
+            camera_to_world=self.camera_to_world,
+            fx=self.fx * across,
+            fy=self.fy * down,
+            cx=self.cx * across,
+            cy=self.cy * down,
+            width=width,
+            height=height,
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class CameraPath:
+    """The cameras of a path and the perturbations written beside them.
+
+    Attributes:
+        cameras: One per entry of ``camera_path``.
+        perturbation: Top-level ``perturbation`` object as parsed from JSON, or None.
+        overrides: Per camera, the entry's own ``perturbation`` object, or None.
+        fps: Frames per second, or None if the file does not say.
+        is_cycle: Whether the path closes.
+        source: The file.
+    """
+
+    cameras: tuple[Camera, ...]
+    perturbation: Mapping[str, Any] | None
+    overrides: tuple[Mapping[str, Any] | None, ...]
+    fps: float | None
+    is_cycle: bool
+    source: str
+
+    def perturbation_of(self, index: int) -> Mapping[str, Any] | None:
+        """The perturbation object that holds for camera ``index``: its own, else the path's."""
+        own = self.overrides[index]
+        return self.perturbation if own is None else own
+
+    @property
+    def perturbations(self) -> tuple[Mapping[str, Any] | None, ...]:
+        """The perturbation object of every camera, for `ns_abstract.PoseSet.from_json`."""
+        return tuple(self.perturbation_of(k) for k in range(len(self.cameras)))
+
+    def following(self, index: int) -> Camera | None:
+        """The camera after ``index``; None for the last."""
+        return self.cameras[index + 1] if index + 1 < len(self.cameras) else None
+
+
+def load_camera_path(path: str | os.PathLike[str], downscale_factor: float = 1) -> CameraPath:
+    """Read the JSON that Nerfstudio's viewer writes.
+
+    Focal lengths are ``(height / 2) / tan(fov / 2)`` in both directions (fov is vertical) and
+    the principal point is the image centre, as in ``nerfstudio.cameras.camera_paths``.
+
+    Args:
+        path: The file.
+        downscale_factor: Images become this many times smaller.
+
+    Raises:
+        InputError: The file or a field in it cannot be used.
+    """
+    path = Path(path)
+    root = load_json(path, "camera path")
+    if not isinstance(root, dict):
+        raise InputError(f"the top level is {show(root)}, not an object", file=path, fix=_FIX_FILE)
+    try:
+        return _parse(root, str(path), downscale_factor)
+    except InputError as error:
+        raise error.within(path) from None
+
+
+def _parse(root: dict[str, Any], source: str, downscale_factor: float) -> CameraPath:
+    kind = root.get("camera_type", "perspective")
+    if not isinstance(kind, str) or kind.lower() != "perspective":
+        raise InputError(
+            f"found {show(kind)}: Splatfacto's rasteriser draws perspective cameras only",
+            field="camera_type",
+            fix="write perspective",
+        )
+    _refuse_crop(root, "crop")
+    height = checked_side(root.get("render_height"), "render_height")
+    width = checked_side(root.get("render_width"), "render_width")
+    entries = root.get("camera_path")
+    if not isinstance(entries, list) or not entries:
+        found = "missing" if entries is None else f"found {show(entries)}"
+        raise InputError(found, field="camera_path", fix="write a list of at least one camera")
+    cameras = []
+    overrides = []
+    for i, entry in enumerate(entries):
+        field = f"camera_path[{i}]"
+        if not isinstance(entry, dict):
+            raise InputError(f"found {show(entry)}", field=field, fix="write an object")
+        _refuse_crop(entry, f"{field}.crop")
+        focal = _focal(entry, root, field, height)
+        camera = Camera(
+            camera_to_world=checked_pose(entry.get("camera_to_world"), f"{field}.camera_to_world"),
+            fx=focal,
+            fy=focal,
+            cx=width / 2,
+            cy=height / 2,
+            width=width,
+            height=height,
+        )
+        cameras.append(camera.rescaled(downscale_factor))
+        overrides.append(_perturbation(entry, f"{field}.perturbation"))
+    fps = root.get("fps")
+    if fps is not None and (not is_number(fps) or not fps > 0):
+        raise InputError(f"found {show(fps)}", field="fps", fix="write a number above 0")
+    is_cycle = root.get("is_cycle")
+    if is_cycle is not None and not isinstance(is_cycle, bool):
+        raise InputError(f"found {show(is_cycle)}", field="is_cycle", fix="write true or false")
+    return CameraPath(
+        cameras=tuple(cameras),
+        perturbation=_perturbation(root, "perturbation"),
+        overrides=tuple(overrides),
+        fps=None if fps is None else float(fps),
+        is_cycle=bool(is_cycle),
+        source=source,
+    )
+
+
+def _refuse_crop(holder: dict[str, Any], field: str) -> None:
+    if holder.get("crop") is not None:
+        raise InputError(
+            "a crop box changes the picture and is not supported",
+            field=field,
+            fix="switch the crop off in the viewer and save the path again",
+        )
+
+
+def checked_side(value: Any, name: str) -> int:
+    """A number of pixels, from the field ``name``.
+
+    Raises:
+        InputError: It is no integer from 1 to `SIDE_LIMIT`.
+    """
+    # The viewer may write 1080.0.
+    if not is_number(value) or value != math.floor(value) or not 1 <= value <= SIDE_LIMIT:
+        found = "missing" if value is None else f"found {show(value)}"
+        raise InputError(found, field=name, fix=f"write an integer from 1 to {SIDE_LIMIT}")
+    return int(value)
+
+
+def _focal(entry: dict[str, Any], root: dict[str, Any], field: str, height: int) -> float:
+    """Focal length in pixels from the entry's vertical field of view, or from the path's default."""
+    field = f"{field}.fov"
+    fov = entry.get("fov")
+    if fov is None:
+        fov = root.get("default_fov")
+        if fov is None:
+            raise InputError("missing, and there is no default_fov", field=field, fix="write degrees")
+        field = "default_fov"
+    return focal_length(fov, height, field)
+
+
+def focal_length(fov: Any, height: int, field: str) -> float:
+    """Focal length in pixels of a vertical field of view in degrees, from the field ``field``.
+
+    Raises:
+        InputError: It is no angle above 0 and below 180 degrees with a float32 focal length.
+    """
+    if not is_number(fov) or not 0 < fov < 180:
+        raise InputError(f"found {show(fov)}", field=field, fix="write degrees above 0 and below 180")
+    # The expression of nerfstudio's three_js_perspective_camera_focal_length, for equal bits.
+    with np.errstate(all="ignore"):
+        focal = float((height / 2.0) / np.tan(float(fov) * (np.pi / 180.0) / 2.0))
+        usable = 0 < np.float32(focal) < np.inf
+    if not usable:
+        problem = f"found {show(fov)}: no float32 focal length"
+        raise InputError(problem, field=field, fix="write a larger angle")
+    return focal
+
+
+def checked_pose(value: Any, field: str) -> NDArray[np.float64]:
+    """A camera-to-world pose [3, 4] float64 from 16 numbers in rows, flat or nested, from the field ``field``.
+
+    Raises:
+        InputError: It is no rigid, right-handed pose of numbers that float32 can hold.
+    """
+    if isinstance(value, list) and len(value) == 4 and all(isinstance(row, list) for row in value):
+        for i, row in enumerate(value):
+            if len(row) != 4:
+                raise InputError(f"{len(row)} numbers", field=f"{field}[{i}]", fix="write four numbers")
+        value = [number for row in value for number in row]
+    if not isinstance(value, list) or len(value) != 16:
+        found = "missing" if value is None else f"found {show(value)}"
+        raise InputError(found, field=field, fix="write 16 numbers, row by row")
+    limit = float(np.finfo(np.float32).max)
+    for i, number in enumerate(value):
+        if not is_number(number) or abs(number) > limit:
+            raise InputError(f"found {show(number)}", field=f"{field}[{i}]", fix="write a number that float32 can hold")
+    matrix = np.array(value, np.float64).reshape(4, 4)
+    last = np.abs(matrix[3] - (0, 0, 0, 1)).max()
+    if last > _LAST_ROW_TOLERANCE:
+        raise InputError(
+            f"the last row is ({', '.join(f'{x:.6g}' for x in matrix[3])}), not (0, 0, 0, 1)",
+            field=field,
+            fix="write the matrix row by row, the position in the fourth column",
+        )
+    rotation = matrix[:3, :3]
+    with np.errstate(over="ignore", invalid="ignore"):
+        distance = float(np.abs(rotation.T @ rotation - np.eye(3)).max())
+    if not distance <= _ROTATION_TOLERANCE:
+        raise InputError(
+            f"the rotation part is {distance:.3g} away from orthonormal (limit {_ROTATION_TOLERANCE:g})",
+            field=field,
+            fix="remove scale and shear from the matrix",
+        )
+    if np.linalg.det(rotation) < 0:
+        raise InputError(
+            "the rotation part mirrors (determinant -1)", field=field, fix="use a right-handed OpenGL frame"
+        )
+    pose = matrix[:3].copy()
+    pose.flags.writeable = False
+    return pose
+
+
+def _perturbation(holder: dict[str, Any], field: str) -> Mapping[str, Any] | None:
+    value = holder.get("perturbation")
+    if value is not None and not isinstance(value, dict):
+        raise InputError(f"found {show(value)}", field=field, fix="write an object")
+    return value

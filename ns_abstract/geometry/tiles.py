@@ -1,0 +1,21 @@
+"""Pictures in square tiles, row by row; tiles may reach past the right and lower edge."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ns_abstract.geometry.camera_path import Camera
+
+
+def tile_grid(camera: Camera, side: int) -> tuple[int, int]:
+    """Tiles across and down."""
+    return -(-camera.width // side), -(-camera.height // side)
+
+
+def assemble(tiles: np.ndarray, camera: Camera) -> np.ndarray:
+    """The image [H, W, ...] from all its tiles [T, side, side, ...] in row-major order."""
+    side = tiles.shape[1]
+    across, down = tile_grid(camera, side)
+    rest = tiles.shape[3:]
+    grid = tiles.reshape(down, across, side, side, *rest).swapaxes(1, 2)
+    return np.ascontiguousarray(grid.reshape(down * side, across * side, *rest)[: camera.height, : camera.width])

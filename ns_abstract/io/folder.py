@@ -1,0 +1,103 @@
+"""Folders that commands write results into: one command at a time, and nothing of others is touched."""
+
+from __future__ import annotations
+
+import errno
+import fcntl
+import os
+import re
+import stat
+from pathlib import Path
+from typing import BinaryIO
+
+from ns_abstract.io.errors import InputError
+from ns_abstract.io.jsonio import load_json
+
+#: Says that the folder is one of results, and is locked while a command writes there.
+MARK = ".ns-abstract.lock"
+#: What results are called; see `ns_abstract.report.files` and `ns_abstract.verify.store`.
+_RESULT = re.compile(r"frame_\d{5,}\.(npz|png)|report\.(json|html)|cells\.sqlite(-wal|-shm)?")
+#: What a killed command may leave of a result; see `ns_abstract.io.atomic`.
+_PART = re.compile(rf"\.({_RESULT.pattern})\.[0-9a-f]{{8}}\.part")
+#: Keys that report.json of every command has.
+_REPORT_KEYS = {"version", "guarantee", "fingerprint", "command"}
+_REPORT_LIMIT = 2**30
+_FULL = "make room there and --resume, or choose a folder on another disk; finished results are kept"
+_FIXES = {
+    **dict.fromkeys((errno.ENOSPC, errno.EDQUOT, errno.EFBIG), _FULL),
+    **dict.fromkeys((errno.ENOTDIR, errno.EEXIST, errno.EISDIR), "name a folder, not a file or what is below one"),
+    errno.ENAMETOOLONG: "choose a shorter name",
+}
+
+
+def claim(folder: Path) -> BinaryIO:
+    """Make a folder of results, or take one over, for one command.
+
+    Returns:
+        An open file; the folder is locked until it is closed, or its process ends.
+
+    Raises:
+        InputError: Another command writes there, the folder cannot be written, or files that this program did not
+            write stand where results would.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        _refuse_strangers(folder)
+        return _locked(folder)
+    except OSError as error:
+        raise unwritable(folder, error) from None
+
+
+def _refuse_strangers(folder: Path) -> None:
+    if (folder / MARK).exists():
+        return
+    found = sorted(entry.name for entry in os.scandir(folder) if _RESULT.fullmatch(entry.name))
+    if found and not _is_report(folder / "report.json"):
+        raise InputError(
+            f"{found[0]} stands there and was not written by this program",
+            file=folder,
+            field="--output-dir",
+            fix="choose another folder, or move it away",
+        )
+
+
+def _is_report(file: Path) -> bool:
+    try:
+        content = load_json(file, "report", limit=_REPORT_LIMIT)
+    except InputError:
+        return False
+    return isinstance(content, dict) and content.keys() >= _REPORT_KEYS
+
+
+def _locked(folder: Path) -> BinaryIO:
+    # a link would make another file of it
+    descriptor = os.open(folder / MARK, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC, 0o666)
+    stream = os.fdopen(descriptor, "r+b")
+    try:
+        fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        stream.close()
+        raise InputError(
+            "locked by a command that is still running",
+            file=folder,
+            field="--output-dir",
+            fix="wait for it, or choose another folder",
+        ) from None
+    return stream
+
+
+def remove_parts(folder: Path) -> None:
+    """Remove what killed commands left of unfinished results; the folder must be locked."""
+    for entry in list(os.scandir(folder)):
+        if _PART.fullmatch(entry.name) and stat.S_ISREG(entry.stat(follow_symlinks=False).st_mode):
+            Path(entry.path).unlink(missing_ok=True)
+
+
+def unwritable(folder: Path, error: OSError) -> InputError:
+    """What a user is told when results cannot be written."""
+    return InputError(
+        f"cannot be written: {error.strerror or type(error).__name__}",
+        file=folder,
+        field="--output-dir",
+        fix=_FIXES.get(error.errno or 0, "choose a folder where files may be made"),
+    )

@@ -1,0 +1,158 @@
+"""Writes a NeRF as a run folder of ``ns-train vanilla-nerf`` (Nerfstudio 1.1.5), without importing Nerfstudio."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from string import Template
+
+from numpy.typing import ArrayLike
+
+from ns_abstract.geometry.views import View
+from ns_abstract.methods.nerf.scene import FieldWeights, NerfScene
+from ns_abstract.methods.run_writer import STEP, background_name, lpips_state, write_run
+
+
+def write_nerf_run(
+    scene: NerfScene,
+    folder: str | Path,
+    *,
+    timestamp: str,
+    experiment_name: str,
+    views: Sequence[View] | None = None,
+    render: Callable[[View], ArrayLike] | None = None,
+) -> Path:
+    """Write ``scene`` as a vanilla-nerf run.
+
+    Files and arguments are those of `ns_abstract.methods.splat.write.write_splatfacto_run`. Nerfstudio itself loads the
+    checkpoint where the fields have its own sizes (8 x 256, head 2 x 128).
+
+    Returns:
+        The path of config.yml.
+
+    Raises:
+        InputError: ``timestamp`` or ``experiment_name`` is not a plain folder name.
+    """
+    config = _CONFIG.safe_substitute(
+        background=background_name(scene.background),
+        far=repr(float(scene.far)),
+        coarse=scene.coarse_samples,
+        importance=scene.importance_samples,
+    )
+    # a data set of its own: a Splatfacto run may stand in the same folder
+    return write_run(
+        scene, Path(folder), "vanilla-nerf", timestamp, experiment_name, data=f"data-{experiment_name}",
+        checkpoint=_checkpoint_bytes(scene), config=config, steps=_STEPS, views=views, render=render,
+    )  # fmt: skip
+
+
+def _checkpoint_bytes(scene: NerfScene) -> bytes:
+    """A checkpoint of plain tensors, numbers, lists and dictionaries: loads with weights_only."""
+    import torch
+
+    pipeline = {"_model.device_indicator_param": torch.empty(0)}
+    for name, weights in (("coarse", scene.coarse), ("fine", scene.fine)):
+        for key, array in _named(weights).items():
+            pipeline[f"_model.field_{name}.{key}"] = torch.tensor(array)
+    pipeline |= lpips_state("_model.lpips.net.")
+    group = {"lr": 0.0005, "betas": (0.9, 0.999), "eps": 1e-8, "weight_decay": 0, "params": []}
+    state = {
+        "step": STEP,
+        "pipeline": pipeline,
+        "optimizers": {"fields": {"state": {}, "param_groups": [group]}},
+        "schedulers": {},
+        "scalers": {},
+    }
+    buffer = io.BytesIO()
+    torch.save(state, buffer)
+    return buffer.getvalue()
+
+
+def _named(weights: FieldWeights) -> dict[str, ArrayLike]:
+    """The arrays of a field under the names of Nerfstudio's ``NeRFField``."""
+    layers = {f"mlp_base.layers.{i}": layer for i, layer in enumerate(weights.base)}
+    layers["field_output_density.net"] = weights.density
+    layers |= {f"mlp_head.layers.{i}": layer for i, layer in enumerate(weights.head)}
+    layers["field_heads.0.net"] = weights.color
+    return {f"{key}.{part}": getattr(layer, part) for key, layer in layers.items() for part in ("weight", "bias")}
+
+
+# what config.yml of vanilla-nerf says; $dataparser is for the writer
+_CONFIG = Template(
+    """\
+max_num_iterations: 1000000
+method_name: vanilla-nerf
+mixed_precision: false
+optimizers:
+  fields:
+    optimizer: !!python/object:nerfstudio.engine.optimizers.RAdamOptimizerConfig
+      _target: &id001 !!python/name:torch.optim.radam.RAdam ''
+      eps: 1.0e-08
+      lr: 0.0005
+      max_norm: null
+      weight_decay: 0
+    scheduler: null
+  temporal_distortion:
+    optimizer: !!python/object:nerfstudio.engine.optimizers.RAdamOptimizerConfig
+      _target: *id001
+      eps: 1.0e-08
+      lr: 0.0005
+      max_norm: null
+      weight_decay: 0
+    scheduler: null
+output_dir: !!python/object/apply:pathlib.PosixPath []
+pipeline: !!python/object:nerfstudio.pipelines.base_pipeline.VanillaPipelineConfig
+  _target: !!python/name:nerfstudio.pipelines.base_pipeline.VanillaPipeline ''
+  datamanager: !!python/object:nerfstudio.data.datamanagers.base_datamanager.VanillaDataManagerConfig
+    _target: !!python/name:nerfstudio.data.datamanagers.base_datamanager.VanillaDataManager ''
+    camera_optimizer: null
+    camera_res_scale_factor: 1.0
+    collate_fn: !!python/name:nerfstudio.data.utils.nerfstudio_collate.nerfstudio_collate ''
+    data: *data
+$dataparser
+    eval_image_indices: !!python/tuple
+    - 0
+    eval_num_images_to_sample_from: -1
+    eval_num_rays_per_batch: 1024
+    eval_num_times_to_repeat_images: -1
+    images_on_gpu: false
+    masks_on_gpu: false
+    patch_size: 1
+    pixel_sampler: !!python/object:nerfstudio.data.pixel_samplers.PixelSamplerConfig
+      _target: !!python/name:nerfstudio.data.pixel_samplers.PixelSampler ''
+      fisheye_crop_radius: null
+      ignore_mask: false
+      is_equirectangular: false
+      keep_full_image: false
+      max_num_iterations: 100
+      num_rays_per_batch: 4096
+      rejection_sample_mask: true
+    train_num_images_to_sample_from: -1
+    train_num_rays_per_batch: 1024
+    train_num_times_to_repeat_images: -1
+  model: !!python/object:nerfstudio.models.vanilla_nerf.VanillaModelConfig
+    _target: !!python/name:nerfstudio.models.vanilla_nerf.NeRFModel ''
+    background_color: $background
+    collider_params:
+      far_plane: $far
+      near_plane: 2.0
+    enable_collider: true
+    enable_temporal_distortion: false
+    eval_num_rays_per_chunk: 4096
+    loss_coefficients:
+      rgb_loss_coarse: 1.0
+      rgb_loss_fine: 1.0
+    num_coarse_samples: $coarse
+    num_importance_samples: $importance
+    prompt: null
+    temporal_distortion_params:
+      kind: !!python/object/apply:nerfstudio.field_components.temporal_distortions.TemporalDistortionKind
+      - dnerf
+    use_gradient_scaling: false"""
+)
+_STEPS = """\
+steps_per_eval_all_images: 25000
+steps_per_eval_batch: 500
+steps_per_eval_image: 500
+steps_per_save: 1000"""

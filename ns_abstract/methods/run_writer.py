@@ -1,0 +1,286 @@
+"""What the writers of run folders share: Nerfstudio's files around the checkpoint, without importing Nerfstudio."""
+
+from __future__ import annotations
+
+import json
+import struct
+import zlib
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from string import Template
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ns_abstract.geometry.views import View, ring
+from ns_abstract.io.atomic import write_atomic
+from ns_abstract.io.errors import InputError
+from ns_abstract.methods.transform import DataparserTransform
+
+STEP = 29999  # the last of Splatfacto's 30,000 steps
+
+# Shapes of the LPIPS metric that a Splatfacto checkpoint carries; rendering does not use them.
+_LPIPS = {
+    "net.slice1.0": (64, 3, 11, 11),
+    "net.slice2.3": (192, 64, 5, 5),
+    "net.slice3.6": (384, 192, 3, 3),
+    "net.slice4.8": (256, 384, 3, 3),
+    "net.slice5.10": (256, 256, 3, 3),
+}
+_LPIPS_HEADS = (64, 192, 384, 256, 256)
+
+
+class Shown(Protocol):
+    """What a data set beside a run needs to know of its scene."""
+
+    @property
+    def background(self) -> NDArray[np.float32]: ...
+
+    @property
+    def dataparser(self) -> DataparserTransform: ...
+
+
+def write_run(
+    scene: Shown,
+    folder: Path,
+    method: str,
+    timestamp: str,
+    experiment_name: str,
+    *,
+    data: str,
+    checkpoint: bytes,
+    config: str,
+    steps: str,
+    views: Sequence[View] | None,
+    render: Callable[[View], ArrayLike] | None,
+) -> Path:
+    """Write a run and a small data set beside it; config.yml comes last, so a run with a config is complete.
+
+    Args:
+        scene: What is shown.
+        folder: Nerfstudio's working directory for this run.
+        method: Name of the method.
+        timestamp, experiment_name: Name of the run, and of its experiment.
+        data: Name of the data set's folder.
+        checkpoint: Content of the checkpoint.
+        config: What config.yml says between the parts that every method has; ``$dataparser`` stands for the parser.
+        steps: Its last lines but those that every method has.
+        views: Cameras of the data set, normalised frame, at least two of one size and field of view.
+        render: Gives the image [H, W, 3] in [0, 1] of a view; without it images hold only the background colour.
+
+    Returns:
+        The path of config.yml.
+
+    Raises:
+        InputError: ``timestamp`` or ``experiment_name`` is not a plain folder name.
+    """
+    run = _run_folder(folder, method, timestamp, experiment_name)
+    write_dataset(scene, folder / data, ring((0.0, 0.0, 0.0), 1.05) if views is None else views, render)
+    transform = {"transform": scene.dataparser.matrix.tolist(), "scale": float(scene.dataparser.scale)}
+    write_file(run / "dataparser_transforms.json", json.dumps(transform, indent=4).encode())
+    # Nerfstudio reads the step out of every name in nerfstudio_models: nothing else may stand there.
+    write_file(run / "nerfstudio_models" / f"step-{STEP:09d}.ckpt", checkpoint, scratch=run)
+    # JSON strings and lists are YAML as well, and keep a name made of digits a string.
+    head = _HEAD.substitute(experiment=json.dumps(experiment_name), data=json.dumps(data))
+    body = Template(config).substitute(dataparser=_DATAPARSER)
+    tail = _TAIL.substitute(steps=steps, timestamp=json.dumps(timestamp))
+    write_file(run / "config.yml", f"{head}\n{body}\n{tail}".encode())
+    return run / "config.yml"
+
+
+def _run_folder(folder: Path, method: str, timestamp: str, experiment_name: str) -> Path:
+    """Make the folder of a run.
+
+    Raises:
+        InputError: ``timestamp`` or ``experiment_name`` is not a plain folder name.
+    """
+    for field, value in (("timestamp", timestamp), ("experiment_name", experiment_name)):
+        if not value or value in {".", ".."} or any(c in value for c in "/\\\0\n"):
+            raise InputError(f"{value!r} is not a folder name", fix="use letters, digits, _ and -", field=field)
+    run = folder / experiment_name / method / timestamp
+    run.mkdir(parents=True, exist_ok=True)
+    return run
+
+
+def write_file(file: Path, data: bytes, *, scratch: Path | None = None) -> None:
+    """Write a file as a whole, in a folder that is made if missing."""
+    file.parent.mkdir(parents=True, exist_ok=True)
+    write_atomic(file, lambda stream: stream.write(data), scratch=scratch)
+
+
+def background_name(colour: NDArray[np.float32]) -> str:
+    """Nerfstudio's name of a colour, or a list where it has none ("random" renders as a fixed grey)."""
+    names = {"white": (1, 1, 1), "black": (0, 0, 0), "random": (0.1490, 0.1647, 0.2157)}
+    for name, value in names.items():
+        if np.array_equal(colour, np.asarray(value, np.float32)):
+            return name
+    return json.dumps([float(c) for c in colour])
+
+
+def lpips_state(prefix: str) -> dict[str, Any]:
+    """Zeros in place of the LPIPS metric's tensors, whose names begin with ``prefix``."""
+    import torch
+
+    def zeros(*shape: int) -> torch.Tensor:
+        # One stored number stands for all.
+        return torch.zeros(1).expand(shape)
+
+    state = {}
+    for name, shape in _LPIPS.items():
+        state[f"{prefix}{name}.weight"] = zeros(*shape)
+        state[f"{prefix}{name}.bias"] = zeros(shape[0])
+    for kind in ("lin", "lins."):
+        for i, channels in enumerate(_LPIPS_HEADS):
+            state[f"{prefix}{kind}{i}.model.1.weight"] = zeros(1, channels, 1, 1)
+    return state
+
+
+def write_dataset(
+    scene: Shown, folder: Path, views: Sequence[View], render: Callable[[View], ArrayLike] | None
+) -> None:
+    """Write transforms.json and one PNG per view; poses are stored in the normalised frame."""
+    if len(views) < 2 or any(
+        (v.height, v.width, v.fov) != (views[0].height, views[0].width, views[0].fov) for v in views
+    ):
+        raise ValueError("views: at least two of one size and field of view are needed")
+    height, width = views[0].height, views[0].width
+    focal = 0.5 * height / np.tan(0.5 * np.deg2rad(views[0].fov))
+    frames = []
+    for k, view in enumerate(views):
+        name = f"images/{k:03d}.png"
+        if render is None:
+            image = np.broadcast_to(scene.background, (height, width, 3))
+        else:
+            image = np.asarray(render(view), np.float64)
+        write_file(folder / name, _png(image))
+        frames.append({"file_path": name, "transform_matrix": view.camera_to_world.tolist()})
+    meta: dict[str, Any] = {
+        "camera_model": "OPENCV",
+        "fl_x": float(focal),
+        "fl_y": float(focal),
+        "cx": 0.5 * width,
+        "cy": 0.5 * height,
+        "w": width,
+        "h": height,
+        "k1": 0,
+        "k2": 0,
+        "p1": 0,
+        "p2": 0,
+    }
+    identity = np.array_equal(scene.dataparser.matrix, np.eye(3, 4)) and scene.dataparser.scale == 1.0
+    if not identity:
+        # Nerfstudio composes these into the transform that it would write itself.
+        meta["applied_transform"] = scene.dataparser.matrix.tolist()
+        meta["applied_scale"] = float(scene.dataparser.scale)
+    meta["frames"] = frames
+    write_file(folder / "transforms.json", json.dumps(meta, indent=1).encode())
+
+
+def _png(image: NDArray[Any]) -> bytes:
+    """An 8-bit RGB PNG of [H, W, 3] values in [0, 1]."""
+    pixels = np.rint(np.clip(image, 0.0, 1.0) * 255.0).astype(np.uint8)
+    height, width, _ = pixels.shape
+    rows = np.zeros((height, 1 + 3 * width), np.uint8)  # a leading 0 per row: no filter
+    rows[:, 1:] = pixels.reshape(height, -1)
+
+    def chunk(kind: bytes, data: bytes) -> bytes:
+        return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+
+    header = struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0)
+    return (
+        b"\x89PNG\r\n\x1a\n"
+        + chunk(b"IHDR", header)
+        + chunk(b"IDAT", zlib.compress(rows.tobytes(), 6))
+        + chunk(b"IEND", b"")
+    )
+
+
+# config.yml of a run: the Python tags are those by which Nerfstudio rebuilds its configuration.
+_HEAD = Template(
+    """\
+!!python/object:nerfstudio.engine.trainer.TrainerConfig
+_target: !!python/name:nerfstudio.engine.trainer.Trainer ''
+data: &data !!python/object/apply:pathlib.PosixPath
+- $data
+experiment_name: $experiment
+gradient_accumulation_steps: {}
+load_checkpoint: null
+load_config: null
+load_dir: null
+load_scheduler: true
+load_step: null
+log_gradients: false
+logging: !!python/object:nerfstudio.configs.base_config.LoggingConfig
+  local_writer: !!python/object:nerfstudio.configs.base_config.LocalWriterConfig
+    _target: !!python/name:nerfstudio.utils.writer.LocalWriter ''
+    enable: true
+    max_log_size: 10
+    stats_to_track: !!python/tuple
+    - !!python/object/apply:nerfstudio.utils.writer.EventName
+      - Train Iter (time)
+    - !!python/object/apply:nerfstudio.utils.writer.EventName
+      - Train Rays / Sec
+    - !!python/object/apply:nerfstudio.utils.writer.EventName
+      - Test PSNR
+    - !!python/object/apply:nerfstudio.utils.writer.EventName
+      - Vis Rays / Sec
+    - !!python/object/apply:nerfstudio.utils.writer.EventName
+      - Test Rays / Sec
+    - !!python/object/apply:nerfstudio.utils.writer.EventName
+      - ETA (time)
+  max_buffer_size: 20
+  profiler: basic
+  relative_log_dir: !!python/object/apply:pathlib.PosixPath []
+  steps_per_log: 10
+machine: !!python/object:nerfstudio.configs.base_config.MachineConfig
+  device_type: cpu
+  dist_url: auto
+  machine_rank: 0
+  num_devices: 1
+  num_machines: 1
+  seed: 42"""
+)
+_DATAPARSER = """\
+    dataparser: !!python/object:nerfstudio.data.dataparsers.nerfstudio_dataparser.NerfstudioDataParserConfig
+      _target: !!python/name:nerfstudio.data.dataparsers.nerfstudio_dataparser.Nerfstudio ''
+      auto_scale_poses: false
+      center_method: none
+      data: *data
+      depth_unit_scale_factor: 0.001
+      downscale_factor: null
+      eval_interval: 8
+      eval_mode: interval
+      load_3D_points: false
+      mask_color: null
+      orientation_method: none
+      scale_factor: 1.0
+      scene_scale: 1.0
+      train_split_fraction: 0.9"""
+_TAIL = Template(
+    """\
+project_name: nerfstudio-project
+prompt: null
+relative_model_dir: !!python/object/apply:pathlib.PosixPath
+- nerfstudio_models
+save_only_latest_checkpoint: true
+start_paused: false
+$steps
+timestamp: $timestamp
+use_grad_scaler: false
+viewer: !!python/object:nerfstudio.configs.base_config.ViewerConfig
+  camera_frustum_scale: 0.1
+  default_composite_depth: true
+  image_format: jpeg
+  jpeg_quality: 75
+  make_share_url: false
+  max_num_display_images: 512
+  num_rays_per_chunk: 32768
+  quit_on_train_completion: false
+  relative_log_filename: viewer_log_filename.txt
+  websocket_host: 0.0.0.0
+  websocket_port: null
+  websocket_port_default: 7007
+vis: tensorboard
+"""
+)

@@ -1,0 +1,706 @@
+"""Fragments of a block of pixels, nearest first: what may be drawn, in which orders, and where the stop hides it.
+
+Gaussian by Gaussian, `collect_fragments` finds the pixels that it may reach and its alpha there, keeps what may
+contribute, and notes which Gaussians that share a pixel may change places (design.md, B5-B6, O1).
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+
+from ns_abstract.arithmetic.simd.intrinsics import advanced, lowest_bit, pointer, prefetch, signed
+from ns_abstract.arithmetic.simd.lanes import load8, maximum, minimum, root, spans, store, where
+from ns_abstract.methods.splat.alphas import alphas
+from ns_abstract.methods.splat.block import (
+    ALPHA_HIGH,
+    ALPHA_LOW,
+    BATCH,
+    HIDDEN,
+    LEFT,
+    LIGHT,
+    LISTED,
+    LOST,
+    MOVES,
+    NUMBERS,
+    OPEN,
+    REACH,
+    RHO,
+    ROUND,
+    THI,
+    TLO,
+    UP,
+    color_ends,
+    color_size,
+    longest_list,
+    set_unknown,
+)
+from ns_abstract.methods.splat.lists import AHEAD, BLOCK, PIXELS
+from ns_abstract.methods.splat.records import FAINT, FORMS, MEAN_X, MEAN_Y, SPREAD, WILD
+
+#: Room for rounding where pixels are left out.
+_ROOM = 1.0 + 2.0**-30
+#: Pixel q of a block lies in row q >> _ROW_SHIFT; sets of pixels are the bits of an int64.
+_ROW_SHIFT = BLOCK.bit_length() - 1
+# what a block may answer in place of a number of pairs
+GIVE_UP = -1
+GROW = -2
+
+
+class _Listed(NamedTuple):
+    """A block's list, nearest first, and what is known of its Gaussians: pointers, see `ProjectedGaussians`.
+
+    Attributes:
+        numbers: [length] the Gaussians' rows.
+        columns: Columns of ``record``.
+        slope: [rows, 3] see `ViewingAxes.depth`.
+        tied: See `ViewingAxes.tied`.
+        x0, y0: The block's first pixel.
+        m: Coefficients of a form.
+    """
+
+    numbers: np.ndarray
+    length: int
+    record: np.ndarray
+    columns: int
+    box: np.ndarray
+    tiles: np.ndarray
+    delta: np.ndarray
+    depth_error: np.ndarray
+    slope: np.ndarray
+    tied: bool
+    x0: int
+    y0: int
+    m: int
+
+
+class _Window(NamedTuple):
+    """How far apart in depth list positions may change places (O1).
+
+    Attributes:
+        room: Positions i, j keep their order where ``room |depth_i - depth_j| > reach_i + reach_j``; if not positive,
+            nothing is known.
+        largest: Largest reach of all but the few positions in ``far``.
+        far: How many these are.
+        farthest: Their largest reach.
+    """
+
+    room: float
+    largest: float
+    far: int
+    farthest: float
+
+
+class _Stop(NamedTuple):
+    """Light at which the rasteriser may stop, and surely does; what no light beyond is followed of; step's rounding."""
+
+    low: float
+    high: float
+    floor: float
+    shrink: float
+    grow: float
+
+
+@njit(cache=True, error_model="numpy", forceinline=True)
+def _uncertain(i, j, listed):
+    """Whether the depth order of Gaussians i and j, listed in this order, may be another in the cell (design.md, O1).
+
+    Depths differ by the third row of the rotation times ``delta_i - delta_j``.
+    """
+    delta, slope, depth_error, m = listed.delta, listed.slope, listed.depth_error, listed.m
+    x = delta[3 * i] - delta[3 * j]
+    y = delta[3 * i + 1] - delta[3 * j + 1]
+    z = delta[3 * i + 2] - delta[3 * j + 2]
+    if listed.tied and x == 0.0 and y == 0.0 and z == 0.0:
+        return i > j
+    center = slope[0] * x + slope[1] * y + slope[2] * z
+    spread = 0.0
+    for k in range(1, m):
+        spread += abs(slope[3 * k] * x + slope[3 * k + 1] * y + slope[3 * k + 2] * z)
+    size = abs(delta[3 * i]) + abs(delta[3 * j]) + abs(delta[3 * i + 1]) + abs(delta[3 * j + 1])
+    size += abs(delta[3 * i + 2]) + abs(delta[3 * j + 2])
+    rounding = ROUND * size * 2.0
+    radius = slope[3 * m] * abs(x) + slope[3 * m + 1] * abs(y) + slope[3 * m + 2] * abs(z)
+    return not (abs(center) > (spread + radius) * UP + rounding + depth_error[i] + depth_error[j])
+
+
+@njit(cache=True, error_model="numpy")
+def _depth_reach(numbers, gaussians, slope, ray, m, entries):
+    """How far in depth each entry may move against the block's central ray (design.md, O1).
+
+    Fills ``entries.reach`` and ``entries.depth``; returns `_Window.room` and `_Window.largest`.
+    """
+    depth, delta, depth_error = gaussians.depth, gaussians.delta, gaussians.depth_error
+    reach, deep = entries.reach, entries.depth
+    count = numbers.size
+    along = 0.0
+    for k in range(1, m):
+        along += abs(slope[k, 0] * ray[0] + slope[k, 1] * ray[1] + slope[k, 2] * ray[2])
+    along += slope[m, 0] * abs(ray[0]) + slope[m, 1] * abs(ray[1]) + slope[m, 2] * abs(ray[2])
+    total = 0.0
+    for k in range(count):
+        ahead = numbers[min(k + AHEAD, count - 1)]
+        prefetch(delta, ahead, 0)
+        prefetch(depth, ahead, 0)
+        prefetch(depth_error, ahead, 0)
+        i = numbers[k]
+        deep[k] = depth[i]
+        # offset from the central ray: what a rotation moves in depth relative to the ray
+        x = delta[i, 0] - depth[i] * ray[0]
+        y = delta[i, 1] - depth[i] * ray[1]
+        z = delta[i, 2] - depth[i] * ray[2]
+        e = slope[m, 0] * abs(x) + slope[m, 1] * abs(y) + slope[m, 2] * abs(z)
+        for row in range(1, m):
+            e += abs(slope[row, 0] * x + slope[row, 1] * y + slope[row, 2] * z)
+        size = abs(delta[i, 0]) + abs(delta[i, 1]) + abs(delta[i, 2]) + abs(depth[i]) * (1.0 + along)
+        reach[k] = e * UP + 4.0 * ROUND * size + depth_error[i]
+        total += reach[k]
+    room = (1.0 - along) * (1.0 - 2.0**-30)
+    if not total < np.inf:
+        room = -1.0
+    # few entries reach far: they are compared with all, the others within a window
+    typical = 4.0 * total / max(count, 1)
+    largest = 0.0
+    for k in range(count):
+        if reach[k] <= typical:
+            largest = max(largest, reach[k])
+    return room, largest
+
+
+@njit(cache=True, error_model="numpy", forceinline=True)
+def _start(numbers, inputs, block):
+    """Set what is known of pixels and list positions to what it is before the first; the `_Window`."""
+    entries, lanes, lengths = block.entries, block.fragments.lanes, block.fragments.lengths
+    for q in range(PIXELS):
+        lanes[TLO + q] = 1.0
+        lanes[THI + q] = 1.0
+        lanes[REACH + q] = -1.0
+        lanes[RHO + q] = 0.0
+        lanes[LOST + q] = 0.0
+        lanes[OPEN + q] = 0.0
+        lengths[q] = 0
+    room, largest = _depth_reach(
+        numbers, inputs.gaussians, inputs.axes.depth, block.ray, inputs.shape.monomials, entries
+    )
+    far = 0
+    farthest = 0.0
+    for k in range(numbers.size):
+        entries.first[k] = k
+        entries.last[k] = k
+        block.reordering.slots[k] = -1
+        entries.asked[k] = 0
+        if entries.reach[k] > largest:
+            entries.far[far] = k
+            far += 1
+            farthest = max(farthest, entries.reach[k])
+    # row 0 is for fragments that do not move
+    for r in range(MOVES):
+        block.reordering.moves[r] = 0.0
+    return _Window(room, largest, far, farthest)
+
+
+@njit(cache=True, error_model="numpy")
+def _reached(record, ox, oy, left, right, top, bottom, m, lanes):
+    """The set of pixels of a range where the exponent may stay low enough for the threshold.
+
+    Row by row, sigma >= (near1^2 + near2^2)/2 bounds the columns, where near1 and near2 are what the forms' spread
+    leaves of |y1| and |y2| (design.md, B2). (ox, oy) is the offset of the block's first pixel from the mean.
+    """
+    inside = ((2 << (bottom * BLOCK + BLOCK - 1)) - 1) & ~((1 << (top * BLOCK)) - 1)
+    wild = record[WILD] != 0.0
+    p, c, g, w1, w2 = 0.0, 0.0, 0.0, 0.0, 0.0
+    spread1, spread2 = np.inf, np.inf
+    if not wild:
+        stride = m + 1
+        p = record[FORMS]
+        c = record[FORMS + stride]
+        g = record[FORMS + 2 * stride]
+        w1 = record[FORMS + 3 * stride]
+        w2 = record[FORMS + 4 * stride]
+        x = max(abs(ox + left), abs(ox + right))
+        y = max(abs(oy + top), abs(oy + bottom))
+        spread1 = (record[SPREAD] * x + record[SPREAD + 1] * y + record[SPREAD + 3]) * _ROOM
+        spread2 = (record[SPREAD + 2] * y + record[SPREAD + 4]) * _ROOM
+    # without a bound on the columns the whole rows are taken
+    numbers = load8(lanes, NUMBERS)
+    start = float(left) + 0.0 * numbers
+    stop = float(right) + 0.0 * numbers
+    if p > 0.0 and spread1 < np.inf and spread2 < np.inf:
+        inverse = 1.0 / p
+        ay = oy + numbers
+        near = maximum(0.0, abs(g * ay - w2) - spread2)
+        rest = 2.0 * record[FAINT] * _ROOM - near * near * (2.0 - _ROOM)
+        half = (root(maximum(rest, 0.0)) + spread1) * inverse * _ROOM
+        center = (c * ay + w1) * inverse - ox
+        slack = (_ROOM - 1.0) * (abs(center) + abs(ox) + half)
+        start = maximum(start, center - half - slack)
+        stop = where(rest >= 0.0, minimum(stop, center + half + slack), -1.0)
+    return spans(minimum(float(BLOCK), start), maximum(-1.0, stop)) & inside
+
+
+@njit(cache=True, error_model="numpy")
+def _pixels_of(record, box, x0, y0, m, lanes):
+    """The set of a block's pixels on which a Gaussian may reach the threshold."""
+    left = int(math.ceil(min(max(box[0] - 0.5 - x0, 0.0), float(BLOCK))))
+    right = int(math.floor(min(max(box[1] - 0.5 - x0, -1.0), BLOCK - 1.0)))
+    top = int(math.ceil(min(max(box[2] - 0.5 - y0, 0.0), float(BLOCK))))
+    bottom = int(math.floor(min(max(box[3] - 0.5 - y0, -1.0), BLOCK - 1.0)))
+    if top > bottom or left > right:
+        return 0
+    ox, oy = x0 + 0.5 - record[MEAN_X], y0 + 0.5 - record[MEAN_Y]
+    return signed(_reached(record, ox, oy, left, right, top, bottom, m, lanes))
+
+
+@njit(cache=True, error_model="numpy", forceinline=True)
+def _pixels_once(k, listed, entries, lanes):
+    """`_pixels_of` list position k, found when first asked for."""
+    if entries.asked[k] == 0:
+        entries.asked[k] = 1
+        i = listed.numbers[k]
+        entries.pixels[k] = _pixels_of(
+            advanced(listed.record, i * listed.columns), advanced(listed.box, 4 * i), listed.x0, listed.y0, listed.m,
+            lanes,
+        )  # fmt: skip
+    return entries.pixels[k]
+
+
+@njit(cache=True, error_model="numpy")
+def _pixels_at(found, pixels):
+    """The set of the pixels that stand in the lanes ``found``."""
+    at = 0
+    while found != 0:
+        at |= 1 << int(pixels[lowest_bit(found)])
+        found &= found - 1
+    return signed(at)
+
+
+@njit(cache=True, error_model="numpy", forceinline=True)
+def _find_pairs(k, found, pixels, listed, entries, lanes, window, reordering, count):
+    """Append the pairs (k, later entry) that share a pixel and are of uncertain order; widen ``first``, ``last``.
+
+    ``pixels`` in the lanes ``found`` are k's. Returns the number of pairs, or -1 where there is no room for them.
+    """
+    reach, deep, far, pairs = entries.reach, entries.depth, entries.far, reordering.pairs
+    i = listed.numbers[k]
+    shown = 0
+    beyond = listed.length
+    near = reach[k] + window.largest
+    # those within the window, then those that reach far
+    other = k
+    f = 0
+    within = True
+    while True:
+        if within:
+            other += 1
+            if other >= listed.length or (deep[other] - deep[k]) * window.room > near:
+                within = False
+                beyond = other
+                continue
+        else:
+            while f < window.far and far[f] < beyond:
+                f += 1
+            if f >= window.far:
+                break
+            other = far[f]
+            f += 1
+            if (deep[other] - deep[k]) * window.room > reach[k] + window.farthest:
+                break
+        if (deep[other] - deep[k]) * window.room > reach[k] + reach[other]:
+            continue
+        if shown == 0:
+            shown = _pixels_at(found, pixels)
+        theirs = _pixels_once(other, listed, entries, lanes)
+        if shown & int(theirs) == 0 or not _uncertain(i, listed.numbers[other], listed):
+            continue
+        if count >= reordering.pair_limit:
+            return -1
+        pairs[2 * count] = k
+        pairs[2 * count + 1] = other
+        entries.last[k] = max(entries.last[k], other)
+        entries.first[other] = min(entries.first[other], k)
+        count += 1
+    return count
+
+
+@njit(cache=True, error_model="numpy")
+def _still_live(found, pixels, live):
+    """Those lanes of ``found`` whose pixel is in ``live``."""
+    left = 0
+    while found != 0:
+        lane = lowest_bit(found)
+        found &= found - 1
+        if live & (1 << int(pixels[lane])) != 0:
+            left |= 1 << lane
+    return left
+
+
+@njit(cache=True, error_model="numpy", forceinline=True)
+def _append(number, q, k, t_low, t_high, fragments):
+    """Append fragment ``number`` to pixel q's list, with the light that it leaves; returns its place there."""
+    at = number * fragments.width
+    lanes, lists = fragments.lanes, fragments.lists
+    fragments.values[at + LEFT] = t_low
+    fragments.values[at + LIGHT] = lanes[THI + q]
+    lanes[TLO + q] = t_low
+    lanes[THI + q] = t_high
+    count = fragments.lengths[q]
+    entry = LISTED * (q * fragments.capacity + count)
+    lists[entry] = number
+    lists[entry + 1] = k
+    lists[entry + 2] = 0
+    fragments.lengths[q] = count + 1
+    return count
+
+
+@njit(cache=True, error_model="numpy")
+def _keep_drawn(found, pixels, number, k, fragments, stop):
+    """Keep the fragments of a Gaussian whose place is certain in those lanes of ``found`` that leave enough light.
+
+    Lane b is fragment ``number + b`` on the pixel ``pixels[b]``. Returns the other lanes.
+    """
+    lanes, values = fragments.lanes, fragments.values
+    bright = max(stop.high, stop.floor)
+    rest = 0
+    while found != 0:
+        lane = lowest_bit(found)
+        found &= found - 1
+        q = int(pixels[lane])
+        at = (number + lane) * fragments.width
+        t_low = lanes[TLO + q] * (1.0 - values[at + ALPHA_HIGH]) * stop.shrink
+        if not t_low > bright:
+            rest |= 1 << lane
+            continue
+        t_high = lanes[THI + q] * (1.0 - values[at + ALPHA_LOW]) * stop.grow
+        _append(number + lane, q, k, t_low, t_high, fragments)
+    return rest
+
+
+@njit(cache=True, error_model="numpy", forceinline=True)
+def _keep_alone(found, pixels, number, k, fragments, stop, live, dim, m):
+    """`_keep_drawn` for lanes that a stop may hide (B6).
+
+    Returns ``live`` without the pixels that surely stop, and ``dim`` with those that get too little light.
+    """
+    lanes, values = fragments.lanes, fragments.values
+    dark = max(stop.low, stop.floor)
+    while found != 0:
+        lane = lowest_bit(found)
+        found &= found - 1
+        q = int(pixels[lane])
+        at = (number + lane) * fragments.width
+        high = values[at + ALPHA_HIGH]
+        before = lanes[THI + q]
+        t_low = lanes[TLO + q] * (1.0 - high) * stop.shrink
+        t_high = before * (1.0 - values[at + ALPHA_LOW]) * stop.grow
+        if t_high <= stop.low:
+            # surely the stop: neither this fragment nor any behind it is drawn
+            live = signed(live & ~(1 << q))
+            continue
+        if t_low <= stop.high:
+            # LOST is the most that any stop so far may leave of the light
+            lanes[LOST + q] = max(lanes[LOST + q], min(before, stop.high / (1.0 - high)))
+            if lanes[LOST + q] >= before:
+                set_unknown(values, at, high, m)
+            else:
+                lanes[RHO + q] = lanes[LOST + q]
+        _append(number + lane, q, k, t_low, t_high, fragments)
+        if t_high <= dark:
+            dim = signed(dim | (1 << q))
+    return live, dim
+
+
+@njit(cache=True, error_model="numpy", forceinline=True)
+def _keep_moving(found, pixels, number, k, slot, block, stop, dim, moved):
+    """Keep the fragments of slot ``slot``, whose place is uncertain; ``dim`` and the number of moves with theirs."""
+    fragments, entries, reordering = block.fragments, block.entries, block.reordering
+    lanes, values = fragments.lanes, fragments.values
+    dark = max(stop.low, stop.floor)
+    reordering.slots[k] = slot
+    reordering.owners[slot] = k
+    drawn = 0
+    while found != 0:
+        lane = lowest_bit(found)
+        found &= found - 1
+        q = int(pixels[lane])
+        at = (number + lane) * fragments.width
+        t_low = lanes[TLO + q] * (1.0 - values[at + ALPHA_HIGH]) * stop.shrink
+        t_high = lanes[THI + q] * (1.0 - values[at + ALPHA_LOW]) * stop.grow
+        count = _append(number + lane, q, k, t_low, t_high, fragments)
+        if t_high <= dark:
+            dim = signed(dim | (1 << q))
+        fragments.lists[LISTED * (q * fragments.capacity + count) + 2] = moved
+        for r in range(MOVES * moved, MOVES * (moved + 1), 8):
+            store(reordering.moves, r, 0.0 * load8(lanes, NUMBERS))
+        moved += 1
+        drawn = signed(drawn | (1 << q))
+        reordering.places[slot * PIXELS + q] = count
+        # fragments up to the last one whose order is uncertain may still come first
+        lanes[REACH + q] = max(lanes[REACH + q], float(entries.last[k]))
+    reordering.drawn[slot] = drawn
+    return dim, moved
+
+
+@njit(cache=True, error_model="numpy", forceinline=True)
+def _set_colors(palette, k, color, color_rows):
+    """Write the colour of list position k: see `Palette`; ``color`` [3, color_rows] is the Gaussian's."""
+    forms, values = palette.forms, palette.values
+    at = k * color_size(forms)
+    for channel in range(3):
+        start = channel * color_rows
+        spread = 0.0
+        for r in range(1, color_rows):
+            spread += abs(color[start + r])
+        spread *= UP
+        for r in range(forms):
+            values[at + 4 * r + channel] = color[start + r]
+        values[at + 4 * forms + channel] = color[start + forms] if color_rows > 1 else 0.0
+        values[at + color_ends(forms) + channel] = color[start] - spread
+        values[at + color_ends(forms) + 4 + channel] = color[start] + spread
+
+
+@njit(cache=True, error_model="numpy")
+def _colors_behind(first, listed, colors, palette, marks):
+    """Ends of the colours of the list's entries from ``first`` on and of the background; marks them (design.md, B6)."""
+    color_columns = colors.shape[1]
+    color_rows = color_columns // 3
+    values, unseen = pointer(colors), palette.unseen
+    for channel in range(4):
+        unseen[channel] = palette.background[channel]
+        unseen[4 + channel] = palette.background[channel]
+    for k in range(first, listed.length):
+        ahead = listed.numbers[min(k + BATCH, listed.length - 1)]
+        for byte in range(0, 8 * color_columns, 64):
+            prefetch(colors, ahead, byte)
+        i = listed.numbers[k]
+        if marks[i] == 0:
+            marks[i] = 1
+        color = advanced(values, i * color_columns)
+        for channel in range(3):
+            at = channel * color_rows
+            spread = 0.0
+            for r in range(1, color_rows):
+                spread += abs(color[at + r])
+            unseen[channel] = min(unseen[channel], color[at] - spread * UP)
+            unseen[4 + channel] = max(unseen[4 + channel], color[at] + spread * UP)
+
+
+@njit(cache=True, error_model="numpy", forceinline=True)
+def _place_batch(start, some, live, listed, inputs, block):
+    """Find the pixels of `Batch` for ``some`` positions from ``start`` on: those that may be reached and take light.
+
+    Returns how many there are.
+    """
+    gaussians, colors, batch = inputs.gaussians, inputs.colors.values, block.batch
+    for b in range(some):
+        ahead = listed.numbers[min(start + b + BATCH, listed.length - 1)]
+        prefetch(gaussians.box, ahead, 0)
+        prefetch(gaussians.tiles, ahead, 0)
+        for byte in range(0, 8 * listed.columns, 64):
+            prefetch(gaussians.record, ahead, byte)
+        prefetch(gaussians.record, ahead, 8 * listed.columns - 8)
+        for byte in range(0, 8 * colors.shape[1], 64):
+            prefetch(colors, ahead, byte)
+        _pixels_once(start + b, listed, block.entries, block.fragments.lanes)
+    end = 0
+    for b in range(some):
+        row = advanced(listed.record, listed.numbers[start + b] * listed.columns)
+        ox, oy = listed.x0 + 0.5 - row[MEAN_X], listed.y0 + 0.5 - row[MEAN_Y]
+        pixels = live & block.entries.pixels[start + b]
+        batch.begins[b] = end
+        while pixels != 0:
+            q = lowest_bit(pixels)
+            pixels &= pixels - 1
+            batch.pixels[end] = q
+            batch.offset_x[end] = ox + (q & (BLOCK - 1))
+            batch.offset_y[end] = oy + (q >> _ROW_SHIFT)
+            end += 1
+    batch.begins[some] = end
+    return end
+
+
+@njit(cache=True, error_model="numpy", forceinline=True)
+def _find_alphas(start, some, used, place, listed, inputs, block):
+    """Alphas of `_place_batch`'s positions on their pixels: fragments from number ``used`` on, and `Batch.found`."""
+    batch = block.batch
+    for b in range(some):
+        i = listed.numbers[start + b]
+        begin = batch.begins[b]
+        n = batch.begins[b + 1] - begin
+        batch.found[b] = 0
+        if n > 0:
+            core = advanced(listed.tiles, 8 * i + 4)
+            sure = (
+                core[0] <= place.tile_x
+                and place.tile_x < core[1]
+                and core[2] <= place.tile_y
+                and place.tile_y < core[3]
+            )
+            given = (used + begin) * block.fragments.width
+            record = advanced(listed.record, i * listed.columns)
+            batch.found[b] = alphas(record, begin, n, given, sure, block, inputs)
+
+
+@njit(cache=True, error_model="numpy", forceinline=True)
+def _hide_dim(dim, k, length, live, missing, fragments, stop_low):
+    """Let pixels ``dim`` take no light behind position k unless something that is listed may still come behind it.
+
+    Returns ``live`` without these and the first position that is ``missing`` in any of them (B6).
+    """
+    lanes = fragments.lanes
+    while dim != 0:
+        q = lowest_bit(dim)
+        dim = signed(dim & (dim - 1))
+        if lanes[REACH + q] <= k:
+            live = signed(live & ~(1 << q))
+            if lanes[THI + q] > stop_low and k + 1 < length:
+                lanes[OPEN + q] = lanes[THI + q]
+                missing = min(missing, k + 1)
+    return live, missing
+
+
+@njit(cache=True, error_model="numpy")
+def collect_fragments(numbers, place, inputs, block, marks_):
+    """Collect the fragments of every pixel of a block, nearest first (design.md, B5-B6).
+
+    Fills ``block`` but for its sums, from the Gaussians ``numbers`` (rows of ``inputs.gaussians``), nearest first; sets
+    ``marks_`` [n] for those that some pixel that takes light may draw, or stop at. Returns the number of pairs and of
+    slots; or GIVE_UP where more pairs are uncertain than there is room for, or GROW where another buffer is too small.
+
+    A list may end where no pose leaves more light than ``inputs.cutoffs.floor``. All that is missing lies behind what
+    it holds, and row OPEN of the lanes bounds the light that comes there, `Palette.unseen` the colours. OPEN is 0 where
+    nothing is missing, as if the floor is negative. Row RHO receives how much transmittance may be lost to a stop that
+    the kept fragments ignore.
+    """
+    fragments, entries, reordering, batch = block.fragments, block.entries, block.reordering, block.batch
+    gaussians, charges, m = inputs.gaussians, inputs.charges, inputs.shape.monomials
+    colors, marks = inputs.colors.values, pointer(marks_)
+    listed = _Listed(
+        pointer(numbers), numbers.size, pointer(gaussians.record), gaussians.record.shape[1], pointer(gaussians.box),
+        pointer(gaussians.tiles), pointer(gaussians.delta), pointer(gaussians.depth_error),
+        pointer(inputs.axes.depth), inputs.axes.tied, place.x0, place.y0, m,
+    )  # fmt: skip
+    length, capacity, color_columns = listed.length, fragments.capacity, colors.shape[1]
+    stop_light, step = inputs.rules.transmittance_min, charges.transmittance
+    stop = _Stop(stop_light * (1.0 - step), stop_light * (1.0 + step), inputs.cutoffs.floor, 1.0 - step, 1.0 + step)
+    window = _start(numbers, inputs, block)
+    if not window.room > 0.0:
+        return GIVE_UP, 0
+    pairs, slots, moved, used = 0, 0, 1, 0
+    # pixels that take light, and those that take none, or too little, behind the fragments whose place is still open
+    live, dim = -1, 0
+    missing = length
+    for start in range(0, length, BATCH):
+        some = min(BATCH, length - start)
+        begun = live
+        end = _place_batch(start, some, live, listed, inputs, block)
+        # eight at a time, some in excess
+        if used + end + 8 > capacity * PIXELS or longest_list(fragments.lengths) + some > capacity:
+            return GROW, 0
+        _find_alphas(start, some, used, place, listed, inputs, block)
+        for b in range(some):
+            found = batch.found[b]
+            begin = batch.begins[b]
+            pixels = advanced(batch.pixels, begin)
+            if live != begun:
+                found = _still_live(found, pixels, live)
+            if found == 0:
+                continue
+            k = start + b
+            i = listed.numbers[k]
+            pairs = _find_pairs(k, found, pixels, listed, entries, fragments.lanes, window, reordering, pairs)
+            if pairs < 0:
+                return GIVE_UP, 0
+            # threads share these bytes: written no more than once each
+            if marks[i] == 0:
+                marks[i] = 1
+            _set_colors(block.palette, k, advanced(pointer(colors), i * color_columns), color_columns // 3)
+            if entries.first[k] == k and entries.last[k] == k:
+                found = _keep_drawn(found, pixels, used + begin, k, fragments, stop)
+                live, dim = _keep_alone(found, pixels, used + begin, k, fragments, stop, live, dim, m)
+            else:
+                if slots >= 2 * capacity or moved + PIXELS > 32 * capacity:
+                    return GROW, 0
+                dim, moved = _keep_moving(found, pixels, used + begin, k, slots, block, stop, dim, moved)
+                slots += 1
+            live, missing = _hide_dim(dim & live, k, length, live, missing, fragments, stop.low)
+        if live == 0:
+            break
+        used += end
+    if missing < length:
+        _colors_behind(missing, listed, colors, block.palette, marks)
+    return pairs, slots
+
+
+@njit(cache=True, error_model="numpy")
+def settle_stops(slots, block, inputs):
+    """Drop or weaken the fragments of uncertain depth order that the stop may hide (design.md, B6).
+
+    ``slots`` is their number.
+    """
+    fragments, entries, reordering = block.fragments, block.entries, block.reordering
+    values, width, lists, lanes = fragments.values, fragments.width, fragments.lists, fragments.lanes
+    m, stop, step = inputs.shape.monomials, inputs.rules.transmittance_min, inputs.charges.transmittance
+    stop_low = stop * (1.0 - step)
+    stop_high = stop * (1.0 + step)
+    # the stop is out of reach of most pixels
+    dark = 0
+    for q in range(PIXELS):
+        lanes[HIDDEN + q] = 0.0
+        if not lanes[TLO + q] > stop_high:
+            dark |= 1 << q
+    if dark == 0:
+        return
+    for slot in range(slots):
+        k = reordering.owners[slot]
+        some = reordering.drawn[slot]
+        while some != 0:
+            q = lowest_bit(some)
+            some &= some - 1
+            if dark & (1 << q) == 0:
+                continue
+            start = q * fragments.capacity
+            e = start + int(reordering.places[slot * PIXELS + q])
+            behind = e
+            end = start + int(fragments.lengths[q])
+            while behind + 1 < end and int(lists[LISTED * (behind + 1) + 1]) <= entries.last[k]:
+                behind += 1
+            t_low = values[int(lists[LISTED * behind]) * width + LEFT]
+            if t_low > stop_high:
+                continue
+            before = e
+            while before > start and int(lists[LISTED * (before - 1) + 1]) >= entries.first[k]:
+                before -= 1
+            light = values[int(lists[LISTED * before]) * width + LIGHT]
+            at = int(lists[LISTED * e]) * width
+            t_high = light * (1.0 - values[at + ALPHA_LOW]) * (1.0 + step)
+            # the most light that a stop at this fragment may leave
+            high = values[at + ALPHA_HIGH]
+            lost = min(light, stop_high / (1.0 - high))
+            if t_high <= stop_low:
+                lanes[HIDDEN + q] = max(lanes[HIDDEN + q], lost)
+                set_unknown(values, at, 0.0, m)
+            elif lost < light:
+                # kept; what the stop may leave of the light is added at the end
+                lanes[RHO + q] = max(lanes[RHO + q], lost, lanes[LOST + q])
+            else:
+                lanes[HIDDEN + q] = max(lanes[HIDDEN + q], lost)
+                set_unknown(values, at, high, m)
+    # a stop at a dropped or weakened fragment also hides the kept fragments behind it
+    for q in range(PIXELS):
+        if lanes[RHO + q] > 0.0:
+            lanes[RHO + q] = max(lanes[RHO + q], lanes[HIDDEN + q])
+
+
+@njit(cache=True, error_model="numpy")
+def number_groups(length, entries):
+    """Number the groups of list positions into ``entries.far``: no uncertain pair spans two groups (design.md, O4)."""
+    group = 0
+    reach = -1
+    for k in range(length):
+        if k > reach:
+            group += 1
+        entries.far[k] = group
+        reach = max(reach, entries.last[k])

@@ -1,0 +1,206 @@
+"""What the compiled stages of the bounds are given and what they leave, as typed records (design.md, G and B).
+
+Kernels take named tuples of arrays and numbers. Inside them the arrays of a record may be pointers to the elements
+(`ns_abstract.arithmetic.simd.intrinsics.pointer`), which are not counted; the fields keep their names and meaning.
+Throughout, n counts the candidates of a cell, m the coefficients of its forms, and t the tiles that are bounded.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from ns_abstract.arithmetic.forms import Basis
+from ns_abstract.arithmetic.rounding import Charges
+from ns_abstract.geometry.camera_path import Intrinsics
+from ns_abstract.methods.splat.constants import RasterRules
+
+
+class FormShape(NamedTuple):
+    """The forms of a cell, as `Basis` tells: ``order`` 2 for one parameter, else 1."""
+
+    dimensions: int
+    order: int
+    monomials: int
+
+
+def form_shape(basis: Basis) -> FormShape:
+    """``basis`` as kernels take it.
+
+    Raises:
+        ValueError: Curvature is kept for one parameter only.
+    """
+    if basis.order == 2 and basis.dimensions != 1:
+        raise ValueError(f"forms of order 2 have one parameter, not {basis.dimensions}")
+    return FormShape(basis.dimensions, basis.order, basis.monomials)
+
+
+class SceneGaussians(NamedTuple):
+    """What the per-Gaussian stage reads of a scene's N Gaussians.
+
+    Attributes:
+        means: [N, 3] world, in the middle of their ranges.
+        mean_radius: [N, 3] half-widths of independent ranges of the means, world axes, or [0, 3].
+        axes: [N, 3, 3] principal axes by column, scaled by their standard deviations, world units.
+        extents: [N] largest standard deviations, world units, up to rounding.
+        noise: [N, 12] see `gaussians.covariance_noise`.
+        opacity_low, opacity_high: [N] ends of the opacities' ranges.
+        faint: [N] see `records.faint_exponents`.
+    """
+
+    means: np.ndarray
+    mean_radius: np.ndarray
+    axes: np.ndarray
+    extents: np.ndarray
+    noise: np.ndarray
+    opacity_low: np.ndarray
+    opacity_high: np.ndarray
+    faint: np.ndarray
+
+
+class CellPoses(NamedTuple):
+    """The poses of a cell; see `ns_abstract.geometry.poses.PoseForms`.
+
+    Attributes:
+        rotation: [rows, 9] forms, world to camera, OpenCV axes, row-major.
+        offset: [rows, 3] forms of what is added to rotated means minus ``origin``, world units.
+        origin: [3] world.
+        camera_reach: [3] upper bounds of the absolute camera coordinates, world.
+        rotation_reach: [9] upper bounds of the absolute entries of the rotation.
+    """
+
+    rotation: np.ndarray
+    offset: np.ndarray
+    origin: np.ndarray
+    camera_reach: np.ndarray
+    rotation_reach: np.ndarray
+
+
+class ProjectionInputs(NamedTuple):
+    """All that the per-Gaussian stage reads."""
+
+    scene: SceneGaussians
+    poses: CellPoses
+    camera: Intrinsics
+    rules: RasterRules
+    charges: Charges
+    shape: FormShape
+
+
+class SceneColors(NamedTuple):
+    """What the colours of a scene's N Gaussians are made of.
+
+    Attributes:
+        means, mean_radius: See `SceneGaussians`.
+        low, high: [N, 3] ranges of what is added to the colours, or [0, 3].
+        sh: [N, K, 3] coefficients of the spherical harmonics.
+        reach: [N, 6] see `colors.color_reach`.
+        degree: Highest band.
+    """
+
+    means: np.ndarray
+    mean_radius: np.ndarray
+    low: np.ndarray
+    high: np.ndarray
+    sh: np.ndarray
+    reach: np.ndarray
+    degree: int
+
+
+class ProjectedGaussians(NamedTuple):
+    """What the per-Gaussian stage leaves of every candidate (design.md, G4-G10).
+
+    Attributes:
+        record: [n, columns] see `records`: mean in pixels, opacity, whitening forms.
+        box: [n, 4] pixels x0, x1, y0, y1 that may be reached.
+        tiles: [n, 8] outer, then inner tile ranges x0, x1, y0, y1 (ends exclusive).
+        depth: [n] at the cell's middle, world units.
+        delta: [n, 3] mean minus the cell's origin, world axes.
+        depth_error: [n] float error of the depth against another's, world units.
+    """
+
+    record: np.ndarray
+    box: np.ndarray
+    tiles: np.ndarray
+    depth: np.ndarray
+    delta: np.ndarray
+    depth_error: np.ndarray
+
+
+class ViewingAxes(NamedTuple):
+    """How the camera looks over a cell.
+
+    Attributes:
+        depth: [rows, 3] forms of the rotation's third row, world to camera; its radii hold its float error, too.
+        middle: [9] the middle pose's rotation, world to camera, row-major.
+        tied: Whether Gaussians of equal ``delta`` have equal depths in the program, and so keep the order of numbers.
+    """
+
+    depth: np.ndarray
+    middle: np.ndarray
+    tied: bool
+
+
+class Colors(NamedTuple):
+    """What the Gaussians and the background look like.
+
+    Attributes:
+        values: [n, 3] colours, or [n, 3 (k + 1)] forms by channel: k coefficients and a radius; k is 1 or m.
+        background: [3].
+        error: Bound of the colours' float error, added to every result.
+    """
+
+    values: np.ndarray
+    background: np.ndarray
+    error: float
+
+
+class Cutoffs(NamedTuple):
+    """What bounds need not follow.
+
+    Attributes:
+        floor: Fragments are left out where no pose lets more light come to them (B6); none if negative.
+        fade: Bound of the program's rounding when it adds up what was left out, in units of the brightest colour.
+        negligible: Bound of what all fragments that were left out for a negligible alpha may add up to.
+        pairs: Most depth-order pairs looked at in one block of pixels.
+    """
+
+    floor: float
+    fade: float
+    negligible: float
+    pairs: int
+
+
+class PixelBounds(NamedTuple):
+    """What the pixel stage leaves.
+
+    Attributes:
+        lower, upper: [t, side, side, 3].
+        linear: [t, side, side, 3, m + 1] forms before the clamp, or empty.
+        slopes: [t, d] sums of absolute linear coefficients, added to.
+        statistics: [threads, 5] blocks, fragments of the longest lists, uncertain pairs, blocks where too many pairs
+            were uncertain, pixels with results that were not numbers.
+        marks: [n] uint8; set to 1 for every Gaussian that some pixel of these tiles may draw or stop at. Those that
+            stay 0 are hidden or too faint for every pose: leaving them out changes nothing.
+    """
+
+    lower: np.ndarray
+    upper: np.ndarray
+    linear: np.ndarray
+    slopes: np.ndarray
+    statistics: np.ndarray
+    marks: np.ndarray
+
+
+class PixelInputs(NamedTuple):
+    """All that the pixel stage reads of a cell."""
+
+    gaussians: ProjectedGaussians
+    axes: ViewingAxes
+    intrinsics: Intrinsics
+    colors: Colors
+    rules: RasterRules
+    charges: Charges
+    cutoffs: Cutoffs
+    shape: FormShape

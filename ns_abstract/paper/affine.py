@@ -1,0 +1,300 @@
+"""The affine face of the rules: forms that carry their range.
+
+An `Enclosure` is a `FormArray` together with an `Interval` that holds the same quantity. Each
+operation is carried out on both, and each narrows the other: the range never exceeds what interval
+arithmetic gives, and a form that says less than its range is replaced by it.
+"""
+
+from __future__ import annotations
+
+from typing import Any, overload
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from ns_abstract.arithmetic.forms import Basis, Float64Array, FormArray, settle
+from ns_abstract.paper import lines
+from ns_abstract.paper.interval import BoolArray, Interval
+
+# `FormArray`'s second-order remainders are third powers; between these sizes none under- or overflows
+_SMALL, _LARGE = 2.0**-200, 2.0**200
+# arguments of exp whose values are between them
+_MODERATE = 100.0
+
+
+def _as_range(form: FormArray) -> Interval:
+    with np.errstate(invalid="ignore"):
+        low, high = form.bounds()
+    # an overflow inside a form leaves ends that say nothing
+    unknown = (low == np.inf) | (high == -np.inf)
+    return Interval(np.where(unknown, -np.inf, low), np.where(unknown, np.inf, high))
+
+
+def form_of(basis: Basis, values: Interval) -> FormArray:
+    """Forms without polynomial part that enclose ``values``."""
+    return FormArray.constant(basis, values.middle, values.radius)
+
+
+def _merge(mask: BoolArray, first: FormArray, second: FormArray) -> FormArray:
+    """``first`` where ``mask``, else ``second``."""
+    return FormArray(first.basis, np.where(mask.ravel(), first.data, second.data), first.shape)
+
+
+class Enclosure:
+    """An array of quantities over a box ``p in [-1, 1]^d``, as forms and as intervals at once.
+
+    Attributes:
+        form: Forms of the quantity.
+        range: Intervals that hold it over the whole box, never wider than the forms' bounds.
+
+    Args:
+        form: Forms.
+        range_: What else is known of the values over the whole box.
+    """
+
+    __array_ufunc__ = None
+    outranks_intervals = True
+
+    def __init__(self, form: FormArray, range_: Interval | None = None) -> None:
+        bounds = _as_range(form)
+        self.range = bounds if range_ is None else bounds.intersect(range_)
+        finite = np.isfinite(form.data).all(axis=0).reshape(form.shape)
+        dominated = ~finite | ~(form.radius < self.range.radius)
+        self.form = _merge(dominated, form_of(form.basis, self.range), form) if np.any(dominated) else form
+
+    @classmethod
+    def of(cls, basis: Basis, values: Interval | ArrayLike) -> Enclosure:
+        """Quantities of which nothing but ``values`` is known."""
+        values = Interval.lift(values)
+        return cls(form_of(basis, values), values)
+
+    @overload
+    @classmethod
+    def lift(cls, value: Enclosure | FormArray, basis: Basis | None = None) -> Enclosure: ...
+
+    @overload
+    @classmethod
+    def lift(cls, value: Enclosure | FormArray | Interval | ArrayLike, basis: Basis) -> Enclosure: ...
+
+    @classmethod
+    def lift(cls, value: Enclosure | FormArray | Interval | ArrayLike, basis: Basis | None = None) -> Enclosure:
+        """``value`` as an enclosure; numbers and intervals need ``basis``.
+
+        Raises:
+            TypeError: They have none.
+        """
+        if isinstance(value, Enclosure):
+            return value
+        if isinstance(value, FormArray):
+            return cls(value)
+        if basis is None:
+            raise TypeError("numbers and intervals have no basis of their own: name one")
+        return cls.of(basis, value)
+
+    @classmethod
+    def parameters(cls, box: Interval, order: int = 1) -> Enclosure:
+        """One parameter per element of ``box``, each running over its interval."""
+        count = int(np.prod(box.shape))
+        basis = Basis(count, order)
+        middle, radius = box.middle.ravel(), box.radius.ravel()
+        form = FormArray.constant(basis, middle)
+        form.data[1 + np.arange(count), np.arange(count)] = radius
+        settle(form.data, basis.dimensions, basis.order, basis.monomials)
+        return cls(FormArray(basis, form.data, box.shape), box)
+
+    @classmethod
+    def stack(cls, parts: list[Enclosure]) -> Enclosure:
+        """Enclosures of one shape along a new first axis."""
+        rows = parts[0].form.basis.rows
+        shape = (len(parts), *parts[0].shape)
+        data = np.stack([part.form.data for part in parts], axis=1).reshape(rows, -1)
+        return cls(FormArray(parts[0].form.basis, data, shape), Interval.stack([part.range for part in parts]))
+
+    @property
+    def basis(self) -> Basis:
+        """Monomials of the forms."""
+        return self.form.basis
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """Shape of the array."""
+        return self.form.shape
+
+    def bounds(self) -> tuple[Float64Array, Float64Array]:
+        """Lower and upper bounds over the box."""
+        return self.range.bounds()
+
+    def meet(self, other: Interval) -> Enclosure:
+        """The same quantity, known to lie in ``other`` as well."""
+        return Enclosure(self.form, self.range.intersect(other))
+
+    def __getitem__(self, index: Any) -> Enclosure:
+        return Enclosure(self.form[index], self.range[index])
+
+    def reshape(self, *shape: int) -> Enclosure:
+        """The same quantities in another shape."""
+        range_ = self.range.reshape(*shape)
+        return Enclosure(FormArray(self.basis, self.form.data, range_.shape), range_)
+
+    def broadcast_to(self, shape: tuple[int, ...]) -> Enclosure:
+        """The quantities repeated to ``shape``."""
+        return Enclosure(self.form.broadcast_to(shape), self.range.broadcast_to(shape))
+
+    def transpose(self) -> Enclosure:
+        """Transpose of a matrix."""
+        return Enclosure(self.form.transpose(), self.range.transpose())
+
+    def _lift(self, value: Enclosure | Interval | ArrayLike) -> Enclosure:
+        return Enclosure.lift(value, self.basis)
+
+    def __neg__(self) -> Enclosure:
+        return Enclosure(-self.form, -self.range)
+
+    def __add__(self, other: Enclosure | Interval | ArrayLike) -> Enclosure:
+        other = self._lift(other)
+        return Enclosure(self.form + other.form, self.range + other.range)
+
+    __radd__ = __add__
+
+    def __sub__(self, other: Enclosure | Interval | ArrayLike) -> Enclosure:
+        other = self._lift(other)
+        return Enclosure(self.form - other.form, self.range - other.range)
+
+    def __rsub__(self, other: Interval | ArrayLike) -> Enclosure:
+        return (-self) + other
+
+    def __mul__(self, other: Enclosure | Interval | ArrayLike) -> Enclosure:
+        if other is self:
+            return self.square()
+        other = self._lift(other)
+        return Enclosure(self.form * other.form, self.range * other.range)
+
+    __rmul__ = __mul__
+
+    def __matmul__(self, other: Enclosure | Interval | ArrayLike) -> Enclosure:
+        """Product of two matrices."""
+        other = self._lift(other)
+        (n, k), (_, m) = self.shape, other.shape
+        return (self.reshape(n, k, 1).broadcast_to((n, k, m)) * other.reshape(1, k, m)).sum(1)
+
+    def __rmatmul__(self, other: Interval | ArrayLike) -> Enclosure:
+        return self._lift(other) @ self
+
+    def sum(self, axis: int = -1) -> Enclosure:
+        """Sum along one axis."""
+        axis %= len(self.shape)
+        if self.shape[axis] == 0:
+            return Enclosure.of(self.basis, self.range.sum(axis))
+        return Enclosure(self.form.sum(axis), self.range.sum(axis))
+
+    def prod(self, axis: int = -1) -> Enclosure:
+        """Product along one axis, front to back."""
+        axis %= len(self.shape)
+        whole = self.range.prod(axis)
+        if self.shape[axis] == 0:
+            return Enclosure.of(self.basis, whole)
+        before = (slice(None),) * axis
+        result = self[(*before, 0)]
+        for i in range(1, self.shape[axis]):
+            result = result * self[(*before, i)]
+        return result.meet(whole)
+
+    def square(self) -> Enclosure:
+        """``x * x``."""
+        return Enclosure(self.form.square(), self.range.square())
+
+    def power(self, exponent: int) -> Enclosure:
+        """``x ** exponent`` for an integer ``exponent >= 0``."""
+        whole = self.range.power(exponent)
+        result = Enclosure.of(self.basis, np.ones(self.shape))
+        base = self
+        while exponent:
+            if exponent & 1:
+                result = result * base
+            exponent >>= 1
+            base = base.square() if exponent else base
+        return result.meet(whole)
+
+    def _curve(self, curve: lines.Curve, domain: BoolArray, taylor: FormArray | None) -> Enclosure:
+        """A convex or concave function: a band, or the Taylor polynomial where that leaves less."""
+        whole = curve.value(self.range)
+        domain = domain & np.isfinite(self.range.lower) & np.isfinite(self.range.upper)
+        inside = Interval(np.where(domain, self.range.lower, 1.0), np.where(domain, self.range.upper, 1.0))
+        slope, offset = lines.band(curve, inside)
+        form = self.form * slope + form_of(self.basis, offset)
+        if taylor is not None:
+            # exp looks after its own argument
+            safe = domain if curve is lines.EXP else domain & (self.range.lower > _SMALL) & (self.range.upper < _LARGE)
+            better = safe & np.isfinite(taylor.data).all(axis=0).reshape(self.shape) & (taylor.radius < form.radius)
+            form = _merge(better, taylor, form)
+        return Enclosure(_merge(domain, form, form_of(self.basis, whole)), whole)
+
+    def exp(self) -> Enclosure:
+        """``exp(x)``."""
+        finite = np.isfinite(self.range.upper) & (np.abs(self.range.middle) < 600.0)
+        return self._curve(lines.EXP, finite, None if self.basis.order == 1 else self._exp_taylor())
+
+    def _exp_taylor(self) -> FormArray:
+        """Second-order forms of ``exp``; not finite where the argument is large."""
+        center, farthest = self.form.center, np.maximum(self.form.center, self.range.upper)
+        moderate = (np.abs(center) < _MODERATE) & (farthest < _MODERATE)
+        value = Interval(np.where(moderate, center, 0.0)).exp()
+        f0 = value.middle
+        # the third derivative over 6, between the centre and every value
+        third = Interval(np.where(moderate, farthest, 0.0)).exp() / 6.0
+        form = self.form.compose(f0, f0, 0.5 * f0, 0.5 * f0, np.where(moderate, third.upper, np.inf))
+        # the kernel's error in exp(c) multiplies 1 + t + t^2 / 2, t = x - c
+        t = Interval(np.where(moderate, (self.range - center).magnitude, 0.0))
+        form.data[form.basis.monomials] += (Interval(value.width) * (1.0 + t + t.square()) * 2.0).upper.ravel()
+        return form
+
+    def reciprocal(self) -> Enclosure:
+        """``1 / x``; nothing is known where ``x`` may be 0."""
+        negative = self.range.upper < 0.0
+        sign = np.where(negative, -1.0, 1.0)
+        positive = Enclosure(self.form * sign, self.range * sign)
+        taylor = positive.form.reciprocal() if self.basis.order == 2 else None
+        result = positive._curve(lines.RECIPROCAL, positive.range.lower > 0.0, taylor)
+        return Enclosure(result.form * sign, self.range.reciprocal())
+
+    def __truediv__(self, other: Enclosure | Interval | ArrayLike) -> Enclosure:
+        other = self._lift(other)
+        return (self * other.reciprocal()).meet(self.range / other.range)
+
+    def __rtruediv__(self, other: Interval | ArrayLike) -> Enclosure:
+        return self._lift(other) / self
+
+    def sqrt(self) -> Enclosure:
+        """``sqrt(x)``; nothing is known where ``x`` may be negative."""
+        taylor = self.form.sqrt() if self.basis.order == 2 else None
+        return self._curve(lines.SQRT, (self.range.lower >= 0.0) & (self.range.upper > 0.0), taylor)
+
+    def absolute(self) -> Enclosure:
+        """``|x|``."""
+        bounded = np.isfinite(self.range.lower) & np.isfinite(self.range.upper)
+        low, high = (np.where(bounded, end, sign) for end, sign in zip(self.range.bounds(), (-1.0, 1.0), strict=True))
+        with np.errstate(all="ignore"):
+            slope = np.clip((np.abs(high) - np.abs(low)) / (high - low), -1.0, 1.0)
+        slope = np.where(low >= 0.0, 1.0, np.where(high <= 0.0, -1.0, np.where(np.isfinite(slope), slope, 0.0)))
+        # |x| - s x for |s| <= 1 is convex, and 0 at x = 0
+        ends = [Interval(end).absolute() - Interval(end) * slope for end in (low, high)]
+        offset = Interval(np.zeros(self.shape), np.maximum(ends[0].upper, ends[1].upper))
+        whole = self.range.absolute()
+        form = self.form * slope + form_of(self.basis, offset)
+        return Enclosure(_merge(bounded, form, form_of(self.basis, whole)), whole)
+
+    def clip(self, low: float, high: float) -> Enclosure:
+        """``min(max(x, low), high)``, from ``max(t, 0) = (t + |t|) / 2``."""
+        above = self - low
+        raised = (above + above.absolute()) * 0.5 + low
+        below = high - raised
+        lowered = high - (below + below.absolute()) * 0.5
+        return lowered.meet(self.range.clip(low, high))
+
+    def norm(self) -> Enclosure:
+        """Frobenius norm over all elements, a scalar."""
+        return self.square().reshape(-1).sum(0).sqrt().meet(self.range.norm())
+
+    def indicator(self) -> Enclosure:
+        """1 where ``x > 0``, else 0; both where undecided (no slope narrows the unit step's range)."""
+        return Enclosure.of(self.basis, self.range.indicator())

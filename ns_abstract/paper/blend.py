@@ -1,0 +1,122 @@
+"""Bounds of front-to-back blending in a fixed order: the paper's SUMCUMPROD and what it replaces.
+
+Layers run along the first axis, nearest first; the other axes are pixels or channels. The blended
+value is ``pc = sum_i a_i c_i prod_{j<i} (1 - a_j)`` ("Abstract Rendering", Algorithm 2, lines 8-10).
+"""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+
+from ns_abstract.paper.affine import Enclosure
+from ns_abstract.paper.interval import Float64Array, Interval
+from ns_abstract.paper.linear import Face, LinearBounds, constant_like
+
+
+def blend(alphas: Float64Array, colors: Float64Array) -> Float64Array:
+    """The blended value of layers [n, ...] (float64)."""
+    light = np.cumprod(np.concatenate([np.ones((1, *alphas.shape[1:])), 1.0 - alphas[:-1]]), axis=0)
+    return (light * alphas * colors).sum(axis=0)
+
+
+def cumulative_blend(alphas: Face, colors: Interval | Float64Array) -> Face:
+    """Lines 8-10 of Algorithm 2 operation by operation: every opacity is used once per layer behind it.
+
+    Args:
+        alphas: Opacities [n, ...], of any face.
+        colors: Colours [n, ...]; numbers for `LinearBounds`.
+
+    Raises:
+        IndexError: There are no layers.
+    """
+    color: Interval | Float64Array = colors[0]
+    total = alphas[0] * color
+    light = 1.0 - alphas[0]
+    for i in range(1, alphas.shape[0]):
+        color = colors[i]
+        total = total + alphas[i] * light * color
+        light = light * (1.0 - alphas[i])
+    return total
+
+
+def _over(alpha: Interval, color: Interval, behind: Interval) -> Interval:
+    """The hull of ``P + a (c - P)``: multi-affine, so its extremes lie at the ends."""
+    ends = itertools.product(alpha.bounds(), color.bounds(), behind.bounds())
+    values = [Interval(p) + Interval(a) * (Interval(c) - p) for a, c, p in ends]
+    return Interval(
+        np.minimum.reduce([value.lower for value in values]), np.maximum.reduce([value.upper for value in values])
+    )
+
+
+def sumcumprod(alphas: Face, colors: Interval | Float64Array, behind: float = 0.0) -> Face:
+    """SUMCUMPROD (Algorithm 5): blend back to front, ``P <- a_i c_i + (1 - a_i) P``, each ``a_i`` once.
+
+    For independent opacities in [0, 1] the interval face is the exact range up to rounding: P
+    increases with the P behind it, and each step is exact. The affine face takes each step as
+    ``P + a (c - P)``, so a remainder behind a layer is multiplied by what passes the layer.
+
+    Args:
+        alphas: Opacities [n, ...], of any face.
+        colors: Colours [n, ...] that broadcast against them; numbers for `LinearBounds`.
+        behind: What shows through all layers.
+
+    Returns:
+        The blended value, of the same face, [...].
+
+    Raises:
+        TypeError: `LinearBounds` with intervals of colours.
+    """
+    n = alphas.shape[0]
+    if isinstance(alphas, LinearBounds):
+        if isinstance(colors, Interval):
+            raise TypeError("linear bounds are blended with numbers for colours")
+        result = LinearBounds.of(alphas.basis, np.full(alphas.shape[1:], behind))
+        for i in reversed(range(n)):
+            result = alphas[i].scale(colors[i]) + (1.0 - alphas[i]) * result
+        return result
+    ranges = alphas if isinstance(alphas, Interval) else alphas.range
+    colors = Interval.lift(colors)
+    value = Interval(behind)
+    form = None if isinstance(alphas, Interval) else Enclosure.of(alphas.basis, value)
+    for i in reversed(range(n)):
+        value = _over(ranges[i], colors[i], value)
+        if form is not None:
+            shape = value.shape
+            alpha = alphas[i].broadcast_to(shape)
+            form = (form + alpha * (colors[i] - form)).meet(value)
+    return constant_like(alphas, value) if form is None else form
+
+
+def convex_combination(weights: Interval, values: Interval | Float64Array) -> Interval:
+    """Bounds of ``sum_i w_i v_i`` for weights in boxes that add up to 1.
+
+    The greatest sum fills the largest values first; by duality it is at most
+    ``m + sum_i max over w_i of w_i (v_i - m)`` for every ``m``, and equal to it for the value at which
+    the filling stops. The bound is evaluated at that ``m``, found in floating point.
+
+    Args:
+        weights: [n, ...], non-negative.
+        values: [n, ...] that broadcast against them.
+
+    Returns:
+        [...]; the sum of the weights is taken to be 1 exactly.
+    """
+    values = Interval.lift(values)
+    shape = np.broadcast_shapes(weights.shape, values.shape)
+    weights, values = weights.broadcast_to(shape), values.broadcast_to(shape)
+    upper = _fill(weights, values.upper)
+    lower = _fill(weights, -values.lower)
+    return Interval(-lower, upper)
+
+
+def _fill(weights: Interval, values: Float64Array) -> Float64Array:
+    """Upper bound of the greatest sum with the numbers ``values``."""
+    order = np.argsort(-values, axis=0)
+    sorted_values = np.take_along_axis(values, order, axis=0)
+    room = np.take_along_axis(weights.upper - weights.lower, order, axis=0)
+    free = 1.0 - weights.lower.sum(axis=0)
+    stop = np.minimum((np.cumsum(room, axis=0) < free).sum(axis=0), values.shape[0] - 1)
+    level = np.take_along_axis(sorted_values, stop[None], axis=0)[0]
+    return (level + (weights * (Interval(values) - level)).sum(0)).upper

@@ -1,0 +1,218 @@
+"""The perturbation file: which poses around a camera path belong to the set."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from ns_abstract.io.errors import InputError
+from ns_abstract.io.fields import Fail, Range, interval, known, vector
+from ns_abstract.io.jsonio import load_json, show
+from ns_abstract.perturbation.variations import KEYS, VARIATIONS, SceneVariation, parse_selection, selection_object
+
+TRANSLATIONS = ("x", "y", "z")
+ROTATIONS = ("yaw", "pitch", "roll")
+
+_KEYS = {
+    "version": "1",
+    "frame": '"camera" or "world"',
+    "units": '"normalised" or "dataset"',
+    "translation": "an object with x, y, z",
+    "rotation": "an object with yaw, pitch, roll",
+    "sweep": '"keyframes" or "segments"',
+    "orbit": "an object with target, axis, azimuth",
+    "scene": "a list of variations of the scene",
+    "hue": "a number",
+    "saturation": "a number",
+}
+
+
+@dataclass(frozen=True)
+class Orbit:
+    """Rigid rotation of the camera about the axis through ``target``; azimuth in radians."""
+
+    target: tuple[float, float, float]
+    axis: tuple[float, float, float]
+    azimuth: Range
+
+
+@dataclass(frozen=True)
+class Perturbation:
+    """A set of poses around a camera path (the file's version 1).
+
+    Attributes:
+        frame: Axes of ``translation``: "camera" (x right, y up, z back) or "world".
+        translation: Ranges of x, y, z, in units of the normalised frame.
+        rotation: Ranges of yaw, pitch, roll, radians.
+        sweep: "keyframes", or "segments": the pose also moves from each entry to the next.
+        orbit: Optional orbit, applied before translation and rotation.
+        scene: What varies of a Splatfacto scene; entry by entry, Gaussian by Gaussian.
+        hue, saturation: Ranges (turns, and of 1) of what is added to the colours of all points of a NeRF together;
+            None: nothing.
+    """
+
+    frame: Literal["camera", "world"] = "camera"
+    translation: Mapping[str, Range] = field(default_factory=dict)
+    rotation: Mapping[str, Range] = field(default_factory=dict)
+    sweep: Literal["keyframes", "segments"] = "keyframes"
+    orbit: Orbit | None = None
+    scene: tuple[SceneVariation, ...] = field(default=(), repr=False)
+    hue: Range | None = None
+    saturation: Range | None = None
+
+
+def load_perturbation(path: str | Path, *, dataset_scale: float = 1.0) -> Perturbation:
+    """Read a perturbation file; a camera path that holds a ``perturbation`` object also serves.
+
+    Args:
+        path: The file.
+        dataset_scale: Normalised units per unit of transforms.json (dataparser_transforms.json).
+
+    Raises:
+        InputError: The file or a field in it cannot be used.
+    """
+    path = Path(path)
+    root = load_json(path, "perturbation file")
+    if isinstance(root, dict) and "camera_path" in root and "perturbation" in root:
+        root = root["perturbation"]
+    try:
+        return parse_perturbation(root, dataset_scale=dataset_scale, field_prefix="", folder=path.parent)
+    except InputError as error:
+        raise error.within(path) from None
+
+
+def parse_perturbation(
+    value: object,
+    *,
+    dataset_scale: float = 1.0,
+    field_prefix: str = "perturbation.",
+    folder: Path | None = None,
+) -> Perturbation:
+    """Check a parsed ``perturbation`` object and convert the camera's translations to the normalised frame.
+
+    Args:
+        value: The object.
+        dataset_scale: See `load_perturbation`.
+        field_prefix: What errors write before a field.
+        folder: Index files are looked for here; None: in the working directory.
+
+    Raises:
+        InputError: A key is unknown, a value has the wrong type, an interval is reversed, a number
+            is not finite, an index file cannot be used, or the variation is one of a NeRF.
+    """
+
+    def fail(name: str, problem: str, fix: str) -> InputError:
+        return InputError(problem, field=f"{field_prefix}{name}".strip("."), fix=fix)
+
+    if not isinstance(value, dict):
+        raise fail("", f"found {show(value)}", "write an object")
+    known(value, _KEYS, "", fail)
+    if value.get("version", 1) != 1 or isinstance(value.get("version"), bool):
+        raise fail("version", f"found {show(value['version'])}", "this program reads version 1")
+    frame = _choice(value, "frame", ("camera", "world"), fail)
+    units = _choice(value, "units", ("normalised", "dataset"), fail)
+    sweep = _choice(value, "sweep", ("keyframes", "segments"), fail)
+    shifts = {name: interval(value[name], name, fail) for name in ("hue", "saturation") if name in value}
+    for name, (low, high) in shifts.items():
+        if low < -1.0 or high > 1.0:
+            raise fail(name, f"found {show(value[name])}", "stay within -1 and 1")
+    translation = _ranges(value, "translation", TRANSLATIONS, fail)
+    if units == "dataset":
+        translation = {name: (dataset_scale * low, dataset_scale * high) for name, (low, high) in translation.items()}
+    return Perturbation(
+        frame=frame,  # pyright: ignore[reportArgumentType]
+        translation=translation,
+        rotation=_ranges(value, "rotation", ROTATIONS, fail),
+        sweep=sweep,  # pyright: ignore[reportArgumentType]
+        orbit=_orbit(value, fail),
+        scene=_scene(value, fail, field_prefix, folder),
+        hue=shifts.get("hue"),
+        saturation=shifts.get("saturation"),
+    )
+
+
+def perturbation_object(perturbation: Perturbation) -> dict[str, Any]:
+    """What a perturbation file holds for a set: `parse_perturbation` reads it back as the same set."""
+
+    def ranges(limits: Mapping[str, Range]) -> dict[str, list[float]]:
+        return {name: list(ends) for name, ends in limits.items()}
+
+    found: dict[str, Any] = {
+        "version": 1,
+        "frame": perturbation.frame,
+        "translation": ranges(perturbation.translation),
+        "rotation": ranges(perturbation.rotation),
+        "sweep": perturbation.sweep,
+    }
+    if (orbit := perturbation.orbit) is not None:
+        found["orbit"] = {"target": list(orbit.target), "axis": list(orbit.axis), "azimuth": list(orbit.azimuth)}
+    if perturbation.scene:
+        found["scene"] = [
+            {"select": selection_object(entry.select)}
+            | ranges({key: limits for key in VARIATIONS if (limits := getattr(entry, key)) is not None})
+            for entry in perturbation.scene
+        ]
+    return found
+
+
+def _choice(value: Mapping[str, Any], name: str, choices: tuple[str, ...], fail: Fail) -> str:
+    found = value.get(name, choices[0])
+    if found not in choices or not isinstance(found, str):
+        raise fail(name, f"found {show(found)}", f"write {' or '.join(choices)}")
+    return found
+
+
+def _ranges(value: Mapping[str, Any], name: str, keys: tuple[str, ...], fail: Fail) -> dict[str, Range]:
+    inner = value.get(name, {})
+    if not isinstance(inner, dict):
+        raise fail(name, f"found {show(inner)}", f"write {_KEYS[name]}")
+    known(inner, keys, f"{name}.", fail)
+    return {key: interval(inner[key], f"{name}.{key}", fail) for key in keys if key in inner}
+
+
+def _scene(value: Mapping[str, Any], fail, prefix: str, folder: Path | None) -> tuple[SceneVariation, ...]:
+    if "scene" not in value:
+        return ()
+    entries = value["scene"]
+    if not isinstance(entries, list) or not entries:
+        raise fail("scene", f"found {show(entries)}", "write a list of objects with select, mean, opacity, color")
+    found = []
+    for k, entry in enumerate(entries):
+        name = f"scene[{k}]"
+        if not isinstance(entry, dict):
+            raise fail(name, f"found {show(entry)}", f"write an object with {', '.join(KEYS)}")
+        known(entry, KEYS, f"{name}.", fail)
+        if "select" not in entry:
+            raise fail(f"{name}.select", "missing", "say which Gaussians vary; {} stands for all")
+        if not any(key in entry for key in VARIATIONS):
+            raise fail(name, "nothing varies", "write mean, opacity or color")
+        ranges = {key: interval(entry[key], f"{name}.{key}", fail) for key in VARIATIONS if key in entry}
+        select = parse_selection(entry["select"], f"{name}.select", fail, folder)
+        found.append(SceneVariation(select, **ranges, name=f"{prefix}{name}"))
+    return tuple(found)
+
+
+def _orbit(value: Mapping[str, Any], fail: Fail) -> Orbit | None:
+    if value.get("orbit") is None:
+        return None
+    inner = value["orbit"]
+    if not isinstance(inner, dict):
+        raise fail("orbit", f"found {show(inner)}", f"write {_KEYS['orbit']}")
+    known(inner, ("target", "axis", "azimuth"), "orbit.", fail)
+    for name in ("target", "axis", "azimuth"):
+        if name not in inner:
+            raise fail(f"orbit.{name}", "missing", f"write {_KEYS['orbit']}")
+    axis = vector(inner["axis"], "orbit.axis", fail)
+    with np.errstate(over="ignore"):
+        length = float(np.linalg.norm(axis))
+    if not 1e-12 < length < np.inf:
+        raise fail("orbit.axis", f"has length {length:g}", "write a direction, such as [0, 0, 1]")
+    return Orbit(
+        target=vector(inner["target"], "orbit.target", fail),
+        axis=axis,
+        azimuth=interval(inner["azimuth"], "orbit.azimuth", fail),
+    )

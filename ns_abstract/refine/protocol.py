@@ -1,0 +1,231 @@
+"""What refinement, certificates and the Python interface know about a representation of scenes.
+
+A representation (`ns_abstract.methods.splat`, `ns_abstract.methods.nerf`) is a folder whose `Method` makes a `Frame` of
+every set of poses. Nothing above `ns_abstract.methods.load` asks which one it is.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from typing import TYPE_CHECKING, Any, Protocol
+
+import numpy as np
+
+from ns_abstract.geometry.box import ParameterBox
+from ns_abstract.geometry.camera_path import Camera
+from ns_abstract.geometry.poses import PoseSet
+from ns_abstract.perturbation.specification import Perturbation
+
+if TYPE_CHECKING:
+    import torch
+
+#: A_lower [..., d], b_lower [...], A_upper, b_upper: see `ns_abstract.refine.result.Leaves`.
+LinearSets = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
+#: Parameter values [d] and tile numbers (None: all) to tiles [t, side, side, 3] float32.
+Render = Callable[[np.ndarray, "np.ndarray | None"], np.ndarray]
+
+
+class Context(Protocol):
+    """What a bounded cell hands on to the cells inside it."""
+
+    @property
+    def nbytes(self) -> int:
+        """Memory that it holds."""
+        ...
+
+    @property
+    def shown(self) -> np.ndarray | None:
+        """Numbers [n] of the scene elements that the cell may show; None where elements are not told apart."""
+        ...
+
+
+class Bounds(Protocol):
+    """Bounds of some tiles over one cell.
+
+    Attributes:
+        lower, upper: [t, side, side, 3] float32, rounded outward.
+        slopes: [d] how much the picture varies by parameter: what a cut along it may gain.
+        context: For the cells inside this one; None: nothing is known that would help.
+        linear: Linear bounds in the cell's parameters, if they were asked for.
+    """
+
+    @property
+    def lower(self) -> np.ndarray: ...
+
+    @property
+    def upper(self) -> np.ndarray: ...
+
+    @property
+    def slopes(self) -> np.ndarray: ...
+
+    @property
+    def context(self) -> Context | None: ...
+
+    @property
+    def linear(self) -> LinearSets | None: ...
+
+
+class Frame(Protocol):
+    """One set of poses of a scene, ready to be rendered and bounded.
+
+    Attributes:
+        pose_set: The poses; their parameters are those of ``box``.
+        box: The parameters of positive width.
+        camera: Size and intrinsics.
+        side: Pixels along a tile's side.
+        across, down: Tiles across and down; tiles are numbered row by row.
+        tilewise: Whether tiles are costly and independent (rays): the whole set is then bounded by [0, 1] at no cost,
+            as a first cover, and tiles are taken a few at a time. Otherwise a call shares most of its work among tiles.
+        tiles_at_once: Most tiles of one call while cells are split, so that time is looked at in between; None: all
+            that a cell concerns.
+        witnesses: Poses rendered in every part of a cell of one parameter that is split.
+    """
+
+    @property
+    def pose_set(self) -> PoseSet: ...
+
+    @property
+    def box(self) -> ParameterBox: ...
+
+    @property
+    def camera(self) -> Camera: ...
+
+    @property
+    def side(self) -> int: ...
+
+    @property
+    def across(self) -> int: ...
+
+    @property
+    def down(self) -> int: ...
+
+    @property
+    def tilewise(self) -> bool: ...
+
+    @property
+    def tiles_at_once(self) -> int | None: ...
+
+    @property
+    def witnesses(self) -> int: ...
+
+    @property
+    def tile_count(self) -> int:
+        """Number of tiles."""
+        ...
+
+    def warm_up(self) -> None:
+        """Compile what is compiled at first use."""
+        ...
+
+    def render(self, values: np.ndarray, tiles: np.ndarray | None = None) -> np.ndarray:
+        """Tiles [t, side, side, 3] float32 of the concrete image at parameter values [d]; all tiles if None."""
+        ...
+
+    def members(self, seed: int) -> Iterator[Render]:
+        """Other scenes of the set, each as a function like `render`; none where only poses vary."""
+        ...
+
+    def bound(self, box: ParameterBox, tiles: np.ndarray, within: Any = None, keep_linear: bool = False) -> Bounds:
+        """Bounds of ``tiles`` over ``box``; ``within`` is the context of these tiles and a box around it."""
+        ...
+
+    def feasible(self, box: ParameterBox) -> ParameterBox | None:
+        """A part of ``box`` that holds all parameters in it of poses of the set; None where there are none."""
+        ...
+
+    def motion(self, box: ParameterBox) -> np.ndarray:
+        """[d] pixels that the picture moves by over each parameter's range (an estimate)."""
+        ...
+
+    def watch(self, tiles: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> None:
+        """Take notice of the inner bounds [t, side, side, 3] of ``tiles`` [t], which a refinement changes meanwhile."""
+        ...
+
+    def allow(self, excess: float) -> float:
+        """Save time from now on where that loosens gaps by no more than a small part of ``excess`` on average.
+
+        Returns:
+            What no more light comes to is left out; 0: nothing is.
+        """
+        ...
+
+    def plan(self, shown: int | None, lower: np.ndarray, upper: np.ndarray) -> list[str]:
+        """What was left out for this frame and why, one sentence each.
+
+        Args:
+            shown: Number of scene elements that some cell shows, if they are told apart.
+            lower: [H, W, 3] what refinement found.
+            upper: [H, W, 3] likewise.
+        """
+        ...
+
+
+class Method(Protocol):
+    """A scene and the program whose pictures are bounded."""
+
+    @property
+    def name(self) -> str:
+        """The scene's name."""
+        ...
+
+    @property
+    def notes(self) -> Sequence[str]:
+        """What was assumed on reading the scene, one sentence each."""
+        ...
+
+    @property
+    def dataset_scale(self) -> float:
+        """Normalised units per unit of the data set."""
+        ...
+
+    @property
+    def program(self) -> dict[str, Any]:
+        """``name`` and ``version`` of the bounded program, and what else tells it from others."""
+        ...
+
+    @property
+    def guarantee(self) -> str:
+        """What bounds of this program are called: "float32-sound" or "real-sound"."""
+        ...
+
+    @property
+    def content(self) -> str:
+        """The scene in a few words."""
+        ...
+
+    @property
+    def plan(self) -> tuple[str, ...]:
+        """What is left out for this scene, whatever the frame."""
+        ...
+
+    @property
+    def fingerprint(self) -> dict[str, Any]:
+        """Scene and program, for results that are continued."""
+        ...
+
+    def describe(self) -> dict[str, Any]:
+        """The scene for reports; ``name`` is among the keys."""
+        ...
+
+    def prepare(self, perturbations: Sequence[Perturbation]) -> None:
+        """Find out what the scene itself may do.
+
+        Raises:
+            InputError: Not with this scene.
+        """
+        ...
+
+    def memory(self, pixels: int) -> int:
+        """Bytes that bounding pictures of ``pixels`` needs beside the leaves."""
+        ...
+
+    def frame(self, poses: PoseSet, slanted: bool = False) -> Frame:
+        """One frame; ``slanted``: its box may count parameters otherwise than the set does, where that is tighter."""
+        ...
+
+    def differentiable(self, poses: PoseSet) -> Callable[[torch.Tensor], torch.Tensor] | None:
+        """Parameter values [d] to the picture [H, W, 3] by differentiable operations, for the search.
+
+        None: certificates are not made of this representation.
+        """
+        ...

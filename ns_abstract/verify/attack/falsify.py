@@ -1,0 +1,503 @@
+"""An attack on an abstract image: search its set of poses for an image that leaves it.
+
+Tolerance is zero. What the attack returns is a lower bound of what is wrong: no violation found is no
+proof. The poses tried are, in this order, given ones, the middle and corners of the box, random ones,
+and two searches that look where an image comes closest to a bound relative to the gap: projected
+gradient ascent through a differentiable twin of the renderer, and bisection towards jumps (the
+rasteriser's thresholds), whose two sides are rendered.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+import torch
+from numpy.typing import ArrayLike, NDArray
+
+from ns_abstract.geometry.box import Float64Array, ParameterBox
+
+#: Parameter values [d] to an image [H, W, 3].
+Render = Callable[[Float64Array], NDArray[np.floating]]
+#: Parameter values [d] and pixels [k, 2] (row, column) to colours [k, 3].
+Probe = Callable[[Float64Array, NDArray[np.int64]], NDArray[np.floating]]
+#: The same in torch, differentiable with respect to the values.
+Twin = Callable[[torch.Tensor, torch.Tensor], torch.Tensor]
+
+STRATEGIES = ("given", "corners", "random", "ascent", "jumps")
+
+_CORNERS = 64
+_KEPT = 16
+# of the poses left after the given ones
+_SHARES = {"corners": 0.4, "random": 0.4, "ascent": 0.6}
+_ASCENT_STEPS = 16
+_FIRST_STEP = 0.25
+_LINE = 9
+_HALVINGS = 60
+# a continuous function falls by about 2^-16 in so many halvings; what falls less than this jumps
+_SUSPECT_HALVINGS = 16
+_SUSPECT_FALL = 2.0**-11
+
+
+@dataclass(frozen=True)
+class Violation:
+    """One value outside its bounds.
+
+    Attributes:
+        values: The pose's parameters, in the box's order and units.
+        row, column, channel: Where.
+        value: What was rendered.
+        bound: The bound it breaks: the lower one if ``value`` is less, else the upper one.
+        amount: Their distance; NaN where one is not a number.
+    """
+
+    values: tuple[float, ...]
+    row: int
+    column: int
+    channel: int
+    value: float
+    bound: float
+    amount: float
+
+
+@dataclass(frozen=True)
+class Attack:
+    """What an attack did and found.
+
+    Attributes:
+        poses: Images rendered in full.
+        probes: Single pixels rendered besides (their values are compared as well).
+        steps: Evaluations of the twin.
+        comparisons: Pixel channels compared with their bounds.
+        violations: Comparisons that failed, and bounds that are not finite.
+        not_finite: Of those, the values and bounds that are not finite numbers.
+        worst: The worst violation of at most 16 pixel channels, largest first, NaN before all.
+        witness_lower, witness_upper: [H, W, 3] least and largest values rendered; NaN where every
+            image was NaN.
+        tried: Poses by strategy.
+        closest: [n, d] poses at which a pixel came closest to a bound relative to the gap, at most 8.
+        seconds: Time spent.
+    """
+
+    poses: int
+    probes: int
+    steps: int
+    comparisons: int
+    violations: int
+    not_finite: int
+    worst: tuple[Violation, ...]
+    witness_lower: Float64Array = field(repr=False)
+    witness_upper: Float64Array = field(repr=False)
+    tried: dict[str, int]
+    closest: Float64Array = field(repr=False)
+    seconds: float
+
+    @property
+    def amount(self) -> float:
+        """How far the worst value lies outside: 0 if nothing does, infinity if something is no number."""
+        if not self.worst:
+            return 0.0
+        return float("inf") if np.isnan(self.worst[0].amount) else self.worst[0].amount
+
+
+class _Enough(Exception):
+    """The budget is spent."""
+
+
+class _Record:
+    """Compares images with the bounds and remembers the extremes and where they were seen."""
+
+    def __init__(
+        self, lower: ArrayLike, upper: ArrayLike, box: ParameterBox, render: Render, limit: int, deadline: float
+    ) -> None:
+        self.lower = np.asarray(lower, np.float64)
+        self.upper = np.asarray(upper, np.float64)
+        if self.lower.shape != self.upper.shape or self.lower.ndim != 3 or self.lower.shape[2] != 3:
+            raise ValueError(f"bounds [H, W, 3] expected, got {self.lower.shape} and {self.upper.shape}")
+        self.box = box
+        self.render = render
+        self.limit = limit
+        self.deadline = deadline
+        shape = self.lower.shape
+        self.poses: list[Float64Array] = []
+        self.seen: set[bytes] = set()
+        self.tried: dict[str, int] = dict.fromkeys(STRATEGIES, 0)
+        self.probes = self.steps = self.comparisons = self.violations = self.not_finite = 0
+        self.least = np.full(shape, np.inf)
+        self.most = np.full(shape, -np.inf)
+        self.least_at = np.full(shape, -1)
+        self.most_at = np.full(shape, -1)
+        self.found: dict[tuple[int, int, int], Violation] = {}
+        bad = ~(np.isfinite(self.lower) & np.isfinite(self.upper))
+        self.not_finite += int(bad.sum())
+        self.violations += int(bad.sum())
+        for place in np.argwhere(bad)[:_KEPT]:
+            bound = self.lower[tuple(place)] if not np.isfinite(self.lower[tuple(place)]) else self.upper[tuple(place)]
+            row, column, channel = map(int, place)
+            self._keep(Violation((), row, column, channel, float("nan"), float(bound), float("nan")))
+
+    def _keep(self, violation: Violation) -> None:
+        place = (violation.row, violation.column, violation.channel)
+        known = self.found.get(place)
+        if known is None or _severity(violation) > _severity(known):
+            self.found[place] = violation
+
+    def image(self, values: Float64Array, strategy: str) -> Float64Array:
+        """Render and compare one pose."""
+        if len(self.poses) >= self.limit or time.perf_counter() >= self.deadline:
+            raise _Enough
+        values = np.clip(np.asarray(values, np.float64), self.box.lower, self.box.upper)
+        image = np.asarray(self.render(values), np.float64)
+        if image.shape != self.lower.shape:
+            raise ValueError(f"rendered image {image.shape}, bounds {self.lower.shape}")
+        self.tried[strategy] += 1
+        number = len(self.poses)
+        self.poses.append(values)
+        self.seen.add(values.tobytes())
+        less, more = image < self.least, image > self.most
+        self.least[less] = image[less]
+        self.most[more] = image[more]
+        self.least_at[less] = number
+        self.most_at[more] = number
+        self._compare(values, image, self.lower, self.upper, None)
+        return image
+
+    def image_once(self, values: Float64Array, strategy: str) -> None:
+        """Render and compare one pose, unless that was done before."""
+        if values.tobytes() not in self.seen:
+            self.image(values, strategy)
+
+    def _compare(
+        self,
+        values: Float64Array,
+        image: Float64Array,
+        lower: Float64Array,
+        upper: Float64Array,
+        pixels: NDArray[np.int64] | None,
+    ) -> None:
+        """Compare [..., 3] values with their bounds; ``pixels`` [k, 2] names them where it is no whole image."""
+        self.comparisons += image.size
+        self.not_finite += int((~np.isfinite(image)).sum())
+        inside = (lower <= image) & (image <= upper)
+        if inside.all():
+            return
+        outside = ~inside
+        # bounds that are not numbers were counted once
+        counted = outside & np.isfinite(lower) & np.isfinite(upper)
+        self.violations += int(counted.sum())
+        amount = np.where(image < lower, lower - image, image - upper)
+        places = np.argwhere(counted)
+        # worst first, NaN before all
+        ranks = np.argsort(-np.nan_to_num(amount[counted], nan=np.inf, posinf=np.inf), kind="stable")[:_KEPT]
+        for place in places[ranks]:
+            index = tuple(place)
+            row, column = (int(place[0]), int(place[1])) if pixels is None else map(int, pixels[place[0]])
+            bound = lower[index] if image[index] < lower[index] else upper[index]
+            where = (row, column, int(place[-1]))
+            seen = (float(image[index]), float(bound), float(amount[index]))
+            self._keep(Violation(tuple(values.tolist()), *where, *seen))
+
+    def pixel(self, probe: Probe | None, values: Float64Array, target: _Target) -> float:
+        """The target's value at a pose, compared with its bounds; rendered in full if there is no probe."""
+        if probe is None:
+            return float(self.image(values, "jumps")[target.row, target.column, target.channel])
+        if time.perf_counter() >= self.deadline:
+            raise _Enough
+        where = np.array([[target.row, target.column]], np.int64)
+        color = np.asarray(probe(values, where), np.float64)
+        self.probes += 1
+        here = (where[:, 0], where[:, 1])
+        self._compare(values, color, self.lower[here], self.upper[here], where)
+        return float(color[0, target.channel])
+
+    def _ranking(self) -> NDArray[np.int64]:
+        """Flat indices into [2, H, W, 3] (upper, lower bound) of what came closest to its bound relative to the gap."""
+        gap = self.upper - self.lower
+        with np.errstate(divide="ignore", invalid="ignore"):
+            score = np.stack([(self.most - self.lower) / gap, (self.upper - self.least) / gap])
+            # what never moved cannot be pushed, and no image leaves [0, 1]
+            score[:, ~((self.most > self.least) & (gap > 0.0))] = -np.inf
+            score[0, self.upper >= 1.0] = -np.inf
+            score[1, self.lower <= 0.0] = -np.inf
+        score[~np.isfinite(score)] = -np.inf
+        order = np.argsort(-score, axis=None, kind="stable")
+        return order[: int(np.isfinite(score).sum())]
+
+    def _target(self, flat: int) -> _Target:
+        side, row, column, channel = (int(v) for v in np.unravel_index(flat, (2, *self.lower.shape)))
+        number = (self.most_at, self.least_at)[side][row, column, channel]
+        return _Target(row, column, channel, 1.0 if side == 0 else -1.0, self.poses[number])
+
+    def targets(self, count: int, generator: np.random.Generator, done: set[int]) -> list[_Target]:
+        """Pixel channels to push, none of them in ``done``, to which they are added.
+
+        A third each: what came closest to a bound; the closest whose extreme pose is no corner of the
+        box (at a corner there is rarely further to go); any of the closest half.
+        """
+        order = self._ranking()
+        if done:
+            order = order[~np.isin(order, np.fromiter(done, np.int64))]
+        at_corner = np.array(
+            [bool(np.all((pose == self.box.lower) | (pose == self.box.upper))) for pose in self.poses], bool
+        )
+        extreme_at = np.stack([self.most_at, self.least_at]).ravel()
+        third = (count + 2) // 3
+        best = list(dict.fromkeys([*order[:third], *order[~at_corner[extreme_at[order]]][: 2 * third]]))[: 2 * third]
+        rest = np.setdiff1d(order[: max(1, len(order) // 2)], best)
+        if len(rest):
+            best += list(generator.choice(rest, min(max(0, count - len(best)), len(rest)), replace=False))
+        done.update(int(flat) for flat in best)
+        return [self._target(flat) for flat in best]
+
+    def closest(self) -> Float64Array:
+        """[n, d] poses of the closest approaches, each once."""
+        order = self._ranking()
+        poses = [self._target(flat).pose for flat in order[:256]]
+        unique = list(dict.fromkeys(tuple(pose.tolist()) for pose in poses))[:8]
+        return np.array(unique, np.float64).reshape(len(unique), self.box.dimensions)
+
+    def attack(self, seconds: float) -> Attack:
+        worst = sorted(self.found.values(), key=_severity, reverse=True)[:_KEPT]
+        unseen = self.most < self.least
+        return Attack(
+            poses=len(self.poses),
+            probes=self.probes,
+            steps=self.steps,
+            comparisons=self.comparisons,
+            violations=self.violations,
+            not_finite=self.not_finite,
+            worst=tuple(worst),
+            witness_lower=np.where(unseen, np.nan, self.least),
+            witness_upper=np.where(unseen, np.nan, self.most),
+            tried=dict(self.tried),
+            closest=self.closest(),
+            seconds=seconds,
+        )
+
+
+@dataclass(frozen=True)
+class _Target:
+    """A pixel channel to push up (sign 1) or down (-1), and the pose where it went furthest."""
+
+    row: int
+    column: int
+    channel: int
+    sign: float
+    pose: Float64Array
+
+
+def _severity(violation: Violation) -> float:
+    return np.inf if np.isnan(violation.amount) else violation.amount
+
+
+def _corners(box: ParameterBox, count: int, generator: np.random.Generator) -> Float64Array:
+    """[n, d] all corners, or ``count`` different ones drawn at random."""
+    if box.dimensions == 0:
+        return np.zeros((0, 0))
+    count = min(count, _CORNERS)
+    if 2**box.dimensions <= count:
+        return box.corners()
+    numbers = generator.choice(2**box.dimensions, count, replace=False)
+    bits = (numbers[:, None] >> np.arange(box.dimensions)) & 1
+    return np.where(bits == 1, np.array(box.upper), np.array(box.lower))
+
+
+def _ascend(record: _Record, twin: Twin, target: _Target, start: Float64Array) -> Float64Array:
+    """Projected gradient ascent of one pixel channel, in parameters scaled to [-1, 1]^d.
+
+    Steps follow the normalised gradient; they double where the value grew and shrink to a quarter where not.
+    """
+    low = torch.tensor(record.box.lower, dtype=torch.float64)
+    high = torch.tensor(record.box.upper, dtype=torch.float64)
+    pixel = torch.tensor([[target.row, target.column]])
+
+    def evaluate(scaled: torch.Tensor) -> tuple[float, torch.Tensor]:
+        scaled = scaled.detach().requires_grad_(True)
+        value = target.sign * twin(low + 0.5 * (scaled + 1.0) * (high - low), pixel)[0, target.channel]
+        record.steps += 1
+        slope = torch.zeros_like(scaled)
+        if value.requires_grad:
+            (slope,) = torch.autograd.grad(value, scaled)
+        return float(value.detach()), slope
+
+    span = high - low
+    scaled = (2.0 * (torch.from_numpy(start) - low) / span - 1.0).clamp(-1.0, 1.0)
+    best, slope = evaluate(scaled)
+    step = _FIRST_STEP
+    for _ in range(_ASCENT_STEPS):
+        # directions that leave the box are no use
+        free = torch.where(((scaled >= 1.0) & (slope > 0)) | ((scaled <= -1.0) & (slope < 0)), 0.0, slope)
+        length = float(free.norm())
+        if not (0.0 < length < np.inf) or time.perf_counter() >= record.deadline:
+            break
+        trial = (scaled + step * free / length).clamp(-1.0, 1.0)
+        value, trial_slope = evaluate(trial)
+        if value > best:
+            scaled, best, slope, step = trial, value, trial_slope, min(2.0 * step, 1.0)
+        else:
+            step *= 0.25
+    return record.box.at(scaled.numpy())
+
+
+def _jump(record: _Record, probe: Probe | None, target: _Target, generator: np.random.Generator) -> None:
+    """Look for a jump of the target on a random line through its pose, and render both sides of it."""
+    low, high = np.array(record.box.lower), np.array(record.box.upper)
+    direction = generator.normal(size=low.size) * (high - low)
+    # the line's ends in the box
+    with np.errstate(divide="ignore", invalid="ignore"):
+        ends = np.stack([(low - target.pose) / direction, (high - target.pose) / direction])
+    ends = ends[:, direction != 0.0]
+    if ends.size == 0:
+        return
+    first, last = np.minimum(ends[0], ends[1]).max(), np.maximum(ends[0], ends[1]).min()
+    places = np.linspace(min(first, 0.0), max(last, 0.0), _LINE)
+
+    def at(place: float) -> Float64Array:
+        return np.clip(target.pose + place * direction, low, high)
+
+    values = [record.pixel(probe, at(place), target) for place in places]
+    k = int(np.argmax(np.abs(np.diff(values))))
+    a, b, value_a, value_b = places[k], places[k + 1], values[k], values[k + 1]
+    difference = abs(value_b - value_a)
+    for halving in range(_HALVINGS):
+        if not abs(value_b - value_a) > (_SUSPECT_FALL * difference if halving >= _SUSPECT_HALVINGS else 0.0):
+            return
+        middle = 0.5 * (a + b)
+        if not (min(a, b) < middle < max(a, b)) or np.array_equal(at(a), at(b)):
+            break
+        value = record.pixel(probe, at(middle), target)
+        # the half with the larger difference holds the larger jump
+        if abs(value - value_a) >= abs(value_b - value):
+            b, value_b = middle, value
+        else:
+            a, value_a = middle, value
+    record.image_once(at(a), "jumps")
+    record.image_once(at(b), "jumps")
+
+
+def falsify(
+    lower: ArrayLike,
+    upper: ArrayLike,
+    box: ParameterBox,
+    render: Render,
+    twin: Twin | None = None,
+    *,
+    probe: Probe | None = None,
+    poses: int = 200,
+    seconds: float = float("inf"),
+    seed: int = 0,
+    starts: ArrayLike | None = None,
+    strategies: Sequence[str] = STRATEGIES,
+) -> Attack:
+    """Attack the abstract image [lower, upper] of the poses of ``box``.
+
+    Args:
+        lower, upper: [H, W, 3]; compared as they are.
+        box: The parameters.
+        render: Parameter values [d] to an image [H, W, 3]. Its images are what must lie inside.
+        twin: Differentiable with respect to the values; it guides the ascent and is not compared.
+            Without it there is no ascent.
+        probe: The value of single pixels, equal to ``render``'s; saves the search for jumps from
+            rendering whole images.
+        poses: Most images rendered.
+        seconds: Most time spent; reaching it ends the attack after the image in progress. A limit
+            makes the outcome depend on the machine.
+        seed: Decides every random choice.
+        starts: [n, d] poses to try first, clipped into the box.
+        strategies: Which of `STRATEGIES` to use. Poses that one does not need go to the next.
+
+    Raises:
+        ValueError: The bounds or images have the wrong shape, or a strategy is unknown.
+    """
+    unknown = set(strategies) - set(STRATEGIES)
+    if unknown:
+        raise ValueError(f"unknown strategies {sorted(unknown)}; there are {', '.join(STRATEGIES)}")
+    began = time.perf_counter()
+    record = _Record(lower, upper, box, render, poses, began + seconds)
+    generator = np.random.default_rng(seed)
+    used = [name for name in strategies if name != "ascent" or twin is not None]
+    try:
+        _search(record, twin, probe, generator, np.zeros((0, 0)) if starts is None else np.asarray(starts), used)
+    except _Enough:
+        pass
+    return record.attack(time.perf_counter() - began)
+
+
+def _search(
+    record: _Record,
+    twin: Twin | None,
+    probe: Probe | None,
+    generator: np.random.Generator,
+    starts: Float64Array,
+    strategies: Sequence[str],
+) -> None:
+    """Run the strategies one after the other until the budget is spent."""
+    box, limit = record.box, record.limit
+
+    def share(name: str) -> int:
+        """Poses of the rest that a strategy may use; all of it for the last one."""
+        rest = limit - len(record.poses)
+        later = STRATEGIES[STRATEGIES.index(name) + 1 :]
+        return max(1, round(_SHARES[name] * rest)) if any(s in strategies for s in later) else rest
+
+    if "given" in strategies:
+        for values in starts:
+            record.image(values, "given")
+    if "corners" in strategies:
+        count = share("corners")
+        record.image(box.middle, "corners")
+        for values in _corners(box, count - 1, generator):
+            record.image(values, "corners")
+    if box.dimensions == 0:
+        return
+    if "random" in strategies:
+        for values in box.sample(share("random"), generator):
+            record.image(values, "random")
+    if "ascent" in strategies and twin is not None and record.poses:
+        # an ascent that ends where an image was rendered before (often a corner) costs no pose
+        count = share("ascent")
+        last, climbs = len(record.poses) + count, 4 * count
+        done: set[int] = set()
+        while len(record.poses) < last and climbs > 0:
+            # a few at a time, so that later targets profit from earlier poses
+            targets = record.targets(9, generator, done)
+            if not targets:
+                break
+            pairs = [(target, start) for target in targets for start in (target.pose, box.sample(1, generator)[0])]
+            for target, start in pairs:
+                if len(record.poses) < last:
+                    record.image_once(_ascend(record, twin, target, start), "ascent")
+                climbs -= 1
+    if "jumps" in strategies and record.poses:
+        while targets := record.targets(3, generator, set()):
+            before = len(record.poses)
+            for target in targets:
+                _jump(record, probe, target, generator)
+            if len(record.poses) == before:
+                # no jump along these lines
+                record.image(box.sample(1, generator)[0], "random")
+    if "random" in strategies:
+        # nothing moved enough to be searched
+        while True:
+            record.image(box.sample(1, generator)[0], "random")
+
+
+def merge(attacks: Sequence[Attack]) -> Attack:
+    """The sum of attacks on images of one size; at least one."""
+    worst = sorted((v for a in attacks for v in a.worst), key=_severity, reverse=True)[:_KEPT]
+    return Attack(
+        poses=sum(a.poses for a in attacks),
+        probes=sum(a.probes for a in attacks),
+        steps=sum(a.steps for a in attacks),
+        comparisons=sum(a.comparisons for a in attacks),
+        violations=sum(a.violations for a in attacks),
+        not_finite=sum(a.not_finite for a in attacks),
+        worst=tuple(worst),
+        witness_lower=np.fmin.reduce([a.witness_lower for a in attacks]),
+        witness_upper=np.fmax.reduce([a.witness_upper for a in attacks]),
+        tried={name: sum(a.tried[name] for a in attacks) for name in STRATEGIES},
+        closest=np.concatenate([a.closest for a in attacks]),
+        seconds=sum(a.seconds for a in attacks),
+    )

@@ -1,0 +1,92 @@
+"""A network behind the picture, as the search for certificates asks it."""
+
+from __future__ import annotations
+
+import dataclasses
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+import torch
+
+from ns_abstract.verify.network import (
+    ImageSets,
+    Network,
+    NetworkArithmetic,
+    OutputBounds,
+    Substitution,
+    bound_outputs,
+)
+from ns_abstract.verify.preprocess import Preprocess
+from ns_abstract.verify.properties import Query
+
+
+class NetworkModel:
+    """A network with its preprocessing, for `ns_abstract.verify.search.Search`.
+
+    Args:
+        network: The network.
+        preprocess: What comes before it.
+        memory: Bytes that its bounds may take.
+        arithmetic: Whether every float32 evaluation is meant, or the exact network alone.
+    """
+
+    def __init__(
+        self, network: Network, preprocess: Preprocess, memory: int, arithmetic: NetworkArithmetic = "float32"
+    ) -> None:
+        self.network, self.preprocess, self.memory = network, preprocess, memory
+        self.arithmetic: NetworkArithmetic = arithmetic
+
+    @cached_property
+    def _session(self) -> Any:
+        """onnxruntime's session, or None for other files than ONNX."""
+        if self.network.source.suffix.lower() != ".onnx":
+            return None
+        import onnxruntime
+
+        options = onnxruntime.SessionOptions()
+        options.intra_op_num_threads = options.inter_op_num_threads = 1
+        return onnxruntime.InferenceSession(str(self.network.source), options, providers=["CPUExecutionProvider"])
+
+    def outputs(self, images: np.ndarray) -> np.ndarray:
+        """[B, n] of onnxruntime (torch for .pt2 files) in float32, picture by picture.
+
+        With network arithmetic real: of the same weights in float64.
+        """
+        with torch.no_grad():
+            inputs = self.preprocess.apply(torch.from_numpy(np.asarray(images, np.float32)))
+            if self.arithmetic == "real":
+                return np.concatenate([self.network(x[None].double()).numpy() for x in inputs])
+            if self._session is None:
+                return np.concatenate([self.network(x[None]).numpy() for x in inputs])
+        name = self._session.get_inputs()[0].name
+        # one at a time: the same picture gives the same bits whatever stands beside it
+        found = [self._session.run(None, {name: x[None].numpy()}) for x in inputs]
+        return np.stack([np.concatenate([np.asarray(y).reshape(-1) for y in outputs]) for outputs in found])
+
+    def differentiable(self, images: torch.Tensor) -> torch.Tensor:
+        return self.network(self.preprocess.apply(images))
+
+    def input_sets(self, linear: tuple[np.ndarray, ...], lower: np.ndarray, upper: np.ndarray) -> ImageSets:
+        return self.preprocess.sets((linear[0], linear[1], linear[2], linear[3]), lower, upper)
+
+    def bound(self, images: ImageSets, query: Query, substitution: Substitution = "everywhere") -> OutputBounds:
+        d = images.dimensions
+        found = bound_outputs(
+            self.network,
+            parametric(images),
+            query.rows,
+            query.offset,
+            substitution=substitution,
+            memory=self.memory,
+            arithmetic=self.arithmetic,
+        )
+        return found if d else dataclasses.replace(found, a=found.a[..., :0])
+
+
+def parametric(images: ImageSets) -> ImageSets:
+    """The same sets with at least one parameter: that of a single pose moves nothing."""
+    if images.dimensions:
+        return images
+    still = np.zeros((*images.b_lower.shape, 1))
+    return dataclasses.replace(images, a_lower=still, a_upper=still)

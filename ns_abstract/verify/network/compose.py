@@ -1,0 +1,562 @@
+"""Layers of networks that are made of several rules of the table (docs/design.md, N11)."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+import torch
+
+from ns_abstract.io.errors import InputError
+from ns_abstract.verify.network import curves
+from ns_abstract.verify.network.build import Builder
+from ns_abstract.verify.network.graph import as_double, item
+from ns_abstract.verify.network.layers import (
+    Activation,
+    Convolution,
+    Gather,
+    LeakyRelu,
+    Linear,
+    Scale,
+    Shape,
+    Sigmoid,
+    Sum,
+    Tanh,
+)
+from ns_abstract.verify.network.maps import Sparse, TransposedConvolution, Variance
+from ns_abstract.verify.network.products import Product
+
+#: Sums of exponentials one of which is exp(0) are no less than this, rounding included.
+_ONE_AND_MORE = 1.0 - 2.0**-10
+#: How far a float32 constant may be from the number that it stands for, relative.
+_NEAR = 2.0**-22
+_ONES = (1, 1)
+#: Entries of a matrix that takes means away; where it would have more, the mean is a layer of its own.
+_CENTRED_AT_ONCE = 1 << 16
+
+
+class Composer(Builder):
+    """A builder of what networks have besides the plain layers."""
+
+    # ------------------------------------------------------------ what is known of nodes
+
+    def _node(self, index: int) -> Any:
+        return self.nodes[index - 1] if index else None
+
+    def _affine(self, index: int) -> tuple[int, float, float]:
+        """(root, factor, offset): node ``index`` is ``factor * root + offset`` with plain numbers."""
+        factor, offset = 1.0, 0.0
+        while index and isinstance(self._node(index).layer, Scale):
+            layer = self._node(index).layer
+            f = layer.factor.reshape(-1)
+            o = torch.zeros(1, dtype=torch.float64) if layer.offset is None else layer.offset.reshape(-1)
+            if not (bool((f == f[0]).all()) and bool((o == o[0]).all())):
+                break
+            factor, offset = factor * float(f[0]), offset + factor * float(o[0])
+            index = self._node(index).inputs[0]
+        return index, factor, offset
+
+    def floor(self, index: int, depth: int = 12) -> float:
+        """A number that node ``index`` never is below, by what computes it, rounding included."""
+        if not index or not depth:
+            return -math.inf
+        node = self._node(index)
+        layer = node.layer
+        if isinstance(layer, (curves.Exp, curves.Softplus, curves.Abs, Sigmoid)):
+            return 0.0
+        if isinstance(layer, LeakyRelu) and layer.alpha == 0.0:
+            return 0.0
+        if isinstance(layer, curves.Power) and layer.exponent % 2 == 0:
+            return 0.0
+        if isinstance(layer, curves.Clip):
+            return layer.least
+        least = [self.floor(k, depth - 1) for k in node.inputs]
+        if isinstance(layer, (Product, Variance)):
+            return 0.0 if (min(least) >= 0.0 or isinstance(layer, Variance)) else -math.inf
+        if min(least) == -math.inf or isinstance(layer, Activation):
+            return -math.inf
+        if isinstance(layer, Scale) and bool((layer.factor >= 0.0).all()):
+            low = layer.factor * least[0] + (0.0 if layer.offset is None else layer.offset)
+            return self._rounded(float(low.min()), layer.offset is None or bool((layer.offset >= 0.0).all()))
+        if type(layer) is Linear:
+            return least[0]
+        positive = (
+            (isinstance(layer, Sum) and min(layer.signs) > 0)
+            or (isinstance(layer, (Sparse, Convolution)) and bool((layer.weight >= 0.0).all()))
+            or isinstance(layer, Gather)
+        )
+        return 0.0 if positive and min(least) >= 0.0 and layer.bias is None else -math.inf
+
+    @staticmethod
+    def _rounded(value: float, positive: bool) -> float:
+        """A sum of numbers that are not negative keeps its size when it is rounded."""
+        return value * (1.0 - 2.0**-16) if positive and value >= 0.0 else -math.inf
+
+    # ------------------------------------------------------------ functions of one number
+
+    def curve(self, x: int, make: Callable[..., curves.Curve], **settings: Any) -> int:
+        """A layer of `ns_abstract.verify.network.curves`."""
+        return self._add(make(self.shape(x), **settings), x)
+
+    def clip(self, x: int, least: float, most: float) -> int:
+        """``min(max(x, least), most)``, with infinite limits, too."""
+        if not least <= most:
+            raise InputError(f"clips to [{least}, {most}]", fix="the limits must not cross")
+        large = 2.0**100
+        if least <= -large and most >= large:
+            return x
+        if least == most:
+            return self.scale(x, np.zeros(()), np.asarray(least))
+        if most >= large or least <= -large:
+            sign, limit = (1.0, least) if most >= large else (-1.0, most)
+            moved = x if limit == 0.0 and sign > 0.0 else self.scale(x, np.asarray(sign), np.asarray(-sign * limit))
+            if limit == 0.0 and sign > 0.0:
+                return self.leaky_relu(moved, 0.0)
+            return self.scale(self.leaky_relu(moved, 0.0), np.asarray(sign), np.asarray(limit))
+        return self.curve(x, curves.Clip, least=least, most=most)
+
+    def prelu(self, x: int, slope: np.ndarray) -> int:
+        """``max(x, 0) + slope min(x, 0)`` as ``slope x + (1 - slope) relu(x)``."""
+        slope = np.asarray(slope, np.float64)
+        if slope.size == 1 and 0.0 <= float(slope.reshape(-1)[0]) <= 1.0:
+            return self.leaky_relu(x, float(slope.reshape(-1)[0]))
+        straight = self.scale(x, slope, None)
+        return self.sum((straight, self.scale(self.leaky_relu(x, 0.0), 1.0 - slope, None)), (1, 1))
+
+    def power(self, x: int, exponent: float) -> int:
+        """``x^exponent`` for whole exponents and half ones."""
+        if exponent == 1.0:
+            return x
+        if exponent == int(exponent) and 2.0 <= exponent <= 8.0:
+            return self.curve(x, curves.Power, exponent=int(exponent))
+        if exponent in (0.5, -0.5):
+            return self.curve(x, curves.Root, floor=self._above(x), inverse=exponent < 0.0)
+        if exponent == -1.0:
+            return self.reciprocal(x)
+        raise InputError(f"exponent {exponent} is not supported", fix="use 2 to 8, 0.5, -0.5 or -1")
+
+    def _above(self, x: int) -> float:
+        found = self.floor(x)
+        return found if found > 0.0 else -math.inf
+
+    def reciprocal(self, x: int) -> int:
+        """``1 / x``; 1 / sqrt is one function."""
+        node = self._node(x)
+        if node is not None and isinstance(node.layer, curves.Root) and not node.layer.inverse:
+            return self.curve(node.inputs[0], curves.Root, floor=node.layer.floor, inverse=True)
+        return self.curve(x, curves.Reciprocal, floor=self._above(x))
+
+    def logarithm(self, x: int) -> int:
+        """The natural logarithm."""
+        return self.curve(x, curves.Log, floor=self._above(x))
+
+    def is_softplus(self, compared: int, limit: float, straight: int, curved: int) -> bool:
+        """Whether ``straight`` where ``compared`` is above the limit is what ``curved`` is there, rounding aside."""
+        (root, s, o), (behind, t, p) = self._affine(straight), self._affine(curved)
+        node = self._node(behind)
+        if node is None or not isinstance(node.layer, curves.Softplus) or limit < 16.0 or o != 0.0 or p != 0.0:
+            return False
+        # softplus is less than 2^-23 from its argument there
+        argument, other = self._affine(node.inputs[0]), self._affine(compared)
+        same = argument[0] == other[0] == root and argument[2] == other[2] == 0.0 and argument[1] == other[1]
+        return same and abs(t * argument[1] - s) <= _NEAR * abs(s)
+
+    # ------------------------------------------------------------ two values that depend on the image
+
+    def spread(self, x: int, shape: Shape) -> int:
+        """The item repeated along axes of length 1, as arrays are."""
+        before = self.shape(x)
+        if before == tuple(shape):
+            return x
+        self._check_size(shape)
+        self.reserve(float(np.prod(shape)))
+        try:
+            index = np.broadcast_to(np.arange(int(np.prod(before))).reshape(1, *before), (1, *shape))[0]
+        except ValueError:
+            raise InputError(f"shapes {item(before)} and {item(shape)} do not fit") from None
+        if int(np.prod(before)) == int(np.prod(shape)):
+            return self.reshape(x, tuple(shape))
+        return self._gather(x, index, 0.0)
+
+    def common(self, *inputs: int) -> tuple[int, ...]:
+        """The inputs, spread to one shape."""
+        try:
+            shape = np.broadcast_shapes(*[(1, *self.shape(k)) for k in inputs])
+        except ValueError:
+            raise InputError(f"shapes {[item(self.shape(k)) for k in inputs]} do not fit") from None
+        if shape[0] != 1:
+            raise InputError(f"shapes {[item(self.shape(k)) for k in inputs]} mix the batch", fix="unsqueeze before")
+        return tuple(self.spread(k, shape[1:]) for k in inputs)
+
+    def plus(self, inputs: Sequence[int], signs: Sequence[int]) -> int:
+        """A sum of values whose shapes may differ."""
+        return self.sum(self.common(*inputs), tuple(signs))
+
+    def product(self, a: int, b: int) -> int:
+        """``a b``; a value times a known function of it is one function (N10)."""
+        found = self._gated(a, b) or self._gated(b, a)
+        if found:
+            return found
+        (root, s, o), (other, t, p) = self._affine(a), self._affine(b)
+        if root == other and o == p == 0.0:
+            return self._times(self.curve(root, curves.Power, exponent=2), s * t)
+        a, b = self.common(a, b)
+        return self._add(Product(self.shape(a)), a, b)
+
+    def _times(self, x: int, factor: float) -> int:
+        return x if factor == 1.0 else self.scale(x, np.asarray(factor), None)
+
+    def _gated(self, value: int, gate: int) -> int:
+        """``value gate`` as one curve; 0 if it is none that is known."""
+        root, s, o = self._affine(value)
+        inner, factor, shift = self._affine(gate)
+        node = self._node(inner)
+        if o != 0.0 or node is None or not isinstance(node.layer, Activation) or s == 0.0 or factor == 0.0:
+            return 0
+        argument, t, c = self._affine(node.inputs[0])
+        layer = node.layer
+        if isinstance(layer, Tanh) and c == 0.0 and t == 1.0 and shift == 0.0:
+            behind = self._node(argument)
+            if behind is not None and isinstance(behind.layer, curves.Softplus) and behind.inputs[0] == root:
+                return self._times(self.curve(root, curves.Mish), s * factor)
+        if argument != root:
+            return 0
+        if isinstance(layer, Sigmoid) and c == 0.0 and shift == 0.0 and t != 0.0:
+            return self._times(self.curve(self._times(root, t), curves.Silu), s * factor / t)
+        if isinstance(layer, curves.Erf) and c == 0.0 and abs(t * math.sqrt(2.0) - 1.0) < _NEAR and shift == factor:
+            return self._times(self.curve(root, curves.Gelu), 2.0 * s * factor)
+        if isinstance(layer, curves.Clip) and shift == 0.0 and layer.least == 0.0:
+            # clip(a x + b, 0, m) of the root
+            a, b = layer.factor * t / layer.most, (layer.factor * c + layer.offset) / layer.most
+            if abs(6.0 * a - 1.0) < _NEAR and abs(2.0 * b - 1.0) < _NEAR:
+                return self._times(self.curve(root, curves.HardSwish), s * factor * layer.most)
+        return 0
+
+    def extreme(self, inputs: Sequence[int], most: bool) -> int:
+        """Greatest or least of several values."""
+        parts = list(self.common(*inputs))
+        while len(parts) > 1:
+            pairs = [self._either(a, b, most) for a, b in zip(parts[::2], parts[1::2], strict=False)]
+            parts = pairs + parts[len(pairs) * 2 :]
+        return parts[0]
+
+    def _either(self, a: int, b: int, most: bool) -> int:
+        if most:
+            return self._maximum(a, b)
+        # min(a, b) = a - relu(a - b)
+        less = self.sum((a, b), (1, -1), exact=True)
+        return self.sum((a, self.leaky_relu(less, 0.0)), (1, -1), exact=True)
+
+    # ------------------------------------------------------------ sparse maps
+
+    def _sparse(
+        self, x: int, shape: Shape, to: np.ndarray, source: np.ndarray, weight: Any, terms: int | None = None
+    ) -> int:
+        """A sparse matrix; positions of equal shape, weights broadcast."""
+        to, source = to.reshape(-1).astype(np.int64), source.reshape(-1).astype(np.int64)
+        weight = np.broadcast_to(np.asarray(weight, np.float64), to.shape)
+        forwards = int(np.bincount(to, minlength=1).max())
+        backwards = int(np.bincount(source, minlength=1).max())
+        layer = Sparse(
+            (self.shape(x),),
+            tuple(shape),
+            forwards + 2 if terms is None else terms,
+            backwards,
+            torch.from_numpy(to.copy()),
+            torch.from_numpy(source.copy()),
+            as_double(weight),
+        )
+        return self._add(layer, x)
+
+    def positions(self, x: int, copies: int = 1) -> np.ndarray:
+        """Flat positions in the item."""
+        size = int(np.prod(self.shape(x)))
+        self.reserve(3.0 * size * copies)
+        return np.arange(size).reshape(self.shape(x))
+
+    def reduce(self, x: int, axes: Sequence[int], mean: bool, keep: bool) -> int:
+        """Sum or mean over axes of the item."""
+        shape = self.shape(x)
+        if not axes:
+            return x
+        count = int(np.prod([shape[k] for k in axes]))
+        kept = tuple(1 if k in axes else n for k, n in enumerate(shape))
+        final = tuple(n for k, n in enumerate(shape) if k not in axes)
+        if mean and len(shape) == 3 and tuple(sorted(axes)) == (1, 2):
+            index = self.average_pool(x, shape[1:], _ONES, (0, 0, 0, 0), True)
+        else:
+            source = self.positions(x)
+            to = np.broadcast_to(np.arange(int(np.prod(kept))).reshape(kept), shape)
+            index = self._sparse(x, kept, to, source, 1.0 / count if mean else 1.0)
+        return index if keep else self.reshape(index, final or (1,))
+
+    def greatest(self, x: int, axes: Sequence[int], keep: bool, most: bool = True) -> int:
+        """Maximum or minimum over axes of the item."""
+        shape = self.shape(x)
+        rest = [k for k in range(len(shape)) if k not in axes]
+        kept = tuple(shape[k] for k in rest)
+        places = self.positions(x).transpose(*rest, *axes).reshape(*kept, -1)
+        parts = [self._gather(x, np.ascontiguousarray(places[..., k]), 0.0) for k in range(places.shape[-1])]
+        index = self.extreme(parts, most)
+        final = tuple(1 if k in axes else n for k, n in enumerate(shape)) if keep else kept
+        return self.reshape(index, final or (1,))
+
+    def take(self, x: int, indices: np.ndarray, axis: int) -> int:
+        """Entries along an axis of the item, in the shape of ``indices``."""
+        shape = self.shape(x)
+        if indices.size and not (-shape[axis] <= indices.min() and indices.max() < shape[axis]):
+            raise InputError(f"indices up to {int(indices.max())} of {shape[axis]} numbers", fix="check the indices")
+        self._check_size((*shape[:axis], max(1, indices.size), *shape[axis + 1 :]))
+        found = np.take(self.positions(x), indices, axis)
+        if found.size == 0:
+            raise InputError("nothing is taken")
+        return self._gather(x, found, 0.0) if found.ndim else self.reshape(self._gather(x, found[None], 0.0), (1,))
+
+    def part(self, x: int, chosen: Sequence[slice]) -> int:
+        """Part of the item; channels of a map are chosen by a convolution, which keeps windows small."""
+        shape = self.shape(x)
+        channels: Any = np.arange(shape[0])[chosen[0]]
+        whole = len(shape) == 3 and all(
+            np.array_equal(np.arange(n)[s], np.arange(n)) for n, s in zip(shape[1:], chosen[1:], strict=True)
+        )
+        if not whole or not len(channels) or len(channels) == shape[0] or shape[1] * shape[2] == 1:
+            return self.slice(x, chosen)
+        self.reserve(float(len(channels) * shape[0]))
+        place = np.zeros((len(channels), shape[0], 1, 1))
+        place[np.arange(len(channels)), channels] = 1.0
+        return self.convolution(x, place, None, _ONES, _ONES, (0, 0, 0, 0), 1, exact=True)
+
+    def rearranged(self, x: int, index: np.ndarray) -> int:
+        """The item's numbers at flat positions ``index``, in its shape."""
+        return self._gather(x, index, 0.0)
+
+    def shift(self, x: int, offset: Any) -> int:
+        """``x + offset`` with a constant, or nothing at all."""
+        return x if offset is None else self.scale(x, np.ones(()), np.asarray(offset, np.float64))
+
+    # ------------------------------------------------------------ sizes of maps
+
+    def rounded_up(self, x: int, kernel: Any, stride: Any, dilation: Any, pads: Any) -> tuple[int, int]:
+        """Rows and columns behind the pads that windows reach if their number is rounded up."""
+        self.check_window(x, kernel, stride, dilation, pads)
+        more = []
+        for k, size in enumerate(self.shape(x)[1:]):
+            reach = (kernel[k] - 1) * dilation[k] + 1
+            free = size + pads[k] + pads[k + 2] - reach
+            count = -(-free // stride[k])
+            # the last window begins inside
+            count -= count * stride[k] >= size + pads[k]
+            more.append(max(0, count * stride[k] - free))
+        return more[0], more[1]
+
+    def average_windows(self, x: int, kernel: Any, stride: Any, pads: Any, more: Any, count_pads: bool) -> int:
+        """Means of windows that may reach past the pads; numbers there never count."""
+        if not any(more):
+            return self.average_pool(x, kernel, stride, pads, count_pads)
+        longer = (*pads[:2], pads[2] + more[0], pads[3] + more[1])
+        if not count_pads:
+            return self.average_pool(x, kernel, stride, longer, False)
+        index = self.average_pool(x, kernel, stride, longer, True)
+        parts = []
+        for k, size in enumerate(self.shape(x)[1:]):
+            start = np.arange(self.shape(index)[1 + k]) * stride[k]
+            parts.append(kernel[k] / (np.minimum(start + kernel[k], size + pads[k] + pads[k + 2]) - start))
+        return self.scale(index, parts[0][:, None] * parts[1][None, :], None)
+
+    def transposed_convolution(
+        self,
+        x: int,
+        weight: np.ndarray,
+        bias: np.ndarray | None,
+        stride: Any,
+        dilation: Any,
+        pads: Any,
+        more: Any,
+        groups: int,
+        exact: bool = False,
+    ) -> int:
+        """A transposed convolution with weights [Cin, Cout / groups, kh, kw] and pads top, left, bottom, right."""
+        shape = self.shape(x)
+        if len(shape) != 3 or weight.ndim != 4:
+            raise InputError(f"weights {item(weight.shape)} on {item(shape)}", fix="only two dimensions are read")
+        if groups < 1 or weight.shape[0] != shape[0] or shape[0] % groups:
+            raise InputError(f"weights {item(weight.shape)} with group = {groups} on {shape[0]} channels")
+        out = weight.shape[1] * groups
+        if bias is not None and bias.shape != (out,):
+            raise InputError(f"bias {item(bias.shape)} of {out} channels")
+        sizes, taps = [out], 1
+        for k in range(2):
+            kernel, s, d = weight.shape[2 + k], stride[k], dilation[k]
+            if min(s, d, kernel) < 1 or min(pads) < 0 or min(more) < 0 or max(more) > 1 << 20:
+                raise InputError(f"strides {list(stride)}, dilations {list(dilation)}, pads {list(pads)}")
+            sizes.append((shape[1 + k] - 1) * s + (kernel - 1) * d + 1 - pads[k] - pads[2 + k] + more[k])
+            taps *= -(-kernel // s)
+        self._check_size(sizes)
+        layer = TransposedConvolution(
+            (shape,),
+            tuple(sizes),
+            0 if exact else shape[0] // groups * taps + 2,
+            int(np.prod(weight.shape[1:])),
+            as_double(weight),
+            None if bias is None else as_double(bias),
+            tuple(stride),
+            tuple(dilation),
+            tuple(pads[:2]),
+            groups,
+        )
+        return self._add(layer, x)
+
+    def resize(self, x: int, maps: Sequence[np.ndarray]) -> int:
+        """Rows and columns mapped by matrices [out, in] each; whole factors of nearest ones by repetition."""
+        shape = self.shape(x)
+        if len(shape) != 3:
+            raise InputError(f"input {item(shape)}", fix="only maps of rows and columns are resized")
+        factors = [m.shape[0] // m.shape[1] for m in maps]
+        if all(
+            f >= 1 and m.shape[0] == f * m.shape[1] and np.array_equal(m, np.repeat(np.eye(m.shape[1]), f, 0))
+            for f, m in zip(factors, maps, strict=True)
+        ):
+            ones = np.ones((shape[0], 1, *factors))
+            return self.transposed_convolution(x, ones, None, factors, _ONES, (0,) * 4, (0, 0), shape[0], exact=True)
+        (h, i), (w, j) = (np.nonzero(m) for m in maps)
+        channels, height, width = shape[0], maps[0].shape[0], maps[1].shape[0]
+        self._check_size((channels, height, width))
+        self.reserve(3.0 * channels * len(h) * len(w))
+        c = np.arange(channels)[:, None, None]
+        to = (c * height + h[None, :, None]) * width + w[None, None, :]
+        source = (c * shape[1] + i[None, :, None]) * shape[2] + j[None, None, :]
+        weight = np.broadcast_to(maps[0][h, i][:, None] * maps[1][w, j][None, :], to.shape).reshape(-1)
+        exact = bool((weight == 1.0).all()) and len(h) == height and len(w) == width
+        # positions between numbers are computed in float32, too
+        return self._sparse(x, (channels, height, width), to, source, weight, 0 if exact else 32)
+
+    # ------------------------------------------------------------ normalisation and attention
+
+    def normalise(self, x: int, axes: Sequence[int], epsilon: float) -> int:
+        """``(x - mean) / sqrt(variance + epsilon)`` over axes of the item (N11)."""
+        if not epsilon > 0.0:
+            raise InputError(f"attribute epsilon = {epsilon} is not supported", fix="it must be positive")
+        shape = self.shape(x)
+        kept = tuple(1 if k in axes else n for k, n in enumerate(shape))
+        group = np.broadcast_to(np.arange(int(np.prod(kept))).reshape(kept), shape).reshape(-1)
+        count = int(np.prod([shape[k] for k in axes]))
+        size = int(np.prod(shape))
+        if size * count <= _CENTRED_AT_ONCE:
+            self.reserve(3.0 * size * count)
+            members = np.argsort(group, kind="stable").reshape(-1, count)
+            to = np.broadcast_to(np.arange(size)[:, None], (size, count))
+            source = members[group]
+            weight = np.where(to == source, 1.0 - 1.0 / count, -1.0 / count)
+            centred = self._sparse(x, shape, to, source, weight.reshape(-1), count + 4)
+        else:
+            mean = self.spread(self._sparse(x, kept, group, np.arange(size), 1.0 / count), shape)
+            centred = self.sum((x, mean), (1, -1))
+        squares = self.curve(centred, curves.Power, exponent=2)
+        positions = np.arange(size)
+        variance = self._add(
+            Variance(
+                (shape, shape),
+                kept,
+                count + 4,
+                1,
+                torch.from_numpy(group.copy()),
+                torch.from_numpy(positions),
+                torch.full((size,), 1.0 / count, dtype=torch.float64),
+            ),
+            squares,
+            x,
+        )
+        root = self.scale(variance, np.ones(()), np.asarray(epsilon))
+        inverse = self.curve(root, curves.Root, floor=epsilon * (1.0 - 2.0**-16), inverse=True)
+        return self.product(centred, self.spread(inverse, shape))
+
+    def softmax(self, x: int, axis: int, logarithm: bool = False) -> int:
+        """``1 / sum_j exp(x_j - x_i)`` along an axis of the item, or its logarithm (N11)."""
+        shape = self.shape(x)
+        count = shape[axis]
+        self._check_size((*shape, count))
+        self.reserve(8.0 * float(np.prod(shape)) * count)
+        positions = np.arange(int(np.prod(shape))).reshape(shape)
+        own = np.broadcast_to(positions[..., None], (*shape, count))
+        others = np.broadcast_to(
+            np.moveaxis(positions, axis, -1)[..., None, :], (*np.moveaxis(positions, axis, -1).shape, count)
+        )
+        others = np.moveaxis(others, -2, axis)
+        to = np.arange(own.size).reshape(own.shape)
+        apart = own != others
+        layer = Sparse(
+            (shape,),
+            (*shape, count),
+            # a program subtracts the greatest first
+            count + 4,
+            2 * count,
+            torch.from_numpy(np.concatenate([to[apart], to[apart]])),
+            torch.from_numpy(np.concatenate([others[apart], own[apart]])),
+            torch.cat([torch.ones(int(apart.sum())), -torch.ones(int(apart.sum()))]).double(),
+        )
+        powers = self.curve(self._add(layer, x), curves.Exp)
+        total = self.reduce(powers, [len(shape)], False, False)
+        if logarithm:
+            return self.scale(self.curve(total, curves.Log, floor=_ONE_AND_MORE), -np.ones(()), None)
+        return self.curve(total, curves.Reciprocal, floor=_ONE_AND_MORE)
+
+    def matmul(self, a: int, b: int) -> int:
+        """A product of matrices that both depend on the image, with leading axes alike."""
+        one, two = self.shape(a), self.shape(b)
+        if len(one) < 2 or len(two) < 2 or one[-1] != two[-2] or one[:-2] != two[:-2]:
+            raise InputError(f"matrices {item(one)} and {item(two)}", fix="leading sizes must agree")
+        lead, (n, k), m = one[:-2], one[-2:], two[-1]
+        shape = (*lead, n, m, k)
+        self._check_size(shape)
+        self.reserve(4.0 * float(np.prod(shape)))
+        first = np.broadcast_to(np.arange(int(np.prod(one))).reshape(*lead, n, 1, k), shape)
+        second = np.broadcast_to(
+            np.swapaxes(np.arange(int(np.prod(two))).reshape(two), -1, -2).reshape(*lead, 1, m, k), shape
+        )
+        index = self.product(self._gather(a, first, 0.0), self._gather(b, second, 0.0))
+        return self.reduce(index, [len(shape) - 1], False, False)
+
+    def matrix_from_left(self, weight: np.ndarray, x: int) -> int:
+        """``weight x`` along the last axis but one."""
+        order = [*range(len(self.shape(x)) - 2), len(self.shape(x)) - 1, len(self.shape(x)) - 2]
+        return self.transpose(self.matrix(self.transpose(x, order), weight, None), order)
+
+
+def interpolation(size: int, out: int, mode: str, coordinates: str, nearest: str, scale: float | None) -> np.ndarray:
+    """[out, size] matrix of ONNX's Resize along one axis."""
+    k = np.arange(out, dtype=np.float64)
+    ratio = out / size if scale is None else scale
+    if coordinates == "align_corners":
+        place = k * (size - 1) / (out - 1) if out > 1 else 0.0 * k
+    elif coordinates == "asymmetric":
+        place = k / ratio
+    elif coordinates == "pytorch_half_pixel" and out == 1:
+        place = 0.0 * k
+    elif coordinates in ("half_pixel", "pytorch_half_pixel"):
+        place = (k + 0.5) / ratio - 0.5
+    else:
+        raise InputError(
+            f"attribute coordinate_transformation_mode = {coordinates} is not supported",
+            fix="use half_pixel, asymmetric or align_corners",
+        )
+    matrix = np.zeros((out, size))
+    rows = np.arange(out)
+    if mode == "nearest":
+        rounded = {
+            "floor": np.floor(place),
+            "ceil": np.ceil(place),
+            "round_prefer_floor": np.ceil(place - 0.5),
+            "round_prefer_ceil": np.floor(place + 0.5),
+        }
+        if nearest not in rounded:
+            raise InputError(f"attribute nearest_mode = {nearest} is not supported", fix="use floor")
+        matrix[rows, np.clip(rounded[nearest], 0, size - 1).astype(np.int64)] = 1.0
+        return matrix
+    place = np.clip(place, 0.0, size - 1.0)
+    low = np.floor(place).astype(np.int64)
+    part = place - low
+    np.add.at(matrix, (rows, low), 1.0 - part)
+    np.add.at(matrix, (rows, np.minimum(low + 1, size - 1)), part)
+    return matrix

@@ -1,0 +1,160 @@
+"""Linear layers beside those of `ns_abstract.verify.network.layers`: sparse matrices, transposed convolutions.
+
+See docs/design.md, N11.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import ClassVar
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+from ns_abstract.verify.network.layers import Linear
+from ns_abstract.verify.network.rows import Rows, full, grid
+
+_UNIT = 2.0**-24
+
+
+def _none() -> Tensor:
+    return torch.zeros(0)
+
+
+@dataclass(frozen=True, eq=False)
+class Sparse(Linear):
+    """A matrix of few numbers on the flattened item: means over axes, resizing, differences.
+
+    Attributes:
+        to, source: [E] int64 positions in the output and in the input.
+        weight: [E] float64.
+        offset: [*shape] float64 or None.
+    """
+
+    to: Tensor = field(default_factory=_none)
+    source: Tensor = field(default_factory=_none)
+    weight: Tensor = field(default_factory=_none)
+    offset: Tensor | None = None
+    mixes: ClassVar[bool] = True
+
+    @property
+    def bias(self) -> Tensor | None:
+        return self.offset
+
+    @cached_property
+    def _sizes(self) -> tuple[int, int]:
+        return int(np.prod(self.shape)), int(np.prod(self.input_shapes[0]))
+
+    def _stored(self, places: Tensor, values: Tensor) -> Tensor:
+        return torch.sparse_coo_tensor(places, values, self._sizes, check_invariants=True).coalesce()
+
+    @cached_property
+    def _matrix(self) -> Tensor:
+        return self._stored(torch.stack([self.to, self.source]), self.weight)
+
+    @cached_property
+    def _single(self) -> Tensor:
+        """[in, out] float32, for rows."""
+        return self._matrix.t().float().coalesce()
+
+    @cached_property
+    def _absolute(self) -> Tensor:
+        matrix = self._matrix
+        return self._stored(matrix.indices(), matrix.values().abs())
+
+    def apply(self, inputs: Sequence[Tensor]) -> Tensor:
+        return torch.sparse.mm(self._matrix.to(inputs[0].dtype), inputs[0].flatten(1).T).T.reshape(-1, *self.shape)
+
+    def magnitude(self, inputs: Sequence[Tensor]) -> Tensor:
+        return torch.sparse.mm(self._absolute.to(inputs[0].dtype), inputs[0].flatten(1).T).T.reshape(-1, *self.shape)
+
+    def backward(self, rows: Rows) -> list[Rows]:
+        whole = full(rows, self.shape, force=True)
+        count = whole.value.shape[0]
+        value = torch.sparse.mm(self._single, torch.from_numpy(whole.value).reshape(count, -1).T).T
+        return [Rows.whole(value.contiguous().numpy().reshape(count, *grid(self.input_shapes[0])))]
+
+
+@dataclass(frozen=True, eq=False)
+class Variance(Sparse):
+    """Means of squares of centred numbers, the first input; the second holds the numbers themselves.
+
+    A program may work the variance out as mean of squares minus square of the mean: what that loses is
+    relative to the numbers and not to their spread.
+    """
+
+    def spare(self, sizes: Sequence[Tensor]) -> Tensor | float:
+        # n + 4 roundings of either term
+        squares = sizes[1].flatten(1).square()
+        mean = torch.sparse.mm(self._absolute, squares.T).T.reshape(-1, *self.shape)
+        return 2.0 * (self.terms + 4) * _UNIT * mean
+
+    def backward(self, rows: Rows) -> list[Rows]:
+        found = super().backward(rows)
+        shape = (found[0].value.shape[0], *grid(self.input_shapes[1]))
+        return [*found, Rows.whole(np.zeros(shape, np.float32))]
+
+
+@dataclass(frozen=True, eq=False)
+class TransposedConvolution(Linear):
+    """Two-dimensional transposed convolution; nearest upsampling by whole factors is one.
+
+    Attributes:
+        weight: [Cin, Cout / groups, kh, kw] float64.
+        offset: [Cout] float64 or None.
+        stride, dilation: (rows, columns).
+        pads: top, left; cut from the result.
+        more: Rows and columns that the result has at its end besides.
+        groups: As in ONNX.
+    """
+
+    weight: Tensor = field(default_factory=_none)
+    offset: Tensor | None = None
+    stride: tuple[int, int] = (1, 1)
+    dilation: tuple[int, int] = (1, 1)
+    pads: tuple[int, int] = (0, 0)
+    groups: int = 1
+    mixes: ClassVar[bool] = True
+
+    @property
+    def bias(self) -> Tensor | None:
+        return None if self.offset is None else self.offset[:, None, None]
+
+    @cached_property
+    def _single(self) -> Tensor:
+        return self.weight.float()
+
+    def _spread(self, x: Tensor, weight: Tensor) -> Tensor:
+        whole = functional.conv_transpose2d(
+            x, weight.to(x.dtype), None, self.stride, groups=self.groups, dilation=self.dilation
+        )
+        top, left = self.pads
+        height, width = self.shape[1:]
+        missing = max(0, top + height - whole.shape[2]), max(0, left + width - whole.shape[3])
+        if any(missing):
+            whole = functional.pad(whole, (0, missing[1], 0, missing[0]))
+        return whole[:, :, top : top + height, left : left + width]
+
+    def apply(self, inputs: Sequence[Tensor]) -> Tensor:
+        return self._spread(inputs[0], self.weight)
+
+    def magnitude(self, inputs: Sequence[Tensor]) -> Tensor:
+        return self._spread(inputs[0], self.weight.abs())
+
+    def backward(self, rows: Rows) -> list[Rows]:
+        value = torch.from_numpy(full(rows, self.shape, force=True).value)
+        _, height, width = self.input_shapes[0]
+        need = [
+            (n - 1) * s + (k - 1) * d + 1
+            for n, s, k, d in zip((height, width), self.stride, self.weight.shape[2:], self.dilation, strict=True)
+        ]
+        top, left = self.pads
+        bottom, right = need[0] - top - value.shape[2], need[1] - left - value.shape[3]
+        # negative pads cut what no input reaches
+        value = functional.pad(value, (left, right, top, bottom))
+        found = functional.conv2d(value, self._single, None, self.stride, 0, self.dilation, self.groups)
+        return [Rows.whole(found.numpy())]

@@ -1,0 +1,144 @@
+"""Arithmetic on constants in an ONNX graph: shapes, masks, indices; by the reference operators of `onnx`."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+import onnx
+from onnx import TensorProto, helper
+
+from ns_abstract.io.errors import InputError
+
+#: Numbers that a result may have.
+_LARGEST = 1 << 24
+#: Results are no larger than the operands spread over each other.
+_SPREAD = frozenset(
+    (
+        "Add",
+        "And",
+        "Div",
+        "Equal",
+        "Expand",
+        "Greater",
+        "GreaterOrEqual",
+        "Less",
+        "LessOrEqual",
+        "Max",
+        "Min",
+        "Mod",
+        "Mul",
+        "Or",
+        "Pow",
+        "Sub",
+        "Where",
+        "Xor",
+    )
+)
+#: Results are no larger than the operands together.
+_PLAIN = frozenset(
+    (
+        "Abs",
+        "Cast",
+        "CastLike",
+        "Ceil",
+        "Clip",
+        "Concat",
+        "Cos",
+        "Erf",
+        "Exp",
+        "Flatten",
+        "Floor",
+        "Identity",
+        "Log",
+        "Neg",
+        "Not",
+        "Reciprocal",
+        "ReduceL1",
+        "ReduceL2",
+        "ReduceMax",
+        "ReduceMean",
+        "ReduceMin",
+        "ReduceProd",
+        "ReduceSum",
+        "Relu",
+        "Reshape",
+        "Round",
+        "ScatterElements",
+        "ScatterND",
+        "Shape",
+        "Sigmoid",
+        "Sign",
+        "Sin",
+        "Size",
+        "Slice",
+        "Split",
+        "Sqrt",
+        "Squeeze",
+        "Tanh",
+        "Transpose",
+        "Trilu",
+        "Unsqueeze",
+    )
+)
+_GROWING = frozenset(("ConstantOfShape", "Gather", "MatMul", "Range", "Tile"))
+FOLDED = _SPREAD | _PLAIN | _GROWING
+
+
+def _size(kind: str, node: onnx.NodeProto, values: Sequence[np.ndarray]) -> float:
+    """Numbers of the result, at most."""
+    if kind in _SPREAD:
+        shapes = [v.shape for v in values]
+        if kind == "Expand":
+            shapes[1] = tuple(int(v) for v in values[1].reshape(-1))
+            if any(v < 0 for v in shapes[1]) or math.prod(shapes[1]) > _LARGEST:
+                return math.inf
+        if math.prod(max(1, v.size) for v in values) <= _LARGEST and kind != "Expand":
+            return 0.0
+        return float(math.prod(np.broadcast_shapes(*shapes)))
+    if kind == "ConstantOfShape":
+        return float(math.prod(float(v) for v in values[0].reshape(-1)))
+    if kind == "Tile":
+        return float(values[0].size) * math.prod(float(v) for v in values[1].reshape(-1))
+    if kind == "Range":
+        start, limit, delta = (float(v.reshape(-1)[0]) for v in values)
+        return abs((limit - start) / delta) if delta else math.inf
+    if kind == "Gather":
+        axis = next((a.i for a in node.attribute if a.name == "axis"), 0)
+        return values[0].size / max(1, values[0].shape[axis]) * values[1].size
+    if kind == "MatMul":
+        return (
+            float(math.prod(values[0].shape[:-1])) * float(math.prod(values[1].shape)) / max(1, values[1].shape[-2:][0])
+        )
+    return float(sum(v.size for v in values))
+
+
+def fold(node: onnx.NodeProto, values: Sequence[np.ndarray | None], opset: int) -> list[np.ndarray]:
+    """The results of a node of constants (None: left out).
+
+    Raises:
+        InputError: They would be too large, or cannot be computed.
+    """
+    from onnx.reference import ReferenceEvaluator
+
+    present = [v for v in values if v is not None]
+    try:
+        size = _size(node.op_type, node, present)
+    except (ValueError, IndexError, ZeroDivisionError) as error:
+        raise InputError(f"cannot be computed ({error})", fix="check its constants") from None
+    if not 0.0 <= size <= _LARGEST:
+        raise InputError(f"makes a constant of {size:,.0f} numbers", fix=f"at most {_LARGEST:,} are made")
+    names = [name for name in node.input if name]
+    kinds = [helper.np_dtype_to_tensor_dtype(v.dtype) for v in present]
+    inputs = [helper.make_tensor_value_info(n, k, None) for n, k in dict(zip(names, kinds, strict=True)).items()]
+    outputs = [helper.make_tensor_value_info(n, TensorProto.UNDEFINED, None) for n in node.output if n]
+    model = helper.make_model(
+        helper.make_graph([node], "constants", inputs, outputs), opset_imports=[helper.make_opsetid("", opset)]
+    )
+    try:
+        with np.errstate(all="ignore"):
+            found = ReferenceEvaluator(model).run(None, dict(zip(names, present, strict=True)))
+    except Exception as error:  # the reference operators raise whatever they meet
+        raise InputError(f"cannot be computed ({error})", fix="check its constants") from None
+    return [np.asarray(v) for v in found]  # type: ignore[union-attr]

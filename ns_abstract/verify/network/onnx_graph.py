@@ -1,0 +1,249 @@
+"""The graph in an ONNX file, its constants and its attributes. Nothing in the file is executed."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import onnx
+
+from ns_abstract.io.errors import InputError
+from ns_abstract.verify.network.compose import Composer
+from ns_abstract.verify.network.graph import Network
+from ns_abstract.verify.network.layers import Shape
+from ns_abstract.verify.network.onnx_fold import FOLDED, fold
+from ns_abstract.verify.network.onnx_tensors import StoredTensors
+
+#: Operator sets whose meaning is known here.
+_OPSETS = range(7, 24)
+
+Rule = Callable[["Reader", onnx.NodeProto, "Attributes"], None]
+
+
+def operator_set(model: onnx.ModelProto, path: Path) -> int:
+    version = 0
+    for entry in model.opset_import:
+        if entry.domain in ("", "ai.onnx"):
+            version = entry.version
+    if version not in _OPSETS:
+        raise InputError(
+            f"operator set {version} is not supported",
+            file=path,
+            field="opset_import",
+            fix=f"export with an operator set from {_OPSETS[0]} to {_OPSETS[-1]}",
+        )
+    return version
+
+
+#: What people do instead of an operator that has no bounds here.
+_INSTEAD = {
+    "ArgMax": "leave it out: properties compare the scores themselves",
+    "ArgMin": "leave it out: properties compare the scores themselves",
+    "Celu": "use Elu",
+    "Cos": "only constants may pass it",
+    "Floor": "leave rounding out",
+    "If": "export without branches",
+    "Loop": "export with fixed sizes",
+    "LRN": "use BatchNormalization",
+    "LSTM": "use convolutions or attention",
+    "GRU": "use convolutions or attention",
+    "NonMaxSuppression": "export without post-processing",
+    "NonZero": "export without post-processing",
+    "QuantizeLinear": "export before quantisation",
+    "DequantizeLinear": "export before quantisation",
+    "Round": "leave rounding out",
+    "Scan": "export with fixed sizes",
+    "Sin": "only constants may pass it",
+    "Softsign": "use Tanh",
+    "TopK": "export without post-processing",
+}
+
+
+class Value(NamedTuple):
+    """What a name stands for: a node of the network, and its shape in the file for a batch of 1."""
+
+    index: int
+    whole: Shape
+
+    @property
+    def item(self) -> Shape:
+        """The shape without a batch; where the file mixed the batch in, all of it."""
+        return self.whole[1:] if len(self.whole) > 1 and self.whole[0] == 1 else self.whole
+
+    @property
+    def batched(self) -> int:
+        """Axes before those of the item: 1 or 0."""
+        return len(self.whole) - len(self.item)
+
+
+class Reader:
+    """Turns one graph's nodes into layers."""
+
+    def __init__(self, path: Path, graph: onnx.GraphProto, opset: int, rules: dict[str, Rule]) -> None:
+        self.path, self.graph, self.opset, self.rules = path, graph, opset, rules
+        self.stored = StoredTensors(path)
+        self.constants: dict[str, np.ndarray] = {}
+        for tensor in graph.initializer:
+            self.constants[tensor.name] = self.stored.array(tensor, f"initializer {tensor.name}")
+        if graph.sparse_initializer:
+            raise InputError("sparse constants are not supported", file=path, fix="store them as dense tensors")
+        self.input_name, shape = self._input()
+        self.builder = Composer(path, shape)
+        self.values: dict[str, Value] = {self.input_name: Value(0, (1, *shape))}
+        #: whether a value is above a number: what the exporter makes of softplus
+        self.above: dict[str, tuple[Value, float]] = {}
+
+    def _fail(self, node: onnx.NodeProto, problem: str, fix: str | None = None) -> InputError:
+        name = node.name or (node.output[0] if node.output else "")
+        return InputError(problem, file=self.path, field=f"node {name} ({node.op_type})", fix=fix)
+
+    def _input(self) -> tuple[str, tuple[int, ...]]:
+        inputs = [value for value in self.graph.input if value.name not in self.constants]
+        if len(inputs) != 1:
+            raise InputError(f"has {len(inputs)} inputs", file=self.path, field="graph.input", fix="one image expected")
+        value = inputs[0]
+        field = f"input {value.name}"
+        kind = value.type.tensor_type
+        if kind.elem_type not in (onnx.TensorProto.FLOAT, onnx.TensorProto.DOUBLE):
+            raise InputError("is not a float32 tensor", file=self.path, field=field, fix="export with a float input")
+        sizes = [d.dim_value if d.HasField("dim_value") else 0 for d in kind.shape.dim]
+        if len(sizes) < 2 or sizes[0] not in (0, 1) or min(sizes[1:]) < 1:
+            shown = [d.dim_value if d.HasField("dim_value") else d.dim_param or "?" for d in kind.shape.dim]
+            raise InputError(
+                f"has shape {shown}",
+                file=self.path,
+                field=field,
+                fix="export with a free batch or a batch of 1 and all other sizes fixed",
+            )
+        return value.name, tuple(sizes[1:])
+
+    def network(self) -> Network:
+        """All outputs that depend on the image, one after the other if they are several."""
+        for node in self.graph.node:
+            try:
+                self._read(node)
+            except InputError as error:
+                if error.field is not None:
+                    raise
+                raise self._fail(node, error.problem, error.fix) from None
+        names = [value.name for value in self.graph.output]
+        for name in names:
+            if name not in self.values:
+                raise InputError(f"output {name!r} does not depend on the image", file=self.path, field="graph.output")
+        found = [self.values[name].index for name in names]
+        if len(found) > 1:
+            flat = [self.builder.reshape(k, (int(np.prod(self.builder.shape(k))),)) for k in found]
+            found = [self.builder.concat(flat, 0)]
+        return self.builder.network(found[0])
+
+    def _read(self, node: onnx.NodeProto) -> None:
+        kind = node.op_type
+        if node.domain not in ("", "ai.onnx"):
+            raise InputError(f"operator of domain {node.domain} is not supported", fix="export without it")
+        inputs = [name for name in node.input if name]
+        if kind in FOLDED and inputs and all(name in self.constants for name in inputs):
+            values = [self.constants[name] if name else None for name in node.input]
+            self.fold(node, *fold(node, values, self.opset))
+            return
+        rule = self.rules.get(kind)
+        if rule is None:
+            instead = _INSTEAD.get(kind)
+            known = ", ".join(sorted(self.rules))
+            raise InputError("operator is not supported", fix=instead or f"use a supported layer: {known}")
+        attributes = Attributes(self, node)
+        rule(self, node, attributes)
+        attributes.done()
+
+    # what rules use
+
+    def value(self, node: onnx.NodeProto, position: int = 0) -> Value:
+        """What makes input ``position``, which must depend on the image."""
+        name = node.input[position] if position < len(node.input) else ""
+        if name in self.values:
+            return self.values[name]
+        if name in self.constants:
+            raise InputError(f"input {position} ({name}) is a constant", fix="it must depend on the image")
+        raise InputError(f"input {position} ({name!r}) is not known", fix="export the network again")
+
+    def moves(self, node: onnx.NodeProto, position: int) -> bool:
+        """Whether an input depends on the image."""
+        return position < len(node.input) and node.input[position] in self.values
+
+    def source(self, node: onnx.NodeProto, position: int = 0) -> int:
+        """Index of the node that makes input ``position``, a batch of items."""
+        value = self.value(node, position)
+        if not value.batched:
+            raise InputError(f"input of shape {list(value.whole)} mixes the batch", fix="keep the batch first")
+        return value.index
+
+    def constant(self, node: onnx.NodeProto, position: int, default: Any = None) -> Any:
+        """Constant input ``position``; ``default`` if it is absent."""
+        name = node.input[position] if position < len(node.input) else ""
+        if not name:
+            return default
+        if name not in self.constants:
+            raise InputError(f"input {position} ({name}) is not a constant", fix="fold constants when exporting")
+        return self.constants[name]
+
+    def weight(self, node: onnx.NodeProto, position: int) -> np.ndarray:
+        found = self.constant(node, position)
+        if found is None:
+            raise InputError(f"input {position} is missing", fix="export the network again")
+        return found
+
+    def result(self, node: onnx.NodeProto, index: int, whole: Shape | None = None, output: int = 0) -> None:
+        """Name an output of the node: items of node ``index``, of shape ``whole`` for a batch of 1."""
+        if whole is None:
+            if any(node.output[1:]):
+                raise InputError("has several outputs", fix="only the first is supported")
+            whole = (1, *self.builder.shape(index))
+        value = Value(index, tuple(whole))
+        value = Value(self.builder.reshape(index, value.item), value.whole)
+        self.builder.name(value.index, node.name or node.output[0], node.op_type)
+        self.values[node.output[output]] = value
+
+    def fold(self, node: onnx.NodeProto, *values: np.ndarray) -> None:
+        """Name the node's constant outputs."""
+        for name, value in zip((n for n in node.output if n), values, strict=False):
+            self.constants[name] = value
+
+
+class Attributes:
+    """A node's attributes, each of which a rule must ask for."""
+
+    def __init__(self, reader: Reader, node: onnx.NodeProto) -> None:
+        self.reader, self.node = reader, node
+        self.found = {a.name: a for a in node.attribute}
+        self.asked: set[str] = set()
+
+    def get(self, name: str, default: Any = None) -> Any:
+        self.asked.add(name)
+        if name not in self.found:
+            return default
+        value = onnx.helper.get_attribute_value(self.found[name])
+        return value.decode() if isinstance(value, bytes) else value
+
+    def ints(self, name: str, count: int, default: int | None = None) -> tuple[int, ...] | None:
+        value = self.get(name)
+        if value is None:
+            return None if default is None else (default,) * count
+        if len(value) != count:
+            raise InputError(f"attribute {name} = {list(value)}", fix=f"{count} numbers expected: two dimensions")
+        return tuple(int(v) for v in value)
+
+    def only(self, name: str, *allowed: Any) -> None:
+        """The attribute may be absent or one of ``allowed``."""
+        value = self.get(name)
+        if value is not None and value not in allowed:
+            raise InputError(f"attribute {name} = {value} is not supported", fix=f"only {allowed[0]} is")
+
+    def ignore(self, *names: str) -> None:
+        """Attributes that do not matter."""
+        self.asked.update(names)
+
+    def done(self) -> None:
+        for name in self.found:
+            if name not in self.asked:
+                raise InputError(f"attribute {name} is not supported", fix="export without it")

@@ -1,0 +1,844 @@
+"""What each ONNX operator becomes; what is not understood is refused, with what to do about it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+import onnx
+
+from ns_abstract.io.errors import InputError
+from ns_abstract.verify.network import curves
+from ns_abstract.verify.network.compose import Composer, interpolation
+from ns_abstract.verify.network.graph import item
+from ns_abstract.verify.network.layers import Shape
+from ns_abstract.verify.network.onnx_graph import Attributes, Reader, Rule, Value
+
+
+def _pads(a: Attributes, size: tuple[int, int], kernel: Any, stride: Any, dilation: Any) -> tuple[int, int, int, int]:
+    """Pads top, left, bottom, right of a window operator."""
+    auto = a.get("auto_pad", "NOTSET")
+    explicit = a.ints("pads", 4, 0)
+    assert explicit is not None
+    if auto == "NOTSET":
+        return explicit  # type: ignore[return-value]
+    if auto == "VALID":
+        return 0, 0, 0, 0
+    if auto not in ("SAME_UPPER", "SAME_LOWER"):
+        raise InputError(f"attribute auto_pad = {auto} is not supported", fix="use explicit pads")
+    ends = []
+    for n, k, s, d in zip(size, kernel, stride, dilation, strict=True):
+        if s < 1:
+            raise InputError(f"attribute strides = {list(stride)}", fix="positive numbers expected")
+        total = max(0, (-(-n // s) - 1) * s + (k - 1) * d + 1 - n)
+        half = total // 2
+        ends.append((half, total - half) if auto == "SAME_UPPER" else (total - half, half))
+    return ends[0][0], ends[1][0], ends[0][1], ends[1][1]
+
+
+def _conv(r: Reader, node: onnx.NodeProto, a: Attributes) -> None:
+    x, weight, bias = r.source(node), r.weight(node, 1), r.constant(node, 2)
+    shape = r.builder.shape(x)
+    if weight.ndim != 4 or len(shape) != 3:
+        raise InputError(
+            f"weights {item(weight.shape)} on {item(shape)}", fix="only two-dimensional convolutions are read"
+        )
+    kernel = a.ints("kernel_shape", 2) or weight.shape[2:]
+    if tuple(kernel) != weight.shape[2:]:
+        raise InputError(f"attribute kernel_shape = {list(kernel)}, weights are {item(weight.shape)}")
+    stride, dilation = a.ints("strides", 2, 1) or (1, 1), a.ints("dilations", 2, 1) or (1, 1)
+    pads = _pads(a, shape[1:], kernel, stride, dilation)
+    r.result(node, r.builder.convolution(x, weight, bias, stride, dilation, pads, int(a.get("group", 1))))
+
+
+def _pool_window(r: Reader, node: onnx.NodeProto, a: Attributes):
+    x = r.source(node)
+    shape = r.builder.shape(x)
+    if len(shape) != 3:
+        raise InputError(f"input {item(shape)}", fix="only two-dimensional pooling is read")
+    kernel = a.ints("kernel_shape", 2)
+    if kernel is None:
+        raise InputError("attribute kernel_shape is missing")
+    stride, dilation = a.ints("strides", 2, 1) or (1, 1), a.ints("dilations", 2, 1) or (1, 1)
+    pads = _pads(a, shape[1:], kernel, stride, dilation)
+    more = r.builder.rounded_up(x, kernel, stride, dilation, pads) if a.get("ceil_mode", 0) else (0, 0)
+    return x, kernel, stride, dilation, pads, more
+
+
+def _average_pool(r: Reader, node: onnx.NodeProto, a: Attributes) -> None:
+    x, kernel, stride, dilation, pads, more = _pool_window(r, node, a)
+    if dilation != (1, 1):
+        raise InputError(f"attribute dilations = {list(dilation)} is not supported", fix="only 1 is")
+    counted = bool(a.get("count_include_pad", 0))
+    r.result(node, r.builder.average_windows(x, kernel, stride, pads, more, counted))
+
+
+def _max_pool(r: Reader, node: onnx.NodeProto, a: Attributes) -> None:
+    x, kernel, stride, dilation, pads, more = _pool_window(r, node, a)
+    a.ignore("storage_order")  # of the second output, which is refused
+    pads = (*pads[:2], pads[2] + more[0], pads[3] + more[1])
+    r.result(node, r.builder.max_pool(x, kernel, stride, dilation, pads))
+
+
+def _global_average(r: Reader, node: onnx.NodeProto, a: Attributes) -> None:
+    x = r.source(node)
+    shape = r.builder.shape(x)
+    if len(shape) != 3:
+        raise InputError(f"input {item(shape)}", fix="only two-dimensional pooling is read")
+    r.result(node, r.builder.average_pool(x, shape[1:], (1, 1), (0, 0, 0, 0), True))
+
+
+def _gemm(r: Reader, node: onnx.NodeProto, a: Attributes) -> None:
+    x, weight, bias = r.value(node), r.weight(node, 1), r.constant(node, 2)
+    a.only("transA", 0)
+    alpha, beta = float(a.get("alpha", 1.0)), float(a.get("beta", 1.0))
+    if weight.ndim != 2:
+        raise InputError(f"weights {item(weight.shape)}", fix="a matrix expected")
+    matrix = weight.astype(np.float64) if a.get("transB", 0) else weight.astype(np.float64).T
+    index = r.builder.matrix(x.index, alpha * matrix, None if bias is None else beta * bias.astype(np.float64))
+    r.result(node, index, (*x.whole[:-1], matrix.shape[0]))
+
+
+def _batch_norm(r: Reader, node: onnx.NodeProto, a: Attributes) -> None:
+    x = r.source(node)
+    a.only("training_mode", 0)
+    a.only("spatial", 1)
+    a.ignore("momentum")
+    scale, shift, mean, variance = (r.weight(node, k) for k in range(1, 5))
+    r.result(node, r.builder.batch_norm(x, scale, shift, mean, variance, float(a.get("epsilon", 1e-5))))
+
+
+def _unary(make: Callable[[Composer, int, Attributes], int]) -> Rule:
+    """A function of every number, whatever the shape."""
+
+    def rule(r: Reader, node: onnx.NodeProto, a: Attributes) -> None:
+        x = r.value(node)
+        r.result(node, make(r.builder, x.index, a), x.whole)
+
+    return rule
+
+
+def _curve(kind: Callable[..., curves.Curve]) -> Rule:
+    return _unary(lambda builder, x, a: builder.curve(x, kind))
+
+
+def _clip(r: Reader, node: onnx.NodeProto, a: Attributes) -> None:
+    x = r.value(node)
+    limits = []
+    for position, (name, default) in enumerate((("min", -math.inf), ("max", math.inf)), 1):
+        found = a.get(name)
+        limits.append(float(np.reshape(r.constant(node, position, default), -1)[0] if found is None else found))
+    r.result(node, r.builder.clip(x.index, *limits), x.whole)
+
+
+def _elu(b: Composer, x: int, a: Attributes) -> int:
+    return b.curve(x, curves.Elu, alpha=_positive(a, "alpha", 1.0))
+
+
+def _celu(b: Composer, x: int, a: Attributes) -> int:
+    alpha = _positive(a, "alpha", 1.0)
+    return b.curve(x, curves.Elu, alpha=alpha, width=alpha)
+
+
+def _selu(b: Composer, x: int, a: Attributes) -> int:
+    alpha, gamma = _positive(a, "alpha", 1.67326319217681884765625), _positive(a, "gamma", 1.05070102214813232421875)
+    return b.curve(x, curves.Elu, alpha=alpha, scale=gamma)
+
+
+def _hard_sigmoid(b: Composer, x: int, a: Attributes) -> int:
+    return b.curve(x, curves.Clip, factor=_positive(a, "alpha", 0.2), offset=float(a.get("beta", 0.5)))
+
+
+def _gelu(b: Composer, x: int, a: Attributes) -> int:
+    a.only("approximate", "none", "tanh")
+    return b.curve(x, curves.GeluTanh if a.get("approximate", "none") == "tanh" else curves.Gelu)
+
+
+def _positive(a: Attributes, name: str, default: float) -> float:
+    value = float(a.get(name, default))
+    if not 0.0 < value < 2.0**20:
+        raise InputError(f"attribute {name} = {value} is not supported", fix="it must be positive")
+    return value
+
+
+def _prelu(r: Reader, node: onnx.NodeProto, a: Attributes) -> None:
+    x = r.value(node)
+    r.result(node, r.builder.prelu(x.index, r.weight(node, 1)), x.whole)
+
+
+def _cast(r: Reader, node: onnx.NodeProto, a: Attributes) -> None:
+    x = r.value(node)
+    a.ignore("saturate")
+    if a.get("to") not in (onnx.TensorProto.FLOAT, onnx.TensorProto.DOUBLE):
+        name = onnx.TensorProto.DataType.Name(int(a.get("to", 0)))
+        raise InputError(f"attribute to = {name} is not supported", fix="export the network in float32")
+    r.values[node.output[0]] = x
+
+
+def _identity(r: Reader, node: onnx.NodeProto, a: Attributes) -> None:
+    r.values[node.output[0]] = r.value(node)
+
+
+def _dropout(r: Reader, node: onnx.NodeProto, a: Attributes) -> None:
+    a.ignore("ratio", "seed")
+    a.only("is_test", 1)
+    training = r.constant(node, 2)
+    if training is not None and bool(np.any(training)):
+        raise InputError("is in training mode", fix="export the network in evaluation mode")
+    if any(node.output[1:]):
+        raise InputError("has a mask as second output", fix="export the network in evaluation mode")
+    r.values[node.output[0]] = r.value(node)
+
+
+def _constant(r: Reader, node: onnx.NodeProto, a: Attributes) -> None:
+    value = a.get("value")
+    if value is not None:
+        r.fold(node, r.stored.array(value, f"node {node.name} (Constant)"))
+        return
+    for name, kind in (
+        ("value_float", np.float32),
+        ("value_int", np.int64),
+        ("value_floats", np.float32),
+        ("value_ints", np.int64),
+    ):
+        value = a.get(name)
+        if value is not None:
+            r.fold(node, np.array(value, kind))
+            return
+    raise InputError("holds no number", fix="only value, value_float(s) and value_int(s) are read")
+
+
+def _shape(r: Reader, node: onnx.NodeProto, a: Attributes) -> None:
+    whole = r.value(node).whole
+    start, end = int(a.get("start", 0)), a.get("end")
+    r.fold(node, np.array(whole[slice(start, None if end is None else int(end))], np.int64))
+
+
+def _number(r: Reader, node: onnx.NodeProto, a: Attributes) -> None:
+    r.fold(node, np.array(math.prod(r.value(node).whole), np.int64))
+
+
+# ---------------------------------------------------------------- two values
+
+
+def _binary(r: Reader, node: onnx.NodeProto, a: Attributes) -> None:
+    kind = node.op_type
+    a.ignore("axis", "broadcast")
+    one, two = (_operand(r, node, k) for k in range(2))
+    if isinstance(one, Value) and isinstance(two, Value):
+        r.result(node, *_both(r.builder, kind, one, two))
+        return
+    if isinstance(one, Value):
+        value, constant = one, np.asarray(two, np.float64)
+    else:
+        assert isinstance(two, Value)
+        value, constant = two, np.asarray(one, np.float64)
+    x, whole = _spread(r.builder, value, constant.shape)
+    if kind == "Div" and not isinstance(one, Value):
+        kind, x = "Mul", r.builder.reciprocal(x)
+    factor, offset = np.ones(()), None
+    if kind == "Mul":
+        factor = constant
+    elif kind == "Div":
+        if not constant.all():
+            raise InputError("divides by zero", fix="check the constant")
+        factor = 1.0 / constant
+    elif kind == "Add":
+        offset = constant
+    else:
+        factor = np.ones(()) if isinstance(one, Value) else -np.ones(())
+        offset = -constant if isinstance(one, Value) else constant
+    r.result(node, r.builder.scale(x, factor, offset), whole)
+
+
+def _operand(r: Reader, node: onnx.NodeProto, position: int) -> Value | np.ndarray:
+    return r.value(node, position) if r.moves(node, position) else r.weight(node, position)
+
+
+def _spread(b: Composer, value: Value, shape: Sequence[int]) -> tuple[int, Shape]:
+    """The value repeated to what a constant of ``shape`` makes of it."""
+    try:
+        whole = np.broadcast_shapes(value.whole, tuple(shape))
+    except ValueError:
+        raise InputError(f"constant {item(shape)} with a value {item(value.whole)}") from None
+    return _to(b, value, whole), whole
+
+
+def _to(b: Composer, value: Value, whole: Shape) -> int:
+    """The value repeated to a shape, as an item of what will have that shape."""
+    if value.whole == tuple(whole):
+        return value.index
+    grown = (1,) * (len(whole) - len(value.whole)) + value.whole
+    after = Value(0, tuple(whole)).item
+    before = grown[len(whole) - len(after) :]
+    return b.spread(b.reshape(value.index, before), after)
+
+
+def _both(b: Composer, kind: str, one: Value, two: Value) -> tuple[int, Shape]:
+    try:
+        whole = np.broadcast_shapes(one.whole, two.whole)
+    except ValueError:
+        raise InputError(f"shapes {item(one.whole)} and {item(two.whole)} do not fit") from None
+    first, second = _to(b, one, whole), _to(b, two, whole)
+    if kind in ("Add", "Sub"):
+        return b.sum((first, second), (1, 1 if kind == "Add" else -1)), whole
+    if kind == "Div":
+        return b.product(first, _to(b, Value(b.reciprocal(two.index), two.whole), whole)), whole
+    return b.product(first, second), whole
+
+
+def _variadic(r: Reader, node: onnx.NodeProto, a: Attributes) -> None:
+    """Max, Min and Sum of any number of values and constants."""
+    kind = node.op_type
+    result = r.value(node, next(k for k in range(len(node.input)) if r.moves(node, k)))
+    done = False
+    for k in range(len(node.input)):
+        other = _operand(r, node, k)
+        if isinstance(other, Value):
+            if other is result and not done:
+                done = True
+                continue
+            if kind == "Sum":
+                result = Value(*_both(r.builder, "Add", result, other))
+                continue
+            whole = np.broadcast_shapes(result.whole, other.whole)
+            parts = _to(r.builder, result, whole), _to(r.builder, other, whole)
+            result = Value(r.builder.extreme(parts, kind == "Max"), whole)
+            continue
+        x, whole = _spread(r.builder, result, other.shape)
+        constant = np.asarray(other, np.float64)
+        if kind == "Sum":
+            result = Value(r.builder.scale(x, np.ones(()), constant), whole)
+            continue
+        # max(x, c) = c + relu(x - c), min(x, c) = c - relu(c - x)
+        sign = np.asarray(1.0 if kind == "Max" else -1.0)
+        above = r.builder.leaky_relu(r.builder.scale(x, sign, -sign * constant), 0.0)
+        result = Value(r.builder.scale(above, sign, constant), whole)
+    r.result(node, result.index, result.whole)
+
+
+def _pow(r: Reader, node: onnx.NodeProto, a: Attributes) -> None:
+    x, exponent = r.value(node), np.asarray(r.weight(node, 1), np.float64)
+    if exponent.size != 1:
+        raise InputError(f"exponents {item(exponent.shape)} are not supported", fix="use one exponent")
+    r.result(node, r.builder.power(x.index, float(exponent.reshape(-1)[0])), x.whole)
+
+
+def _greater(r: Reader, node: onnx.NodeProto, a: Attributes) -> None:
+    limit = np.asarray(r.weight(node, 1), np.float64)
+    if limit.size != 1:
+        raise InputError("compares with several numbers", fix="only softplus of torch's exporter is read")
+    r.above[node.output[0]] = r.value(node), float(limit.reshape(-1)[0])
+
+
+def _where(r: Reader, node: onnx.NodeProto, a: Attributes) -> None:
+    if node.input[0] in r.above:
+        value, limit = r.above[node.input[0]]
+        straight, curved = r.value(node, 1), r.value(node, 2)
+        if not r.builder.is_softplus(value.index, limit, straight.index, curved.index):
+            raise InputError("chooses by a value that depends on the image", fix="only torch's softplus is read")
+        r.values[node.output[0]] = curved
+        return
+    chosen = np.asarray(r.weight(node, 0), bool)
+    parts = [_operand(r, node, k) for k in (1, 2)]
+    shapes = [chosen.shape, *(p.whole if isinstance(p, Value) else p.shape for p in parts)]
+    whole = np.broadcast_shapes(*shapes)
+    moving, offset = [], np.zeros(whole)
+    for part, mask in zip(parts, (chosen, ~chosen), strict=True):
+        if isinstance(part, Value):
+            moving.append(r.builder.scale(_to(r.builder, part, whole), mask.astype(np.float64), None))
+        else:
+            offset = offset + np.where(mask, np.asarray(part, np.float64), 0.0)
+    index = r.builder.sum(tuple(moving), (1,) * len(moving), exact=True) if len(moving) > 1 else moving[0]
+    r.result(node, r.builder.scale(index, np.ones(()), offset) if offset.any() else index, whole)
+
+
+def _matmul(r: Reader, node: onnx.NodeProto, a: Attributes) -> None:
+    b = r.builder
+    one, two = (_operand(r, node, k) for k in range(2))
+    if isinstance(one, Value) and isinstance(two, Value):
+        rank = max(len(one.whole), len(two.whole))
+        if min(len(one.whole), len(two.whole)) < 2:
+            raise InputError(f"shapes {item(one.whole)} and {item(two.whole)}", fix="give both two axes or more")
+        wholes = [(1,) * (rank - len(v.whole)) + v.whole for v in (one, two)]
+        lead = np.broadcast_shapes(wholes[0][:-2], wholes[1][:-2])
+        # as items without a batch
+        first, second = (
+            b.spread(b.reshape(v.index, w), (*lead, *w[-2:])) for v, w in zip((one, two), wholes, strict=True)
+        )
+        r.result(node, b.matmul(first, second), (*lead, wholes[0][-2], wholes[1][-1]))
+        return
+    if isinstance(one, Value):
+        weight = _matrix(two)
+        r.result(node, b.matrix(one.index, weight.T, None), (*one.whole[:-1], weight.shape[1]))
+        return
+    assert isinstance(two, Value)
+    weight = _matrix(one)
+    if len(two.whole) < 2:
+        raise InputError(f"a value {item(two.whole)}", fix="give it two axes or more")
+    x = b.reshape(two.index, two.whole)
+    r.result(node, b.matrix_from_left(weight, x), (*two.whole[:-2], weight.shape[0], two.whole[-1]))
+
+
+def _matrix(constant: Any) -> Any:
+    """A constant as a matrix [.., ..] float64."""
+    found = np.asarray(constant, np.float64)
+    if found.ndim < 2 or math.prod(found.shape[:-2]) != 1:
+        raise InputError(f"weights {item(found.shape)}", fix="a matrix expected")
+    return found.reshape(found.shape[-2:])
+
+
+# ---------------------------------------------------------------- shapes
+
+
+def _places(r: Reader, value: Value) -> np.ndarray:
+    """Flat positions in the shape that the file sees."""
+    return r.builder.positions(value.index).reshape(value.whole)
+
+
+def _moved(r: Reader, node: onnx.NodeProto, value: Value, places: np.ndarray, output: int = 0) -> None:
+    """An output that holds the numbers at flat positions of a value."""
+    if places.size == 0:
+        raise InputError(f"nothing is left of {item(value.whole)}", fix="check the constants")
+    index = value.index
+    if places.size != math.prod(value.whole) or not np.array_equal(places.reshape(-1), np.arange(places.size)):
+        index = r.builder.rearranged(index, places.reshape(Value(0, places.shape or (1,)).item))
+    r.result(node, index, places.shape or (1,), output)
+
+
+def _flatten(r: Reader, node: onnx.NodeProto, a: Attributes) -> None:
+    x, axis = r.value(node), int(a.get("axis", 1))
+    if not -len(x.whole) <= axis <= len(x.whole):
+        raise InputError(f"attribute axis = {axis} of {item(x.whole)}", fix="use 1")
+    axis = axis + len(x.whole) if axis < 0 else axis
+    r.result(node, x.index, (math.prod(x.whole[:axis]), math.prod(x.whole[axis:])))
+
+
+def _reshape(r: Reader, node: onnx.NodeProto, a: Attributes) -> None:
+    x = r.value(node)
+    target = [int(v) for v in np.atleast_1d(r.weight(node, 1))]
+    if 0 in target:
+        # without a 0 in the shape, as the exporters write it, the attribute means nothing
+        a.only("allowzero", 0)
+    a.ignore("allowzero")
+    for k, size in enumerate(target):
+        if size == 0:
+            if k >= len(x.whole):
+                raise InputError(f"shape {target} copies a size that is not there", fix="check the shape")
+            target[k] = x.whole[k]
+    total, rest = math.prod(x.whole), math.prod(v for v in target if v != -1)
+    if target.count(-1) > 1 or rest <= 0 or total % rest or (-1 not in target and rest != total):
+        raise InputError(f"shape {target} of {total} numbers", fix="export with a batch of 1")
+    r.result(node, x.index, tuple(total // rest if v == -1 else v for v in target))
+
+
+def _axes(r: Reader, node: onnx.NodeProto, a: Attributes, rank: int) -> list[int] | None:
+    """Axes of the shape that the file sees, from an attribute or the second input."""
+    axes = a.get("axes")
+    if axes is None:
+        axes = r.constant(node, 1)
+    if axes is None:
+        return None
+    found = [int(v) for v in np.atleast_1d(axes)]
+    if any(not -rank <= v < rank for v in found) or len({v % rank for v in found}) != len(found):
+        raise InputError(f"axes {found} of {rank}", fix="check the axes")
+    return sorted(v % rank for v in found)
+
+
+def _squeeze(r: Reader, node: onnx.NodeProto, a: Attributes) -> None:
+    x = r.value(node)
+    axes = _axes(r, node, a, len(x.whole))
+    axes = [k for k, n in enumerate(x.whole) if n == 1] if axes is None else axes
+    if any(x.whole[k] != 1 for k in axes):
+        raise InputError(f"axes {axes} of {item(x.whole)} are not 1", fix="check the axes")
+    r.result(node, x.index, tuple(n for k, n in enumerate(x.whole) if k not in axes) or (1,))
+
+
+def _unsqueeze(r: Reader, node: onnx.NodeProto, a: Attributes) -> None:
+    x = r.value(node)
+    named = a.get("axes")
+    count = np.size(r.weight(node, 1) if named is None else named)
+    shape = list(x.whole)
+    for k in _axes(r, node, a, len(shape) + count) or []:
+        shape.insert(k, 1)
+    r.result(node, x.index, tuple(shape))
+
+
+def _transpose(r: Reader, node: onnx.NodeProto, a: Attributes) -> None:
+    x = r.value(node)
+    rank = len(x.whole)
+    order = [int(v) for v in a.get("perm", range(rank - 1, -1, -1))]
+    if sorted(order) != list(range(rank)):
+        raise InputError(f"attribute perm = {order} of {rank} axes", fix="check the axes")
+    _moved(r, node, x, _places(r, x).transpose(order))
+
+
+def _pad(r: Reader, node: onnx.NodeProto, a: Attributes) -> None:
+    x = r.source(node)
+    rank = 1 + len(r.builder.shape(x))
+    mode, pads = a.get("mode", "constant"), a.get("pads")
+    if pads is None:
+        pads = r.weight(node, 1)
+    value = a.get("value")
+    if value is None:
+        value = r.constant(node, 2, 0.0)
+    pads = [int(v) for v in np.atleast_1d(pads)]
+    axes = r.constant(node, 3)
+    if axes is not None:
+        axes = [int(v) for v in np.atleast_1d(axes)]
+        if len(pads) != 2 * len(axes) or any(not -rank <= v < rank for v in axes):
+            raise InputError(f"pads = {pads} of axes {axes}", fix="give two pads an axis")
+        spread = [0] * (2 * rank)
+        for k, axis in enumerate(axes):
+            spread[axis % rank], spread[rank + axis % rank] = pads[k], pads[len(axes) + k]
+        pads = spread
+    if len(pads) != 2 * rank or pads[0] or pads[rank]:
+        raise InputError(f"pads = {pads} is not supported", fix="give pads of every axis, none of the batch")
+    before, after = pads[1:rank], pads[rank + 1 :]
+    r.result(node, r.builder.pad(x, before, after, mode, float(np.asarray(value).reshape(-1)[0])))
+
+
+def _concat(r: Reader, node: onnx.NodeProto, a: Attributes) -> None:
+    axis = a.get("axis")
+    parts = [_operand(r, node, k) for k in range(len(node.input))]
+    wholes = [p.whole if isinstance(p, Value) else p.shape for p in parts]
+    rank = len(wholes[0])
+    if axis is None or not -rank <= axis < rank:
+        raise InputError(f"attribute axis = {axis} is not supported", fix="name an axis of the item")
+    axis %= rank
+    if any(len(w) != rank or w[:axis] + w[axis + 1 :] != wholes[0][:axis] + wholes[0][axis + 1 :] for w in wholes):
+        raise InputError(f"shapes {[item(w) for w in wholes]} do not fit", fix="check the axis")
+    values = [p for p in parts if isinstance(p, Value)]
+    if len(values) == len(parts) and axis > 0 and all(v.batched for v in values):
+        r.result(node, r.builder.concat([v.index for v in values], axis - 1))
+        return
+    whole = (*wholes[0][:axis], sum(w[axis] for w in wholes), *wholes[0][axis + 1 :])
+    if axis == 0 and all(v.batched for v in values):
+        raise InputError("attribute axis = 0 is not supported", fix="the batch, axis 0, must stay")
+    after = Value(0, whole).item
+    r.builder.reserve(float(math.prod(whole)) * len(parts))
+    moving, offset, done = [], np.zeros(whole), 0
+    for part, size in zip(parts, (w[axis] for w in wholes), strict=True):
+        place = (slice(None),) * axis + (slice(done, done + size),)
+        done += size
+        if isinstance(part, Value):
+            index = np.full(whole, -1, np.int64)
+            index[place] = _places(r, part)
+            moving.append(r.builder.rearranged(part.index, index.reshape(after)))
+        else:
+            offset[place] = part
+    total = r.builder.sum(tuple(moving), (1,) * len(moving), exact=True) if len(moving) > 1 else moving[0]
+    r.result(node, r.builder.shift(total, offset.reshape(after)), whole)
+
+
+def _slice(r: Reader, node: onnx.NodeProto, a: Attributes) -> None:
+    x = r.value(node)
+    starts, ends = a.get("starts"), a.get("ends")
+    if starts is None:
+        starts, ends = r.weight(node, 1), r.weight(node, 2)
+    starts, ends = np.atleast_1d(starts), np.atleast_1d(ends)
+    axes = a.get("axes")
+    axes = np.atleast_1d(r.constant(node, 3, np.arange(len(starts))) if axes is None else axes)
+    steps = np.atleast_1d(r.constant(node, 4, np.ones(len(starts), np.int64)))
+    if not len(starts) == len(ends) == len(axes) == len(steps):
+        raise InputError("starts, ends, axes and steps differ in length", fix="check the constants")
+    rank = len(x.whole)
+    chosen = [slice(None)] * rank
+    for start, end, axis, step in zip(starts, ends, axes, steps, strict=True):
+        if not -rank <= axis < rank or step == 0:
+            raise InputError(f"axis {axis} with step {step} of {item(x.whole)}", fix="check the constants")
+        start, end, size = int(start), int(end), x.whole[int(axis)]
+        if step < 0:
+            # before the first number is None for Python, and far below for ONNX
+            start, end = min(start, size - 1), None if end < -size else end
+        chosen[int(axis)] = slice(start, end, int(step))
+    if x.batched and len(range(1)[chosen[0]]) == 1:
+        _part(r, node, x, chosen)
+    else:
+        _moved(r, node, x, _places(r, x)[tuple(chosen)])
+
+
+def _part(r: Reader, node: onnx.NodeProto, x: Value, chosen: Sequence[slice], output: int = 0) -> None:
+    """Part of an item."""
+    if not x.batched:
+        _moved(r, node, x, _places(r, x)[tuple(chosen)], output)
+        return
+    index = r.builder.part(x.index, chosen[1:])
+    r.result(node, index, (1, *r.builder.shape(index)), output)
+
+
+def _split(r: Reader, node: onnx.NodeProto, a: Attributes) -> None:
+    x = r.value(node)
+    axis, rank = int(a.get("axis", 0)), len(x.whole)
+    if not -rank <= axis < rank:
+        raise InputError(f"attribute axis = {axis} of {item(x.whole)}", fix="check the axis")
+    axis %= rank
+    sizes = a.get("split")
+    if sizes is None:
+        sizes = r.constant(node, 1)
+    size, count = x.whole[axis], len(node.output)
+    a.only("num_outputs", count)
+    if sizes is None:
+        each = -(-size // count)
+        sizes = [each] * (count - 1) + [size - each * (count - 1)]
+    sizes = [int(v) for v in np.atleast_1d(sizes)]
+    if sum(sizes) != size or len(sizes) != count or min(sizes) < 1:
+        raise InputError(f"split = {sizes} of {size}", fix="check the sizes")
+    done = 0
+    for output, length in enumerate(sizes):
+        if node.output[output]:
+            chosen = [slice(None)] * rank
+            chosen[axis] = slice(done, done + length)
+            _part(r, node, x, chosen, output)
+        done += length
+
+
+def _gather(r: Reader, node: onnx.NodeProto, a: Attributes) -> None:
+    x, indices = r.value(node), np.asarray(r.weight(node, 1))
+    axis, rank = int(a.get("axis", 0)), len(x.whole)
+    if not -rank <= axis < rank:
+        raise InputError(f"attribute axis = {axis} of {item(x.whole)}", fix="check the axis")
+    size = x.whole[axis]
+    if indices.dtype.kind not in "iu" or (indices.size and not (-size <= indices.min() and indices.max() < size)):
+        raise InputError(f"indices do not lie in the {size} numbers of axis {axis}", fix="check the indices")
+    r.builder.reserve(float(math.prod(x.whole)) / size * indices.size)
+    _moved(r, node, x, np.take(_places(r, x), indices, axis))
+
+
+def _expand(r: Reader, node: onnx.NodeProto, a: Attributes) -> None:
+    x, shape = r.value(node), [int(v) for v in np.atleast_1d(r.weight(node, 1))]
+    index, whole = _spread(r.builder, x, shape)
+    r.result(node, index, whole)
+
+
+def _tile(r: Reader, node: onnx.NodeProto, a: Attributes) -> None:
+    x, repeats = r.value(node), [int(v) for v in np.atleast_1d(r.weight(node, 1))]
+    r.builder.reserve(float(math.prod(x.whole)) * math.prod(float(max(0, v)) for v in repeats))
+    _moved(r, node, x, np.tile(_places(r, x), repeats))
+
+
+def _depth_to_space(r: Reader, node: onnx.NodeProto, a: Attributes) -> None:
+    x = r.value(node)
+    size, mode = int(a.get("blocksize", 0)), a.get("mode", "DCR")
+    n, c, h, w = x.whole if len(x.whole) == 4 else (0, 0, 0, 0)
+    if size < 1 or n != 1:
+        raise InputError(f"attribute blocksize = {size} of {item(x.whole)}", fix="check the size")
+    if node.op_type == "SpaceToDepth":
+        if h % size or w % size:
+            raise InputError(f"attribute blocksize = {size} of {item(x.whole)}", fix="it must divide the size")
+        places = _places(r, x).reshape(n, c, h // size, size, w // size, size).transpose(0, 3, 5, 1, 2, 4)
+        _moved(r, node, x, places.reshape(n, c * size * size, h // size, w // size))
+        return
+    if c % (size * size) or mode not in ("DCR", "CRD"):
+        raise InputError(f"attributes blocksize = {size}, mode = {mode} of {item(x.whole)}", fix="check the size")
+    rest = c // (size * size)
+    if mode == "DCR":
+        places = _places(r, x).reshape(n, size, size, rest, h, w).transpose(0, 3, 4, 1, 5, 2)
+    else:
+        places = _places(r, x).reshape(n, rest, size, size, h, w).transpose(0, 1, 4, 2, 5, 3)
+    _moved(r, node, x, places.reshape(n, rest, h * size, w * size))
+
+
+def _resize(r: Reader, node: onnx.NodeProto, a: Attributes) -> None:
+    x = r.source(node)
+    shape = r.builder.shape(x)
+    if len(shape) != 3:
+        raise InputError(f"input {item(shape)}", fix="only maps of rows and columns are resized")
+    mode = a.get("mode", "nearest")
+    a.only("antialias", 0)
+    a.only("keep_aspect_ratio_policy", "stretch")
+    a.ignore("cubic_coeff_a", "exclude_outside", "extrapolation_value")
+    if mode not in ("nearest", "linear", "bilinear"):
+        raise InputError(f"attribute mode = {mode} is not supported", fix="use nearest or linear")
+    axes = [int(v) % 4 for v in a.get("axes", range(4))]
+    old = node.op_type == "Upsample" or r.opset < 11
+    scales = a.get("scales")
+    if scales is None:
+        scales = r.constant(node, 1 if old else 2)
+    sizes = None if old else r.constant(node, 3)
+    coordinates = a.get("coordinate_transformation_mode", "asymmetric" if old else "half_pixel")
+    nearest = a.get("nearest_mode", "floor" if old else "round_prefer_floor")
+    whole: list[int] = [1, *shape]
+    ratio: list[float | None] = [None] * 4
+    out = list(whole)
+    if sizes is not None and np.size(sizes):
+        for axis, size in zip(axes, np.atleast_1d(sizes), strict=True):
+            out[axis] = int(size)
+    elif scales is not None and np.size(scales) == len(axes):
+        for axis, scale in zip(axes, np.atleast_1d(scales), strict=True):
+            if not 0.0 < float(scale) < 1024.0:
+                raise InputError(f"scales {list(np.atleast_1d(scales))}", fix="positive numbers expected")
+            out[axis], ratio[axis] = math.floor(whole[axis] * float(scale)), float(scale)
+    else:
+        raise InputError("neither scales nor sizes are given", fix="export with fixed sizes")
+    if out[:2] != whole[:2] or min(out) < 1:
+        raise InputError(f"resizes {item(whole)} to {item(out)}", fix="only rows and columns may change")
+    r.builder.reserve(float(math.prod(out)) * 4.0)
+    maps = [interpolation(whole[k], out[k], mode, coordinates, nearest, ratio[k]) for k in (2, 3)]
+    r.result(node, r.builder.resize(x, maps))
+
+
+# ---------------------------------------------------------------- windows, means and norms
+
+
+def _conv_transpose(r: Reader, node: onnx.NodeProto, a: Attributes) -> None:
+    x, weight, bias = r.source(node), r.weight(node, 1), r.constant(node, 2)
+    a.only("auto_pad", "NOTSET", "VALID")
+    a.ints("kernel_shape", 2)
+    stride, dilation = a.ints("strides", 2, 1) or (1, 1), a.ints("dilations", 2, 1) or (1, 1)
+    pads, more = a.ints("pads", 4, 0) or (0,) * 4, a.ints("output_padding", 2, 0) or (0, 0)
+    if a.get("output_shape") is not None:
+        raise InputError("attribute output_shape is not supported", fix="use pads and output_padding")
+    groups = int(a.get("group", 1))
+    r.result(node, r.builder.transposed_convolution(x, weight, bias, stride, dilation, pads, more, groups))
+
+
+def _reduce(r: Reader, node: onnx.NodeProto, a: Attributes) -> None:
+    x = r.value(node)
+    kind, rank = node.op_type, len(x.whole)
+    axes = _axes(r, node, a, rank)
+    if not axes and a.get("noop_with_empty_axes", 0):
+        r.values[node.output[0]] = x
+        return
+    a.ignore("noop_with_empty_axes")
+    axes = axes or list(range(rank))
+    keep = bool(a.get("keepdims", 1))
+    inner = [k - x.batched for k in axes if k >= x.batched]
+    if kind in ("ReduceMean", "ReduceSum"):
+        index = r.builder.reduce(x.index, inner, kind == "ReduceMean", True)
+    else:
+        index = r.builder.greatest(x.index, inner, True, kind == "ReduceMax") if inner else x.index
+    whole = tuple(1 if k in axes else n for k, n in enumerate(x.whole))
+    r.result(node, index, whole if keep else tuple(n for k, n in enumerate(whole) if k not in axes) or (1,))
+
+
+def _global_max(r: Reader, node: onnx.NodeProto, a: Attributes) -> None:
+    x = r.source(node)
+    r.result(node, r.builder.greatest(x, list(range(1, len(r.builder.shape(x)))), True))
+
+
+def _softmax(r: Reader, node: onnx.NodeProto, a: Attributes) -> None:
+    x = r.value(node)
+    rank = len(x.whole)
+    axis = int(a.get("axis", -1 if r.opset >= 13 else 1))
+    if not -rank <= axis < rank:
+        raise InputError(f"attribute axis = {axis} of {item(x.whole)}", fix="check the axis")
+    axis %= rank
+    if r.opset < 13 and axis != rank - 1:
+        raise InputError(f"attribute axis = {axis} before operator set 13", fix="use the last axis, or operator set 13")
+    if axis < x.batched:
+        raise InputError(f"attribute axis = {axis} is not supported", fix="the batch must stay")
+    index = r.builder.softmax(x.index, axis - x.batched, node.op_type == "LogSoftmax")
+    r.result(node, index, x.whole)
+
+
+def _layer_norm(r: Reader, node: onnx.NodeProto, a: Attributes) -> None:
+    x = r.value(node)
+    rank = len(x.whole)
+    axis = int(a.get("axis", -1)) % rank
+    a.ignore("stash_type")
+    if axis < x.batched or any(node.output[1:]):
+        raise InputError(f"attribute axis = {axis} is not supported", fix="normalise over axes of the item alone")
+    inner = list(range(axis - x.batched, rank - x.batched))
+    index = r.builder.normalise(x.index, inner, float(a.get("epsilon", 1e-5)))
+    index = r.builder.scale(index, np.asarray(r.weight(node, 1), np.float64), None)
+    r.result(node, r.builder.shift(index, r.constant(node, 2)), x.whole)
+
+
+def _group_norm(r: Reader, node: onnx.NodeProto, a: Attributes) -> None:
+    x = r.source(node)
+    shape = r.builder.shape(x)
+    channels = shape[0]
+    groups = channels if node.op_type == "InstanceNormalization" else int(a.get("num_groups", 0))
+    a.ignore("stash_type")
+    if groups < 1 or channels % groups or len(shape) < 2:
+        raise InputError(f"attribute num_groups = {groups} of {channels} channels", fix="it must divide them")
+    split = (groups, channels // groups, *shape[1:])
+    index = r.builder.normalise(r.builder.reshape(x, split), list(range(1, len(split))), float(a.get("epsilon", 1e-5)))
+    index = r.builder.reshape(index, shape)
+    parts = []
+    for k in (1, 2):
+        found = np.asarray(r.weight(node, k), np.float64)
+        if found.shape not in ((channels,), (groups,)):
+            raise InputError(
+                f"input {k} {item(found.shape)} of {channels} channels", fix="one number a channel expected"
+            )
+        parts.append(np.repeat(found, channels // found.size).reshape(-1, *[1] * (len(shape) - 1)))
+    r.result(node, r.builder.shift(r.builder.scale(index, parts[0], None), parts[1]))
+
+
+RULES: dict[str, Rule] = {
+    "Abs": _curve(curves.Abs),
+    "Add": _binary,
+    "AveragePool": _average_pool,
+    "BatchNormalization": _batch_norm,
+    "Cast": _cast,
+    "Celu": _unary(_celu),
+    "Clip": _clip,
+    "Concat": _concat,
+    "Constant": _constant,
+    "Conv": _conv,
+    "ConvTranspose": _conv_transpose,
+    "DepthToSpace": _depth_to_space,
+    "Div": _binary,
+    "Dropout": _dropout,
+    "Elu": _unary(_elu),
+    "Erf": _curve(curves.Erf),
+    "Exp": _curve(curves.Exp),
+    "Expand": _expand,
+    "Flatten": _flatten,
+    "Gather": _gather,
+    "Gelu": _unary(_gelu),
+    "Gemm": _gemm,
+    "GlobalAveragePool": _global_average,
+    "GlobalMaxPool": _global_max,
+    "Greater": _greater,
+    "GroupNormalization": _group_norm,
+    "HardSigmoid": _unary(_hard_sigmoid),
+    "HardSwish": _curve(curves.HardSwish),
+    "Identity": _identity,
+    "InstanceNormalization": _group_norm,
+    "LayerNormalization": _layer_norm,
+    "LeakyRelu": _unary(lambda b, x, a: b.prelu(x, np.asarray(float(a.get("alpha", 0.01))))),
+    "Log": _unary(lambda b, x, a: b.logarithm(x)),
+    "LogSoftmax": _softmax,
+    "MatMul": _matmul,
+    "Max": _variadic,
+    "MaxPool": _max_pool,
+    "Min": _variadic,
+    "Mish": _curve(curves.Mish),
+    "Mul": _binary,
+    "Neg": _unary(lambda b, x, a: b.scale(x, -np.ones(()), None)),
+    "PRelu": _prelu,
+    "Pad": _pad,
+    "Pow": _pow,
+    "Reciprocal": _unary(lambda b, x, a: b.reciprocal(x)),
+    "ReduceMax": _reduce,
+    "ReduceMean": _reduce,
+    "ReduceMin": _reduce,
+    "ReduceSum": _reduce,
+    "Relu": _unary(lambda b, x, a: b.leaky_relu(x, 0.0)),
+    "Reshape": _reshape,
+    "Resize": _resize,
+    "Selu": _unary(_selu),
+    "Shape": _shape,
+    "Sigmoid": _unary(lambda b, x, a: b.sigmoid(x)),
+    "Size": _number,
+    "Slice": _slice,
+    "Softmax": _softmax,
+    "Softplus": _curve(curves.Softplus),
+    "SpaceToDepth": _depth_to_space,
+    "Split": _split,
+    "Sqrt": _unary(lambda b, x, a: b.power(x, 0.5)),
+    "Squeeze": _squeeze,
+    "Sub": _binary,
+    "Sum": _variadic,
+    "Tanh": _unary(lambda b, x, a: b.tanh(x)),
+    "Tile": _tile,
+    "Transpose": _transpose,
+    "Unsqueeze": _unsqueeze,
+    "Upsample": _resize,
+    "Where": _where,
+}

@@ -1,0 +1,130 @@
+"""What an ONNX file stores, checked before it is read: its messages and its tensors."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import onnx
+from google.protobuf.message import DecodeError
+from onnx import numpy_helper
+
+from ns_abstract.io.errors import InputError
+from ns_abstract.io.jsonio import file_size, show
+from ns_abstract.methods.runs import check_memory
+
+#: Numbers that one stored tensor may have.
+_LARGEST = 1 << 28
+#: Largest file: the format's own limit.
+_LARGEST_FILE = 1 << 31
+#: Bytes in memory for a byte of a file: the file, its messages, tensors in float32 and float64, onnxruntime's copy.
+_COPIES = 6
+#: Part of a large file that must be stored; the rest are holes, which read as zeros.
+_HOLES, _LARGE = 16, 16 << 20
+#: How often tensors may share the bytes of files beside the model.
+_SHARED = 4
+_FIX = "export the network again"
+
+
+def parse_model(path: Path) -> onnx.ModelProto:
+    """The messages of an ONNX file, without data that lie in other files.
+
+    Raises:
+        InputError: The file cannot be read, or is too large for the memory that is free.
+    """
+    size = file_size(path, "network")
+    if size > _LARGEST_FILE or (size > _LARGE and path.stat().st_blocks * 512 * _HOLES < size):
+        problem = f"claims {size:,} bytes, {path.stat().st_blocks * 512:,} of them are stored"
+        raise InputError(problem, file=path, fix="copy it again whole, or export with external data")
+    check_memory(_COPIES * size, path, "the network")
+    try:
+        model = onnx.load(str(path), load_external_data=False)
+    except OSError as error:
+        raise InputError(f"cannot be read: {error.strerror or error}", file=path, fix="check the path") from None
+    except (DecodeError, ValueError, TypeError) as error:
+        raise InputError(f"is not an ONNX model ({str(error) or type(error).__name__})", file=path, fix=_FIX) from None
+    if not model.graph.node or not model.graph.output:
+        raise InputError("holds no network", file=path, field="graph", fix=_FIX)
+    return model
+
+
+class StoredTensors:
+    """Reads the tensors of one model, also from files beside it.
+
+    Args:
+        path: The model.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self._sizes: dict[Path, int] = {}
+        self._taken = 0
+
+    def array(self, tensor: onnx.TensorProto, field: str) -> np.ndarray:
+        """A stored constant.
+
+        Raises:
+            InputError: It claims more than is stored, or cannot be used.
+        """
+        count = 1
+        for size in tensor.dims:
+            if size < 0:
+                raise InputError(f"has a negative size {size}", file=self.path, field=field, fix=_FIX)
+            count *= size
+        if count > _LARGEST:
+            problem = f"has {count:,} numbers"
+            raise InputError(problem, file=self.path, field=field, fix=f"at most {_LARGEST:,} are read")
+        try:
+            kind = onnx.helper.tensor_dtype_to_np_dtype(tensor.data_type)
+        except (KeyError, ValueError, TypeError):
+            raise InputError(f"has type {tensor.data_type}", file=self.path, field=field, fix="use float32") from None
+        if kind.kind not in "fiub":
+            raise InputError(f"has type {kind}", file=self.path, field=field, fix="use float32")
+        if tensor.data_location == onnx.TensorProto.EXTERNAL:
+            array = self._external(tensor, field, kind, count)
+        else:
+            try:
+                array = numpy_helper.to_array(tensor)
+            except Exception as error:  # numpy_helper raises whatever it meets
+                raise InputError(f"cannot be read ({error})", file=self.path, field=field, fix=_FIX) from None
+        if array.dtype.kind not in "fiub":
+            raise InputError(f"has type {array.dtype}", file=self.path, field=field, fix="use float32")
+        if array.dtype.kind == "f" and not np.isfinite(array).all():
+            raise InputError("holds numbers that are not finite", file=self.path, field=field, fix="train again")
+        return array
+
+    def _external(self, tensor: onnx.TensorProto, field: str, kind: np.dtype, count: int) -> np.ndarray:
+        """A constant whose data stand in a file that must lie beside the model."""
+        where = {entry.key: entry.value for entry in tensor.external_data}
+        folder = self.path.resolve().parent
+        location = where.get("location", "")
+
+        def fail(problem: str, fix: str = "put the data beside the model") -> InputError:
+            return InputError(problem, file=self.path, field=field, fix=fix)
+
+        try:
+            target = (folder / location).resolve()
+            start, length = int(where.get("offset", 0)), int(where.get("length", kind.itemsize * count))
+        except (OSError, ValueError, RuntimeError) as error:
+            raise fail(f"cannot read {show(location)} ({error})") from None
+        if not location or Path(location).is_absolute() or not target.is_relative_to(folder) or target == folder:
+            raise fail(f"points to {show(location)}, outside the model's folder")
+        if target not in self._sizes:
+            try:
+                self._sizes[target] = file_size(target, "file of external data")
+            except InputError as error:
+                raise fail(f"cannot read {show(location)}: {error.problem}") from None
+        if start < 0 or length != kind.itemsize * count or start + length > self._sizes[target]:
+            problem = f"needs {kind.itemsize * count:,} bytes, has {length:,} at {start:,} of {show(location)}"
+            raise fail(f"{problem}, a file of {self._sizes[target]:,}", _FIX)
+        self._taken += length
+        if self._taken > _SHARED * sum(self._sizes.values()):
+            raise fail("shares its data with too many others", _FIX)
+        check_memory(_COPIES * self._taken, self.path, "the network")
+        try:
+            with target.open("rb") as stream:
+                stream.seek(start)
+                data = stream.read(length)
+            return np.frombuffer(data, kind.newbyteorder("<"), count).astype(kind).reshape(tuple(tensor.dims))
+        except (OSError, ValueError) as error:
+            raise fail(f"cannot read {show(location)} ({error})") from None

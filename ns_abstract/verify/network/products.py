@@ -1,0 +1,68 @@
+"""Products of two values that both depend on the image (docs/design.md, N9)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import ClassVar, Protocol
+
+import torch
+from torch import Tensor
+
+from ns_abstract.verify.network.layers import Shape
+
+#: Both factors must move by more than this of their sizes to be worth better bounds.
+_MOVES = 2.0**-7
+
+
+class Interval(Protocol):
+    """What is known of a node: [m, *shape] each."""
+
+    @property
+    def lower(self) -> Tensor:
+        """Least values."""
+        ...
+
+    @property
+    def upper(self) -> Tensor:
+        """Largest values."""
+        ...
+
+
+@dataclass(frozen=True)
+class Plane:
+    """``low <= x y - first x - second y <= high``; all [m, *shape] float64, slopes are float32 numbers."""
+
+    first: Tensor
+    second: Tensor
+    low: Tensor
+    high: Tensor
+
+
+@dataclass(frozen=True, eq=False)
+class Product:
+    """``x y`` number by number; ``shape`` is one item of both factors and of the result."""
+
+    shape: Shape
+    mixes: ClassVar[bool] = True
+
+    def __call__(self, inputs: Sequence[Tensor]) -> Tensor:
+        return inputs[0] * inputs[1]
+
+    def open(self, x: Interval, y: Interval) -> Tensor:
+        """Where better bounds of the factors would give a better plane."""
+        widths, sizes = [], []
+        for f in (x, y):
+            widths.append(f.upper - f.lower)
+            sizes.append(torch.maximum(f.lower.abs(), f.upper.abs()))
+        return (widths[0] > _MOVES * sizes[0]) & (widths[1] > _MOVES * sizes[1])
+
+    def plane(self, x: Interval, y: Interval) -> Plane:
+        """The planes half way between McCormick's: any slopes do, as ``x y - a x - b y`` is extreme at corners."""
+        first = (0.5 * (y.lower + y.upper)).float().double()
+        second = (0.5 * (x.lower + x.upper)).float().double()
+        corners = torch.stack([u * v - first * u - second * v for u in (x.lower, x.upper) for v in (y.lower, y.upper)])
+        sizes = [torch.maximum(f.lower.abs(), f.upper.abs()) for f in (x, y)]
+        # three products and two sums at each corner
+        room = 2.0**-48 * (sizes[0] * sizes[1] + first.abs() * sizes[0] + second.abs() * sizes[1])
+        return Plane(first, second, corners.amin(0) - room, corners.amax(0) + room)

@@ -1,0 +1,336 @@
+"""The Python interface: `import ns_abstract as nsa`, on splats, a NeRF and a third representation."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import os
+import signal
+import sqlite3
+import subprocess
+import sys
+import threading
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import onnxruntime
+import pytest
+from certifying import classifier, linear
+from conftest import Inputs
+from nerfs import tiny_scene
+from wall import WALL, write_wall
+
+import ns_abstract as nsa
+from ns_abstract.cli import render as render_command
+from ns_abstract.geometry.camera_path import Camera as PinholeCamera
+from ns_abstract.geometry.views import look_at
+from ns_abstract.methods import load
+from ns_abstract.methods.nerf.write import write_nerf_run
+from ns_abstract.report.files import load_frame
+
+PICTURES = ("lower", "upper", "witness_lower", "witness_upper", "image")
+
+
+@pytest.fixture
+def wall(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> nsa.Scene:
+    """A scene of a representation that the package does not know."""
+    monkeypatch.setattr(load, "REPRESENTATIONS", [WALL, *load.REPRESENTATIONS])
+    return nsa.load_scene(write_wall(tmp_path / "painted.wall"))
+
+
+def straight(size: int = 10) -> nsa.Camera:
+    return nsa.Camera(np.eye(4), width=size, height=size)
+
+
+def outside(result: nsa.BoundResult, scene: nsa.Scene, poses: nsa.PoseSet, count: int = 200) -> int:
+    """Pixel channels of random pictures of the set that lie outside the bounds."""
+    frame = scene.method().frame(poses.of(scene))
+    values = [*frame.box.sample(count, np.random.default_rng(3)), *frame.box.corners()]
+    found = 0
+    for v in values:
+        pose = frame.pose_set.pose(v)
+        camera = dataclasses.replace(PinholeCamera(**_fields(poses.camera)), camera_to_world=pose)
+        image = nsa.render(scene, camera)
+        assert image.dtype == np.float64 and image.shape == result.lower.shape
+        found += int((~((result.lower <= image) & (image <= result.upper))).sum())
+    return found
+
+
+def _fields(camera: PinholeCamera) -> dict[str, Any]:
+    return {field.name: getattr(camera, field.name) for field in dataclasses.fields(PinholeCamera)}
+
+
+# ---------------------------------------------------------------- a third representation
+
+
+def test_third_representation_is_bounded(wall: nsa.Scene, tmp_path: Path) -> None:
+    poses = nsa.PoseSet(straight(), translation={"x": 0.1, "y": (-0.05, 0.1)}, frame="world")
+    result = nsa.bound(wall, poses, target_ratio=1.1, time_budget=60.0, keep_cells=True)
+    assert result.ratio is not None and 1.0 <= result.ratio <= 1.1 and result.status == "done"
+    assert result.guarantee == "real-sound" and result.parameters.names == ("x", "y") == poses.parameters
+    assert outside(result, wall, poses) == 0
+    assert result.mpg < 0.5 and result.mpg <= result.xpg and not result.interrupted
+    assert result.trace[-1].mpg == pytest.approx(result.mpg)
+    assert result.cells is not None and result.cells.A_lower.shape[-1] == 2
+    result.save(tmp_path / "frame.npz")
+    stored = load_frame(tmp_path / "frame.npz")
+    for name in PICTURES:
+        np.testing.assert_array_equal(getattr(stored.result, name), getattr(result, name))
+    assert stored.status == "done" and stored.has_leaves
+
+
+def test_unsound_bounds_of_a_representation_are_noticed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(load, "REPRESENTATIONS", [WALL])
+    scene = nsa.load_scene(write_wall(tmp_path / "painted.wall", fault=0.2))
+    poses = nsa.PoseSet(straight(), translation={"x": 0.1}, frame="world")
+    assert outside(nsa.bound(scene, poses, target_ratio=10.0), scene, poses) > 0
+
+
+def test_third_representation_is_certified(wall: nsa.Scene, tmp_path: Path) -> None:
+    size = 8
+    net = classifier(tmp_path / "net.onnx", size)
+    poses = nsa.PoseSet(straight(size), translation={"x": 0.02}, frame="world")
+    session = onnxruntime.InferenceSession(str(net), providers=["CPUExecutionProvider"])
+    frame = wall.method().frame(poses.of(wall))
+
+    def says(x: float) -> int:
+        pose = frame.pose_set.pose(np.array([x]))
+        image = nsa.render(wall, dataclasses.replace(PinholeCamera(**_fields(poses.camera)), camera_to_world=pose))
+        return int(session.run(None, {"image": image.transpose(2, 0, 1)[None].astype(np.float32)})[0].argmax())
+
+    label = says(0.0)
+    cert = nsa.certify(wall, poses, net, {"type": "classification", "label": label}, time_budget=60.0)
+    assert cert.certified > 0.5 and cert.certified + cert.falsified + cert.unknown == pytest.approx(1.0)
+    assert cert.parameters == (("x", "normalised units"),) and cert.state == "done"
+    rng = np.random.default_rng(0)
+    for cell in cert.cells:
+        if cell.verdict == "certified":
+            assert cell.margin is not None and cell.margin > 0.0
+            assert {says(x) for x in rng.uniform(cell.lower[0], cell.upper[0], 5)} == {label}
+        if cell.verdict == "falsified":
+            assert cell.counterexample is not None and says(float(cell.counterexample[0])) != label
+    # the wrong label is falsified, not certified
+    wrong = nsa.certify(wall, poses, net, {"type": "classification", "label": (label + 1) % 3}, time_budget=20.0)
+    assert wrong.certified < 0.5 and wrong.falsified > 0.5 and wrong.verdict == "falsified"
+
+
+def test_third_representation_from_the_command_line(wall: nsa.Scene, tmp_path: Path, blobs: Inputs) -> None:
+    spec = tmp_path / "spec.json"
+    # a unit of its data set is two normalised ones
+    value = {"version": 1, "frame": "world", "units": "dataset", "translation": {"y": 0.03}}
+    spec.write_text(json.dumps(value))
+    options = render_command.Render(wall.source.file, blobs.path, tmp_path / "out", spec, frames=(1,), time_budget=20.0)
+    assert render_command.render(options) == 0
+    document = json.loads((tmp_path / "out" / "report.json").read_text())
+    assert document["renderer"]["name"] == "wall" and document["guarantee"] == "real-sound"
+    (entry,) = document["frames"]
+    assert entry["parameters"][0]["upper"] == 0.06 and entry["ratio"] <= 1.05
+    assert "perspective left out" in entry["plan"][0] and "lighting left out" in document["plan"][0]
+    # the command line and the interface say the same
+    path = nsa.load_camera_path(blobs.path)
+    result = nsa.bound(wall, nsa.PoseSet.from_json(path.cameras[1], value), time_budget=20.0)
+    stored = load_frame(tmp_path / "out" / "frame_00001.npz").result
+    for name in ("lower", "upper"):
+        np.testing.assert_array_equal(getattr(result, name), getattr(stored, name))
+    with pytest.raises(nsa.InputError, match="straight on"):
+        nsa.bound(wall, nsa.PoseSet(path.cameras[0], rotation={"yaw": 0.1}))
+
+
+# ---------------------------------------------------------------- ending early
+
+
+def test_on_progress_ends_the_work(wall: nsa.Scene) -> None:
+    poses = nsa.PoseSet(straight(), translation={"x": 0.3, "y": 0.3}, frame="world")
+    seen: list[nsa.Progress] = []
+
+    def enough(progress: nsa.Progress) -> bool:
+        seen.append(progress)
+        return not (progress.covered == 1.0 and progress.cells > 30)
+
+    result = nsa.bound(wall, poses, target_ratio=1.0, time_budget=600.0, on_progress=enough)
+    assert result.interrupted and result.bounded and outside(result, wall, poses, 50) == 0
+    assert [p.cells for p in seen] == sorted(p.cells for p in seen) and seen[-1].cells > 30
+    assert all(p.frame == 0 and p.budget <= 600.0 and p.mpg >= p.mpg_witness for p in seen)
+
+
+@pytest.mark.parametrize("how", ["signal", "raised"])
+def test_interrupt_keeps_what_is_known(how: str, wall: nsa.Scene, request: pytest.FixtureRequest) -> None:
+    if how == "signal":
+        if threading.current_thread() is not threading.main_thread():
+            pytest.skip("signals reach the main thread alone")
+        # commands in the background are started with the signal ignored
+        found = signal.signal(signal.SIGINT, signal.default_int_handler)
+        request.addfinalizer(lambda: signal.signal(signal.SIGINT, found))
+    poses = nsa.PoseSet(straight(), translation={"x": 0.3, "y": 0.3}, frame="world")
+
+    told: list[int] = []
+
+    def interrupt(progress: nsa.Progress) -> None:
+        if progress.covered == 1.0 and not told:
+            told.append(progress.cells)
+            if how == "raised":
+                raise KeyboardInterrupt
+            os.kill(os.getpid(), signal.SIGINT)
+
+    before = signal.getsignal(signal.SIGINT)
+    result = nsa.bound(wall, poses, target_ratio=1.0, time_budget=600.0, on_progress=interrupt)
+    assert signal.getsignal(signal.SIGINT) is before
+    assert result.interrupted and result.bounded and outside(result, wall, poses, 50) == 0
+    # nothing lingers
+    assert not nsa.bound(wall, poses, target_ratio=100.0).interrupted
+
+
+def test_certificate_ends_early_and_goes_on(wall: nsa.Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from ns_abstract.api import certifying
+
+    monkeypatch.setattr(certifying, "_TRACE", 0.0)
+    rows = np.stack([np.ones(3 * 64), np.zeros(3 * 64)]) / 192
+    net = linear(tmp_path / "net.onnx", rows, np.array([0.0, 0.6]), 8)
+    poses = nsa.PoseSet(straight(8), translation={"x": 0.6}, frame="world")
+    prop = {"type": "classification", "label": 0}
+    out = tmp_path / "out"
+    seen: list[nsa.CertifyProgress] = []
+
+    def stop(progress: nsa.CertifyProgress) -> bool:
+        seen.append(progress)
+        return False
+
+    early = nsa.certify(wall, poses, net, prop, output_dir=out, on_progress=stop)
+    assert early.interrupted and early.unknown > 0.0 and len(seen) == 1 and seen[0].open > 0.0
+    late = nsa.certify(wall, poses, net, prop, output_dir=out, resume=True)
+    whole = nsa.certify(wall, poses, net, prop)
+    assert late.state == whole.state == "done"
+    for name in ("certified", "falsified", "unknown", "verdict"):
+        assert getattr(late, name) == getattr(whole, name)
+    with sqlite3.connect(out / "cells.sqlite") as base:
+        assert base.execute("SELECT count(*) FROM cells").fetchone()[0] == len(whole.cells)
+    assert (out / "report.html").exists() and late.report["coverage"]["certified"] == late.certified
+
+
+# ---------------------------------------------------------------- splats and NeRFs
+
+
+def test_splats(blobs: Inputs, tmp_path: Path) -> None:
+    """The same bits as the command line writes."""
+    scene, path = nsa.load_scene(blobs.config), nsa.load_camera_path(blobs.path)
+    spec = json.loads(blobs.spec.read_text())
+    result = nsa.bound(scene, nsa.PoseSet.from_json(path.cameras[0], spec), target_ratio=1.5)
+    options = render_command.Render(blobs.config, blobs.path, tmp_path, blobs.spec, frames=(0,), target_ratio=1.5)
+    assert render_command.render(options) == 0
+    stored = load_frame(tmp_path / "frame_00000.npz").result
+    for name in PICTURES:
+        np.testing.assert_array_equal(getattr(stored, name), getattr(result, name))
+    assert result.guarantee == "float32-sound" and result.cells is None
+    real = nsa.bound(scene, nsa.PoseSet(path.cameras[0], translation={"x": 0.01}), arithmetic="real", target_ratio=2.0)
+    assert real.guarantee == "real-sound"
+    assert "blobs" in repr(scene) and "Gaussians" in repr(scene)
+    varied = {"scene": [{"select": {}, "opacity": 0.05}]}
+    wider = nsa.bound(scene, nsa.PoseSet.from_json(path.cameras[0], varied), target_ratio=5.0, time_budget=5.0)
+    assert wider.mpg > 0.0 and any("opacity" in sentence for sentence in wider.plan)
+
+
+def test_nerf(tmp_path: Path) -> None:
+    config = write_nerf_run(tiny_scene(0), tmp_path, timestamp="2026-01-01_000000", experiment_name="tiny")
+    scene = nsa.load_scene(config, num_samples=8)
+    camera = nsa.Camera(look_at((1.5, 0.0, 0.5), (0.0, 0.0, 0.0)), width=3, height=3)
+    poses = nsa.PoseSet(camera, rotation={"yaw": 1e-3})
+    result = nsa.bound(scene, poses, target_ratio=3.0, time_budget=60.0)
+    assert result.guarantee == "real-sound" and outside(result, scene, poses, 20) == 0
+    with pytest.raises(nsa.InputError) as caught:
+        nsa.bound(scene, poses, arithmetic="float32")
+    assert caught.value.field == "--arithmetic"
+
+
+# ---------------------------------------------------------------- arguments
+
+
+def test_camera_is_that_of_the_path(blobs: Inputs) -> None:
+    theirs = nsa.load_camera_path(blobs.path).cameras[0]
+    ours = nsa.Camera(theirs.camera_to_world, fov=45.0, width=theirs.width, height=theirs.height)
+    for name, value in _fields(theirs).items():
+        np.testing.assert_array_equal(_fields(ours)[name], value)
+    whole = nsa.Camera(np.concatenate([theirs.camera_to_world, [[0, 0, 0, 1]]]), 45.0, theirs.width, theirs.height)
+    np.testing.assert_array_equal(whole.camera_to_world, ours.camera_to_world)
+
+
+def test_perturbations_of_a_path(blobs: Inputs, tmp_path: Path) -> None:
+    path = json.loads(blobs.path.read_text())
+    path["perturbation"] = {"translation": {"x": 0.1}}
+    path["camera_path"][1]["perturbation"] = {"translation": {"y": 0.2}}
+    (tmp_path / "path.json").write_text(json.dumps(path))
+    found = nsa.load_camera_path(tmp_path / "path.json")
+    assert [p and p["translation"] for p in found.perturbations] == [{"x": 0.1}, {"y": 0.2}, {"x": 0.1}]
+    sets = [nsa.PoseSet.from_json(c, p) for c, p in zip(found.cameras, found.perturbations, strict=True)]
+    assert [s.parameters for s in sets] == [("x",), ("y",), ("x",)]
+    swept = nsa.PoseSet(found.cameras[0], translation={"x": 0.1}, following=found.following(0))
+    assert swept.parameters == ("x", "segment")
+    assert nsa.PoseSet.from_json(found.cameras[0], None).parameters == ()
+    turning = nsa.PoseSet(found.cameras[0], orbit={"target": np.zeros(3), "axis": (0, 0, 1), "azimuth": (0.0, 1.0)})
+    assert turning.parameters == ("azimuth",)
+
+
+MISTAKES = {
+    "reversed": (lambda: nsa.PoseSet(straight(), translation={"x": (0.1, -0.1)}), "translation.x"),
+    "unknown axis": (lambda: nsa.PoseSet(straight(), translation={"w": 0.1}), "translation.w"),
+    "not a number": (lambda: nsa.PoseSet(straight(), rotation={"yaw": float("nan")}), "rotation.yaw"),
+    "frame": (lambda: nsa.PoseSet(straight(), frame="sideways"), "frame"),
+    "unknown key": (lambda: nsa.PoseSet.from_json(straight(), {"shake": 1}), "shake"),
+    "no camera": (lambda: nsa.PoseSet(np.eye(4), translation={"x": 0.1}), "camera"),  # type: ignore[arg-type]
+    "fov": (lambda: nsa.Camera(np.eye(4), fov=200.0), "fov"),
+    "width": (lambda: nsa.Camera(np.eye(4), width=0), "width"),
+    "pose": (lambda: nsa.Camera(2.0 * np.eye(4)), "camera_to_world"),
+}
+
+
+@pytest.mark.parametrize("name", MISTAKES)
+def test_mistakes_name_the_field(name: str) -> None:
+    make, field = MISTAKES[name]
+    with pytest.raises(nsa.InputError) as caught:
+        make()
+    assert caught.value.field == field and caught.value.fix and "\n" not in str(caught.value)
+
+
+def test_files_that_are_not_there(tmp_path: Path, wall: nsa.Scene) -> None:
+    with pytest.raises(nsa.InputError) as caught:
+        nsa.load_scene(tmp_path / "none.yml")
+    assert caught.value.file is not None and caught.value.file.endswith("none.yml")
+    poses = nsa.PoseSet(straight(), translation={"x": 0.1})
+    with pytest.raises(nsa.InputError, match=r"none\.onnx"):
+        nsa.certify(wall, poses, tmp_path / "none.onnx", {"type": "classification", "label": 0})
+    for more in ({"target_ratio": 0.5}, {"time_budget": 0.0}):
+        with pytest.raises(nsa.InputError) as caught:
+            nsa.bound(wall, poses, **more)
+        assert caught.value.field == next(iter(more))
+
+
+# ---------------------------------------------------------------- notebooks, imports
+
+
+def test_results_show_themselves(wall: nsa.Scene, tmp_path: Path) -> None:
+    poses = nsa.PoseSet(straight(8), translation={"x": 0.1}, frame="world")
+    shown = nsa.bound(wall, poses)._repr_html_()
+    assert shown.count("data:image/png;base64,") == 4
+    for text in ("lower bound", "upper bound", "gap", "one render", "real-sound", "ratio"):
+        assert text in shown
+    net = classifier(tmp_path / "net.onnx", 8)
+    text = nsa.certify(wall, poses, net, {"type": "classification", "label": 0}, time_budget=5.0)._repr_html_()
+    assert "certified" in text and "every image" in text
+
+
+def test_import_is_light() -> None:
+    code = (
+        "import sys, ns_abstract as nsa; assert not {'numpy', 'torch', 'numba', 'onnx'} & set(sys.modules); "
+        "assert set(nsa.__all__) <= set(dir(nsa)); nsa.InputError; assert 'numpy' not in sys.modules; "
+        "[getattr(nsa, name) for name in nsa.__all__]; assert 'nerfstudio' not in sys.modules"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True, timeout=120)
+    with pytest.raises(AttributeError, match="no attribute 'nothing'"):
+        nsa.nothing  # noqa: B018
+
+
+def test_version_is_that_of_the_package() -> None:
+    import importlib.metadata
+
+    assert importlib.metadata.version("ns-abstract") == nsa.__version__
+    assert (Path(nsa.__file__).parent / "py.typed").exists()
