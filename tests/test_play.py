@@ -23,11 +23,13 @@ from ns_abstract.report.certificate import CertifiedRun, certificate_document
 from ns_abstract.report.certificate_page import certificate_page
 from ns_abstract.report.files import load_frame, save_frame
 from ns_abstract.report.picture import preview
-from ns_abstract.report.play import STEP, play_data
+from ns_abstract.report.play import play_data
 from ns_abstract.report.record import Report
 
 SIDE = 16
 LARGE = 10**9
+#: Of what the page shows of small pictures.
+STEP = 1e-4
 
 
 def sloped(height: int = 20, width: int = 24, d: int = 2, seed: int = 0) -> FrameResult:
@@ -51,7 +53,7 @@ def sloped(height: int = 20, width: int = 24, d: int = 2, seed: int = 0) -> Fram
                 rows.append((low, high, (top, left), A, b - 0.003, A, b + 0.002))
     columns = [np.array(column) for column in zip(*rows, strict=True)]
     leaves = Leaves(columns[0], columns[1], columns[2].astype(np.int32), *(c.astype(np.float32) for c in columns[3:]))
-    values = np.array([box.at(scaled) for scaled in ([-1.0] * d, [0.0] * d, [1.0] * d)])
+    values = np.array([box.at(np.full(d, scaled)) for scaled in (-1.0, 0.0, 1.0)])
     poses = np.stack([middle + slope @ (values[k] - 0.5) for k in range(3)]).astype(np.float32)
     reach = np.abs(slope).sum(axis=-1)
     return frame(
@@ -90,47 +92,67 @@ def unpacked(text: str) -> dict[str, Any]:
         at += planes.size
         found[entry["name"]] = np.ascontiguousarray(planes.T).view(kind).reshape(entry["shape"])
     assert at == len(rest)
+    for name, axis in (("lower", 1), ("image", 1), ("view_images", 0)):
+        if name in found:
+            found[name] = np.cumsum(found[name], axis=axis, dtype=found[name].dtype)
+    for name, base in (("upper", "lower"), ("witness_lower", "lower"), ("witness_upper", "upper")):
+        found[name] = found[name] + found[base]
+    if "slope" in found:
+        slope, offset, tile = found["slope"], found["offset"], found["tile"].tolist()
+        for leaf in range(len(tile)):
+            if leaf and slope.shape[1] == 1 and tile[leaf] == tile[leaf - 1]:
+                slope[leaf] += slope[leaf - 1]
+                offset[leaf] += offset[leaf - 1] + slope[leaf, 0] + slope[leaf - 1, 0]
+            else:
+                slope[leaf], offset[leaf] = (np.cumsum(a[leaf], axis=-1, dtype=np.int16) for a in (slope, offset))
+        found |= {f"{name}_more": found[f"{name}_more"] + found[name] for name in ("slope", "offset")}
     return found
 
 
 def stored_bounds(found: dict[str, Any], leaf: int, scaled: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """[3, s, s] linear bounds of a leaf as they stand in the page."""
-    slope, offset = found["slope"][leaf], found["offset"][leaf]
-    # in as many bits as the page has
-    both = (slope, slope + found["slope_more"][leaf]), (offset, offset + found["offset_more"][leaf])
-    slopes, offsets = ([a.astype(np.float64) for a in pair] for pair in both)
-    a, b = found["slope_step"][leaf], found["offset_step"][leaf]
-    low, high = (np.tensordot(scaled, s * a, 1) + o * b for s, o in zip(slopes, offsets, strict=True))
+    pairs = (("slope", "offset"), ("slope_more", "offset_more"))
+    low, high = (
+        (np.tensordot(scaled, found[a][leaf].astype(np.float64), 1) + found[b][leaf]) / found["cell_steps"]
+        for a, b in pairs
+    )
     return low, high
 
 
-@pytest.mark.parametrize("bits", [16, 8])
+@pytest.mark.parametrize("steps", [10_000, 1000, 100])
 @pytest.mark.parametrize("d", [1, 2, 3])
-def test_numbers_of_the_page_enclose_those_of_the_file(d: int, bits: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    result, rng = sloped(d=d, seed=d), np.random.default_rng(bits)
-    monkeypatch.setattr(play, "_BITS", (bits,))
-    assert result.leaves is not None
-    # slopes and offsets far from each other, an upper slope of zero, large numbers beside small ones
+def test_numbers_of_the_page_enclose_those_of_the_file(d: int, steps: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    result, rng = sloped(d=d, seed=d), np.random.default_rng(steps)
+    monkeypatch.setattr(play, "LEVELS", ((10_000, steps),))
     leaves = result.leaves
+    assert leaves is not None
+    # an upper slope of zero, bounds that cross nothing and say nothing, numbers that no step can hold
     leaves.A_upper[0] = 0.0
     leaves.A_lower[1] *= -1.0
-    leaves.b_upper[1] += 3.0
+    leaves.b_upper[1] += 1.3
     leaves.b_lower[2] = -40.0
+    leaves.A_upper[2, :, :, 0] = 1e9
     text = play_data(result, LARGE)
     assert text is not None
     found = unpacked(text)
+    places = {(*tile, *box): leaf for leaf, (tile, box) in enumerate(
+        zip(leaves.tile.tolist(), leaves.box_lower.tolist(), strict=True))}  # fmt: skip
     worst = 0.0
-    for leaf in range(leaves.tile.shape[0]):
+    for row, (tile, box) in enumerate(zip(found["tile"].tolist(), found["box_lower"].tolist(), strict=True)):
+        leaf = places[(*tile, *box)]
+        np.testing.assert_array_equal(found["box_upper"][row], leaves.box_upper[leaf])
         for scaled in (*rng.uniform(-1.0, 1.0, (6, d)), np.ones(d), -np.ones(d)):
             low, high = (
                 (A[leaf].astype(np.float64) @ scaled + b[leaf]).transpose(2, 0, 1)
                 for A, b in ((leaves.A_lower, leaves.b_lower), (leaves.A_upper, leaves.b_upper))
             )
-            stored = stored_bounds(found, leaf, scaled)
-            assert (stored[0] <= low).all() and (stored[1] >= high).all()
+            stored = stored_bounds(found, row, scaled)
+            # pictures lie in [0, 1], whatever the file says
+            assert (stored[0] <= np.maximum(low, 0.0)).all() and (stored[1] >= np.minimum(high, 1.0)).all()
             if leaf > 2:
                 worst = max(worst, float((low - stored[0]).max()), float((stored[1] - high).max()))
-    assert 0.0 < worst < (2e-4 if bits == 16 else 0.03)
+    # half a step by slope, twice where the slope rounds the other way, and one for the offset
+    assert 0.0 < worst <= (1.0 + d) / steps + 1e-9
 
 
 def test_finished_bounds_stand_as_whole_steps() -> None:
@@ -147,23 +169,25 @@ def test_finished_bounds_stand_as_whole_steps() -> None:
     assert (found["lower"] * 1e-4 <= result.lower).all() and (
         found["upper"].astype(np.float64) / 1e4 >= result.upper
     ).all()
-    assert found["step"] == STEP and found["ends"] == [[-0.5, 1.5]] * 2
+    assert found["steps"] == 10_000 and found["ends"] == [[-0.5, 1.5]] * 2
 
 
 def test_what_does_not_fit_is_left_out() -> None:
-    result = sloped(d=1)
-    sizes = {}
-    for bits in ((16,), (8,), ()):
+    result, sizes = sloped(d=1), []
+    for level in play.LEVELS:
         with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(play, "_BITS", bits)
-            sizes[bits] = len(play_data(result, LARGE) or "")
-    assert sizes[16,] > sizes[8,] > sizes[()] > 0
-    for most, kinds in ((sizes[16,], "i2"), (sizes[16,] - 1, "i1"), (sizes[8,] - 1, None)):
-        text = play_data(result, most)
-        assert text is not None and len(text) <= most
-        arrays = {entry["name"]: entry["type"] for entry in unpacked(text)["arrays"]}
-        assert arrays.get("slope") == kinds
-    assert play_data(result, sizes[()] - 1) is None and play_data(replace(result, leaves=None), sizes[()]) is not None
+            patch.setattr(play, "LEVELS", (level,))
+            sizes.append(len(play_data(result, LARGE) or ""))
+    assert sizes[:4] == sorted(sizes[:4], reverse=True) and sizes[-2] > sizes[-1] > 0 and sizes[3] > sizes[-1]
+    for size, level in zip(sizes, play.LEVELS, strict=True):
+        text = play_data(result, size)
+        assert text is not None and len(text) <= size
+        found = unpacked(text)
+        # the first that fits; a coarser one may fit where a finer one is no larger
+        first = next(k for k, other in enumerate(sizes) if other <= size)
+        assert (found["steps"], found["cell_steps"]) == play.LEVELS[first] and first <= play.LEVELS.index(level)
+    assert play_data(result, min(sizes) - 1) is None
+    assert play_data(replace(result, leaves=None), sizes[-1]) is not None
 
 
 def test_views_are_kept_and_checked(tmp_path: Path) -> None:

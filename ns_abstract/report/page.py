@@ -174,7 +174,8 @@ def _play(plays: Mapping[int, str]) -> str:
         '<canvas id="play-curve" width="480" height="230" hidden aria-label="bounds of the pixel over one parameter; '
         'dots are renders"></canvas></div></div>'
         "<p>Lower and upper bound at the sliders' pose are those of the cell around it, which are linear in the "
-        "parameters; numbers are rounded outward to 0.0001. The render is the nearest one that was made.</p>" + data
+        "parameters; numbers are rounded outward to the last digit shown. The render is the nearest one that was made.</p>"
+        + data
     )
 
 
@@ -390,7 +391,8 @@ def draw_legend(entries: Sequence[tuple[str, str]], right: float) -> str:
 def _stairs(points: Sequence[tuple[float, float]], end: float) -> list[tuple[float, float]]:
     """What is known between the points: a bound holds until a better one is there."""
     found: list[tuple[float, float]] = []
-    for (start, value), (stop, _) in zip(points, [*points[1:], (end, 0.0)], strict=True):
+    stops = [*(start for start, _ in points[1:]), end]
+    for (start, value), stop in zip(points, stops, strict=False):
         found += [(start, value), (stop, value)]
     return found
 

@@ -30,20 +30,36 @@
     return found;
   }
 
+  // every number stands as a difference from a guess, modulo its type (report/play.py)
   function prepare(f) {
     f.d = f.names.length;
+    f.step = 1 / f.steps;
     f.pose = f.ends.map(([a, b]) => 0.5 * (a + b));
     f.cells = Boolean(f.slope) && f.d > 0;
-    if (!f.cells) return;
-    // the upper bound stands as the difference from the lower one
-    for (const name of ["slope", "offset"]) {
-      const more = f[name + "_more"], base = f[name];
-      for (let i = 0; i < more.length; i++) more[i] += base[i];
+    const row = 3 * f.width, size = row * f.height;
+    for (let i = 0; i < size; i++) {
+      if (i % row > 2) { f.lower[i] += f.lower[i - 3]; f.image[i] += f.image[i - 3]; }
+      f.upper[i] += f.lower[i];
+      f.witness_lower[i] += f.lower[i];
+      f.witness_upper[i] += f.upper[i];
     }
-    // leaves by tile
+    if (f.view_images) for (let i = size; i < f.view_images.length; i++) f.view_images[i] += f.view_images[i - size];
+    if (!f.cells) return;
+    const side = f.side, one = 3 * side * side;
     f.tiles = new Map();
     for (let l = 0; l < f.tile.length / 2; l++) {
-      const key = f.tile[2 * l] + "," + f.tile[2 * l + 1];
+      const key = f.tile[2 * l] + "," + f.tile[2 * l + 1], o = l * one, s = o * f.d;
+      const follows = f.d === 1 && f.tiles.has(key);
+      for (let i = 0; i < one * f.d; i++) {
+        if (follows) f.slope[s + i] += f.slope[s + i - one];
+        else if (i % side) f.slope[s + i] += f.slope[s + i - 1];
+        f.slope_more[s + i] += f.slope[s + i];
+      }
+      for (let i = 0; i < one; i++) {
+        if (follows) f.offset[o + i] += f.offset[o + i - one] + f.slope[s + i] + f.slope[s + i - one];
+        else if (i % side) f.offset[o + i] += f.offset[o + i - 1];
+        f.offset_more[o + i] += f.offset[o + i];
+      }
       if (!f.tiles.has(key)) f.tiles.set(key, []);
       f.tiles.get(key).push(l);
     }
@@ -67,16 +83,16 @@
 
   // lower and upper bound of one number of a leaf, in steps, rounded outward
   function value(f, { leaf, scaled }, channel, spot, n) {
-    const area = f.side * f.side, scale = 1 / f.step;
-    const o = (leaf * 3 + channel) * area + spot;
-    let low = f.offset[o] * f.offset_step[leaf], top = f.offset_more[o] * f.offset_step[leaf];
+    const area = f.side * f.side, o = (leaf * 3 + channel) * area + spot;
+    let low = f.offset[o], top = f.offset_more[o];
     for (let k = 0; k < f.d; k++) {
-      const s = ((leaf * f.d + k) * 3 + channel) * area + spot, by = f.slope_step[leaf] * scaled[k];
-      low += f.slope[s] * by;
-      top += f.slope_more[s] * by;
+      const s = ((leaf * f.d + k) * 3 + channel) * area + spot;
+      low += f.slope[s] * scaled[k];
+      top += f.slope_more[s] * scaled[k];
     }
+    low *= f.steps / f.cell_steps; top *= f.steps / f.cell_steps;
     // what holds on the whole set holds here
-    return [Math.max(Math.floor(low * scale), f.lower[n]), Math.min(Math.ceil(top * scale), f.upper[n])];
+    return [Math.max(Math.floor(low), f.lower[n]), Math.min(Math.ceil(top), f.upper[n])];
   }
 
   function evaluate(f) {
@@ -133,7 +149,7 @@
         // down to 8 bits: bounds outward
         if (shown === "lower") v = Math.floor(lower[n] * f.step * 255 + 1e-9);
         else if (shown === "upper") v = Math.ceil(upper[n] * f.step * 255 - 1e-9);
-        else if (shown === "image") v = view < 0 ? Math.round(f.image[n] * f.step * 255) : f.view_images[view * 3 * size + n];
+        else if (shown === "image") v = view < 0 ? f.image[n] : f.view_images[view * 3 * size + n];
         else v = colors[3 * Math.min(255, Math.floor((length(f, ...gaps, 3 * i) / (f.scale || 1)) * 255)) + ch];
         out[4 * i + ch] = v;
       }
@@ -166,7 +182,7 @@
     body.replaceChildren();
     get("play-where").textContent = pixel ? "row " + pixel[0] + ", column " + pixel[1] + (pinned ? " (held)" : "") : "point at the picture; click to hold a pixel";
     if (!pixel) { curve(); return; }
-    const digits = Math.round(-Math.log10(f.step));
+    const digits = Math.round(Math.log10(f.steps));
     ["red", "green", "blue"].forEach((name, ch) => {
       const n = (pixel[0] * f.width + pixel[1]) * 3 + ch, row = document.createElement("tr");
       const cells = [f.now.lower, f.now.upper, f.witness_lower, f.witness_upper].map((a) => (a[n] * f.step).toFixed(digits));

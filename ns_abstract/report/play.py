@@ -1,9 +1,17 @@
 """What a page needs to show a frame's bounds at any pose of its set: numbers, rounded outward, in few bytes.
 
 On a leaf's box every pixel lies between two functions that are linear in the parameters
-(`ns_abstract.refine.result.Leaves`). Their coefficients become whole numbers with one step by leaf; what that rounding
-may move a pixel by is added to the offsets, so that what the page shows still holds. Finished bounds are whole
-multiples of `STEP`.
+(`ns_abstract.refine.result.Leaves`). Their coefficients become whole multiples of one step; what that rounding may move
+a pixel by is added to the offsets, so that what the page shows still holds. Finished bounds are whole multiples of a
+step, too.
+
+Numbers stand as differences from a guess, modulo 2^16 (2^8 for screens' pictures), which leaves small ones:
+
+* ``lower``, ``image``: from the pixel to the left; ``upper`` and ``witness_lower``: from ``lower``; ``witness_upper``:
+  from ``upper``; ``view_images``: from the view before;
+* ``slope``, ``offset``: with one parameter and a leaf of the same tile before, from that leaf's slope, and from its
+  offset moved on by both slopes; else from the pixel to the left; ``slope_more``, ``offset_more``: of the upper bound,
+  from the lower one's.
 """
 
 from __future__ import annotations
@@ -18,14 +26,21 @@ from numpy.typing import NDArray
 
 from ns_abstract.refine.result import FrameResult, Leaves
 
-#: Precision that the page shows pixels with; lower bounds are rounded down to it and upper bounds up.
-STEP = 1e-4
-#: Bits of coefficients, finest first.
-_BITS = (16, 8)
+#: Steps of finished bounds, and of leaves' coefficients if there are any, best first; the first that fits is taken.
+LEVELS: tuple[tuple[int, int | None], ...] = (
+    (10_000, 10_000),
+    (1000, 1000),
+    (1000, 250),
+    (1000, 100),
+    (10_000, None),
+    (1000, None),
+)
 #: Room for float64 roundings, of the page's and of this module's evaluation.
 _SLACK = 1e-12
-#: Part of its size that a compressed number takes at least; what is larger even so is not tried.
-_BEST = 0.08
+#: Coefficients from here on, which say nothing of a value in [0, 1], are replaced.
+_LARGE = 2.5
+#: Every so many tiles tell how large all of them will be, and how sure that is.
+_SAMPLED, _SURE = 8, 0.85
 
 
 def play_data(result: FrameResult, most: int) -> str | None:
@@ -37,35 +52,46 @@ def play_data(result: FrameResult, most: int) -> str | None:
         result: The frame.
         most: Characters that it may take.
     """
-    base = _base(result)
-    if result.leaves is not None and result.leaves.tile.shape[0]:
-        for bits in _BITS:
-            arrays = base | _views(result) | _linear(result.leaves, bits)
-            text = _packed(result, arrays, most)
-            if text is not None:
-                return text
-    return _packed(result, base, most)
+    leaves = result.leaves if result.leaves is not None and result.leaves.tile.shape[0] else None
+    for steps, finest in LEVELS:
+        if finest is not None and leaves is None:
+            continue
+        head = {"steps": steps, "cell_steps": finest}
+        arrays = _base(result, steps)
+        if finest is not None and leaves is not None:
+            if _guess(leaves, finest) > most:
+                continue
+            arrays |= _views(result) | _linear(leaves, finest)
+        text = _packed(result, head, arrays)
+        if len(text) <= most:
+            return text
+    return None
 
 
-def _packed(result: FrameResult, arrays: dict[str, NDArray[Any]], most: int) -> str | None:
-    if sum(array.nbytes for array in arrays.values()) * _BEST > 0.75 * most:
-        return None
+def _guess(leaves: Leaves, steps: int) -> float:
+    """Characters that leaves will take at least, from some of their tiles: trying all is slow."""
+    numbers = leaves.tile[:, 0].astype(np.int64) * 65536 + leaves.tile[:, 1]
+    some = np.flatnonzero(np.isin(numbers, np.unique(numbers)[::_SAMPLED]))
+    part = Leaves(**{name: getattr(leaves, name)[some] for name in Leaves.__dataclass_fields__})
+    packed = zlib.compress(b"".join(map(_planes, _linear(part, steps).values())), 6)
+    return _SURE * len(packed) * numbers.size / some.size * 4.0 / 3.0
+
+
+def _packed(result: FrameResult, head: dict[str, Any], arrays: dict[str, NDArray[Any]]) -> str:
     box = result.box
-    head = {
+    about = {
         "index": result.index,
         "height": result.lower.shape[0],
         "width": result.lower.shape[1],
         "names": list(box.names),
         "units": list(box.units),
         "ends": [list(side) for side in zip(box.lower, box.upper, strict=True)],
-        "step": STEP,
         "arrays": [
             {"name": name, "type": array.dtype.str[1:], "shape": list(array.shape)} for name, array in arrays.items()
         ],
     }
-    parts = [json.dumps(head, allow_nan=False).encode() + b"\n", *map(_planes, arrays.values())]
-    text = base64.b64encode(zlib.compress(b"".join(parts), 6)).decode()
-    return text if len(text) <= most else None
+    parts = [json.dumps(about | head, allow_nan=False).encode() + b"\n", *map(_planes, arrays.values())]
+    return base64.b64encode(zlib.compress(b"".join(parts), 6)).decode()
 
 
 def _planes(array: NDArray[Any]) -> bytes:
@@ -74,25 +100,25 @@ def _planes(array: NDArray[Any]) -> bytes:
     return flat.view(np.uint8).reshape(flat.size, array.itemsize).T.tobytes()
 
 
-def steps_down(values: NDArray[np.floating]) -> NDArray[np.uint16]:
-    """Values in [0, 1] as multiples of `STEP`, rounded down."""
-    return np.floor(values.astype(np.float64) * (1.0 / STEP)).astype(np.uint16)
+def _base(result: FrameResult, steps: int) -> dict[str, NDArray[Any]]:
+    def whole(name: str, rounded: Any) -> NDArray[np.int16]:
+        return rounded(getattr(result, name).astype(np.float64) * steps).astype(np.int16)
 
-
-def steps_up(values: NDArray[np.floating]) -> NDArray[np.uint16]:
-    """Values in [0, 1] as multiples of `STEP`, rounded up."""
-    return np.ceil(values.astype(np.float64) * (1.0 / STEP)).astype(np.uint16)
-
-
-def _base(result: FrameResult) -> dict[str, NDArray[Any]]:
+    lower, upper = whole("lower", np.floor), whole("upper", np.ceil)
     # what was rendered is rounded inward: it lies inside what the page shows as the bounds
+    least, most = whole("witness_lower", np.ceil), whole("witness_upper", np.floor)
     return {
-        "lower": steps_down(result.lower),
-        "upper": steps_up(result.upper),
-        "witness_lower": steps_up(result.witness_lower),
-        "witness_upper": steps_down(result.witness_upper),
-        "image": np.rint(result.image.astype(np.float64) * (1.0 / STEP)).astype(np.uint16),
+        "lower": _across(lower, 1),
+        "upper": upper - lower,
+        "witness_lower": least - lower,
+        "witness_upper": most - upper,
+        "image": _across(np.rint(result.image * 255.0).astype(np.uint8), 1),
     }
+
+
+def _across(array: NDArray[Any], axis: int) -> NDArray[Any]:
+    """Every number less the one before it along an axis."""
+    return np.diff(array, axis=axis, prepend=np.zeros_like(np.take(array, [0], axis)))
 
 
 def _views(result: FrameResult) -> dict[str, NDArray[Any]]:
@@ -100,52 +126,45 @@ def _views(result: FrameResult) -> dict[str, NDArray[Any]]:
         return {}
     # as a screen shows them
     images = np.rint(result.views.images * 255.0).astype(np.uint8)
-    return {"view_values": result.views.values, "view_images": images}
+    return {"view_values": result.views.values, "view_images": _across(images, 0)}
 
 
-def _linear(leaves: Leaves, bits: int) -> dict[str, NDArray[Any]]:
-    """Whole coefficients with one step for slopes and one for offsets by leaf, rounded outward."""
-    kind, top = (np.int16, 32767) if bits == 16 else (np.int8, 127)
-    count = leaves.tile.shape[0]
-    slopes = [leaves.A_lower.astype(np.float64), leaves.A_upper.astype(np.float64)]
-    offsets = [leaves.b_lower.astype(np.float64), leaves.b_upper.astype(np.float64)]
-
-    def step(arrays: list[NDArray[np.float64]]) -> NDArray[np.float64]:
-        largest = np.maximum.reduce([np.abs(a).reshape(count, -1).max(axis=1, initial=0.0) for a in arrays])
-        # a little more, so that what is rounded outward still fits
-        return np.where(largest > 0.0, largest / (top - 2), 1.0)
-
-    slope_step = step(slopes)
-    whole = [np.rint(a / slope_step[:, None, None, None, None]) for a in slopes]
-    lost = [
-        np.abs(a - w * slope_step[:, None, None, None, None]).sum(axis=-1) + _SLACK
-        for a, w in zip(slopes, whole, strict=True)
-    ]
-    low, high = offsets[0] - lost[0], offsets[1] + lost[1]
-    offset_step = step([low, high])
-    scaled = offset_step[:, None, None, None]
-    bottom, top_end = np.floor(low / scaled), np.ceil(high / scaled)
-    # as differences from the lower bound: mostly zero and small
+def _linear(leaves: Leaves, steps: int) -> dict[str, NDArray[Any]]:
+    """Leaves by tile and box, as whole coefficients rounded outward, as differences."""
+    order = np.lexsort((*leaves.box_lower.T[::-1], leaves.tile[:, 1], leaves.tile[:, 0]))
+    low_slope, low = _whole(leaves.A_lower[order], leaves.b_lower[order], steps, -1.0)
+    top_slope, top = _whole(leaves.A_upper[order], leaves.b_upper[order], steps, 1.0)
+    boxes = leaves.box_lower[order], leaves.box_upper[order]
+    tile, slope, offset = leaves.tile[order], low_slope.copy(), low.copy()
+    follows = np.zeros(tile.shape[0], bool)
+    if boxes[0].shape[1] == 1:
+        follows[1:] = (tile[1:] == tile[:-1]).all(axis=1)
+    after = np.flatnonzero(follows)
+    slope[after] -= low_slope[after - 1]
+    offset[after] -= low[after - 1] + low_slope[after, 0] + low_slope[after - 1, 0]
+    slope[~follows], offset[~follows] = _across(low_slope[~follows], -1), _across(low[~follows], -1)
     return {
-        "box_lower": leaves.box_lower,
-        "box_upper": leaves.box_upper,
-        "tile": leaves.tile,
-        "slope_step": slope_step,
-        "offset_step": offset_step,
-        "slope": _spread(whole[0], kind),
-        "slope_more": _spread(_wrapped(whole[1] - whole[0], bits), kind),
-        "offset": _spread(bottom, kind),
-        "offset_more": _spread(_wrapped(top_end - bottom, bits), kind),
+        "box_lower": boxes[0],
+        "box_upper": boxes[1],
+        "tile": tile,
+        "slope": slope,
+        "slope_more": top_slope - low_slope,
+        "offset": offset,
+        "offset_more": top - low,
     }
 
 
-def _wrapped(difference: NDArray[np.float64], bits: int) -> NDArray[np.float64]:
-    """Differences modulo 2^bits: the page adds them in as many bits."""
-    size = float(1 << bits)
-    return np.mod(difference + 0.5 * size, size) - 0.5 * size
-
-
-def _spread(whole: NDArray[np.float64], kind: Any) -> NDArray[Any]:
-    """[L, s, s, 3, ...] as [L, ..., 3, s, s]: neighbouring pixels stand side by side."""
-    axes = (0, *range(4, whole.ndim), 3, 1, 2)
-    return np.ascontiguousarray(whole.transpose(axes)).astype(kind)
+def _whole(
+    slopes: NDArray[np.float32], offsets: NDArray[np.float32], steps: int, way: float
+) -> tuple[NDArray[np.int16], NDArray[np.int16]]:
+    """Slopes [L, d, 3, s, s] and offsets [L, 3, s, s] in steps, rounded downward (``way`` -1) or upward (1)."""
+    axes = (0, *range(4, slopes.ndim), 3, 1, 2)
+    a = np.ascontiguousarray(slopes.astype(np.float64).transpose(axes))
+    b = np.ascontiguousarray(offsets.astype(np.float64).transpose(0, 3, 1, 2))
+    known = (np.abs(b) < _LARGE) & (np.abs(a).sum(axis=1) < _LARGE)
+    # values lie in [0, 1] whatever the coefficients say
+    a, b = np.where(known[:, None], a, 0.0), np.where(known, b, 0.5 + 0.5 * way)
+    whole = np.rint(a * steps)
+    lost = np.abs(a - whole / steps).sum(axis=1) + _SLACK
+    outward = np.floor if way < 0.0 else np.ceil
+    return whole.astype(np.int16), outward((b + way * lost) * steps).astype(np.int16)

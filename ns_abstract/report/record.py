@@ -44,7 +44,7 @@ _PREVIEW_PIXELS = 256
 PAGE_FRAMES = 60
 #: Characters of the page that its numbers may take, all frames together, and most bytes of a frame file that is read
 #: again for them.
-_PLAY_CHARACTERS, _PLAY_FILE = 6_000_000, 512 << 20
+_PLAY_CHARACTERS, _PLAY_FILE = 10_000_000, 512 << 20
 _CHUNK = 2**20
 
 METRICS = {
@@ -533,7 +533,7 @@ class Report:
         pictures = {}
         for entry in shown_frames(document["frames"], PAGE_FRAMES):
             pictures[entry["index"]] = self._preview(entry["index"])
-        plays = {index: text for index in pictures if (text := self._play(index)) is not None}
+        plays = {index: play for index in pictures if (play := self._play(index)) is not None}
         text = render_page(document, pictures, plays)
         write_atomic(self.folder / "report.html", lambda stream: stream.write(text.encode()))
         took = time.monotonic() - begin
