@@ -221,7 +221,7 @@ def test_alpha_threshold_of_all(order):
 
 @pytest.mark.parametrize("antialiased", [False, True])
 @pytest.mark.parametrize("order, names", [(1, ("x",)), (2, ("x",)), (1, ("x", "yaw", "roll"))])
-def test_reach_counts_every_error(order, antialiased, names):
+def test_extent_counts_every_error(order, antialiased, names):
     """What a record says of how far its forms may be from their centres covers all terms, the float error too."""
     places = np.random.default_rng(5).uniform(-1.0, 1.0, (70, 2))
     splats = scene(
@@ -402,7 +402,7 @@ def test_colors_are_shared_by_cells_that_turn_and_not_by_others():
                     for bounds in (kept, SplatBounds(splats, GSPLAT_1_4_0, FLOAT32))
                 )
                 assert (found.lower == fresh.lower).all() and (found.upper == fresh.upper).all()
-                assert (found.visible == fresh.visible).all() and (found.reach == fresh.reach).all()
+                assert (found.visible == fresh.visible).all() and (found.tile_ranges == fresh.tile_ranges).all()
 
 
 @both_orders
