@@ -8,6 +8,6 @@ from planted.polynomials import POLYNOMIALS
 from planted.splats import SPLATS
 from planted.verdicts import VERDICTS
 
-FAULTS = (*FORMS, *SPLATS, *POLYNOMIALS, *FIELDS, *VERDICTS, *CERTIFICATES)
+FAULTS = (*FORMS, *POLYNOMIALS, *FIELDS, *VERDICTS, *CERTIFICATES, *SPLATS)
 
 __all__ = ["FAULTS", "Fault", "apply"]
