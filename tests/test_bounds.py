@@ -22,7 +22,7 @@ from ns_abstract.methods.splat.blend import _sort as sort_group
 from ns_abstract.methods.splat.bounds import SplatBounds
 from ns_abstract.methods.splat.constants import GSPLAT_1_4_0, PAPER
 from ns_abstract.methods.splat.frame import SplatFrame
-from ns_abstract.methods.splat.records import FORMS, SPREAD, WILD, columns
+from ns_abstract.methods.splat.records import FORMS, SPREAD, UNBOUNDED, columns
 from ns_abstract.methods.splat.render import Renderer
 from ns_abstract.perturbation.specification import Perturbation
 
@@ -235,7 +235,7 @@ def test_extent_counts_every_error(order, antialiased, names):
     m = forms.rotation.basis.monomials
     width = columns(6 if antialiased else 5, m)
     record = bounds._buffer("record", (70, width))
-    assert (record[:, WILD] == 0.0).all() and width % 8 == 0
+    assert (record[:, UNBOUNDED] == 0.0).all() and width % 8 == 0
     for f in range(5):
         form = record[:, FORMS + f * (m + 1) : FORMS + (f + 1) * (m + 1)]
         spread = np.abs(form[:, 1:]).sum(axis=1)
