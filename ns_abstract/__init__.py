@@ -11,6 +11,7 @@ if TYPE_CHECKING:
     from ns_abstract.api.bounding import BoundResult, Progress, bound
     from ns_abstract.api.certifying import Certificate, CertifiedCell, CertifyProgress, certify
     from ns_abstract.api.poses import Camera, PoseSet
+    from ns_abstract.api.reaching import ReachCell, ReachProgress, ReachResult, reach
     from ns_abstract.api.scenes import Scene, load_scene, render
     from ns_abstract.geometry.camera_path import CameraPath, load_camera_path
     from ns_abstract.io.errors import InputError
@@ -21,6 +22,7 @@ _HOMES = {
     "api.bounding": ("BoundResult", "Progress", "bound"),
     "api.certifying": ("Certificate", "CertifiedCell", "CertifyProgress", "certify"),
     "api.poses": ("Camera", "PoseSet"),
+    "api.reaching": ("ReachCell", "ReachProgress", "ReachResult", "reach"),
     "api.scenes": ("Scene", "load_scene", "render"),
     "geometry.camera_path": ("CameraPath", "load_camera_path"),
     "io.errors": ("InputError",),
@@ -37,12 +39,16 @@ __all__ = [
     "InputError",
     "PoseSet",
     "Progress",
+    "ReachCell",
+    "ReachProgress",
+    "ReachResult",
     "Scene",
     "__version__",
     "bound",
     "certify",
     "load_camera_path",
     "load_scene",
+    "reach",
     "render",
 ]
 

@@ -27,6 +27,7 @@ LEVELS = (
     "demo",
     "report",
     "verify",
+    "reach",
     "api",
     "viewer",
     "nerfstudio",

@@ -8,9 +8,10 @@ from pathlib import Path
 import numpy as np
 
 from ns_abstract.demo.airfield import airfield
+from ns_abstract.demo.approach import FOV, SIZE, rotation, write_approach
 from ns_abstract.demo.buoy import buoy_path, buoy_scene, buoy_views
 from ns_abstract.demo.paths import dataset_views, write_airfield_paths
-from ns_abstract.geometry.camera_path import Camera
+from ns_abstract.geometry.camera_path import Camera, focal_length
 from ns_abstract.geometry.views import View
 from ns_abstract.methods.nerf.write import write_nerf_run
 from ns_abstract.methods.run_writer import write_file
@@ -56,3 +57,13 @@ def write_demo(folder: Path) -> tuple[Path, dict[str, Path]]:
         scene, folder, timestamp=TIMESTAMP, experiment_name="airfield", views=dataset_views(), render=picture
     )
     return config, write_airfield_paths(folder)
+
+
+def write_loop_demo(folder: Path) -> tuple[Path, Path]:
+    """Fit and write the network and LOOP.json of an approach to the airfield of `write_demo`; returns both files."""
+    renderer = Renderer(activate(airfield(), GSPLAT_1_4_0), GSPLAT_1_4_0)
+    focal = focal_length(FOV, SIZE, "fov")
+    pose = rotation()
+    camera = Camera(pose[:3], focal, focal, 0.5 * SIZE, 0.5 * SIZE, SIZE, SIZE)
+    view = np.ascontiguousarray(pose[:3, :3].T * np.array([1.0, -1.0, -1.0])[:, None])
+    return write_approach(folder, lambda place: renderer.image(camera, view, place).astype(np.float32))

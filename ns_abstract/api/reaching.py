@@ -1,0 +1,610 @@
+"""A network in the loop: `reach`, its result, and the search that the command line runs, too."""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import json
+import os
+import tempfile
+import time
+from collections.abc import Callable, Mapping
+from contextlib import ExitStack
+from dataclasses import dataclass, field
+from functools import cached_property, partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ns_abstract.api.bounding import listener
+from ns_abstract.api.certification import MEMORY
+from ns_abstract.api.job import Job
+from ns_abstract.api.scenes import Scene, platform_problems
+from ns_abstract.api.searching import search_blocks
+from ns_abstract.execution.ending import AbandonedError, abandoning
+from ns_abstract.execution.engines import Engine, EngineName, started
+from ns_abstract.execution.opening import Recipe, opened
+from ns_abstract.execution.stopping import StopRequest, interruptible
+from ns_abstract.geometry.box import ParameterBox
+from ns_abstract.io.errors import InputError
+from ns_abstract.reach.loop import Loop, load_loop
+from ns_abstract.reach.page import loop_page
+from ns_abstract.reach.search import QUESTIONS, LoopFindings, LoopSearch, Question, Run, pushes, simulate
+from ns_abstract.reach.tubes import Dependence, Pictures, Pilot, Reacher, Tube
+from ns_abstract.report.certificate import now, write_certificate
+from ns_abstract.report.record import file_stamp, guarantee_text, plain, versions
+from ns_abstract.verify.cells import Cell, Grid
+from ns_abstract.verify.model import NetworkModel
+from ns_abstract.verify.network import NetworkArithmetic, load_network
+from ns_abstract.verify.store import Block, Store, Tally, fractions
+
+#: Of the search's rules: results of different ones are not mixed.
+_RULES = 1
+#: Seconds between notes of progress, and between reports.
+_TRACE, _REPORT = 1.0, 30.0
+#: Random runs for the report, and part of the time for them; runs from a cell whose tube is shown; cells shown, and
+#: part of the time for them.
+_RUNS, _RUNS_SHARE, _CELL_RUNS, _SHOWN, _SHOWN_SHARE = 200, 0.1, 20, 2, 0.1
+#: Falsifying runs in report.json.
+_EXAMPLES = 5
+#: What is said in the report of every question.
+SENTENCES: dict[Question, str] = {
+    "safe": "no state of any run from the cell is in an unsafe set, at the sampling times 0 to the last",
+    "reaches": "that, and every run from the cell is inside the goal, at the end or (when: any) at some one step",
+}
+#: What the words of the report mean.
+METRICS = {
+    "certified": "part of the initial box's volume where the question is answered yes for every run",
+    "falsified": "part in cells with a run, stored and simulated again, that goes wrong",
+    "unknown": "the rest",
+    "simulated": "runs from random initial states with random disturbances, and the part that went well; says nothing "
+    "about others",
+    "width": "mean over the states of the width of the tube by step, and of the hull of simulated runs from the same "
+    "cell",
+}
+
+
+class LoopJob:
+    """An opened scene and a loop.
+
+    Args:
+        scene: The scene.
+        loop: The loop.
+        arithmetic: "float32" or "real", of the pictures; None: float32.
+        network_arithmetic: The same of the network.
+
+    Raises:
+        InputError: The loop does not go with the scene or the network, or the platform's arithmetic is not sound.
+    """
+
+    def __init__(
+        self,
+        scene: Scene,
+        loop: Loop,
+        arithmetic: str | None = None,
+        network_arithmetic: NetworkArithmetic = "float32",
+    ) -> None:
+        if problems := platform_problems():
+            raise InputError(
+                f"the platform's arithmetic failed the self-check ({problems[0]})",
+                fix="nothing can be certified here; use another machine",
+            )
+        self.loop = loop
+        self.network = load_network(loop.network)
+        self.model = NetworkModel(self.network, loop.preprocess, MEMORY, network_arithmetic)
+        size = loop.preprocess.size(self.network.input_shape)
+        outputs = loop.control.gain.shape[1]
+        if self.network.output_size != outputs:
+            raise InputError(
+                f"the network has {self.network.output_size} outputs, the gain {outputs} columns",
+                field="control.gain",
+                fix=f"write one column by output, {self.network.output_size}",
+            )
+        self.job = Job(scene, [loop.camera.poses(size)], arithmetic=arithmetic)
+        if self.job.method.differentiable(self.job.pose_sets[0]) is None:
+            raise InputError(
+                f"loops are for splats, this run is a {self.job.method.content}",
+                file=scene.source.file,
+                fix="give a run of splatfacto or a .ply",
+            )
+
+    def reacher(self, dependence: Dependence = "kept") -> Reacher:
+        """Computes tubes of the loop."""
+        view = Pictures(self.job.method, self.job.pose_sets[0])
+        return Reacher(self.loop, view, Pilot(self.model, self.loop.control), dependence)
+
+    @cached_property
+    def search(self) -> LoopSearch:
+        """The search."""
+        return LoopSearch(self.reacher())
+
+    @property
+    def questions(self) -> list[int]:
+        """Numbers of the questions that are asked."""
+        return [k for k, name in enumerate(QUESTIONS) if (self.loop.goal if name == "reaches" else self.loop.unsafe)]
+
+    @property
+    def recipe(self) -> Recipe[LoopJob]:
+        """How another process opens it; files are looked for under the same paths."""
+        again = partial(
+            _open, self.job.recipe.open, self.loop, Path(self.loop.network).absolute(), self.model.arithmetic
+        )
+        return Recipe(again, self.fingerprint, self.job.source.file)
+
+    @property
+    def fingerprint(self) -> dict[str, Any]:
+        """What a stored search must agree with to be continued."""
+        return self._fingerprint
+
+    @cached_property
+    def _fingerprint(self) -> dict[str, Any]:
+        text = json.dumps(self.loop.value, sort_keys=True)
+        return {
+            **self.job.fingerprint,
+            "network": file_stamp(self.loop.network)["sha256"],
+            "loop": hashlib.sha256(text.encode()).hexdigest(),
+            "network_arithmetic": self.model.arithmetic,
+            "rules": _RULES,
+        }
+
+
+def _open(open_job: Callable[[], Job], loop: Loop, network: Path, arithmetic: NetworkArithmetic) -> LoopJob:
+    job = LoopJob.__new__(LoopJob)
+    job.loop, job.job = loop, open_job()
+    job.network = load_network(network)
+    job.model = NetworkModel(job.network, loop.preprocess, MEMORY, arithmetic)
+    return job
+
+
+def examine_cells(recipe: Recipe[LoopJob], number: int, grid: Grid, cells: tuple[Cell, ...]) -> LoopFindings:
+    """Examine cells on a worker, which opens the files once and keeps them.
+
+    Raises:
+        InputError: The worker reads other files under the same names than the command did.
+    """
+    return examine_here(opened(recipe), number, grid, cells)
+
+
+def examine_here(job: LoopJob, number: int, grid: Grid, cells: tuple[Cell, ...]) -> LoopFindings:
+    """Examine cells in this process."""
+    import numba
+    import torch
+
+    numba.set_num_threads(1)
+    torch.set_num_threads(1)
+    return job.search.examine(number, grid, cells)
+
+
+@dataclass(frozen=True)
+class ReachProgress:
+    """Where a search stands: fractions of the initial box for the strongest question asked, and seconds.
+
+    Attributes:
+        safe, reaches: Fractions that are certified; None where it was not asked.
+        falsified, open: Fractions for the strongest question.
+        seconds: Time spent.
+    """
+
+    safe: float | None
+    reaches: float | None
+    falsified: float
+    open: float
+    seconds: float
+
+
+class ReachRun:
+    """The search of a loop, with its store and its report.
+
+    Args:
+        job: What is examined.
+        folder: Output folder.
+        settings: What the report says that was asked for.
+        command: The command line, or the call.
+    """
+
+    def __init__(self, job: LoopJob, folder: Path, settings: Mapping[str, Any], command: tuple[str, ...]) -> None:
+        self.job, self.folder, self.settings, self.command = job, folder, settings, command
+        self.grids: dict[int, Grid] = {}
+        self.rows: dict[int, list[dict[str, Any]]] = {}
+        self.started = now()
+        self.simulated: list[Run] = []
+        self.tubes: list[dict[str, Any]] = []
+        self.examples: list[dict[str, Any]] = []
+
+    def run(
+        self,
+        engine: Callable[[ExitStack], Engine],
+        budget: float,
+        stop: StopRequest,
+        *,
+        resume: bool = False,
+        on_progress: Callable[[ReachProgress], object] = lambda progress: None,
+    ) -> dict[str, Any]:
+        """Search, and write the results as they come; returns the content of report.json.
+
+        Args:
+            engine: Starts the engine, which ends with the stack.
+            budget: Seconds.
+            stop: Asked at least twice a second.
+            resume: Whether to go on with what the folder holds.
+            on_progress: Told about once a second.
+
+        Raises:
+            InputError: The folder cannot be used.
+        """
+        job, box = self.job, self.job.loop.box
+        begin = time.perf_counter()
+        parameters = list(zip(box.names, box.units, strict=True))
+        with ExitStack() as stack:
+            with stop.at_once():
+                fixed: dict[int, dict[str, float]] = {number: {} for number in job.questions}
+                store = Store(self.folder, job.fingerprint, parameters, fixed, resume=resume)
+                stack.callback(store.close)
+            stack.enter_context(store.told())
+            try:
+                with stop.at_once():
+                    self._begin(store, box)
+                    self.report(store, "running")
+                self._simulate(begin + _RUNS_SHARE * budget, stop)
+                with ExitStack() as engines:
+                    self._search(store, engine(engines), begin + (1.0 - _SHOWN_SHARE) * budget, stop, on_progress)
+                self._show(store, begin + budget, stop)
+            finally:
+                # also after a failure: what is finished is written
+                store.finish(self.grids)
+                document = self.report(store, "interrupted" if stop() else "budget" if store.open_blocks else "done")
+        return document
+
+    def _begin(self, store: Store, box: ParameterBox) -> None:
+        for number in self.job.questions:
+            grid = store.grid(number, box)
+            if grid is None:
+                grid = Grid.adaptive(box, [1] * box.dimensions)
+                store.begin(number, grid, [grid.roots()])
+            self.grids[number] = grid
+        self.job.job.warm_up(0)
+
+    def _search(
+        self,
+        store: Store,
+        engine: Engine,
+        deadline: float,
+        stop: StopRequest,
+        on_progress: Callable[[ReachProgress], object],
+    ) -> None:
+        traced = reported = time.perf_counter()
+
+        def between(instant: float) -> None:
+            nonlocal traced, reported
+            if instant - traced >= _TRACE:
+                traced = instant
+                store.trace()
+                on_progress(self.progress(store))
+            if instant - reported >= _REPORT:
+                reported = instant
+                self.report(store, "running")
+
+        search_blocks(
+            store,
+            engine,
+            self.grids,
+            lambda *found: examine_here(self.job, *found),
+            (examine_cells, self.job.recipe),
+            deadline=deadline,
+            stop=stop,
+            keep=lambda block, findings: self._keep(store, block, findings),
+            between=between,
+        )
+        store.trace()
+        on_progress(self.progress(store))
+
+    def progress(self, store: Store) -> ReachProgress:
+        """Where the search stands."""
+        shares = {QUESTIONS[tally.frame]: fractions(tally) for tally in store.tallies()}
+        last = shares[list(shares)[-1]]
+        known = {name: shares[name]["certified"] if name in shares else None for name in QUESTIONS}
+        return ReachProgress(known["safe"], known["reaches"], last["falsified"], last["open"], store.seconds)
+
+    def _keep(self, store: Store, block: Block, findings: LoopFindings) -> None:
+        """Store runs that go wrong before their cells are said to be falsified."""
+        for cell, run in findings.runs:
+            place = "_".join(f"{a}-{b}" for a, b in zip(cell.first, cell.past, strict=True)) or "state"
+            buffer = io.BytesIO()
+            names = np.array(self.job.loop.names, str)
+            np.savez(buffer, states=run.states, controls=run.controls, disturbances=run.disturbances, names=names)
+            store.keep_image(f"{QUESTIONS[block.frame]}_{place}", buffer.getvalue())
+            if len(self.examples) < _EXAMPLES:
+                margin = run.margin(self.job.loop, QUESTIONS[block.frame])
+                self.examples.append({"question": QUESTIONS[block.frame], "margin": margin, "states": run.states})
+
+    # ---------------------------------------------------------------- report
+
+    def _simulate(self, deadline: float, stop: StopRequest) -> None:
+        """Random runs, the same ones every time."""
+        loop, reacher = self.job.loop, self.job.search.reacher
+        for number in range(_RUNS):
+            generator = np.random.default_rng([17, number])
+            start = loop.box.sample(1, generator)[0]
+            if stop() or (self.simulated and time.perf_counter() >= deadline):
+                return
+            try:
+                with abandoning(stop):
+                    push = pushes(loop, generator, "random")
+                    self.simulated.append(simulate(reacher, loop.state(loop.box, start), push))
+            except AbandonedError:
+                return
+
+    def _show(self, store: Store, deadline: float, stop: StopRequest) -> None:
+        """Tubes of a few certified cells beside simulated runs and what less dependence would give."""
+        found = [row for number in self.job.questions for row in store.leaves(number, "certified")]
+        if not found:
+            return
+        chosen = [found[len(found) * (2 * k + 1) // (2 * _SHOWN)] for k in range(_SHOWN)]
+        for row in {json.dumps([row["lower"], row["upper"]]): row for row in chosen}.values():
+            try:
+                with abandoning(lambda: stop() or time.perf_counter() >= deadline):
+                    self.tubes.append(shown_tube(self.job, row["lower"], row["upper"], _CELL_RUNS))
+            except AbandonedError:
+                return
+
+    def document(self, store: Store, state: str) -> dict[str, Any]:
+        """Content of report.json."""
+        job, loop = self.job, self.job.loop
+        self.rows = {tally.frame: store.leaves(tally.frame) for tally in store.tallies()}
+        entries = {QUESTIONS[tally.frame]: self._entry(tally) for tally in store.tallies()}
+        program = job.job.method.program
+        return plain(
+            {
+                "version": 1,
+                "kind": "loop",
+                "verdict": verdict(entries),
+                "questions": entries,
+                "guarantee": job.job.method.guarantee,
+                "guarantee_text": guarantee_text(job.job.method.guarantee, program["name"]),
+                "network_guarantee": job.network.guarantee(job.model.arithmetic),
+                "renderer": {name: program[name] for name in ("name", "version")},
+                "scene": job.job.describe(),
+                "model": file_stamp(loop.network),
+                "loop": loop.value,
+                "dynamics": loop.dynamics.about,
+                "parameters": [
+                    {"name": n, "unit": u, "lower": a, "upper": b}
+                    for n, u, a, b in zip(loop.box.names, loop.box.units, loop.box.lower, loop.box.upper, strict=True)
+                ],
+                "simulated_states": [run.states for run in self.simulated[:40]],
+                "tubes": self.tubes,
+                "falsifying": self.examples,
+                "trace": store.points,
+                "seconds": store.seconds,
+                "effort": store.effort,
+                "unknown_because": store.reasons,
+                "cells_seal": {"rows": store.seal.rows, "sum": store.seal.text},
+                "plan": job.job.plan,
+                "state": state,
+                "metrics": METRICS,
+                "settings": self.settings,
+                "fingerprint": job.fingerprint,
+                "command": self.command,
+                "packages": versions(),
+                "started": self.started,
+                "updated": now(),
+            }
+        )
+
+    def _entry(self, tally: Tally) -> dict[str, Any]:
+        question, shares = QUESTIONS[tally.frame], fractions(tally)
+        rows = self.rows[tally.frame]
+        kinds = ("certified", "falsified", "unknown")
+        went_well = sum(run.margin(self.job.loop, question) > 0.0 for run in self.simulated)
+        count = len(self.simulated)
+        return {
+            "text": SENTENCES[question],
+            "certified": shares["certified"],
+            "falsified": shares["falsified"],
+            "unknown": shares["unknown"] + shares["open"],
+            "not_examined": shares["open"],
+            "cells": {kind: sum(row["verdict"] == kind for row in rows) for kind in kinds},
+            "simulated": {"runs": count, "went_well": went_well / count if count else None},
+            "certified_of_went_well": shares["certified"] * count / went_well if went_well else None,
+            "least_margin": min((row["margin"] for row in rows if row["verdict"] == "certified"), default=None),
+        }
+
+    def report(self, store: Store, state: str) -> dict[str, Any]:
+        """Write report.json and report.html; returns the former's content."""
+        document = self.document(store, state)
+        write_certificate(self.folder, document, loop_page(document, self.rows, self.job.loop))
+        return document
+
+
+def verdict(entries: Mapping[str, Mapping[str, Any]]) -> str:
+    """Of the whole initial box: falsified, reaches, safe or unknown."""
+    if any(entry["cells"]["falsified"] for entry in entries.values()):
+        return "falsified"
+    done = [name for name, entry in entries.items() if entry["unknown"] == 0.0 and entry["cells"]["certified"]]
+    return done[-1] if done else "unknown"
+
+
+def shown_tube(job: LoopJob, lower: list[float], upper: list[float], runs: int) -> dict[str, Any]:
+    """A tube beside the hull of simulated runs, and its widths with less dependence.
+
+    Args:
+        job: The loop.
+        lower, upper: [m] the cell.
+        runs: How many.
+    """
+    box = ParameterBox(job.loop.box.names, job.loop.box.units, tuple(lower), tuple(upper))
+    kept = job.search.reacher
+    tube = kept.tube(box, whole=True)
+    generator = np.random.default_rng(5)
+    starts = [*box.corners(), *box.sample(max(0, runs - 2**box.dimensions), generator)]
+    found = [simulate(kept, job.loop.state(box, start), pushes(job.loop, generator, "ends")) for start in starts]
+    states = np.stack([run.states for run in found])
+    modes: tuple[Dependence, ...] = ("step", "none")
+    hulls = [entry.hull() for entry in tube.sets]
+    return {
+        "lower": list(box.lower),
+        "upper": list(box.upper),
+        "tube": [[low.tolist(), high.tolist()] for low, high in hulls],
+        "runs": len(found),
+        "hull": [
+            [low.tolist(), high.tolist()] for low, high in zip(states.min(axis=0), states.max(axis=0), strict=True)
+        ],
+        "width": widths(tube),
+        "width_simulated": (states.max(axis=0) - states.min(axis=0)).mean(axis=1).tolist(),
+        "width_by_dependence": {mode: widths(job.reacher(mode).tube(box, whole=True)) for mode in modes},
+        "reason": tube.reason,
+    }
+
+
+def widths(tube: Tube) -> list[float]:
+    """By step, the mean over the states of a tube's width; as far as the tube goes."""
+    return [float(np.mean(np.subtract(*entry.hull()[::-1]))) for entry in tube.sets]
+
+
+@dataclass(frozen=True)
+class ReachCell:
+    """A cell of the initial box.
+
+    Attributes:
+        question: "safe" or "reaches".
+        lower, upper: Ends of its box, in the order of `ReachResult.parameters`.
+        verdict: "certified", "falsified" or "unknown".
+        margin: Proved lower bound of the distance to going wrong; that of the falsifying run; or None.
+        start: Initial parameters of the falsifying run, or None.
+    """
+
+    question: str
+    lower: np.ndarray
+    upper: np.ndarray
+    verdict: str
+    margin: float | None
+    start: np.ndarray | None
+
+
+@dataclass(frozen=True)
+class ReachResult:
+    """What holds of the runs of a loop.
+
+    Attributes:
+        safe, reaches: Fractions of the initial box's volume that are certified to be so; None where it was not asked.
+        falsified: Fraction in cells with a run that goes wrong, for the strongest question asked.
+        verdict: Of the whole box: "falsified", "reaches", "safe" or "unknown".
+        cells: What the fractions are made of.
+        parameters: Names and units of the cells' axes.
+        state: "done", "budget" (the time ended first) or "interrupted".
+        seconds: Time spent.
+        report: Content of report.json.
+    """
+
+    safe: float | None
+    reaches: float | None
+    falsified: float
+    verdict: str
+    cells: tuple[ReachCell, ...] = field(repr=False)
+    parameters: tuple[tuple[str, str], ...]
+    state: str
+    seconds: float
+    report: dict[str, Any] = field(repr=False)
+
+
+def reach(
+    scene: Scene,
+    loop: str | os.PathLike[str],
+    *,
+    time_budget: float = 600.0,
+    output_dir: str | os.PathLike[str] | None = None,
+    arithmetic: str | None = None,
+    network_arithmetic: NetworkArithmetic = "float32",
+    resume: bool = False,
+    on_progress: Callable[[ReachProgress], object] | None = None,
+    workers: int = 1,
+    engine: EngineName = "local",
+    scheduler_address: str | None = None,
+) -> ReachResult:
+    """Prove of a network in the loop that no run from a box of initial states goes wrong, or find one that does.
+
+    Ctrl-C and ``on_progress`` returning False end the work between two cells, with what is known.
+
+    Args:
+        scene: The scene.
+        loop: LOOP.json.
+        time_budget: Seconds.
+        output_dir: Folder for cells.sqlite, the report and falsifying runs; None: nothing is kept on disk.
+        arithmetic: "float32" or "real", of the pictures; None: float32.
+        network_arithmetic: "float32": every float32 evaluation of the network; "real": the exact network alone.
+        resume: Whether to go on with what ``output_dir`` holds.
+        on_progress: Told about once a second.
+        workers: Processes; with more than one, a script needs ``if __name__ == "__main__":``.
+        engine: "dask" spreads the cells over a Dask cluster.
+        scheduler_address: HOST:PORT of its scheduler; None: a cluster on this machine.
+
+    Raises:
+        InputError: An argument cannot be used.
+    """
+    if not 0.0 < time_budget < float("inf"):
+        raise InputError(f"found {time_budget}", field="time_budget", fix="give a positive number")
+    if workers < 1:
+        raise InputError(f"found {workers}", field="workers", fix="give a number of at least 1")
+    if resume and output_dir is None:
+        raise InputError("given without output_dir", field="resume", fix="give the folder to go on with")
+    job = open_loop(scene, Path(loop), arithmetic, network_arithmetic)
+    settings = {"time_budget": time_budget, "arithmetic": arithmetic, "workers": workers, "engine": engine}
+    with ExitStack() as stack:
+        folder = Path(output_dir) if output_dir is not None else Path(
+            stack.enter_context(tempfile.TemporaryDirectory(prefix="ns-abstract-"))
+        )  # fmt: skip
+        stop = stack.enter_context(interruptible())
+        run = ReachRun(job, folder, settings, ("ns_abstract.reach",))
+        document = run.run(
+            lambda engines: engines.enter_context(started(engine, scheduler_address, workers)),
+            time_budget,
+            stop,
+            resume=resume,
+            on_progress=listener(stop, on_progress),
+        )
+    return result(run, document)
+
+
+def open_loop(
+    scene: Scene, file: Path, arithmetic: str | None = None, network_arithmetic: NetworkArithmetic = "float32"
+) -> LoopJob:
+    """Open LOOP.json with its network.
+
+    Raises:
+        InputError: A file or a field cannot be used.
+    """
+    loop = load_loop(file)
+    try:
+        return LoopJob(scene, loop, arithmetic, network_arithmetic)
+    except InputError as error:
+        raise error.within(file) if error.field and not error.field.startswith("--") else error from None
+
+
+def result(run: ReachRun, document: Mapping[str, Any]) -> ReachResult:
+    """The result of a search that has ended."""
+    cells = [
+        ReachCell(
+            QUESTIONS[number],
+            np.array(row["lower"], np.float64),
+            np.array(row["upper"], np.float64),
+            row["verdict"],
+            row["margin"],
+            None if row["counterexample"] is None else np.array(row["counterexample"], np.float64),
+        )
+        for number, rows in sorted(run.rows.items())
+        for row in rows
+    ]
+    entries = document["questions"]
+    known = {name: entries[name]["certified"] if name in entries else None for name in QUESTIONS}
+    return ReachResult(
+        safe=known["safe"],
+        reaches=known["reaches"],
+        falsified=list(entries.values())[-1]["falsified"],
+        verdict=document["verdict"],
+        cells=tuple(cells),
+        parameters=tuple(zip(run.job.loop.box.names, run.job.loop.box.units, strict=True)),
+        state=document["state"],
+        seconds=document["seconds"],
+        report=dict(document),
+    )

@@ -1,0 +1,301 @@
+"""Discrete dynamics ``x' = f(x, u)``: one concrete step in float64, and its enclosure over a box (docs/design.md, R1).
+
+Every law is written once, as a function of arithmetic: `Floats` evaluates it, `Forms` encloses it, and `Sizes` follows
+how large its terms are, which is what a float64 evaluation's rounding is charged by.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ns_abstract.arithmetic.forms import MAX_DIMENSIONS, Basis, FormArray
+from ns_abstract.arithmetic.rounding import UNDERFLOW64, UNIT64, gamma
+from ns_abstract.arithmetic.trigonometry import cos_sin
+from ns_abstract.io.errors import InputError
+from ns_abstract.io.fields import Fail, known
+from ns_abstract.io.jsonio import FIX_MODERATE, is_moderate, show
+
+Float64 = NDArray[np.float64]
+
+#: Most states and controls together.
+MOST = MAX_DIMENSIONS
+#: Roundings on the longest way through a law: sums of up to `MOST` + 1 products, five more products, and four units of
+#: a library's sine or cosine; twice that, to spare.
+STEP_ROUNDINGS = 40
+
+
+class Floats:
+    """Numbers as they are; works on any type with + and * (float64, exact fractions where no angle occurs)."""
+
+    @staticmethod
+    def cos_sin(angle: Any) -> tuple[Any, Any]:
+        """Cosine and sine."""
+        return np.cos(angle), np.sin(angle)
+
+    @staticmethod
+    def signed_square(value: Any) -> Any:
+        """``v |v|``."""
+        return value * abs(value)
+
+    @staticmethod
+    def scaled(value: Any, factor: float) -> Any:
+        """``factor * value``."""
+        return value * factor
+
+
+class Forms(Floats):
+    """Enclosures by affine forms (A1-A3)."""
+
+    @staticmethod
+    def cos_sin(angle: FormArray) -> tuple[FormArray, FormArray]:
+        return cos_sin(angle)
+
+    @staticmethod
+    def signed_square(value: FormArray) -> FormArray:
+        """``v |v|`` has the derivative ``2 |v|``, and half its second one is the sign of v (A3)."""
+        low, high = value.bounds()
+        middle = value.center
+        least = np.where(low > 0.0, 1.0, -1.0)
+        most = np.where(high < 0.0, -1.0, 1.0)
+        return value.compose(middle * np.abs(middle), 2.0 * np.abs(middle), least, most, 0.0)
+
+
+class Sizes(Floats):
+    """Upper bounds of the sizes of terms; sums never cancel."""
+
+    @staticmethod
+    def cos_sin(angle: Any) -> tuple[Any, Any]:
+        # an error of the angle is one of its cosine; the library's own is relative to 1
+        return 1.0 + angle, 1.0 + angle
+
+    @staticmethod
+    def scaled(value: Any, factor: float) -> Any:
+        return value * abs(factor)
+
+
+#: Law of motion: states [n], controls [m] and arithmetic to states [n].
+Law = Callable[[Sequence[Any], Sequence[Any], type[Floats]], list[Any]]
+
+
+class Enclosure(NamedTuple):
+    """``f(x, u) = center + slopes (xi, eta) + e`` with ``|e| <= radius``, and a float64 evaluation of it, too.
+
+    ``xi`` and ``eta`` count x and u from the middles of their boxes in half-widths, so they are in [-1, 1].
+
+    Attributes:
+        center: [n].
+        slopes: [n, n + m].
+        radius: [n].
+        middle, half: [n + m] of the boxes of x and u.
+    """
+
+    center: Float64
+    slopes: Float64
+    radius: Float64
+    middle: Float64
+    half: Float64
+
+
+def middle_half(lower: Float64, upper: Float64) -> tuple[Float64, Float64]:
+    """Middles and half-widths of intervals, so that ``middle - half <= lower`` and ``upper <= middle + half``."""
+    middle = 0.5 * (lower + upper)
+    return middle, np.maximum(upper - middle, middle - lower) * (1.0 + 4.0 * UNIT64)
+
+
+@dataclass(frozen=True)
+class Dynamics:
+    """A law of motion.
+
+    Attributes:
+        name: As LOOP.json calls it.
+        states, controls: How many.
+        law: The law.
+        about: Its equations, for people.
+    """
+
+    name: str
+    states: int
+    controls: int
+    law: Law
+    about: str
+
+    def step(self, x: Float64, u: Float64) -> Float64:
+        """[n] the next state, in float64, from a state [n] and a control [m]."""
+        return np.array(self.law(list(map(np.float64, x)), list(map(np.float64, u)), Floats), np.float64)
+
+    def enclose(self, lower: Float64, upper: Float64) -> Enclosure:
+        """Enclosure over the box [n + m] of states and controls, of the exact law and of `step` (R1).
+
+        What leaves the range of float64 gets a radius that is not finite.
+        """
+        n, m = self.states, self.controls
+        middle, half = middle_half(lower, upper)
+        basis = Basis(n + m, 1)
+        with np.errstate(all="ignore"):
+            forms = [FormArray.parameter(basis, k, middle[k], half[k]) for k in range(n + m)]
+            found = self.law(forms[:n], forms[n:], Forms)
+            sizes = list(np.maximum(np.abs(lower), np.abs(upper)))
+            size = np.array(self.law(sizes[:n], sizes[n:], Sizes), np.float64)
+            radius = np.array([float(form.radius) for form in found])
+            radius = (radius + 2.0 * gamma(STEP_ROUNDINGS) * size) * (1.0 + 4.0 * UNIT64) + UNDERFLOW64
+        center = np.array([float(form.center) for form in found])
+        slopes = np.array([form.linear.reshape(-1) for form in found]).reshape(n, n + m)
+        return Enclosure(center, slopes, radius, middle, half)
+
+
+# ---------------------------------------------------------------- the family
+
+
+def affine(a: Float64, b: Float64, c: Float64) -> Dynamics:
+    """``x' = A x + B u + c`` with A [n, n], B [n, m], c [n]."""
+
+    def law(x: Sequence[Any], u: Sequence[Any], kind: type[Floats]) -> list[Any]:
+        found = []
+        for row in range(a.shape[0]):
+            total = x[0] * 0.0
+            for value, factor in zip((*x, *u), (*a[row], *b[row]), strict=True):
+                total = total + kind.scaled(value, float(factor))
+            found.append(total + (abs(float(c[row])) if kind is Sizes else float(c[row])))
+        return found
+
+    return Dynamics("affine", a.shape[0], b.shape[1], law, "x' = A x + B u + c")
+
+
+def unicycle(dt: float, speed: float | None) -> Dynamics:
+    """A unicycle, ``(x, y, heading)``, by Euler's rule: it moves along its heading and turns.
+
+    ``x' = x + dt v cos(heading)``, ``y' = y + dt v sin(heading)``, ``heading' = heading + dt w``; the controls are
+    (v, w), or w alone where ``speed`` gives v.
+    """
+
+    def law(x: Sequence[Any], u: Sequence[Any], kind: type[Floats]) -> list[Any]:
+        cosine, sine = kind.cos_sin(x[2])
+
+        def moved(part: Any) -> Any:
+            return kind.scaled(part, dt * speed) if speed is not None else kind.scaled(u[0] * part, dt)
+
+        return [x[0] + moved(cosine), x[1] + moved(sine), x[2] + kind.scaled(u[-1], dt)]
+
+    text = "x' = x + dt v cos(h), y' = y + dt v sin(h), h' = h + dt w"
+    return Dynamics("unicycle", 3, 2 if speed is None else 1, law, text)
+
+
+def double_integrator(dt: float, axes: int, linear: float, quadratic: float) -> Dynamics:
+    """Positions and velocities of 1 to 4 axes, ``(p_1, .., v_1, ..)``, driven by accelerations, with drag.
+
+    ``p' = p + dt v``, ``v' = v + dt (u - linear v - quadratic v |v|)`` by Euler's rule, axis by axis.
+    """
+
+    def law(x: Sequence[Any], u: Sequence[Any], kind: type[Floats]) -> list[Any]:
+        places = [x[k] + kind.scaled(x[axes + k], dt) for k in range(axes)]
+        speeds = []
+        for k in range(axes):
+            v = x[axes + k]
+            total = v + kind.scaled(u[k], dt) + kind.scaled(v, -dt * linear)
+            if quadratic:
+                total = total + kind.scaled(kind.signed_square(v), -dt * quadratic)
+            speeds.append(total)
+        return [*places, *speeds]
+
+    text = "p' = p + dt v, v' = v + dt (u - linear v - quadratic v |v|)"
+    return Dynamics("double integrator", 2 * axes, axes, law, text)
+
+
+# ---------------------------------------------------------------- LOOP.json
+
+_KEYS = {
+    "affine": ("type", "A", "B", "c"),
+    "unicycle": ("type", "speed"),
+    "double integrator": ("type", "axes", "drag", "quadratic_drag"),
+}
+
+
+def matrix(value: Any, name: str, rows: int, columns: int | None, fail: Fail) -> Float64:
+    """A [rows, columns] matrix of moderate numbers; ``columns`` None: as many as the first row has.
+
+    Raises:
+        InputError: Of ``fail``.
+    """
+    if columns is None and isinstance(value, list) and value and isinstance(value[0], list):
+        columns = len(value[0])
+    good = isinstance(value, list) and len(value) == rows and columns is not None
+    good = good and all(
+        isinstance(row, list) and len(row) == columns and all(is_moderate(v) for v in row) for row in value
+    )
+    if not good or not columns:
+        fix = f"write {rows} rows of {columns or 'equally many'} numbers, each {FIX_MODERATE}"
+        raise fail(name, f"found {show(value)}", fix)
+    return np.array(value, np.float64)
+
+
+def numbers(value: Any, name: str, count: int, fail: Fail) -> Float64:
+    """[count] moderate numbers.
+
+    Raises:
+        InputError: Of ``fail``.
+    """
+    if not (isinstance(value, list) and len(value) == count and all(is_moderate(v) for v in value)):
+        raise fail(name, f"found {show(value)}", f"write {count} numbers, each {FIX_MODERATE}")
+    return np.array(value, np.float64)
+
+
+def number(value: Any, name: str, fail: Fail, *, positive: bool = False) -> float:
+    """One moderate number.
+
+    Raises:
+        InputError: Of ``fail``.
+    """
+    if not is_moderate(value) or (positive and not value > 0):
+        raise fail(name, f"found {show(value)}", f"write a {'positive ' if positive else ''}number, {FIX_MODERATE}")
+    return float(value)
+
+
+def parse_dynamics(value: Any, states: int, dt: float, fail: Fail) -> Dynamics:
+    """The object under the key ``dynamics``.
+
+    Args:
+        value: The object.
+        states: Number of states.
+        dt: Sampling time, seconds.
+        fail: Makes errors.
+
+    Raises:
+        InputError: A key is unknown, or a value cannot be used.
+    """
+    kinds = ", ".join(_KEYS)
+    if not isinstance(value, Mapping):
+        raise fail("dynamics", f"found {show(value)}", f"write an object with a type: {kinds}")
+    kind = value.get("type")
+    if not isinstance(kind, str) or kind not in _KEYS:
+        raise fail("dynamics.type", f"found {show(kind)}", f"write one of {kinds}")
+    known(value, _KEYS[kind], "dynamics.", fail)
+    if kind == "affine":
+        a = matrix(value.get("A"), "dynamics.A", states, states, fail)
+        b = matrix(value.get("B"), "dynamics.B", states, None, fail)
+        c = numbers(value.get("c", [0.0] * states), "dynamics.c", states, fail)
+        found = affine(a, b, c)
+    elif kind == "unicycle":
+        speed = None if "speed" not in value else number(value["speed"], "dynamics.speed", fail)
+        found = unicycle(dt, speed)
+    else:
+        axes = value.get("axes")
+        if type(axes) is not int or not 1 <= axes <= MOST // 3:
+            raise fail("dynamics.axes", f"found {show(axes)}", f"write a whole number from 1 to {MOST // 3}")
+        drags = [number(value.get(key, 0), f"dynamics.{key}", fail) for key in ("drag", "quadratic_drag")]
+        found = double_integrator(dt, axes, *drags)
+    if found.states != states:
+        raise fail("state", f"{states} names", f"dynamics of type {kind} have {found.states} here; name as many")
+    if found.states + found.controls > MOST:
+        count = f"{found.states} states and {found.controls} controls"
+        raise fail("dynamics", count, f"use at most {MOST} together")
+    return found
+
+
+def unusable(problem: str, name: str, fix: str) -> InputError:
+    """The error of a field, for `ns_abstract.io.fields`."""
+    return InputError(problem, field=name, fix=fix)

@@ -1,0 +1,396 @@
+"""LOOP.json: a camera, a network and a law of motion in a closed loop, and what is to be shown of it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from fractions import Fraction
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ns_abstract.geometry.box import ParameterBox
+from ns_abstract.geometry.camera_path import Camera, checked_pose, focal_length
+from ns_abstract.geometry.poses import PoseSet
+from ns_abstract.io.errors import InputError
+from ns_abstract.io.fields import Fail, interval, known
+from ns_abstract.io.jsonio import file_beside, is_moderate, is_number, load_json, show
+from ns_abstract.perturbation.specification import ROTATIONS, TRANSLATIONS, Perturbation
+from ns_abstract.reach.dynamics import MOST, Dynamics, matrix, number, numbers, parse_dynamics, unusable
+from ns_abstract.verify.preprocess import Preprocess, parse_preprocess
+
+Float64 = NDArray[np.float64]
+
+#: Most steps, unsafe sets, and outputs of the network.
+MOST_STEPS, _MOST_SETS, _MOST_OUTPUTS = 1000, 64, 64
+#: Poses that may be looked at: positions in normalised units, angles in radians.
+FARTHEST, _TURN = 1e4, 10.0
+_KEYS = (
+    "version", "state", "units", "initial", "steps", "sampling_time", "dynamics", "disturbance", "camera", "network",
+    "preprocess", "control", "unsafe", "goal",
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Face:
+    """``normal . x - offset``, a function of the state that is above 0 on one side of a plane.
+
+    Attributes:
+        normal: [n].
+        offset: The plane's place.
+    """
+
+    normal: tuple[float, ...]
+    offset: float
+
+    def exact(self, x: Sequence[float]) -> Fraction:
+        """The value at a state of float64 numbers, without rounding."""
+        terms = (Fraction(a) * Fraction(v) for a, v in zip(self.normal, x, strict=True) if a)
+        return sum(terms, start=Fraction(0)) - Fraction(self.offset)
+
+
+@dataclass(frozen=True)
+class Goal:
+    """The open box to be in.
+
+    Attributes:
+        faces: All above 0 inside.
+        when: "end", after the last step; "any", after at least one.
+    """
+
+    faces: tuple[Face, ...]
+    when: Literal["end", "any"]
+
+
+@dataclass(frozen=True)
+class CameraMount:
+    """A camera whose pose is an affine function of the state.
+
+    Attributes:
+        rotation: [3, 3] camera to world (OpenGL axes: x right, y up, z back) where all angles are 0.
+        fov: Vertical, degrees.
+        names: Parameters that move: of x, y, z (world axes, normalised units) and yaw, pitch, roll (radians, about the
+            camera's own axes, in this order).
+        offset: [d] their values at state 0.
+        factors: [d, n].
+        fixed: Values of the others.
+    """
+
+    rotation: Float64
+    fov: float
+    names: tuple[str, ...]
+    offset: Float64
+    factors: Float64
+    fixed: Mapping[str, float]
+
+    def poses(self, size: tuple[int, int]) -> PoseSet:
+        """All poses that may be looked at, in pictures of ``size`` (height, width)."""
+        ranges = {name: (-FARTHEST, FARTHEST) if name in TRANSLATIONS else (-_TURN, _TURN) for name in self.names}
+        ranges |= {name: (value, value) for name, value in self.fixed.items()}
+        focal = focal_length(self.fov, size[0], "camera.fov")
+        height, width = size
+        pose = np.concatenate([self.rotation, np.zeros((3, 1))], axis=1)
+        camera = Camera(pose, focal, focal, 0.5 * width, 0.5 * height, width, height)
+        chosen = [{n: ranges[n] for n in group if n in ranges} for group in (TRANSLATIONS, ROTATIONS)]
+        return PoseSet.around(camera, Perturbation(frame="world", translation=chosen[0], rotation=chosen[1]))
+
+    def values(self, x: Float64) -> Float64:
+        """[d] parameters of the pose at a state [n], in float64."""
+        return self.offset + self.factors @ x
+
+
+@dataclass(frozen=True)
+class Control:
+    """``u = clip(K (y - goal))`` of the network's outputs y.
+
+    Attributes:
+        gain: [m, o] K.
+        goal: [o].
+        lower, upper: [m], infinite where nothing is clipped.
+    """
+
+    gain: Float64
+    goal: Float64
+    lower: Float64
+    upper: Float64
+
+    def of(self, outputs: Float64) -> Float64:
+        """[m] the control for outputs [o], in float64."""
+        return np.clip(self.gain @ (outputs - self.goal), self.lower, self.upper)
+
+
+@dataclass(frozen=True)
+class Loop:
+    """What LOOP.json says.
+
+    Attributes:
+        names, units: Of the states [n].
+        lower, upper: [n] initial box.
+        steps: How many.
+        dt: Sampling time, seconds.
+        dynamics: The law of motion.
+        disturbance: [2, n] least and most of what is added to every next state.
+        camera: Where pictures are taken.
+        network: File of the network.
+        preprocess: What comes before it.
+        control: What comes behind it; None until the network's outputs are known.
+        unsafe: Closed sets, each given by faces: outside where any of them is above 0.
+        goal: Or None.
+        value: The file's content.
+    """
+
+    names: tuple[str, ...]
+    units: tuple[str, ...]
+    lower: Float64
+    upper: Float64
+    steps: int
+    dt: float
+    dynamics: Dynamics
+    disturbance: Float64
+    camera: CameraMount
+    network: Path
+    preprocess: Preprocess
+    control: Control
+    unsafe: tuple[tuple[Face, ...], ...]
+    goal: Goal | None
+    value: Mapping[str, Any]
+
+    @property
+    def box(self) -> ParameterBox:
+        """The initial states that differ, as the box that cells are cut from."""
+        free = [k for k in range(len(self.names)) if self.lower[k] < self.upper[k]]
+        return ParameterBox(
+            tuple(self.names[k] for k in free),
+            tuple(self.units[k] for k in free),
+            tuple(float(self.lower[k]) for k in free),
+            tuple(float(self.upper[k]) for k in free),
+        )
+
+    def initial(self, box: ParameterBox) -> tuple[Float64, Float64]:
+        """[n], [n] ends of all states for a part of the initial box."""
+        lower, upper = self.lower.copy(), self.upper.copy()
+        for name, low, high in zip(box.names, box.lower, box.upper, strict=True):
+            lower[self.names.index(name)], upper[self.names.index(name)] = low, high
+        return lower, upper
+
+    def state(self, box: ParameterBox, values: Sequence[float] | Float64) -> Float64:
+        """[n] the state at parameter values [m] of a part of the initial box."""
+        x = self.lower.copy()
+        for name, value in zip(box.names, values, strict=True):
+            x[self.names.index(name)] = value
+        return x
+
+
+def load_loop(path: str | Path) -> Loop:
+    """Read LOOP.json; the network's file is looked for beside it.
+
+    Raises:
+        InputError: The file or a field in it cannot be used.
+    """
+    path = Path(path)
+    value = load_json(path, "loop file")
+    try:
+        return parse_loop(value, path.parent)
+    except InputError as error:
+        raise error.within(path) from None
+
+
+def parse_loop(value: Any, folder: Path) -> Loop:
+    """Check the content of LOOP.json.
+
+    Args:
+        value: The content.
+        folder: Where the network's file lies.
+
+    Raises:
+        InputError: A key is unknown, or a value cannot be used.
+    """
+
+    def fail(name: str, problem: str, fix: str) -> InputError:
+        return unusable(problem, name, fix)
+
+    if not isinstance(value, dict):
+        raise fail("", f"found {show(value)}", "write an object")
+    known(value, _KEYS, "", fail)
+    if value.get("version") != 1 or isinstance(value.get("version"), bool):
+        raise fail("version", f"found {show(value.get('version'))}", "write 1")
+    names = _names(value.get("state"), fail)
+    n = len(names)
+    units = value.get("units", [""] * n)
+    if not (isinstance(units, list) and len(units) == n and all(isinstance(u, str) and len(u) < 40 for u in units)):
+        raise fail("units", f"found {show(units)}", f"write {n} short texts")
+    lower, upper = _ranges(value.get("initial"), "initial", names, fail, every=True)
+    steps = value.get("steps")
+    if type(steps) is not int or not 1 <= steps <= MOST_STEPS:
+        raise fail("steps", f"found {show(steps)}", f"write a whole number from 1 to {MOST_STEPS}")
+    dt = number(value.get("sampling_time"), "sampling_time", fail, positive=True)
+    dynamics = parse_dynamics(value.get("dynamics"), n, dt, fail)
+    disturbance = np.stack(_ranges(value.get("disturbance", {}), "disturbance", names, fail))
+    file = value.get("network")
+    if not isinstance(file, str) or not file:
+        raise fail("network", f"found {show(file)}", "name an .onnx or .pt2 file beside this one")
+    try:
+        network = file_beside(folder, file)
+    except InputError as error:
+        raise InputError(error.problem, fix=error.fix, field="network") from None
+    unsafe = value.get("unsafe", [])
+    if not isinstance(unsafe, list) or len(unsafe) > _MOST_SETS:
+        raise fail("unsafe", f"found {show(unsafe)}", f"write a list of at most {_MOST_SETS} sets")
+    goal = None if "goal" not in value else _goal(value["goal"], names, fail)
+    if not unsafe and goal is None:
+        raise fail("unsafe", "missing", "give unsafe sets, or a goal, or both")
+    return Loop(
+        names,
+        tuple(units),
+        lower,
+        upper,
+        steps,
+        dt,
+        dynamics,
+        disturbance,
+        _camera(value.get("camera"), n, fail),
+        network,
+        parse_preprocess(value.get("preprocess", {})),
+        _control(value.get("control"), dynamics.controls, fail),
+        tuple(_unsafe(entry, f"unsafe[{k}]", names, fail) for k, entry in enumerate(unsafe)),
+        goal,
+        value,
+    )
+
+
+def _names(value: Any, fail: Fail) -> tuple[str, ...]:
+    good = isinstance(value, list) and 1 <= len(value) < MOST
+    good = good and all(isinstance(v, str) and 0 < len(v) <= 40 and v.isprintable() for v in value)
+    if not good or len(set(value)) != len(value):
+        raise fail("state", f"found {show(value)}", f"write 1 to {MOST - 1} different short names")
+    return tuple(value)
+
+
+def _ranges(
+    value: Any, field: str, names: tuple[str, ...], fail: Fail, *, every: bool = False
+) -> tuple[Float64, Float64]:
+    """Ends [n] of an interval by state; a number r is [-r, r], or r itself where ``every`` state has to be given."""
+    if not isinstance(value, Mapping):
+        raise fail(field, f"found {show(value)}", "write an object with a range by state")
+    known(value, names, f"{field}.", fail)
+    ends = np.zeros((2, len(names)))
+    for k, name in enumerate(names):
+        entry = value.get(name)
+        if entry is None and not every:
+            continue
+        if every and is_number(entry):
+            entry = [entry, entry]
+        low, high = interval(entry, f"{field}.{name}", fail)
+        if not is_moderate(low) or not is_moderate(high):
+            raise fail(f"{field}.{name}", f"found {show([low, high])}", "write moderate numbers")
+        ends[:, k] = low, high
+    return ends[0], ends[1]
+
+
+def _camera(value: Any, n: int, fail: Fail) -> CameraMount:
+    if not isinstance(value, Mapping):
+        raise fail("camera", f"found {show(value)}", "write an object")
+    known(value, ("camera_to_world", "fov", "position", *ROTATIONS), "camera.", fail)
+    pose = checked_pose(value.get("camera_to_world"), "camera.camera_to_world")
+    fov = value.get("fov", 45.0)
+    focal_length(fov, 1, "camera.fov")
+    names: list[str] = []
+    rows: list[Float64] = []
+    offsets: list[float] = []
+    fixed: dict[str, float] = {}
+
+    def take(name: str, offset: float, row: Float64) -> None:
+        if row.any():
+            names.append(name)
+            rows.append(row)
+            offsets.append(offset)
+        elif abs(offset) > (FARTHEST if name in TRANSLATIONS else _TURN):
+            raise fail("camera", f"{name} is {offset:g}", f"stay within {FARTHEST:g} units and {_TURN:g} rad")
+        else:
+            fixed[name] = offset
+
+    place = value.get("position")
+    if not isinstance(place, Mapping):
+        raise fail("camera.position", f"found {show(place)}", "write an object with offset and matrix")
+    known(place, ("offset", "matrix"), "camera.position.", fail)
+    start = numbers(place.get("offset", [0.0] * 3), "camera.position.offset", 3, fail)
+    factors = matrix(place.get("matrix"), "camera.position.matrix", 3, n, fail)
+    if pose[:, 3].any():
+        raise fail("camera.camera_to_world", "has a position", "write 0, 0, 0 there: camera.position says where it is")
+    for name, offset, row in zip(TRANSLATIONS, start, factors, strict=True):
+        take(name, float(offset), row)
+    for name in ROTATIONS:
+        entry = value.get(name, {})
+        if not isinstance(entry, Mapping):
+            raise fail(f"camera.{name}", f"found {show(entry)}", "write an object with offset and row")
+        known(entry, ("offset", "row"), f"camera.{name}.", fail)
+        offset = number(entry.get("offset", 0.0), f"camera.{name}.offset", fail)
+        take(name, offset, numbers(entry.get("row", [0.0] * n), f"camera.{name}.row", n, fail))
+    if not names:
+        raise fail("camera", "the pose does not depend on the state", "give it a matrix or a row that is not 0")
+    return CameraMount(pose[:, :3].copy(), float(fov), tuple(names), np.array(offsets), np.stack(rows), fixed)
+
+
+def _control(value: Any, controls: int, fail: Fail) -> Control:
+    if not isinstance(value, Mapping):
+        raise fail("control", f"found {show(value)}", "write an object with gain, goal and clip")
+    known(value, ("gain", "goal", "clip"), "control.", fail)
+    gain = np.eye(controls) if "gain" not in value else matrix(value["gain"], "control.gain", controls, None, fail)
+    if gain.shape[1] > _MOST_OUTPUTS:
+        raise fail("control.gain", f"{gain.shape[1]} columns", f"use a network of at most {_MOST_OUTPUTS} outputs")
+    goal = numbers(value.get("goal", [0.0] * gain.shape[1]), "control.goal", gain.shape[1], fail)
+    lower, upper = np.full(controls, -np.inf), np.full(controls, np.inf)
+    clip = value.get("clip")
+    if clip is not None:
+        if not isinstance(clip, list) or len(clip) != controls:
+            raise fail("control.clip", f"found {show(clip)}", f"write {controls} intervals [low, high]")
+        for k, entry in enumerate(clip):
+            lower[k], upper[k] = interval(entry, f"control.clip[{k}]", fail, symmetric=False)
+    return Control(gain, goal, lower, upper)
+
+
+def _box_faces(value: Any, field: str, names: tuple[str, ...], fail: Fail, *, inside: bool) -> tuple[Face, ...]:
+    """Faces of a box; above 0 inside, or each above 0 on its own outside."""
+    if not isinstance(value, Mapping) or not value:
+        raise fail(field, f"found {show(value)}", "write an object with [low, high] by state, null for no end")
+    known(value, names, f"{field}.", fail)
+    faces = []
+    for name, ends in value.items():
+        good = isinstance(ends, list) and len(ends) == 2 and all(v is None or is_number(v) for v in ends)
+        if not good or ends == [None, None] or (None not in ends and ends[0] > ends[1]):
+            raise fail(f"{field}.{name}", f"found {show(ends)}", "write [low, high], null where there is no end")
+        unit = np.eye(len(names))[names.index(name)]
+        for end, sign in zip(ends, (1.0, -1.0), strict=True):
+            if end is not None:
+                side = sign if inside else -sign
+                faces.append(Face(tuple((side * unit).tolist()), side * float(end)))
+    return tuple(faces)
+
+
+def _unsafe(value: Any, field: str, names: tuple[str, ...], fail: Fail) -> tuple[Face, ...]:
+    if not isinstance(value, Mapping) or len(value) != 1:
+        raise fail(field, f"found {show(value)}", 'write {"box": ..} or {"half_space": ..}')
+    known(value, ("box", "half_space"), f"{field}.", fail)
+    if "box" in value:
+        return _box_faces(value["box"], f"{field}.box", names, fail, inside=False)
+    entry = value["half_space"]
+    if not isinstance(entry, Mapping):
+        raise fail(f"{field}.half_space", f"found {show(entry)}", "write an object with normal and at_least")
+    known(entry, ("normal", "at_least"), f"{field}.half_space.", fail)
+    normal = numbers(entry.get("normal"), f"{field}.half_space.normal", len(names), fail)
+    if not normal.any():
+        raise fail(f"{field}.half_space.normal", "all are 0", "write a direction")
+    end = number(entry.get("at_least"), f"{field}.half_space.at_least", fail)
+    return (Face(tuple((-normal).tolist()), -end),)
+
+
+def _goal(value: Any, names: tuple[str, ...], fail: Fail) -> Goal:
+    if not isinstance(value, Mapping):
+        raise fail("goal", f"found {show(value)}", "write an object with box and when")
+    known(value, ("box", "when"), "goal.", fail)
+    when = value.get("when", "end")
+    if when not in ("end", "any") or not isinstance(when, str):
+        raise fail("goal.when", f"found {show(when)}", "write end or any")
+    return Goal(_box_faces(value.get("box"), "goal.box", names, fail, inside=True), when)  # pyright: ignore[reportArgumentType]

@@ -1,0 +1,328 @@
+"""The search for what holds of every run from a box of initial states (docs/design.md, R5).
+
+Two questions, each with its own cells: do all runs stay out of the unsafe sets ("safe"), and do they reach the goal as
+well ("reaches")? What becomes of a cell depends on the cell alone.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections import OrderedDict
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ns_abstract.geometry.box import ParameterBox
+from ns_abstract.io.errors import InputError
+from ns_abstract.reach.loop import Loop
+from ns_abstract.reach.tubes import Reacher, Tube
+from ns_abstract.verify.cells import Cell, Grid
+from ns_abstract.verify.search import FAILURES, ContradictionError, Findings, Leaf
+
+Float64 = NDArray[np.float64]
+Question = Literal["safe", "reaches"]
+#: The questions by the number that they have in the store.
+QUESTIONS: tuple[Question, ...] = ("safe", "reaches")
+
+#: Runs before a tube is computed, beside the one from the middle; and after it: from corners, and from elsewhere.
+_EARLY, _CORNERS, _RANDOM = 2, 2, 1
+#: Runs of the search for a smaller margin where a cell is proved and where not, and its first step as a part of the
+#: cell.
+_STEPS, _STEPS_OPEN, _FIRST_STEP = 3, 1, 0.25
+#: Ranks of cells, as in `ns_abstract.verify.search`: nothing is known; some run goes wrong.
+_RANK_UNKNOWN, _RANK_BROKEN = 1e6, 2e3
+#: Tubes and runs kept for the other question.
+_KEPT, _KEPT_RUNS = 64, 1024
+
+
+@dataclass(frozen=True, eq=False)
+class Run:
+    """A simulated run.
+
+    Attributes:
+        states: [steps + 1, n] float64.
+        controls: [steps, m].
+        disturbances: [steps, n] what was added.
+    """
+
+    states: Float64
+    controls: Float64
+    disturbances: Float64
+
+    def margin(self, loop: Loop, question: Question) -> float:
+        """How far the run is from going wrong: it does where this is not above 0. Its sign is exact; NaN: no number."""
+        if not np.isfinite(self.states).all():
+            return math.nan
+        states = self.states.tolist()
+        found = [max(face.exact(x) for face in faces) for x in states for faces in loop.unsafe]
+        if question == "reaches":
+            assert loop.goal is not None
+            depths = [min(face.exact(x) for face in loop.goal.faces) for x in states]
+            found.append(depths[-1] if loop.goal.when == "end" else max(depths))
+        return float(min(found)) if found else math.inf
+
+
+def simulate(reacher: Reacher, start: Float64, disturbances: Float64) -> Run:
+    """One run with the real renderer and the deployed network, in float64 but for these.
+
+    Args:
+        reacher: The loop.
+        start: [n] initial state.
+        disturbances: [steps, n], added to every next state.
+    """
+    loop = reacher.loop
+    states, controls = [np.asarray(start, np.float64)], []
+    with np.errstate(all="ignore"):
+        for push in disturbances:
+            x = states[-1]
+            if not np.isfinite(x).all():
+                break
+            u = reacher.pilot.concrete(reacher.view.image(loop.camera.values(x)))
+            controls.append(u)
+            states.append(loop.dynamics.step(x, u) + push)
+    missing = loop.steps + 1 - len(states)
+    lost = np.full((missing, len(start)), np.nan)
+    empty = np.full((loop.steps - len(controls), loop.dynamics.controls), np.nan)
+    return Run(
+        np.concatenate([np.stack(states), lost]),
+        np.concatenate([np.array(controls).reshape(-1, loop.dynamics.controls), empty]),
+        np.asarray(disturbances, np.float64),
+    )
+
+
+def pushes(loop: Loop, generator: np.random.Generator, kind: Literal["middle", "ends", "random"]) -> Float64:
+    """[steps, n] disturbances inside their box: its middle, one corner of it throughout, or anything in it."""
+    low, high = loop.disturbance
+    shape = loop.steps, len(low)
+    if kind == "middle":
+        found = np.broadcast_to(0.5 * (low + high), shape)
+    elif kind == "ends":
+        found = np.broadcast_to(np.where(generator.random(len(low)) < 0.5, low, high), shape)
+    else:
+        found = low + generator.random(shape) * (high - low)
+    return np.clip(found, low, high)
+
+
+@dataclass(frozen=True)
+class LoopFindings(Findings):
+    """What became of a block.
+
+    Attributes:
+        runs: The runs behind falsified cells.
+    """
+
+    runs: tuple[tuple[Cell, Run], ...] = ()
+
+
+@dataclass
+class _Seen:
+    """Runs from one cell."""
+
+    cell: Cell
+    box: ParameterBox
+    starts: list[Float64] = field(default_factory=list)
+    runs: list[Run] = field(default_factory=list)
+    margins: list[float] = field(default_factory=list)
+
+    @property
+    def worst(self) -> int:
+        return int(np.argmin(np.where(np.isfinite(self.margins), self.margins, np.inf)))
+
+    @property
+    def broken(self) -> int:
+        return sum(math.isfinite(margin) and margin <= 0.0 for margin in self.margins)
+
+    @property
+    def undecided(self) -> int:
+        return sum(math.isnan(margin) for margin in self.margins)
+
+
+class LoopSearch:
+    """Examines cells of the initial box.
+
+    Args:
+        reacher: Computes tubes.
+    """
+
+    def __init__(self, reacher: Reacher) -> None:
+        self.reacher, self.loop = reacher, reacher.loop
+        self._tubes: OrderedDict[ParameterBox, Tube | str] = OrderedDict()
+        self._runs: OrderedDict[bytes, Run] = OrderedDict()
+
+    def tube(self, box: ParameterBox) -> Tube | str:
+        """The tube of a cell, kept for a while; or why there is none."""
+        if box not in self._tubes:
+            while len(self._tubes) >= _KEPT:
+                self._tubes.popitem(last=False)
+            try:
+                self._tubes[box] = self.reacher.tube(box)
+            except InputError:
+                raise
+            except FAILURES as error:
+                self._tubes[box] = " ".join(f"{type(error).__name__}: {error}".split())[:200]
+        return self._tubes[box]
+
+    def proved(self, tube: Tube, question: Question) -> float:
+        """Lower bound of the margin of all runs in a tube; minus infinity where nothing is known (R5)."""
+        if tube.reason or len(tube.sets) != self.loop.steps + 1 or not all(step.finite for step in tube.sets):
+            return -math.inf
+        found = tube.safe(self.loop.unsafe)
+        if question == "reaches":
+            goal = self.loop.goal
+            assert goal is not None
+            steps = [self.loop.steps] if goal.when == "end" else range(self.loop.steps + 1)
+            # some one step is in the goal for all runs
+            found = min(found, max(tube.inside(k, goal.faces) for k in steps))
+        return found if math.isfinite(found) or found == math.inf else -math.inf
+
+    def examine(self, number: int, grid: Grid, block: Sequence[Cell]) -> LoopFindings:
+        """Examine cells for the question of this number.
+
+        Raises:
+            ContradictionError: A run leaves its tube: the program has a fault.
+            AbandonedError: There is no time for it (`ns_abstract.execution.ending`).
+        """
+        question = QUESTIONS[number]
+        begin = time.perf_counter()
+        leaves: list[Leaf] = []
+        children: list[tuple[float, Cell]] = []
+        samples: list[tuple[Cell, bool]] = []
+        runs: list[tuple[Cell, Run]] = []
+        bounded = 0
+        for cell in block:
+            begun = time.perf_counter()
+            found = self._one(question, grid, cell, runs)
+            seen, bound, reason, slopes = found
+            bounded += bound is not None
+            samples.append((cell, seen.margins[0] > 0.0))
+            seconds = time.perf_counter() - begun
+            if bound is not None and bound > 0.0 and not seen.undecided:
+                # without unsafe sets nothing can go wrong, which is as good as any number
+                leaves.append(Leaf(cell, "certified", min(bound, 1e300), seconds))
+                continue
+            if seen.undecided:
+                reason = "the states of a run are no finite numbers"
+            hopeless = seen.broken + seen.undecided == len(seen.margins)
+            if cell.volume > 1 and not hopeless:
+                rank = self._rank(seen, bound, cell.volume / grid.volume)
+                children += [(rank, part) for part in grid.split(cell, slopes, 2)]
+            elif seen.broken:
+                leaf, run = self._counterexample(question, seen, seconds)
+                leaves.append(leaf)
+                if leaf.verdict == "falsified":
+                    runs.append((cell, run))
+            else:
+                leaves.append(Leaf(cell, "unknown", None, seconds, reason=reason or "the finest cell"))
+        return LoopFindings(
+            tuple(leaves),
+            tuple((cell,) for _, cell in children),
+            tuple(samples),
+            bounded,
+            time.perf_counter() - begin,
+            tuple(rank for rank, _ in children),
+            tuple(runs),
+        )
+
+    def _one(
+        self, question: Question, grid: Grid, cell: Cell, runs: list[tuple[Cell, Run]]
+    ) -> tuple[_Seen, float | None, str, Float64]:
+        """Runs, proven margin or None, why there is none, and what a cut along each parameter may gain."""
+        box = grid.box_of(cell)
+        seen, generator = _Seen(cell, box), np.random.default_rng([*cell.first, *cell.past])
+        self._run(question, seen, box.middle, pushes(self.loop, generator, "middle"))
+        for end in (box.lower, box.upper)[: _EARLY if box.dimensions else 0]:
+            self._run(question, seen, np.array(end), pushes(self.loop, generator, "ends"))
+        width = np.array(box.upper) - np.array(box.lower)
+        if seen.broken or seen.undecided:
+            return seen, None, "", width
+        tube = self.tube(box)
+        if isinstance(tube, str):
+            return seen, None, tube, width
+        bound = self.proved(tube, question)
+        # no proof is believed without an attack, and no doubt is left without one
+        proved = bound > 0.0
+        for _ in range(_CORNERS if box.dimensions and proved else 1):
+            corner = np.where(generator.random(box.dimensions) < 0.5, box.lower, box.upper)
+            self._run(question, seen, corner, pushes(self.loop, generator, "ends"))
+        for start in box.sample(_RANDOM, generator):
+            self._run(question, seen, start, pushes(self.loop, generator, "random"))
+        self._descend(question, seen, generator, _STEPS if proved else _STEPS_OPEN)
+        for start, run in zip(seen.starts, seen.runs, strict=True):
+            outside = first_outside(tube, run)
+            if outside is not None:
+                raise ContradictionError(f"internal error: the run from {start.tolist()} leaves its tube at {outside}")
+        if proved and seen.broken:
+            raise ContradictionError(
+                f"internal error: margin proved to be at least {bound} from {box.lower} to {box.upper}, found "
+                f"{seen.margins[seen.worst]} from {seen.starts[seen.worst].tolist()}"
+            )
+        slopes = tube.slopes if tube.slopes.any() else width
+        return seen, bound if bound > -math.inf else None, tube.reason, slopes
+
+    def _run(self, question: Question, seen: _Seen, start: Float64, disturbances: Float64) -> float:
+        state = self.loop.state(seen.box, start)
+        key = state.tobytes() + disturbances.tobytes()
+        if key not in self._runs:
+            while len(self._runs) >= _KEPT_RUNS:
+                self._runs.popitem(last=False)
+            self._runs[key] = simulate(self.reacher, state, disturbances)
+        run = self._runs[key]
+        seen.starts.append(start)
+        seen.runs.append(run)
+        seen.margins.append(run.margin(self.loop, question))
+        return seen.margins[-1]
+
+    def _descend(self, question: Question, seen: _Seen, generator: np.random.Generator, steps: int) -> None:
+        """Without gradients: from the worst start so far, random directions, kept where the margin falls."""
+        box = seen.box
+        if not box.dimensions or seen.broken:
+            return
+        low, high = np.array(box.lower), np.array(box.upper)
+        best, step = seen.worst, _FIRST_STEP
+        for _ in range(steps):
+            turn = generator.standard_normal(box.dimensions)
+            start = np.clip(seen.starts[best] + step * turn * (high - low), low, high)
+            if self._run(question, seen, start, seen.runs[best].disturbances) < seen.margins[best]:
+                best = len(seen.starts) - 1
+            else:
+                step *= 0.5
+
+    def _rank(self, seen: _Seen, bound: float | None, share: float) -> float:
+        """How many times the bound misses the margin that runs show; the nearest to a proof come first."""
+        if seen.broken:
+            return _RANK_BROKEN - math.log2(share)
+        margin = seen.margins[seen.worst]
+        if bound is None or not 0.0 < margin < math.inf:
+            return 10.0 - math.log2(share) if bound is None else _RANK_UNKNOWN * (1.0 + share)
+        return min((margin - bound) / margin, _RANK_UNKNOWN)
+
+    def _counterexample(self, question: Question, seen: _Seen, seconds: float) -> tuple[Leaf, Run]:
+        """The worst run, simulated once more."""
+        start, old = seen.starts[seen.worst], seen.runs[seen.worst]
+        run = simulate(self.reacher, self.loop.state(seen.box, start), old.disturbances)
+        margin = run.margin(self.loop, question)
+        low, high = self.loop.disturbance
+        inside = seen.box.contains(start) and bool(((low <= run.disturbances) & (run.disturbances <= high)).all())
+        if not (margin <= 0.0 and inside):
+            return Leaf(seen.cell, "unknown", None, seconds, reason="a run that goes wrong was not confirmed"), run
+        leaf = Leaf(seen.cell, "falsified", margin, seconds, counterexample=tuple(start.tolist()))
+        return leaf, run
+
+
+def first_outside(tube: Tube, run: Run) -> str | None:
+    """The first state or control of a run that is not in a tube, in words; None where all are (no tolerance)."""
+    for step, entry in enumerate(tube.sets):
+        if not entry.finite:
+            return None
+        low, high = entry.hull()
+        state = run.states[step]
+        if not ((low <= state) & (state <= high)).all():
+            return f"step {step}: {state.tolist()} not in {low.tolist()} to {high.tolist()}"
+    for step, (low, high) in enumerate(tube.controls):
+        if not ((low <= run.controls[step]) & (run.controls[step] <= high)).all():
+            return f"the control of step {step}"
+    return None

@@ -1,0 +1,408 @@
+"""Sets of states over time: affine functions of the initial state and of what came in since (docs/design.md, R2-R4)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Literal, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ns_abstract.arithmetic.rounding import UNDERFLOW64, UNIT64, gamma
+from ns_abstract.execution.ending import checkpoint
+from ns_abstract.geometry.box import ParameterBox
+from ns_abstract.geometry.poses import PoseSet
+from ns_abstract.geometry.tiles import assemble
+from ns_abstract.reach.dynamics import middle_half
+from ns_abstract.reach.loop import Control, Face, Loop
+from ns_abstract.refine.protocol import Frame, Method
+from ns_abstract.verify.model import NetworkModel
+from ns_abstract.verify.properties import Query
+
+Float64 = NDArray[np.float64]
+#: What is kept from step to step: how states depend on the initial state and on earlier disturbances ("kept"); only how
+#: control depends on the state within a step ("step"); nothing, intervals of states and of controls ("none").
+Dependence = Literal["kept", "step", "none"]
+
+#: Symbols beyond which the smallest ones are put together.
+_MOST_SYMBOLS = 64
+#: Roundings of a few operations on one number: scaling, shifting, halving.
+_FEW = 16
+
+
+@dataclass(frozen=True)
+class AffineSet:
+    """All ``center + generators s + e`` with s in [-1, 1]^q and |e| <= radius (R2).
+
+    Attributes:
+        center: [n].
+        generators: [n, q]; quantities of one step share their symbols s, the first of which are the initial state's.
+        radius: [n].
+        first: How many symbols are the initial state's.
+    """
+
+    center: Float64
+    generators: Float64
+    radius: Float64
+    first: int
+
+    @classmethod
+    def box(cls, lower: Float64, upper: Float64) -> AffineSet:
+        """A box [n], one symbol for every side that has a width."""
+        middle, half = middle_half(lower, upper)
+        wide = np.flatnonzero(half > 0.0)
+        return cls(middle, np.diag(half)[:, wide], np.zeros(len(middle)), len(wide))
+
+    @property
+    def finite(self) -> bool:
+        """Whether anything is known."""
+        return bool(all(np.isfinite(part).all() for part in (self.center, self.generators, self.radius)))
+
+    @property
+    def size(self) -> Float64:
+        """[n] upper bounds of absolute values."""
+        spread = np.abs(self.generators).sum(axis=1) + self.radius
+        return (np.abs(self.center) + spread) * (1.0 + 2.0 * gamma(self.generators.shape[1] + 4)) + UNDERFLOW64
+
+    def hull(self) -> tuple[Float64, Float64]:
+        """[n], [n] the smallest box around it, rounded outward; a width of 0 stays one."""
+        spread = np.abs(self.generators).sum(axis=1) + self.radius
+        spread = spread * (1.0 + 2.0 * gamma(self.generators.shape[1] + 4))
+        still = spread == 0.0
+        low, high = self.center - spread, self.center + spread
+        low, high = np.nextafter(low, -np.inf), np.nextafter(high, np.inf)
+        return np.where(still, self.center, low), np.where(still, self.center, high)
+
+    def mapped(self, matrix: Float64, offset: Float64, radius: Float64 | float = 0.0) -> AffineSet:
+        """``matrix x + offset + e`` with |e| <= radius, in the same symbols.
+
+        Entries of ``matrix`` may carry relative errors of `_FEW` units.
+        """
+        n, q = self.generators.shape
+        share = 2.0 * gamma(n + _FEW)
+        with np.errstate(all="ignore"):
+            steep = np.abs(matrix)
+            size = np.abs(self.center) + np.abs(self.generators).sum(axis=1) + self.radius
+            # every entry is a sum of n products and an offset
+            spread = steep @ (self.radius + share * size) + share * np.abs(offset) + radius
+            spread = spread * (1.0 + 2.0 * gamma(n + q + _FEW)) + np.where(steep.any(axis=1), UNDERFLOW64, 0.0)
+            found = matrix @ self.center + offset, matrix @ self.generators
+        return AffineSet(*found, spread, self.first)
+
+    def beside(self, other: AffineSet) -> AffineSet:
+        """Both one after the other; ``other`` is in the same symbols."""
+        names = "center", "generators", "radius"
+        parts = [np.concatenate([getattr(entry, name) for entry in (self, other)]) for name in names]
+        return AffineSet(parts[0], parts[1], parts[2], self.first)
+
+    def promoted(self) -> AffineSet:
+        """The same with a symbol of its own for every side of the remainder, so that it is followed as well.
+
+        Where there are too many symbols the smallest become part of the remainder first: a box around their sum.
+        """
+        generators, radius = self.generators, self.radius
+        n = len(radius)
+        spare = generators.shape[1] + n - max(_MOST_SYMBOLS, self.first + n)
+        if spare > 0:
+            weight = np.abs(generators).sum(axis=0)
+            weight[: self.first] = np.inf
+            gone = np.argsort(weight, kind="stable")[:spare]
+            more = np.abs(generators[:, gone]).sum(axis=1)
+            radius = (radius + more) * (1.0 + 2.0 * gamma(len(gone) + 4))
+            generators = np.delete(generators, gone, axis=1)
+        wide = np.flatnonzero(radius > 0.0)
+        return AffineSet(
+            self.center, np.concatenate([generators, np.diag(radius)[:, wide]], axis=1), np.zeros(n), self.first
+        )
+
+    def least(self, face: Face) -> float:
+        """Lower bound of a face's value; minus infinity where nothing is known."""
+        found = self.mapped(np.array(face.normal)[None], np.array([-face.offset]))
+        low = float(found.hull()[0][0])
+        return low if np.isfinite(low) else -np.inf
+
+
+def _scaled(values: AffineSet, middle: Float64, half: Float64) -> AffineSet:
+    """``(values - middle) / half``: positions in [-1, 1] in boxes; 0 where a box has no width."""
+    with np.errstate(all="ignore"):
+        inverse = np.where(half > 0.0, 1.0 / half, 0.0)
+    shifted = values.mapped(np.eye(len(middle)), -middle)
+    return shifted.mapped(np.diag(inverse), np.zeros(len(middle)))
+
+
+# ---------------------------------------------------------------- pictures and the network
+
+
+class View(Protocol):
+    """Pictures from all poses that a camera may have."""
+
+    pose_set: PoseSet
+
+    def image(self, values: Float64) -> np.ndarray:
+        """[H, W, 3] float32 at pose parameters [d]."""
+        ...
+
+    def sets(self, box: ParameterBox) -> tuple[tuple[np.ndarray, ...], np.ndarray, np.ndarray, np.ndarray]:
+        """Linear sets, lower, upper and slopes of a box of poses, as `ns_abstract.verify.search.Scene` has them."""
+        ...
+
+
+class Pictures:
+    """A scene's pictures.
+
+    Args:
+        method: The scene and its program.
+        poses: All poses that may be looked at; boxes of them are bounded.
+    """
+
+    def __init__(self, method: Method, poses: PoseSet) -> None:
+        self.frame: Frame = method.frame(poses)
+        self.pose_set = self.frame.pose_set
+        self._tiles = np.arange(self.frame.tile_count)
+
+    def image(self, values: Float64) -> np.ndarray:
+        checkpoint()
+        return assemble(self.frame.render(np.asarray(values, np.float64)), self.frame.camera)
+
+    def sets(self, box: ParameterBox) -> tuple[tuple[np.ndarray, ...], np.ndarray, np.ndarray, np.ndarray]:
+        found = self.frame.bound(box, self._tiles, keep_linear=True)
+        assert found.linear is not None
+        whole = [assemble(part, self.frame.camera) for part in (*found.linear, found.lower, found.upper)]
+        return (whole[0], whole[1], whole[2], whole[3]), whole[4], whole[5], found.slopes
+
+
+@dataclass(frozen=True)
+class Controls:
+    """``u = slopes q + center + e`` with |e| <= radius, and ``lower <= u <= upper``, of poses at q in [-1, 1]^d.
+
+    Attributes:
+        slopes: [m, d].
+        center, radius, lower, upper: [m].
+    """
+
+    slopes: Float64
+    center: Float64
+    radius: Float64
+    lower: Float64
+    upper: Float64
+
+
+def clipped(raw: Controls, lower: Float64, upper: Float64) -> Controls:
+    """``clip(z, lower, upper)`` for z given by ``raw`` (R3).
+
+    ``clip(z) - lambda z`` is largest and smallest at the ends of z's range or where the clip begins, for any lambda.
+    """
+    low, high = np.clip(raw.lower, lower, upper), np.clip(raw.upper, lower, upper)
+    inside = (raw.lower >= lower) & (raw.upper <= upper)
+    with np.errstate(all="ignore"):
+        slope = np.clip((high - low) / (raw.upper - raw.lower), 0.0, 1.0)
+    slope = np.where(np.isfinite(slope), slope, 0.0)
+    ends = np.stack([raw.lower, raw.upper, np.clip(lower, raw.lower, raw.upper), np.clip(upper, raw.lower, raw.upper)])
+    room = 8.0 * UNIT64 * (np.abs(ends).max(axis=0) + np.maximum(np.abs(low), np.abs(high)))
+    distance = np.clip(ends, lower, upper) - slope * ends
+    middle, half = middle_half(distance.min(axis=0) - room, distance.max(axis=0) + room)
+    size = np.abs(raw.slopes).sum(axis=1) + np.abs(raw.center) + np.abs(middle)
+    radius = (slope * raw.radius + half + 8.0 * UNIT64 * size) * (1.0 + 8.0 * UNIT64) + UNDERFLOW64
+    # a relaxation that is wider than the range itself is none
+    flat = ~inside & ~(radius < 0.5 * (high - low))
+    center, spread = middle_half(low, high)
+
+    def chosen(same: Float64, steep: Float64, level: Float64 | float) -> Float64:
+        shape = (-1, *[1] * (same.ndim - 1))
+        return np.where(inside.reshape(shape), same, np.where(flat.reshape(shape), level, steep))
+
+    return Controls(
+        chosen(raw.slopes, slope[:, None] * raw.slopes, 0.0),
+        chosen(raw.center, slope * raw.center + middle, center),
+        chosen(raw.radius, radius, spread),
+        low,
+        high,
+    )
+
+
+class Pilot:
+    """From sets of pictures to sets of controls.
+
+    Args:
+        model: The network with its preprocessing.
+        control: What comes behind it.
+    """
+
+    def __init__(self, model: NetworkModel, control: Control) -> None:
+        self.model, self.control = model, control
+        unit, zero = np.eye(control.gain.shape[1]), np.zeros(2 * sum(control.gain.shape))
+        # lower and upper bounds of K y, and of y for its size
+        rows = np.concatenate([control.gain, -control.gain, unit, -unit])
+        self._query = Query(rows, zero)
+
+    def concrete(self, image: np.ndarray) -> Float64:
+        """[m] the control for a picture, as the deployed network computes it."""
+        return self.control.of(self.model.outputs(image[None])[0].astype(np.float64))
+
+    def bound(self, linear: Sequence[np.ndarray], lower: np.ndarray, upper: np.ndarray) -> Controls | None:
+        """The controls for a set of pictures, and float64 evaluations of K (y - goal); None: nothing is known (R3)."""
+        control = self.control
+        m, o = control.gain.shape
+        images = self.model.input_sets(tuple(part[None] for part in linear), lower[None], upper[None])
+        found = self.model.bound(images, self._query)
+        least = found.lower[0]
+        if not np.isfinite(least).all():
+            # what is not known to be finite need not be a number either, which no clip mends
+            return None
+        usable = np.isfinite(found.b[0])
+        a, b = np.where(usable[:, None], found.a[0], 0.0), np.where(usable, found.b[0], least)
+        with np.errstate(all="ignore"):
+            shift = control.gain @ control.goal
+            steep, outputs = np.abs(control.gain), np.maximum(-least[2 * m : 2 * m + o], -least[2 * m + o :])
+            # K (y - goal) in float64, K goal above, and the sums below
+            room = 2.0 * gamma(2 * o + _FEW) * (steep @ (np.abs(outputs) + np.abs(control.goal)))
+            slopes = 0.5 * (a[:m] - a[m : 2 * m])
+            apart = 0.5 * np.abs(a[:m] + a[m : 2 * m]).sum(axis=1)
+            bottom, top = b[:m] - apart, -b[m : 2 * m] + apart
+            size = np.abs(a[: 2 * m]).sum(axis=1).reshape(2, m).sum(axis=0) + np.abs(bottom) + np.abs(top)
+            center, half = middle_half(bottom, top)
+            low, high = least[:m], -least[m : 2 * m]
+            # the float64 evaluation errs beside the exact function
+            wide = room + 2.0 * gamma(a.shape[1] + _FEW) * (size + np.abs(shift))
+            raw = Controls(slopes, center - shift, half + wide, low - shift - wide, high - shift + wide)
+            poor = ~(raw.radius < 0.5 * (raw.upper - raw.lower))
+            middle, spread = middle_half(raw.lower, raw.upper)
+            raw = Controls(
+                np.where(poor[:, None], 0.0, raw.slopes),
+                np.where(poor, middle, raw.center),
+                np.where(poor, spread, raw.radius),
+                raw.lower,
+                raw.upper,
+            )
+            return clipped(raw, control.lower, control.upper)
+
+
+# ---------------------------------------------------------------- the tube
+
+
+def clearance(state: AffineSet, unsafe: Sequence[Sequence[Face]]) -> float:
+    """Lower bound, over unsafe sets, of the distance to them along the best face (R4)."""
+    return min((max(state.least(face) for face in faces) for faces in unsafe), default=np.inf)
+
+
+@dataclass(frozen=True)
+class Tube:
+    """States of all runs from a cell, step by step.
+
+    Attributes:
+        sets: By step, from 0; as many as were found before the end or a reason to stop.
+        controls: [steps, 2, m] least and most control of every step.
+        slopes: [m] how much pictures moved by initial parameter, summed over the steps: what a cut may gain.
+        reason: Why it ends early, or "".
+    """
+
+    sets: tuple[AffineSet, ...]
+    controls: Float64
+    slopes: Float64
+    reason: str = ""
+
+    def safe(self, unsafe: Sequence[Sequence[Face]]) -> float:
+        """Lower bound, over all steps and unsafe sets, of the distance to them along the best face (R4)."""
+        return min((clearance(step, unsafe) for step in self.sets), default=np.inf)
+
+    def inside(self, step: int, faces: Sequence[Face]) -> float:
+        """Lower bound of how deep all states of a step lie inside a box."""
+        return min(self.sets[step].least(face) for face in faces)
+
+
+@dataclass
+class Reacher:
+    """Tubes of a loop.
+
+    Attributes:
+        loop: The loop.
+        view: Its pictures.
+        pilot: Its network and control.
+        dependence: What is kept from step to step.
+    """
+
+    loop: Loop
+    view: View
+    pilot: Pilot
+    dependence: Dependence = "kept"
+    _limits: tuple[Float64, Float64] = field(init=False)
+
+    def __post_init__(self) -> None:
+        box = self.view.pose_set.box
+        self._limits = np.array(box.lower), np.array(box.upper)
+
+    def tube(self, cell: ParameterBox, *, whole: bool = False) -> Tube:
+        """The tube of a cell of the initial box; it ends early where an unsafe set cannot be ruled out.
+
+        Args:
+            cell: The cell.
+            whole: Whether to go on although unsafe sets cannot be ruled out.
+        """
+        lower, upper = self.loop.initial(cell)
+        state = AffineSet.box(lower, upper)
+        # which symbols are which parameters of the cell
+        free = [k for k in range(len(lower)) if upper[k] > lower[k]]
+        places = [cell.names.index(self.loop.names[k]) for k in free]
+        slopes = np.zeros(cell.dimensions)
+        sets, controls = [state], []
+        reason = ""
+        for step in range(self.loop.steps + 1):
+            if not state.finite:
+                reason = f"the states of step {step} are not finite"
+            elif not whole and not clearance(state, self.loop.unsafe) > 0.0:
+                reason = f"unsafe states cannot be ruled out at step {step}"
+            if reason or step == self.loop.steps:
+                break
+            checkpoint()
+            if self.dependence != "kept":
+                state = AffineSet.box(*state.hull())
+            found = self._advanced(state.promoted())
+            if isinstance(found, str):
+                reason = f"{found} at step {step}"
+                break
+            state, control, moved = found
+            if self.dependence == "kept":
+                slopes[places] += moved[: len(places)]
+            sets.append(state)
+            controls.append(control)
+        if self.dependence != "kept":
+            slopes[:] = np.array(cell.upper) - np.array(cell.lower)
+        return Tube(tuple(sets), np.array(controls), slopes, reason)
+
+    def _advanced(self, state: AffineSet) -> tuple[AffineSet, Float64, Float64] | str:
+        """One step (R4): the next set, least and most controls [2, m], and how much the picture moves by symbol."""
+        loop, camera = self.loop, self.loop.camera
+        rounding = 2.0 * gamma(len(loop.names) + _FEW)
+        size = np.abs(camera.factors) @ state.size + np.abs(camera.offset)
+        pose = state.mapped(camera.factors, camera.offset, rounding * size)
+        low, high = pose.hull()
+        if not ((low >= self._limits[0]) & (high <= self._limits[1])).all():
+            return "the camera may leave the range of poses"
+        names, units = self.view.pose_set.box.names, self.view.pose_set.box.units
+        linear, lower, upper, slopes = self.view.sets(
+            ParameterBox(names, units, tuple(low.tolist()), tuple(high.tolist()))
+        )
+        if not all(np.isfinite(part).all() for part in (*linear, lower, upper)) or (lower > upper).any():
+            return "the picture's bounds are not finite"
+        controls = self.pilot.bound(linear, lower, upper)
+        if controls is None:
+            return "the network's bounds are not finite"
+        place = _scaled(pose, *middle_half(low, high))
+        moved = np.abs(np.asarray(slopes, np.float64)) @ np.abs(place.generators)
+        control = place.mapped(controls.slopes, controls.center, controls.radius)
+        ends = control.hull()
+        ends = np.maximum(ends[0], controls.lower), np.minimum(ends[1], controls.upper)
+        if not (np.isfinite(ends[0]).all() and np.isfinite(ends[1]).all() and (ends[0] <= ends[1]).all()):
+            return "the controls' bounds are not finite"
+        if self.dependence == "none":
+            middle, half = middle_half(*ends)
+            control = AffineSet(middle, np.zeros_like(control.generators), half, control.first)
+        hull = state.hull()
+        law = loop.dynamics.enclose(np.concatenate([hull[0], ends[0]]), np.concatenate([hull[1], ends[1]]))
+        both = _scaled(state.beside(control), law.middle, law.half)
+        push, wide = middle_half(*loop.disturbance)
+        # the sum with the disturbance is rounded where a run is simulated, too
+        added = 4.0 * UNIT64 * (np.abs(law.center + push) + np.abs(loop.disturbance).max(axis=0))
+        follow = both.mapped(law.slopes, law.center + push, law.radius + wide + added)
+        return follow, np.stack(ends), moved
