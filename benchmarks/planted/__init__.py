@@ -4,10 +4,11 @@ from planted.certificates import CERTIFICATES
 from planted.fault import Fault, apply
 from planted.fields import FIELDS
 from planted.forms import FORMS
+from planted.loops import LOOPS
 from planted.polynomials import POLYNOMIALS
 from planted.splats import SPLATS
 from planted.verdicts import VERDICTS
 
-FAULTS = (*FORMS, *POLYNOMIALS, *FIELDS, *VERDICTS, *CERTIFICATES, *SPLATS)
+FAULTS = (*FORMS, *POLYNOMIALS, *FIELDS, *VERDICTS, *CERTIFICATES, *SPLATS, *LOOPS)
 
 __all__ = ["FAULTS", "Fault", "apply"]

@@ -104,7 +104,7 @@ def approach_loop(network: str = "estimator.onnx") -> dict[str, Any]:
         "version": 1,
         "state": ["along", "across", "up"],
         "units": ["units", "units", "units"],
-        "initial": {"along": [_START, _START + 0.04], "across": 0.04, "up": [_HEIGHT - 0.03, _HEIGHT + 0.03]},
+        "initial": {"along": [_START, _START + 0.04], "across": [-0.04, 0.04], "up": [_HEIGHT - 0.03, _HEIGHT + 0.03]},
         "steps": _STEPS,
         "sampling_time": _DT,
         "dynamics": {

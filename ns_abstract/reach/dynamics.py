@@ -1,4 +1,4 @@
-"""Discrete dynamics ``x' = f(x, u)``: one concrete step in float64, and its enclosure over a box (docs/design.md, R1).
+"""Discrete dynamics ``x' = f(x, u)``: one concrete step in float64, and its enclosure over a box (docs/design.md, L1).
 
 Every law is written once, as a function of arithmetic: `Floats` evaluates it, `Forms` encloses it, and `Sizes` follows
 how large its terms are, which is what a float64 evaluation's rounding is charged by.
@@ -129,7 +129,7 @@ class Dynamics:
         return np.array(self.law(list(map(np.float64, x)), list(map(np.float64, u)), Floats), np.float64)
 
     def enclose(self, lower: Float64, upper: Float64) -> Enclosure:
-        """Enclosure over the box [n + m] of states and controls, of the exact law and of `step` (R1).
+        """Enclosure over the box [n + m] of states and controls, of the exact law and of `step` (L1).
 
         What leaves the range of float64 gets a radius that is not finite.
         """

@@ -1,4 +1,4 @@
-"""The search for what holds of every run from a box of initial states (docs/design.md, R5).
+"""The search for what holds of every run from a box of initial states (docs/design.md, L5).
 
 Two questions, each with its own cells: do all runs stay out of the unsafe sets ("safe"), and do they reach the goal as
 well ("reaches")? What becomes of a cell depends on the cell alone.
@@ -167,7 +167,7 @@ class LoopSearch:
         return self._tubes[box]
 
     def proved(self, tube: Tube, question: Question) -> float:
-        """Lower bound of the margin of all runs in a tube; minus infinity where nothing is known (R5)."""
+        """Lower bound of the margin of all runs in a tube; minus infinity where nothing is known (L5)."""
         if tube.reason or len(tube.sets) != self.loop.steps + 1 or not all(step.finite for step in tube.sets):
             return -math.inf
         found = tube.safe(self.loop.unsafe)

@@ -1,4 +1,4 @@
-"""Sets of states over time: affine functions of the initial state and of what came in since (docs/design.md, R2-R4)."""
+"""Sets of states over time: affine functions of the initial state and of what came in since (docs/design.md, L2-L4)."""
 
 from __future__ import annotations
 
@@ -27,13 +27,15 @@ Dependence = Literal["kept", "step", "none"]
 
 #: Symbols beyond which the smallest ones are put together.
 _MOST_SYMBOLS = 64
+#: Half-width below which positions in a box are not told apart.
+_NARROWEST = 2.0**-500
 #: Roundings of a few operations on one number: scaling, shifting, halving.
 _FEW = 16
 
 
 @dataclass(frozen=True)
 class AffineSet:
-    """All ``center + generators s + e`` with s in [-1, 1]^q and |e| <= radius (R2).
+    """All ``center + generators s + e`` with s in [-1, 1]^q and |e| <= radius (L2).
 
     Attributes:
         center: [n].
@@ -126,9 +128,11 @@ class AffineSet:
 def _scaled(values: AffineSet, middle: Float64, half: Float64) -> AffineSet:
     """``(values - middle) / half``: positions in [-1, 1] in boxes; 0 where a box has no width."""
     with np.errstate(all="ignore"):
-        inverse = np.where(half > 0.0, 1.0 / half, 0.0)
+        usable = half > _NARROWEST
+        inverse = np.where(usable, 1.0 / half, 0.0)
     shifted = values.mapped(np.eye(len(middle)), -middle)
-    return shifted.mapped(np.diag(inverse), np.zeros(len(middle)))
+    # where a quotient could overflow, all that is known is that the position is in [-1, 1]
+    return shifted.mapped(np.diag(inverse), np.zeros(len(middle)), np.where(usable | (half == 0.0), 0.0, 1.0))
 
 
 # ---------------------------------------------------------------- pictures and the network
@@ -189,7 +193,7 @@ class Controls:
 
 
 def clipped(raw: Controls, lower: Float64, upper: Float64) -> Controls:
-    """``clip(z, lower, upper)`` for z given by ``raw`` (R3).
+    """``clip(z, lower, upper)`` for z given by ``raw`` (L3).
 
     ``clip(z) - lambda z`` is largest and smallest at the ends of z's range or where the clip begins, for any lambda.
     """
@@ -241,7 +245,7 @@ class Pilot:
         return self.control.of(self.model.outputs(image[None])[0].astype(np.float64))
 
     def bound(self, linear: Sequence[np.ndarray], lower: np.ndarray, upper: np.ndarray) -> Controls | None:
-        """The controls for a set of pictures, and float64 evaluations of K (y - goal); None: nothing is known (R3)."""
+        """The controls for a set of pictures, and float64 evaluations of K (y - goal); None: nothing is known (L3)."""
         control = self.control
         m, o = control.gain.shape
         images = self.model.input_sets(tuple(part[None] for part in linear), lower[None], upper[None])
@@ -282,7 +286,7 @@ class Pilot:
 
 
 def clearance(state: AffineSet, unsafe: Sequence[Sequence[Face]]) -> float:
-    """Lower bound, over unsafe sets, of the distance to them along the best face (R4)."""
+    """Lower bound, over unsafe sets, of the distance to them along the best face (L4)."""
     return min((max(state.least(face) for face in faces) for faces in unsafe), default=np.inf)
 
 
@@ -303,7 +307,7 @@ class Tube:
     reason: str = ""
 
     def safe(self, unsafe: Sequence[Sequence[Face]]) -> float:
-        """Lower bound, over all steps and unsafe sets, of the distance to them along the best face (R4)."""
+        """Lower bound, over all steps and unsafe sets, of the distance to them along the best face (L4)."""
         return min((clearance(step, unsafe) for step in self.sets), default=np.inf)
 
     def inside(self, step: int, faces: Sequence[Face]) -> float:
@@ -371,7 +375,7 @@ class Reacher:
         return Tube(tuple(sets), np.array(controls), slopes, reason)
 
     def _advanced(self, state: AffineSet) -> tuple[AffineSet, Float64, Float64] | str:
-        """One step (R4): the next set, least and most controls [2, m], and how much the picture moves by symbol."""
+        """One step (L4): the next set, least and most controls [2, m], and how much the picture moves by symbol."""
         loop, camera = self.loop, self.loop.camera
         rounding = 2.0 * gamma(len(loop.names) + _FEW)
         size = np.abs(camera.factors) @ state.size + np.abs(camera.offset)

@@ -1,0 +1,42 @@
+"""Faults in loops: dynamics, sets of states, controls, verdicts."""
+
+from planted.fault import Fault
+
+_DYNAMICS, _TUBES, _SEARCH, _LOOP = "reach/dynamics.py", "reach/tubes.py", "reach/search.py", "reach/loop.py"
+_STEP = "test_reach.py::test_a_step_is_enclosed"
+_SETS = "test_reach.py::test_affine_sets_hold_their_images"
+_CLIP = "test_reach.py::test_a_clip_is_enclosed"
+_RUNS = "test_reach.py::test_tubes_hold_every_run"
+_VERDICTS = "test_reach.py::test_a_good_controller_is_certified_and_a_bad_one_falsified"
+
+LOOPS = (
+    Fault(
+        "loops: the float64 step's rounding is not charged",
+        _DYNAMICS, "Dynamics.enclose", "2.0 * gamma(STEP_ROUNDINGS) * size", "0.0 * size", _STEP,
+    ),
+    Fault(
+        "loops: quadratic drag curves one way only",
+        _DYNAMICS, "Forms.signed_square", "np.where(low > 0.0, 1.0, -1.0)", "np.where(low > 0.0, 1.0, 1.0)", _STEP,
+    ),
+    Fault(
+        "loops: a map forgets the remainder",
+        _TUBES, "AffineSet.mapped", "self.radius + share * size", "share * size", _SETS,
+    ),
+    Fault(
+        "loops: dropped symbols are lost",
+        _TUBES, "AffineSet.promoted", "(radius + more) * (1.0 + 2.0 * gamma(len(gone) + 4))", "radius", _SETS,
+    ),
+    Fault(
+        "loops: a clip is taken for a straight line",
+        _TUBES, "clipped", "slope * raw.radius + half + 8.0 * UNIT64 * size", "slope * raw.radius", _CLIP,
+    ),
+    Fault(
+        "loops: disturbances are left out",
+        _TUBES, "Reacher._advanced", "law.radius + wide + added", "law.radius + added", _RUNS,
+    ),
+    Fault(
+        "loops: a run's margin has the wrong side",
+        _LOOP, "Face.exact", "sum(terms, start=Fraction(0)) - Fraction(self.offset)",
+        "Fraction(self.offset) - sum(terms, start=Fraction(0))", _VERDICTS,
+    ),
+)

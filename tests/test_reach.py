@@ -1,0 +1,335 @@
+"""A network in the loop: tubes hold every run, exactly; what goes wrong is found; bad files are refused."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from fractions import Fraction
+from pathlib import Path
+from typing import Any
+
+import mpmath
+import numpy as np
+import pytest
+
+from ns_abstract.demo.approach import write_network
+from ns_abstract.geometry.box import ParameterBox
+from ns_abstract.io.errors import InputError
+from ns_abstract.reach.dynamics import Dynamics, Floats, affine, double_integrator, unicycle
+from ns_abstract.reach.loop import Face, Loop, parse_loop
+from ns_abstract.reach.search import LoopSearch, first_outside, pushes, simulate
+from ns_abstract.reach.tubes import AffineSet, Controls, Dependence, Pilot, Reacher, clipped
+from ns_abstract.verify.cells import Grid
+from ns_abstract.verify.model import NetworkModel
+from ns_abstract.verify.network import load_network
+
+SIDE = 2
+RNG = np.random.default_rng(3)
+LAWS: dict[str, Dynamics] = {
+    "affine": affine(RNG.normal(size=(3, 3)), RNG.normal(size=(3, 2)), RNG.normal(size=3)),
+    "unicycle": unicycle(0.1, None),
+    "unicycle at one speed": unicycle(0.1, 0.7),
+    "double integrator": double_integrator(0.1, 2, 0.3, 0.0),
+    "double integrator with quadratic drag": double_integrator(0.1, 2, 0.3, 0.8),
+}
+
+
+class Exact(Floats):
+    """High precision."""
+
+    @staticmethod
+    def cos_sin(angle: Any) -> tuple[Any, Any]:
+        return mpmath.cos(angle), mpmath.sin(angle)
+
+
+@pytest.mark.parametrize("name", LAWS)
+@pytest.mark.parametrize("width", [0.0, 1e-9, 0.1, 3.0])
+def test_a_step_is_enclosed(name: str, width: float) -> None:
+    """The exact step and the one in float64 lie in the enclosure, without a tolerance."""
+    law, rng = LAWS[name], np.random.default_rng(1)
+    n = law.states
+    with mpmath.workprec(300):
+        for scale in (1e-3, 1.0, 1e4):
+            middle = scale * rng.normal(size=n + law.controls)
+            half = width * scale * rng.uniform(0.0, 1.0, n + law.controls)
+            low, high = middle - half, middle + half
+            found = law.enclose(low, high)
+            assert np.isfinite(found.radius).all()
+            for k in range(25):
+                z = np.where(rng.random(len(low)) < 0.5, low, high) if k < 5 else rng.uniform(low, high)
+                z = np.clip(z, low, high)
+                exact = law.law([mpmath.mpf(v) for v in z[:n]], [mpmath.mpf(v) for v in z[n:]], Exact)
+                place = [
+                    (mpmath.mpf(v) - mpmath.mpf(m)) / mpmath.mpf(h) if h else mpmath.mpf(0)
+                    for v, m, h in zip(z, found.middle, found.half, strict=True)
+                ]
+                for row, values in enumerate(zip(exact, law.step(z[:n], z[n:]), strict=True)):
+                    line = mpmath.mpf(found.center[row])
+                    for slope, at in zip(found.slopes[row], place, strict=True):
+                        line += mpmath.mpf(slope) * at
+                    for value in values:
+                        assert abs(mpmath.mpf(value) - line) <= mpmath.mpf(found.radius[row])
+
+
+def exactly(values: np.ndarray) -> list[Fraction]:
+    return [Fraction(float(v)) for v in values]
+
+
+def test_affine_sets_hold_their_images() -> None:
+    """Maps, hulls and order reduction against exact arithmetic."""
+    rng = np.random.default_rng(2)
+    for scale in (1e-9, 1.0, 1e8):
+        n, q, rows = 3, 70, 2
+        values = AffineSet(rng.normal(size=n), scale * rng.normal(size=(n, q)), scale * rng.random(n), 2)
+        matrix, offset = rng.normal(size=(rows, n)), rng.normal(size=rows)
+        image, (low, high), fewer = values.mapped(matrix, offset), values.hull(), values.promoted()
+        assert fewer.generators.shape[1] <= 64 and (fewer.generators[:, :2] == values.generators[:, :2]).all()
+        reduced_low, reduced_high = fewer.hull()
+        for _ in range(20):
+            s, e = rng.choice([-1.0, 1.0], q), values.radius * rng.choice([-1.0, 1.0], n)
+            x = [
+                Fraction(float(values.center[i]))
+                + sum(a * b for a, b in zip(exactly(values.generators[i]), exactly(s), strict=True))
+                + Fraction(float(e[i]))
+                for i in range(n)
+            ]
+            for i in range(n):
+                assert Fraction(float(low[i])) <= x[i] <= Fraction(float(high[i]))
+                assert Fraction(float(reduced_low[i])) <= x[i] <= Fraction(float(reduced_high[i]))
+            for i in range(rows):
+                y = sum(a * b for a, b in zip(exactly(matrix[i]), x, strict=True)) + Fraction(float(offset[i]))
+                line = sum(a * b for a, b in zip(exactly(image.generators[i]), exactly(s), strict=True))
+                assert abs(y - line - Fraction(float(image.center[i]))) <= Fraction(float(image.radius[i]))
+
+
+def test_a_clip_is_enclosed() -> None:
+    rng = np.random.default_rng(4)
+    for _ in range(300):
+        slopes, center, radius = rng.normal(size=(1, 2)), rng.normal(size=1), rng.random(1)
+        spread = np.abs(slopes).sum() + radius
+        raw = Controls(slopes, center, radius, center - 1.01 * spread, center + 1.01 * spread)
+        ends = np.sort(2.0 * rng.normal(size=2))
+        found = clipped(raw, ends[:1], ends[1:] if rng.random() < 0.8 else np.array([np.inf]))
+        for _ in range(10):
+            q, e = rng.uniform(-1.0, 1.0, 2), radius[0] * rng.choice([-1.0, 0.3, 1.0])
+            z = sum((a * b for a, b in zip(exactly(slopes[0]), exactly(q), strict=True)), Fraction(float(center[0])))
+            z += Fraction(float(e))
+            top = ends[1] if found.upper[0] <= ends[1] else np.inf
+            u = max(z, Fraction(float(ends[0])))
+            u = u if top == np.inf else min(u, Fraction(float(top)))
+            line = sum((a * b for a, b in zip(exactly(found.slopes[0]), exactly(q), strict=True)), Fraction(0))
+            assert abs(u - line - Fraction(float(found.center[0]))) <= Fraction(float(found.radius[0]))
+            assert Fraction(float(found.lower[0])) <= u <= Fraction(float(found.upper[0]))
+
+
+# ---------------------------------------------------------------- loops without a renderer
+
+
+class Wall:
+    """Pictures that fade with the pose: ``0.5 + 0.3 a . sin(v)``, bounded by Taylor's formula."""
+
+    def __init__(self, loop: Loop) -> None:
+        self.pose_set = loop.camera.poses((SIDE, SIDE))
+        self.slopes = np.random.default_rng(0).normal(size=(SIDE, SIDE, 3, len(loop.camera.names))) * 0.2
+
+    def image(self, values: np.ndarray) -> np.ndarray:
+        return (0.5 + 0.3 * self.slopes @ np.sin(values)).astype(np.float32)
+
+    def sets(self, box: ParameterBox) -> tuple[tuple[np.ndarray, ...], np.ndarray, np.ndarray, np.ndarray]:
+        middle, half = box.middle, 0.5 * (np.array(box.upper) - np.array(box.lower))
+        a = 0.3 * self.slopes * (np.cos(middle) * half)
+        b = 0.5 + 0.3 * self.slopes @ np.sin(middle)
+        room = 0.3 * np.abs(self.slopes) @ (0.5 * half**2) * 1.0001 + 1e-6
+        spread = np.abs(a).sum(axis=-1) + room
+        return (a, b - room, a, b + room), b - spread, b + spread, np.abs(a).mean(axis=(0, 1, 2))
+
+
+def specification(kind: str, gain: float = -2.0) -> dict[str, Any]:
+    """A loop of two controls that are driven by two estimates."""
+    laws = {
+        "affine": ({"type": "affine", "A": [[1.0, 0.0, 0.0], [0.0, 1.0, 0.1], [0.0, 0.0, 0.9]],
+                    "B": [[0.1, 0.0], [0.0, 0.1], [0.0, 0.05]], "c": [0.01, 0.0, 0.0]}, 3),
+        "unicycle": ({"type": "unicycle"}, 3),
+        "double integrator": ({"type": "double integrator", "axes": 2, "drag": 0.5, "quadratic_drag": 0.4}, 4),
+    }  # fmt: skip
+    dynamics, n = laws[kind]
+    names = ["p", "q", "r", "s"][:n]
+    return {
+        "version": 1,
+        "state": names,
+        "initial": {name: [-0.05, 0.05] for name in names} | {"r": 0.01},
+        "steps": 20,
+        "sampling_time": 0.1,
+        "dynamics": dynamics,
+        "disturbance": {"p": 0.001},
+        "camera": {
+            "camera_to_world": np.eye(4).tolist(),
+            "position": {"matrix": np.eye(3, n).tolist()},
+            "yaw": {"offset": 0.1, "row": [0.0, 0.5, 0.0, 0.0][:n]},
+        },
+        "network": "net.onnx",
+        "control": {"gain": [[gain, 0.0], [0.0, gain]], "goal": [0.02, -0.01], "clip": [[-0.5, 0.4], [-0.4, 0.5]]},
+        "unsafe": [{"box": {"p": [0.9, None]}}, {"half_space": {"normal": [-1.0] + [0.0] * (n - 1), "at_least": 0.9}}],
+        "goal": {"box": {"p": [-0.8, 0.8]}, "when": "end"},
+    }
+
+
+def reacher(folder: Path, value: dict[str, Any], dependence: Dependence = "kept") -> Reacher:
+    loop = parse_loop(value, folder)
+    wall, rng = Wall(loop), np.random.default_rng(6)
+    states = rng.uniform(-0.2, 0.2, (200, len(loop.names)))
+    images = np.stack([np.moveaxis(wall.image(loop.camera.values(x)), -1, 0).ravel() for x in states])
+    known = np.concatenate([images, np.ones((len(images), 1))], axis=1)
+    last = np.linalg.lstsq(known, states[:, :2], rcond=1e-3)[0].T
+    # pictures are not negative, so that the hidden layer is open
+    write_network(folder / "net.onnx", [np.eye(12), np.zeros(12), last[:, :-1], last[:, -1]], SIDE)
+    model = NetworkModel(load_network(loop.network), loop.preprocess, 1 << 28)
+    return Reacher(loop, wall, Pilot(model, loop.control), dependence)
+
+
+@pytest.mark.parametrize("kind", ["affine", "unicycle", "double integrator"])
+def test_tubes_hold_every_run(tmp_path: Path, kind: str) -> None:
+    """More than 1000 simulated states by law of motion, in tubes of every kind, without a tolerance."""
+    value = specification(kind)
+    modes: tuple[Dependence, ...] = ("kept", "step", "none")
+    found = {mode: reacher(tmp_path, value, mode) for mode in modes}
+    loop, box = found["kept"].loop, found["kept"].loop.box
+    tubes = {mode: entry.tube(box, whole=True) for mode, entry in found.items()}
+    rng, states = np.random.default_rng(7), 0
+    for start in [*box.corners()[:20], *box.sample(60, rng)]:
+        run = simulate(found["kept"], loop.state(box, start), pushes(loop, rng, "ends" if states % 2 else "random"))
+        for mode, tube in tubes.items():
+            assert first_outside(tube, run) is None, mode
+        # not only in the box, but where its initial state says
+        entry = tubes["kept"].sets[-1]
+        if not tubes["kept"].reason:
+            first, x0 = run.states[0], AffineSet.box(loop.lower, loop.upper)
+            free = np.flatnonzero(loop.lower < loop.upper)
+            p = [
+                (Fraction(first[k]) - Fraction(x0.center[k])) / Fraction(x0.generators[k, j])
+                for j, k in enumerate(free)
+            ]
+            for k, value in enumerate(exactly(run.states[-1])):
+                line = sum(a * b for a, b in zip(exactly(entry.generators[k]), p, strict=False))
+                rest = sum(map(abs, exactly(entry.generators[k, entry.first :])))
+                assert abs(value - line - Fraction(entry.center[k])) <= rest + Fraction(entry.radius[k])
+        states += len(run.states)
+    assert states > 1000
+    last = {mode: np.subtract(*tube.sets[-1].hull()[::-1]).max() for mode, tube in tubes.items() if not tube.reason}
+    assert last["kept"] < last.get("step", np.inf) and last["kept"] < 0.7 * last.get("none", np.inf)
+
+
+def examined(search: LoopSearch, number: int, most: int = 60) -> list[Any]:
+    """All leaves of a search, in the order of the cells."""
+    box = search.loop.box
+    grid = Grid.adaptive(box, [1] * box.dimensions)
+    blocks, leaves = [tuple(grid.roots())], []
+    while blocks and most:
+        found = search.examine(number, grid, blocks.pop(0))
+        leaves += found.leaves
+        blocks += found.blocks
+        most -= 1
+    return leaves
+
+
+def test_a_good_controller_is_certified_and_a_bad_one_falsified(tmp_path: Path) -> None:
+    value = specification("affine")
+    value["initial"] = {"p": [-0.02, 0.02], "q": 0.0, "r": 0.0}
+    for number in (0, 1):
+        good = examined(LoopSearch(reacher(tmp_path, value)), number)
+        assert good and {leaf.verdict for leaf in good} == {"certified"}
+    wrong = value | {"unsafe": [{"box": {"q": [0.001, None]}}, {"box": {"q": [None, -0.001]}}]}
+    bad = examined(LoopSearch(reacher(tmp_path, wrong)), 0)
+    assert bad and {leaf.verdict for leaf in bad} == {"falsified"}
+    assert all(leaf.margin <= 0.0 and leaf.counterexample is not None for leaf in bad)
+
+
+def test_what_is_not_finite_is_never_safe(tmp_path: Path) -> None:
+    value = specification("affine")
+    value["dynamics"]["A"] = (1e15 * np.ones((3, 3))).tolist()
+    value["steps"] = 40
+    value["camera"] = value["camera"] | {"position": {"offset": [0.0] * 3, "matrix": (1e-15 * np.eye(3)).tolist()}}
+    value["unsafe"], value["initial"] = [{"box": {"q": [1e308, None]}}], {"p": [-1.0, 1.0], "q": 0.0, "r": 0.0}
+    leaves = examined(LoopSearch(reacher(tmp_path, value)), 0, most=3)
+    assert not any(leaf.verdict == "certified" for leaf in leaves)
+
+
+def test_a_face_is_exact() -> None:
+    assert Face((1.0, -1.0), 0.1).exact([0.3, 0.2]) == Fraction(0.3) - Fraction(0.2) - Fraction(0.1)
+    assert Face((1.0,), 0.1).exact([0.1]) == 0
+
+
+# ---------------------------------------------------------------- LOOP.json
+
+
+def change(path: str, value: Any) -> Callable[[dict[str, Any]], None]:
+    def apply(whole: dict[str, Any]) -> None:
+        *rest, last = path.split(".")
+        for key in rest:
+            whole = whole[int(key)] if isinstance(whole, list) else whole[key]
+        if isinstance(whole, list):
+            whole[int(last)] = value
+        else:
+            whole[last] = value
+
+    return apply
+
+
+HOSTILE: dict[str, tuple[str, Any]] = {
+    "version": ("version", 2),
+    "unknown": ("surprise", 1),
+    "state": ("state", ["p", "p", "r"]),
+    "state ": ("state", []),
+    "initial": ("initial", {"p": [0, 1]}),
+    "initial.p": ("initial.p", [1, 0]),
+    "initial.p ": ("initial.p", [0, 1e200]),
+    "steps": ("steps", 10**9),
+    "steps ": ("steps", True),
+    "sampling_time": ("sampling_time", 0),
+    "dynamics": ("dynamics", 3),
+    "dynamics.type": ("dynamics.type", "teleport"),
+    "dynamics.A": ("dynamics.A", [[1, 2], [3, 4]]),
+    "dynamics.B": ("dynamics.B", [[], [], []]),
+    "dynamics.B ": ("dynamics.B", np.ones((3, 7)).tolist()),
+    "dynamics.c": ("dynamics.c", [0, 0, "x"]),
+    "disturbance.p": ("disturbance.p", -1),
+    "camera": ("camera", []),
+    "camera.camera_to_world": ("camera.camera_to_world", [[1, 0], [0, 1]]),
+    "camera.camera_to_world ": ("camera.camera_to_world", (2.0 * np.eye(4)).tolist()),
+    "camera.fov": ("camera.fov", 180),
+    "camera.position.matrix": ("camera.position.matrix", [[1, 2, 3]]),
+    "camera.yaw.row": ("camera.yaw.row", [1]),
+    "network": ("network", "../net.onnx"),
+    "network ": ("network", 7),
+    "control.gain": ("control.gain", [[1.0]]),
+    "control.goal": ("control.goal", [1.0]),
+    "control.clip[0]": ("control.clip.0", [1, -1]),
+    "unsafe": ("unsafe", {}),
+    "unsafe[0]": ("unsafe.0", {"box": {}, "half_space": {}}),
+    "unsafe[0].box.p": ("unsafe.0.box.p", [None, None]),
+    "unsafe[1].half_space.normal": ("unsafe.1.half_space.normal", [0, 0, 0]),
+    "goal.when": ("goal.when", ["end"]),
+    "goal.box": ("goal.box", {}),
+}
+
+
+@pytest.mark.parametrize("field", HOSTILE)
+def test_a_bad_file_is_refused_by_field(tmp_path: Path, field: str) -> None:
+    value = json.loads(json.dumps(specification("affine")))
+    path, wrong = HOSTILE[field]
+    change(path, wrong)(value)
+    with pytest.raises(InputError) as caught:
+        parse_loop(value, tmp_path)
+    named = caught.value.field or ""
+    assert caught.value.fix
+    # the field itself, or one inside or around it
+    first = field.strip()
+    assert first == "unknown" or named.split("[")[0].split(".")[0] == first.split("[")[0].split(".")[0]
+
+
+def test_nothing_asked_is_refused(tmp_path: Path) -> None:
+    value = specification("affine")
+    value.pop("goal")
+    value["unsafe"] = []
+    with pytest.raises(InputError, match="unsafe"):
+        parse_loop(value, tmp_path)
