@@ -529,7 +529,7 @@ def test_dask_worker_killed(planted: Case, finished: Path, tmp_path: Path) -> No
                 killed = True
                 os.kill(next(iter(client.run(os.getpid).values())), signal.SIGKILL)
             for number, findings in engine.collect(0.5):
-                assert store.settle(flying.pop(number), findings, grid)
+                assert store.close_block(flying.pop(number), findings, grid)
         engine.close()
     assert killed
     store.close()

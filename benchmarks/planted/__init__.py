@@ -4,8 +4,11 @@ from planted.certificates import CERTIFICATES
 from planted.depths import DEPTHS
 from planted.fault import Fault, apply
 from planted.fields import FIELDS
+from planted.forms import FORMS
 from planted.polynomials import POLYNOMIALS
+from planted.splats import SPLATS
+from planted.verdicts import VERDICTS
 
-FAULTS = (*POLYNOMIALS, *FIELDS, *CERTIFICATES, *DEPTHS)
+FAULTS = (*FORMS, *POLYNOMIALS, *FIELDS, *VERDICTS, *CERTIFICATES, *SPLATS, *DEPTHS)
 
 __all__ = ["FAULTS", "Fault", "apply"]

@@ -16,8 +16,8 @@ DEPTHS = (
     Fault(
         "depth: the coordinate's own rounding is not charged",
         _BOUNDS, "SplatBounds._depths",
-        "self.charges.camera_coordinate * ((sizes + spread + poses.camera_reach) @ reach) + spread @ reach",
-        "spread @ reach", _ATTACK + "[one pose-classic-1.4.0]", compiled=True,
+        "self.charges.camera_coordinate * ((sizes + spread + poses.camera_magnitude) @ most) + spread @ most",
+        "spread @ most", _ATTACK + "[one pose-classic-1.4.0]", compiled=True,
     ),
     Fault(
         "depth: what all depths have in common is forgotten",

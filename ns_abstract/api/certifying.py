@@ -191,7 +191,7 @@ class CertificateRun:
                 if findings is None:
                     continue
                 self._keep_images(store, block, findings)
-                store.settle(block, findings, self.grids[block.frame])
+                store.close_block(block, findings, self.grids[block.frame])
                 finished += 1
             now = time.perf_counter()
             if now - traced >= _TRACE:

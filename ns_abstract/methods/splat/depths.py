@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
-from ns_abstract.arithmetic.rounding import UNIT64
+from ns_abstract.arithmetic.rounding import FRAGMENT_ROUNDING, UNIT64, UP
 from ns_abstract.arithmetic.simd.intrinsics import advanced
 from ns_abstract.arithmetic.simd.lanes import maximum, minimum, store
 from ns_abstract.methods.splat.blend import blend_affine, blend_quadratic, form_range
@@ -21,8 +21,6 @@ from ns_abstract.methods.splat.block import (
     FORM,
     OPEN,
     RHO,
-    ROUND,
-    UP,
     color_ends,
     color_size,
     listed_fragment,
@@ -35,7 +33,7 @@ _SUM, DEPTH = 0, 3
 ACCUMULATION_LOW, ACCUMULATION_HIGH, DEPTH_LOW, DEPTH_HIGH = range(4)
 
 
-class _Reach(NamedTuple):
+class _Span(NamedTuple):
     """Depths of a pixel's fragments against the reference, and without it.
 
     Attributes:
@@ -69,7 +67,7 @@ def _set_reference(begin, end, fragments, palette, reference, m):
 
 @njit(cache=True, error_model="numpy", forceinline=True)
 def _shift_depths(begin, end, block, reference, m):
-    """Fill the palette ``block.shifted`` for a pixel's fragments: depths against the reference, and 1; its `_Reach`.
+    """Fill the palette ``block.shifted`` for a pixel's fragments: depths against the reference, and 1; its `_Span`.
 
     What reordering changes in colours is taken out of their rows of moves.
     """
@@ -86,7 +84,7 @@ def _shift_depths(begin, end, block, reference, m):
             change = coefficient - reference[k]
             shifted[key + 4 * k + DEPTH] = change
             # the difference's rounding
-            radius += ROUND * (abs(coefficient) + abs(reference[k]))
+            radius += FRAGMENT_ROUNDING * (abs(coefficient) + abs(reference[k]))
             spread += abs(change) if k > 0 else 0.0
         shifted[key + 4 * forms + DEPTH] = radius
         spread = (spread + radius) * UP
@@ -100,7 +98,7 @@ def _shift_depths(begin, end, block, reference, m):
             for lane in range(DEPTH):
                 moves[move + lane] = 0.0
                 moves[move + 4 + lane] = 0.0
-    return _Reach(nearest, farthest, largest)
+    return _Span(nearest, farthest, largest)
 
 
 @njit(cache=True, error_model="numpy", forceinline=True)
@@ -116,7 +114,7 @@ def _range(polynomial, order, m):
         if slope < 2.0 * abs(bend):
             vertex = middle - 0.25 * slope * slope / bend
             low, high = min(low, vertex), max(high, vertex)
-    room = 8.0 * ROUND * (abs(middle) + size)
+    room = 8.0 * FRAGMENT_ROUNDING * (abs(middle) + size)
     return low - room, high + room
 
 
@@ -139,7 +137,7 @@ def _weighted_mean(t, radius, low, high, total_low, total_high, order, m):
     room = 0.0
     for k in range(m):
         room += abs(t[k]) + 2.0 * factor * abs(t[m + k])
-    off = (off + factor * radius) * UP + ROUND * (room + factor * max(abs(low), abs(high)))
+    off = (off + factor * radius) * UP + FRAGMENT_ROUNDING * (room + factor * max(abs(low), abs(high)))
     return max(first_low, other_low - off), min(first_high, other_high + off)
 
 
@@ -150,7 +148,7 @@ def shade_layers(left, above, block, inputs, bounds):
     Reads the depths in lane `DEPTH` of the palette, and changes rows of moves, which are of no use afterwards.
     """
     fragments, moves, t = block.fragments, block.reordering.moves, block.sums
-    lanes, charges, cutoffs = fragments.lanes, inputs.charges, inputs.cutoffs
+    per_pixel, charges, cutoffs = fragments.per_pixel, inputs.charges, inputs.cutoffs
     order, m = inputs.shape.order, inputs.shape.monomials
     common, unseen = inputs.colors.common, block.palette.unseen
     # behind the polynomials: ends and radii by lane, the reference, two polynomials of the result
@@ -163,7 +161,7 @@ def shade_layers(left, above, block, inputs, bounds):
         begin, n = q * fragments.capacity, int(fragments.lengths[q])
         end = begin + n
         _set_reference(begin, end, fragments, block.palette, reference, m)
-        reach = _shift_depths(begin, end, block, reference, m)
+        span = _shift_depths(begin, end, block, reference, m)
         if order == 2:
             r, ends = blend_quadratic(begin, end, fragments, block.shifted, moves, t)
         else:
@@ -175,9 +173,9 @@ def shade_layers(left, above, block, inputs, bounds):
         store(by_lane, 8, r)
         rounding = 1.01 * (charges.blend_fragment * n + charges.blend_pixel)
         # light that is lost to a stop that was ignored, and that comes to what is missing (B6)
-        lost = lanes[RHO + q] * (1.0 + charges.lost_light)
-        passed = lanes[OPEN + q] * (1.0 + charges.lost_light)
-        nearest, farthest, largest = reach.nearest, reach.farthest, reach.largest
+        lost = per_pixel[RHO + q] * (1.0 + charges.lost_light)
+        passed = per_pixel[OPEN + q] * (1.0 + charges.lost_light)
+        nearest, farthest, largest = span.nearest, span.farthest, span.largest
         shift_low, shift_high = _range(reference, order, m)
         if passed > 0.0:
             nearest = min(nearest, unseen[DEPTH] - shift_high)
@@ -227,7 +225,7 @@ def shade_layers(left, above, block, inputs, bounds):
         off = error / total_low * UP
         low, high = max(low, shift_low + nearest - off), min(high, shift_high + farthest + off)
         size = max(abs(low), abs(high))
-        off = common[m] + charges.expected_depth * size + 16.0 * ROUND * (all_of_it + size)
+        off = common[m] + charges.expected_depth * size + 16.0 * FRAGMENT_ROUNDING * (all_of_it + size)
         low, high = low - off, high + off
         known = low <= high and math.isfinite(high - low)
         layers[DEPTH_LOW], layers[DEPTH_HIGH] = max(low if known else 0.0, 0.0), high if known else np.inf
