@@ -84,7 +84,7 @@ def pictures(snapshot: Snapshot | None, height: int, width: int, depth: bool = F
         least, most = snapshot.witness_lower, snapshot.witness_upper
     gaps = [np.linalg.norm(high - low, axis=-1, keepdims=True) for low, high in ((lower, upper), (least, most))]
     found = [resampled(torch.from_numpy(image), height, width) for image in (lower, upper, *gaps)]
-    named = dict(zip(OUTPUTS, found, strict=True))
+    named: dict[str, torch.Tensor] = dict(zip(OUTPUTS, found, strict=True))
     if depth:
         known = None if snapshot is None else snapshot.depth
         ends = np.array([[[0.0]], [[_FAR]]], np.float32) if known is None else np.minimum(known, np.float32(_FAR))
