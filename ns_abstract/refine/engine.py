@@ -306,7 +306,7 @@ class Refinement:
         last = part.last & (~part.first | (self.random.random(box.dimensions) < 0.5))
         return np.where(last, box.upper, np.where(part.first, box.lower, box.middle))
 
-    def _settle(self, tiles: np.ndarray, changes: dict[int, _Change] | None = None) -> None:
+    def _update_outer(self, tiles: np.ndarray, changes: dict[int, _Change] | None = None) -> None:
         """Update the outer bound of ``tiles``, given what has changed since the round began."""
         for t in tiles:
             self.outer_lower[t], self.outer_upper[t] = self.tiles[t].outer(None if changes is None else changes[t])
@@ -444,7 +444,7 @@ class Refinement:
         told = [numbers for numbers in elements if numbers is not None]
         if len(told) == len(elements):
             self.shown = np.unique(np.concatenate(told))
-        self._settle(everything)
+        self._update_outer(everything)
         self._record(1.0)
         return True
 
@@ -544,7 +544,7 @@ class Refinement:
                 fresh.update(rows)
                 # by number, not by time: where a round ends must not depend on the machine
                 if (number + 1) % look == 0 and number + 1 < len(jobs):
-                    self._settle(np.array(sorted(fresh), np.int64), changes)
+                    self._update_outer(np.array(sorted(fresh), np.int64), changes)
                     fresh.clear()
                     if self.goal.met(self._record(1.0)):
                         break
@@ -552,7 +552,7 @@ class Refinement:
                 return
             for t, change in changes.items():
                 self.tiles[t].replace(change)
-            self._settle(np.array(sorted(changes), np.int64))
+            self._update_outer(np.array(sorted(changes), np.int64))
 
     def _choose(self) -> tuple[list[tuple[_Cell, dict[int, int]]], int]:
         """The cells to split in the next round, each with its row by tile, and into how many parts."""
