@@ -2,7 +2,9 @@
 
 Only what the format's users write is read: ``declare-const``, and ``assert`` of ``<=``, ``>=``, ``and``,
 ``or`` over bounds of single inputs and linear expressions of the outputs. In certificates of scenes bounds of the
-inputs are set aside: the images take their place. Numbers that overflow or vanish on the way are refused, and constraints with huge or tiny
+inputs are set aside: the images take their place.
+
+Numbers that overflow or vanish on the way are refused, and constraints with huge or tiny
 factors are multiplied by powers of two, which changes no sign: no overflow may become a verdict.
 """
 
@@ -165,7 +167,7 @@ def _bound(constraint: _Linear, ends: np.ndarray) -> bool:
         raise InputError(
             "a constraint joins several inputs, or inputs and outputs", fix="assert bounds of single inputs"
         )
-    (key, value), index = used[0], -1 - used[0][0]
+    value, index = used[0][1], -1 - used[0][0]
     limit = -constant / value
     side = 1 if value > 0.0 else 0
     if abs(value) != 1.0:

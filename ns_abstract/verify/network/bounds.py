@@ -1,4 +1,4 @@
-"""Bounds of a network's outputs over sets of images (docs/design.md, N, N1, N2, N6, N0)."""
+"""Bounds of a network's outputs over sets of images (docs/design.md, N, N0, N1, N2, N6, N12)."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from ns_abstract.execution.ending import checkpoint
 from ns_abstract.verify.network.graph import Network, NetworkArithmetic
 from ns_abstract.verify.network.layers import Activation, LeakyRelu, Linear, Scale, Sum
 from ns_abstract.verify.network.maxima import Candidates, MaxPool, upper_planes
@@ -35,6 +36,8 @@ _OVERFLOW = 2.0**126
 #: So many open numbers of a node are tightened only if some of them gain by it: if not so large a part of these
 #: keeps so large a part of its width.
 _MANY, _SOME, _GAIN = 1024, 64, 0.95
+#: Signs of many units are given up if so few of some are found out, and so many of the layer before were not.
+_UNSURE = 0.25
 #: Differences in windows are bounded by rows if so large a part of those tried first is decided by it.
 _CLOSES = 0.1
 #: Room for rounding of lines relative to references and sizes.
@@ -222,6 +225,8 @@ class _Cells:
         self.folded: set[int] = set()
         #: what rows may stop at
         self.stops: dict[int, _Planes] = {}
+        #: part of the latest ReLU's inputs whose signs have not been found out
+        self.unsure = 0.0
         self.last = self._forward()
         if substitution == "end":
             self._planes(fields, "everywhere")
@@ -303,6 +308,8 @@ class _Cells:
                 open_ = node.layer.open(*inputs[0].interval)
                 decides = isinstance(node.layer, LeakyRelu)
                 forms[source] = inputs[0] = self._tighten(source, inputs[0], open_, decides)
+                if decides:
+                    self.unsure = float(node.layer.open(*inputs[0].interval).double().mean())
                 forms.append(self._activate(k, source, node.layer, inputs[0]))
                 if self.network.depth[source] > 1:
                     self.stops[source] = self._stop(source, inputs[0])
@@ -500,10 +507,13 @@ class _Cells:
 
             known = Candidates(
                 inside,
-                *(gathered(v) for v in (x.reference, x.c, x.r)),
-                torch.stack([gathered(x.a[:, i]) for i in range(self.d)], 2),
-                *(gathered(v) for v in interval),
-                winner[:, :, 0][at],
+                reference=gathered(x.reference),
+                middle=gathered(x.c),
+                radius=gathered(x.r),
+                slopes=torch.stack([gathered(x.a[:, i]) for i in range(self.d)], 2),
+                lower=gathered(interval.lower),
+                upper=gathered(interval.upper),
+                winner=winner[:, :, 0][at],
             )
             apart = self._apart(source, layer, part, known)
             row = torch.arange(len(part))
@@ -636,6 +646,10 @@ class _Cells:
             widths = [(f.upper - f.lower).reshape(open_.shape)[some] for f in (before, found)]
             if bool((widths[1] > _GAIN * widths[0]).double().mean() > _GAIN):
                 return found
+            lower, upper = (v.reshape(open_.shape)[some] for v in found.interval)
+            if decides and self.unsure > _UNSURE and float(((lower < 0.0) & (upper > 0.0)).double().mean()) > _GAIN:
+                # hardly any sign is found out, nor was it in the layer before: what follows is not worth it
+                return found
             form, open_ = found, open_ & ~first
             where = open_.nonzero().numpy()
         cell, flat = where[:, 0], np.ravel_multi_index(tuple(where[:, 1:].T), shape)
@@ -700,6 +714,7 @@ class _Cells:
 
     def _descend(self, start: int, at: int, batch: _Batch, found: _Reached, need: Float64 | None) -> None:
         """Pass a batch from node ``at`` on to the image."""
+        checkpoint()
         while at > 0:
             if at not in batch.waiting:
                 at -= 1

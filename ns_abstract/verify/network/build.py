@@ -183,9 +183,7 @@ class Builder:
             # rows of windows, then their columns: fewer pairs of numbers
             x = self.max_pool(x, (kernel[0], 1), (stride[0], 1), (dilation[0], 1), (pads[0], 0, pads[2], 0))
             return self.max_pool(x, (1, kernel[1]), (1, stride[1]), (1, dilation[1]), (0, pads[1], 0, pads[3]))
-        layer = MaxPool(
-            (self.shape(x),), (channels, *size), tuple(kernel), tuple(stride), tuple(dilation), tuple(pads)
-        )
+        layer = MaxPool((self.shape(x),), (channels, *size), tuple(kernel), tuple(stride), tuple(dilation), tuple(pads))
         self._check_size(layer.shape)
         # the largest taps of a window at a time, and their places
         self.reserve(float(np.prod(kernel)) * size[0] * size[1])

@@ -58,7 +58,8 @@ class MaxPool:
     @property
     def overlaps(self) -> int:
         """Windows that one number may be in."""
-        return int(np.prod([k if d > 1 else -(-k // s) for k, s, d in zip(self.kernel, self.stride, self.dilation)]))
+        axes = zip(self.kernel, self.stride, self.dilation, strict=True)
+        return int(np.prod([k if d > 1 else -(-k // s) for k, s, d in axes]))
 
     def taps(self, x: Tensor, padding: float) -> Tensor:
         """[m, C, K, windows] the numbers of every window, for maps [m, C, H, W]."""
