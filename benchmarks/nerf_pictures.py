@@ -1,4 +1,4 @@
-"""Pictures of a splat run for `train_lego.py`, made by the CPU renderer: a NeRF of the same scene can be trained on them.
+"""Pictures of a splat run for `train_lego.py`, by the CPU renderer: a NeRF of the same scene can be trained on them.
 
     python benchmarks/nerf_pictures.py RUN/config.yml CAMERA_PATH.json PICTURES.npz [--views 96 --side 64]
     python benchmarks/train_lego.py PICTURES.npz RUNS --name NAME --layers 4 --width 64 --skip 2 --head-width 32 \

@@ -104,9 +104,7 @@ def main() -> None:
     directions /= np.linalg.norm(directions, axis=-1, keepdims=True)
     origins = np.repeat(poses[~held, None, :3, 3], len(grid), axis=1)
     colors = images[~held].reshape(len(directions), -1, 4) / 255.0
-    d, o, c = (
-        torch.from_numpy(a.reshape(-1, a.shape[-1])).float().to(device) for a in (directions, origins, colors)
-    )
+    d, o, c = (torch.from_numpy(a.reshape(-1, a.shape[-1])).float().to(device) for a in (directions, origins, colors))
     bright = torch.nonzero(torch.from_numpy(images[~held].reshape(-1, 4)[:, 3] > 0)).ravel()
     network = NerfNetwork(options.layers, options.width, options.skip, 2, options.head_width).to(device)
     unused = (torch.arange(60) % 10 >= options.frequencies).nonzero().ravel().to(device)

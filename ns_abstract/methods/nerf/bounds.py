@@ -305,9 +305,7 @@ class NerfBounds:
             for which in (slice(0, n // 2), slice(n // 2, n)):
                 part = None if aim is None else (aim[0][which], aim[1][which])
                 given = None if known is None else known[which]
-                halves.append(
-                    self.rays(pose_set, box, pixels[which], tolerance, given, part, shifts, given_division)
-                )
+                halves.append(self.rays(pose_set, box, pixels[which], tolerance, given, part, shifts, given_division))
             lower, upper, alpha = (
                 np.concatenate([getattr(half, name) for half in halves]) for name in ("lower", "upper", "alpha")
             )

@@ -41,7 +41,7 @@ def fit_planes(
     """Planes below ``low`` and above ``high`` on every part, and so on their union.
 
     The plane ``a p + b`` lies above the parts with middles c and half-widths h where
-    ``b >= max_k(high_k - a c_k + |a| h_k)``; the right side is convex in a, and the plane's mean over the cell, so it is
+    ``b >= max_k(high_k - a c_k + |a| h_k)``; the right side is convex in a, and the plane's mean over the cell. It is
     made small axis by axis. Whatever the slopes are, the offset is right.
 
     Args:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import itertools
 import math
+import time
 from collections import OrderedDict
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -16,7 +17,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from ns_abstract.arithmetic.rounding import UNIT64
-from ns_abstract.execution.ending import checkpoint
 from ns_abstract.geometry.box import ParameterBox
 from ns_abstract.geometry.poses import COLOR_SHIFTS, PoseSet
 from ns_abstract.methods.nerf.bounds import Division, NerfBounds, Pencil, RayBounds, Shifts
@@ -37,8 +37,6 @@ _SHIFT_PARTS, _SHIFT_FINER = 12, 2
 #: Part of the margin that the width of all pixels may cost; rays are refined down to the first where they cost more
 #: than the second.
 _AIM, _ENOUGH = 0.2, 0.4
-#: A cell whose pixels cost so many times its margin is cut first.
-_HOPELESS = 30.0
 #: Bytes of bounds that are kept.
 _KEPT = 1 << 29
 #: Rays that are bounded to learn how long it takes and how wide cells may be.
@@ -95,6 +93,9 @@ class Strips:
         self._known: OrderedDict[tuple, _Kept] = OrderedDict()
         self._bytes = 0
         self._layout: Layout | None = None
+        self._reach = bounds.reach
+        #: Seconds that a ray takes over a strip of the first level, and how many there are, once some have been tried.
+        self.effort: tuple[float, int] | None = None
 
     # ---------------------------------------------------------------- layout
 
@@ -102,12 +103,16 @@ class Strips:
         """Strips that the network's bounds bear, tried on a few rays in the middle of the set."""
         if self._layout is None:
             tried = self.pixels[np.unique(np.linspace(0, len(self.pixels) - 1, _TRIED).astype(int))]
-            reach = self.bounds.reach
+            reach = self._reach
             for _ in range(_ROUNDS):
                 found = self._cut(reach, tried)
                 strip = self._strip(found.counts, tuple(n // 2 for n in found.counts))
-                checkpoint()
-                learned = self.run([self._call(strip, tried, found, 0, None)])[0].reach
+                learned = reach
+                # one ray first: where not even a few can be done, that tells how long they take
+                for rays in (tried[len(tried) // 2 :][:1], tried):
+                    begin = time.perf_counter()
+                    learned = self.run([self._call(strip, rays, found, 0, None)])[0].reach
+                    self.effort = (time.perf_counter() - begin) / len(rays), math.prod(found.counts)
                 if 0.6 < learned / reach < 1.7:
                     break
                 reach = learned
@@ -244,14 +249,15 @@ class Strips:
         """
         everything = np.arange(len(self.groups))
         linear, lower, upper = self._level_sets(box, 0, everything)
-        weights = None
-        for level in range(1, self.levels(box)):
+        weights, levels = None, self.levels(box)
+        for level in range(1, levels):
             if weights is None:
                 weights = None if weigh is None else weigh()
                 if weights is None:
                     break
             cost = np.add.reduceat((weights * _widths(linear)).sum(axis=1), np.arange(0, len(self.pixels), GROUP))
-            if not _ENOUGH < cost.sum() < _HOPELESS:
+            # what no level can make good is not begun
+            if not _ENOUGH < cost.sum() < TOLERANCES[level - 1] / TOLERANCES[levels - 1]:
                 break
             order = np.argsort(-cost, kind="stable")
             left = cost.sum() - np.cumsum(cost[order])
@@ -280,9 +286,7 @@ class Strips:
             for axis, (count, (first, past)) in enumerate(zip(counts, ranges, strict=True))
         ]
         edges += [
-            ends
-            for ends, name in zip(self._shift_ends(level), COLOR_SHIFTS, strict=True)
-            if name in self.shifting
+            ends for ends, name in zip(self._shift_ends(level), COLOR_SHIFTS, strict=True) if name in self.shifting
         ]
         ends, slack = [], []
         for axis, lines in enumerate(edges):
