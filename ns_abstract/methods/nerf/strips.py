@@ -26,6 +26,8 @@ from ns_abstract.methods.nerf.planes import fit_planes
 GROUP = 8
 #: What an open sample may move a pixel by, by level.
 TOLERANCES = (0.02, 0.005, 0.0012, 3e-4)
+#: Times that, where samples may lie anywhere in their bins: bounds are loose there anyhow.
+_SWEPT = 8.0
 #: Strips by axis from each level to the next: with one parameter, and with more.
 _FINER_LINE, _FINER = 4, 2
 #: Most parts of a strip: with one parameter, and with more.
@@ -127,14 +129,14 @@ class Strips:
             box = self._strip(counts, [n // 2 for n in counts])
             pencil = Pencil(self.geometry, box, pixels, self.bounds.taylor, self.bounds.swept)
             moves = pencil.displacement(self.bounds.distances, self.bounds.lengths)
-            division = self.bounds.division(moves, _PARTS_LINE if d < 2 else _PARTS)
+            division = self.bounds.division(moves, _PARTS_LINE if moves.shape[2] < 2 else _PARTS)
             if division is not None or max(counts, default=_MOST) >= _MOST:
                 break
             widest = np.nan_to_num(moves[..., :d].reshape(-1, d).max(axis=0), nan=np.inf)
             counts[int(np.argmax(widest))] *= 2
         if division is None:
             # nothing is known then
-            division = Division((), d + self.bounds.swept)
+            counts, division = [1] * d, Division((), d + self.bounds.swept)
         return Layout(tuple(counts), division, reach)
 
     def _strip(self, counts: Sequence[int], place: Sequence[int]) -> ParameterBox:
@@ -182,7 +184,8 @@ class Strips:
         self, strip: ParameterBox, pixels: np.ndarray, layout: Layout, level: int, known: np.ndarray | None
     ) -> tuple:
         shifts = self._shifts(level)
-        return self.geometry, strip, pixels, TOLERANCES[level], known, None, shifts, layout.division
+        tolerance = TOLERANCES[level] * (_SWEPT if self.bounds.swept else 1.0)
+        return self.geometry, strip, pixels, tolerance, known, None, shifts, layout.division
 
     def _ensure(self, level: int, place: tuple[int, ...], groups: Sequence[int]) -> list[_Kept]:
         """Bounds of ``groups`` over a strip, those that are missing worked out."""
