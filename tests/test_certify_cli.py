@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import base64
+import hashlib
 import importlib.util
 import json
 import os
@@ -527,7 +529,7 @@ def test_dask_worker_killed(planted: Case, finished: Path, tmp_path: Path) -> No
                 killed = True
                 os.kill(next(iter(client.run(os.getpid).values())), signal.SIGKILL)
             for number, findings in engine.collect(0.5):
-                assert store.settle(flying.pop(number), findings, grid)
+                assert store.close_block(flying.pop(number), findings, grid)
         engine.close()
     assert killed
     store.close()
@@ -620,7 +622,19 @@ def test_page(finished: Path) -> None:
         "not its rounding to 8 bits", "every float32", "worst certified", "cells.sqlite", "How to reproduce",
     ):  # fmt: skip
         assert part in page, part
-    assert not re.search(r"<script|https?://", page)
+    assert "https://" not in page and "http://" not in page
+    # one script, which the policy names by its hash, and its data
+    scripts = re.findall(r"<script([^>]*)>(.*?)</script>", page, re.DOTALL)
+    (_, data), (_, code) = scripts
+    digest = base64.b64encode(hashlib.sha256(code.encode()).digest()).decode()
+    assert f"script-src 'sha256-{digest}'\"" in page and scripts[0][0] == ' type="application/json" id="cell-data"'
+    # every cell can be chosen, and some show a picture
+    found = json.loads(data)
+    chosen = {int(number) for number in re.findall(r'data-cell="(\d+)"', page)}
+    assert chosen == set(range(len(found["cells"]))) and len(chosen) > 3
+    rows = sqlite3.connect(finished / "cells.sqlite").execute("SELECT verdict, margin FROM cells").fetchall()
+    assert sorted((cell[1], cell[4]) for cell in found["cells"]) == sorted(rows)
+    assert found["pictures"] and {cell[6] for cell in found["cells"]} >= set(range(len(found["pictures"])))
 
 
 def test_ring_strip_plane_and_bars() -> None:
@@ -640,7 +654,12 @@ def test_ring_strip_plane_and_bars() -> None:
         ]
 
     frames = [entry(0, "azimuth"), entry(1, "x"), entry(2, "x", "y"), entry(3, "x", "y", "z")]
-    drawn = page._map({"frames": frames}, {k: rows(max(1, k)) for k in range(4)})
+    drawn = page._map({"frames": frames}, {k: rows(max(1, k)) for k in range(4)}, {})
+    assert "data-cell" not in drawn
+    numbers = page._numbered({"frames": frames}, cells := {k: rows(max(1, k)) for k in range(4)})
+    each = page._map({"frames": frames}, cells, numbers)
+    # every cell of rings, strips and planes; a bar has the first of each verdict
+    assert sorted(map(int, re.findall(r'data-cell="(\d+)"', each))) == [*range(13), 14, 15]
     assert drawn.count("<svg") == 4
     for title in ("Verdicts around the orbit", "Verdicts along x", "Verdicts over two parameters", "Parts of each"):
         assert title in drawn

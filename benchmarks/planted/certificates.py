@@ -150,7 +150,7 @@ CERTIFICATES = (
     ),
     Fault(
         "search: a bound below 0 is a proof",
-        _SEARCH, "Search._settle", "bound is not None and bound > 0.0", "bound is not None and bound > -0.05",
+        _SEARCH, "Search._verdicts", "bound is not None and bound > 0.0", "bound is not None and bound > -0.05",
         _VERDICTS + "[1-0.43]",
     ),
     Fault(
@@ -206,7 +206,7 @@ CERTIFICATES = (
     ),
     Fault(
         "store: what comes twice counts twice",
-        _STORE, "Store.settle", "if gone is None:\n    return False", "pass",
+        _STORE, "Store.close_block", "if gone is None:\n    return False", "pass",
         "test_certify_search.py::test_result_that_comes_twice_counts_once",
     ),
     Fault(

@@ -44,6 +44,8 @@ _LAST = 5.0
 #: Counterexamples in report.json by frame, and images of each kind on the page.
 _EXAMPLES, _IMAGES = 5, 6
 _PIXELS = 256
+#: Cells whose picture the page shows when they are chosen, and its longest side.
+_SEEN, _SEEN_PIXELS = 64, 96
 #: Cells that are bounded in weaker ways besides, part of the time for it, and seconds that it may always take.
 _COMPARED, _COMPARE_SHARE, _COMPARE_LEAST = 5, 0.03, 1.0
 
@@ -97,6 +99,7 @@ class CertificateRun:
         self.job, self.frames, self.folder = job, tuple(frames), folder
         self.grids: dict[int, Grid] = {}
         self.shown: list[dict[str, Any]] = []
+        self.seen: dict[tuple[int, int], dict[str, Any]] = {}
         self.rows: dict[int, list[dict[str, Any]]] = {}
         #: When no more pictures are rendered for the report.
         self.over = float("inf")
@@ -196,7 +199,7 @@ class CertificateRun:
                 if findings is None:
                     continue
                 self._keep_images(store, block, findings)
-                store.settle(block, findings, self.grids[block.frame])
+                store.close_block(block, findings, self.grids[block.frame])
                 finished += 1
             now = time.perf_counter()
             if now - traced >= _TRACE:
@@ -357,7 +360,11 @@ class CertificateRun:
         # kernels may have to be compiled for others
         if state != "interrupted":
             self.shown = self._pictures(rows)
-        write_certificate(self.folder, document, certificate_page(document, rows, self.shown))
+            # positions of cells change while they are split
+            self.seen = {} if state == "running" else self._cell_pictures(rows)
+        elif self.seen:
+            self.seen = {}
+        write_certificate(self.folder, document, certificate_page(document, rows, self.shown, self.seen))
         return document
 
     def _entry(self, tally: Any, rows: list[dict[str, Any]]) -> dict[str, Any]:
@@ -430,15 +437,40 @@ class CertificateRun:
             text = f"frame {frame}, margin {'not a number' if margin is None else f'{margin:.4g}'}"
             wanted.append(("counterexample", text, frame, row["counterexample"]))
         found = []
-        for title, text, frame, values in wanted:
-            pictures = self.job.pictures(frame)
-            known = dict(zip(names, values, strict=True))
-            try:
-                with abandoning(lambda: time.perf_counter() >= self.over):
-                    image = pictures.image(np.array([known[name] for name in pictures.box.names]))
-            except AbandonedError:
-                break
-            found.append({"title": title, "text": text, "png": preview(to_bytes(image), _PIXELS)})
+        with suppress(AbandonedError):
+            for title, text, frame, values in wanted:
+                found.append({"title": title, "text": text, "png": self._drawn(frame, values, _PIXELS)})
+        return found
+
+    def _drawn(self, frame: int, values: Sequence[float], side: int) -> bytes:
+        """PNG of the picture at parameter values in the order of all parameters.
+
+        Raises:
+            AbandonedError: There is no time for more pictures.
+        """
+        known = dict(zip((name for name, _ in self.job.parameters), values, strict=True))
+        pictures = self.job.pictures(frame)
+        with abandoning(lambda: time.perf_counter() >= self.over):
+            image = pictures.image(np.array([known[name] for name in pictures.box.names]))
+        return preview(to_bytes(image), side)
+
+    def _cell_pictures(self, rows: Mapping[int, list[dict[str, Any]]]) -> dict[tuple[int, int], dict[str, Any]]:
+        """By frame and position, a picture of some cells: the same number of each verdict, evenly spread."""
+        kinds = {
+            kind: [(frame, k) for frame, found in rows.items() for k, row in enumerate(found) if row["verdict"] == kind]
+            for kind in ("certified", "falsified", "unknown")
+        }
+        share = _SEEN // max(1, sum(map(bool, kinds.values())))
+        wanted = [key for keys in kinds.values() for key in keys[:: max(1, -(-len(keys) // share))]]
+        found = {}
+        with suppress(AbandonedError):
+            for frame, k in wanted:
+                row = rows[frame][k]
+                values, text = row["counterexample"], "the counterexample's picture"
+                if values is None:
+                    values = [0.5 * (a + b) for a, b in zip(row["lower"], row["upper"], strict=True)]
+                    text = "one picture, at the cell's middle"
+                found[frame, k] = {"png": self._drawn(frame, values, _SEEN_PIXELS), "text": text}
         return found
 
 

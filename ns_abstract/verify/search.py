@@ -212,7 +212,7 @@ class Search:
         failing = [seen[k] for k in open_cells if k not in proved]
         self._sample(failing, self._late)
         self._ascend(failing)
-        leaves, children = self._settle(seen, bounded, reasons, slopes)
+        leaves, children = self._verdicts(seen, bounded, reasons, slopes)
         seconds = time.perf_counter() - begin
         # cells of one rank are examined together
         children.sort(key=lambda child: child[0])
@@ -366,7 +366,7 @@ class Search:
 
     # ---------------------------------------------------------------- verdicts
 
-    def _settle(
+    def _verdicts(
         self, seen: Sequence[_Seen], bounded: dict[int, float], reasons: dict[int, str], slopes: np.ndarray
     ) -> tuple[list[Leaf], list[tuple[float, Cell]]]:
         leaves: list[Leaf] = []

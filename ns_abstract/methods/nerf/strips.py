@@ -68,12 +68,12 @@ class Layout:
     Attributes:
         counts: Strips of the first level along each parameter of the poses.
         division: Cells and parts of every strip.
-        reach: Where the bounds of every strip begin (`NerfBounds.reach`).
+        displacement: Where the bounds of every strip begin (`NerfBounds.displacement`).
     """
 
     counts: tuple[int, ...]
     division: Division
-    reach: float
+    displacement: float
 
 
 class Strips:
@@ -95,7 +95,7 @@ class Strips:
         self._known: OrderedDict[tuple, _Kept] = OrderedDict()
         self._bytes = 0
         self._layout: Layout | None = None
-        self._reach = bounds.reach
+        self._displacement = bounds.displacement
         #: Seconds that a ray takes over a strip of the first level, and how many there are, once some have been tried.
         self.effort: tuple[float, int] | None = None
 
@@ -105,26 +105,26 @@ class Strips:
         """Strips that the network's bounds bear, tried on a few rays in the middle of the set."""
         if self._layout is None:
             tried = self.pixels[np.unique(np.linspace(0, len(self.pixels) - 1, _TRIED).astype(int))]
-            reach = self._reach
+            displacement = self._displacement
             for _ in range(_ROUNDS):
-                found = self._cut(reach, tried)
+                found = self._cut(displacement, tried)
                 strip = self._strip(found.counts, tuple(n // 2 for n in found.counts))
-                learned = reach
+                learned = displacement
                 # one ray first: where not even a few can be done, that tells how long they take
                 for rays in (tried[len(tried) // 2 :][:1], tried):
                     begin = time.perf_counter()
-                    learned = self.run([self._call(strip, rays, found, 0, None)])[0].reach
+                    learned = self.run([self._call(strip, rays, found, 0, None)])[0].displacement
                     self.effort = (time.perf_counter() - begin) / len(rays), math.prod(found.counts)
-                if 0.6 < learned / reach < 1.7:
+                if 0.6 < learned / displacement < 1.7:
                     break
-                reach = learned
+                displacement = learned
             self._layout = found
         return self._layout
 
-    def _cut(self, reach: float, pixels: np.ndarray) -> Layout:
+    def _cut(self, displacement: float, pixels: np.ndarray) -> Layout:
         d = self.poses.dimensions
         counts = [1] * d
-        self.bounds.reach = reach
+        self.bounds.displacement = displacement
         while True:
             box = self._strip(counts, [n // 2 for n in counts])
             pencil = Pencil(self.geometry, box, pixels, self.bounds.taylor, self.bounds.swept)
@@ -137,7 +137,7 @@ class Strips:
         if division is None:
             # nothing is known then
             counts, division = [1] * d, Division((), d + self.bounds.swept)
-        return Layout(tuple(counts), division, reach)
+        return Layout(tuple(counts), division, displacement)
 
     def _strip(self, counts: Sequence[int], place: Sequence[int]) -> ParameterBox:
         """The strip ``place`` of ``counts`` along each parameter; neighbours share their ends exactly."""
@@ -208,7 +208,7 @@ class Strips:
             for k, group in enumerate(missing):
                 known = None if above is None else above[k].alpha
                 calls.append(self._call(strip, self.pixels[self.groups[group]], layout, level, known))
-            self.bounds.reach = layout.reach
+            self.bounds.displacement = layout.displacement
             for group, result in zip(missing, self.run(calls), strict=True):
                 found[group] = self._keep((level, place, group), result)
         return [found[group] for group in groups]

@@ -194,7 +194,7 @@ def charge(value, y, x, cell, noise, total):
 
 
 @njit(cache=True, error_model="numpy")
-def reach(value, y, x, cell, slopes, offsets, lower, upper, total, plane, box):
+def concretize(value, y, x, cell, slopes, offsets, lower, upper, total, plane, box):
     """Bounds of rows on a node of which planes and intervals are known (N5).
 
     Args:
