@@ -179,12 +179,12 @@ def other_offset(rows: Any, slope: Any, centre: Any, half: Any) -> Any:
     return (rows - slope @ centre.T).mean(axis=1)
 
 
-def neighbours(self: Any, axis: int, count: int, box: ParameterBox) -> tuple[int, int]:
-    first, past = original_overlapped(self, axis, count, box)
-    return max(0, first - 1), max(1, past - 1)
+def a_quarter_strip_on(self: Any, axis: int, count: int, first: int, past: int, parts: int) -> Any:
+    lines = original_ends(self, axis, count, first, past, parts)
+    return lines - 0.25 * (lines[-1] - lines[0])
 
 
-original_overlapped = strips_module.Strips._overlapped
+original_ends = strips_module.Strips._part_ends
 
 
 @pytest.mark.parametrize(
@@ -192,13 +192,13 @@ original_overlapped = strips_module.Strips._overlapped
     [
         (planes_module, "united", half_a_part),
         (planes_module, "_offset", other_offset),
-        (strips_module.Strips, "_overlapped", neighbours),
+        (strips_module.Strips, "_part_ends", a_quarter_strip_on),
     ],
 )
 def test_planted_faults_are_found(monkeypatch: pytest.MonkeyPatch, target: Any, name: str, fault: Any) -> None:
     def failed() -> int:
         frame = NerfFrame(tiny_scene(3, density=30.0), UNIFORM, poses({"rotation": {"yaw": 0.2}}))
-        return sum(outside(frame, box, frame.sets(box), 10) for box in frame.box.split(0, 64)[10:50:13])
+        return sum(outside(frame, box, frame.sets(box), 10) for box in frame.box.split(0, 64)[10:50:8])
 
     assert failed() == 0
     monkeypatch.setattr(target, name, fault)

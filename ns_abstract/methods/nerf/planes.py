@@ -38,7 +38,7 @@ def united(low: np.ndarray, high: np.ndarray, ends: list[Float64Array]) -> tuple
 def fit_planes(
     low: np.ndarray, high: np.ndarray, ends: Sequence[Float64Array], slack: Sequence[float] = ()
 ) -> LinearSets:
-    """Planes below ``low`` and above ``high`` on every part, and so on their union.
+    """Planes below ``low`` and above ``high`` on every part, and so on their union (design.md, F12).
 
     The plane ``a p + b`` lies above the parts with middles c and half-widths h where
     ``b >= max_k(high_k - a c_k + |a| h_k)``; the right side is convex in a, and the plane's mean over the cell. It is

@@ -77,7 +77,7 @@ class Layout:
 
 
 class Strips:
-    """Bounds of all rays of a frame over strips of its set.
+    """Bounds of all rays of a frame over strips of its set (design.md, F13).
 
     Args:
         bounds: Of the scene.
