@@ -14,6 +14,7 @@ import json
 import math
 import time
 from pathlib import Path
+from typing import cast
 
 import numpy as np
 import torch
@@ -23,6 +24,7 @@ from torch.nn import functional
 import ns_abstract as nsa
 from ns_abstract.geometry.camera_path import load_camera_path
 from ns_abstract.io.jsonio import load_json
+from ns_abstract.refine.protocol import RayFrame
 from ns_abstract.verify.model import NetworkModel
 from ns_abstract.verify.network import load_network
 from ns_abstract.verify.preprocess import Preprocess
@@ -105,7 +107,7 @@ def main() -> None:
     judge = NetworkModel(load_network(file), Preprocess(), 1 << 30)
     right = np.mean([
         judge.outputs(frame.render(np.array([a])).reshape(1, side, side, 3))[0].argmax() == 1
-        for a in np.linspace(*arc, 200)
+        for a in np.linspace(arc[0], arc[1], 200)
     ])  # fmt: skip
     print(
         f"{scene.method().content}, {side} x {side}, {options.num_samples} samples, {options.arc} rad: certified "
@@ -123,13 +125,14 @@ def attack(
     cells = [cell for cell in found.cells if cell.verdict == "certified"]
     if not cells:
         return
-    frame = scene.method().frame(poses.of(scene))
+    frame = cast("RayFrame", scene.method().frame(poses.of(scene)))
     rng = np.random.default_rng(1)
     compared = violated = wrong = 0
     while compared < n:
         cell = cells[rng.integers(len(cells))]
         box = frame.box.replace(0, float(cell.lower[0]), float(cell.upper[0]))
         bounds = frame.sets(box)
+        assert bounds.linear is not None
         a_lower, b_lower, a_upper, b_upper = (part.astype(np.float64) for part in bounds.linear)
         for p in (-1.0, 1.0, *rng.uniform(-1.0, 1.0, 6)):
             picture = frame.render(box.at(np.array([p])))
