@@ -260,7 +260,7 @@ def test_an_orbit_is_certified_and_attacked(run: Path, net: Path, tmp_path: Path
     scene, poses = opened(run), small_set()
     truth = differences(scene, poses, np.linspace(0.3, 0.33, 200))
     level = float(truth.min() - 0.2 * np.ptp(truth) - 0.02)
-    found = nsa.certify(scene, poses, net, claim_above(level, tmp_path), time_budget=60.0)
+    found = nsa.certify(scene, poses, net, claim_above(level, tmp_path), time_budget=600.0)
     assert found.certified == 1.0 and found.guarantee == "real-sound" and found.state == "done"
     for cell in found.cells:
         angles = np.linspace(cell.lower[0], cell.upper[0], 5)
@@ -273,7 +273,7 @@ def test_where_it_fails_is_falsified(run: Path, net: Path, tmp_path: Path) -> No
     truth = differences(scene, poses, angles)
     level = float(np.quantile(truth, 0.4))
     prop = claim_above(level, tmp_path)
-    found = nsa.certify(scene, poses, net, prop, time_budget=60.0, output_dir=tmp_path / "out")
+    found = nsa.certify(scene, poses, net, prop, time_budget=600.0, output_dir=tmp_path / "out")
     assert 0.5 < found.certified < 0.61 and 0.35 < found.falsified < 0.41
     for cell in found.cells:
         inside = (angles >= cell.lower[0]) & (angles <= cell.upper[0])
@@ -290,7 +290,7 @@ def test_colours_and_several_parameters_are_certified(run: Path, net: Path, tmp_
     camera = nsa.Camera(EYE, width=SIDE, height=SIDE)
     spec = {"rotation": {"yaw": 2e-4, "roll": 2e-4}, "hue": [0.0, 0.02]}
     prop = claim_above(-15.0, tmp_path)
-    found = nsa.certify(scene, nsa.PoseSet.from_json(camera, spec), net, prop, time_budget=60.0)
+    found = nsa.certify(scene, nsa.PoseSet.from_json(camera, spec), net, prop, time_budget=600.0)
     assert found.certified == 1.0 and len(found.parameters) == 3
 
 
@@ -354,7 +354,7 @@ def test_command_line(
             command.main()
         return int(leave.value.code or 0), capsys.readouterr().err
 
-    code, said = call("--time-budget", "60")
+    code, said = call("--time-budget", "600")
     assert code == 0, said
     report = json.loads((out / "report.json").read_text())
     assert report["frames"][0]["coverage"]["certified"] == 1.0 and report["guarantee"] == "real-sound"

@@ -355,6 +355,8 @@ class Certification:
         if not self.job.rays:
             return
         frame = cast("RayFrame", self.search_frame(index))
+        # compiling says nothing about rays
+        frame.warm_up()
         begin = time.perf_counter()
         more = ""
         try:

@@ -307,7 +307,6 @@ class NerfFrame:
         Raises:
             AbandonedError: There is no time to find out.
         """
-        self.warm_up()
         strips = self._strips
         try:
             strips.layout()
