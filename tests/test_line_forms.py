@@ -17,7 +17,7 @@ def lanes(function, *operands: FormArray, numbers: tuple[np.ndarray, ...] = ()) 
     """``function`` lane by lane; ``numbers`` are further arguments, [lanes] each."""
     data = np.zeros_like(operands[0].data)
     for lane in range(data.shape[1]):
-        forms = [tuple(float(x) for x in form.data[:4, lane]) for form in operands]
+        forms = [line_forms.LineForm(*map(float, form.data[:4, lane])) for form in operands]
         data[:4, lane] = function(*forms, *(float(n[lane]) for n in numbers))
     set_norms(data, *layout(BASIS))
     return FormArray(BASIS, data, operands[0].shape)
