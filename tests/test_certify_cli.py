@@ -35,6 +35,7 @@ from ns_abstract.methods.nerf.write import write_nerf_run
 from ns_abstract.methods.splat.method import SplatMethod
 from ns_abstract.methods.splat.reference import Reference
 from ns_abstract.verify import model
+from ns_abstract.verify.eight_bit import rounded
 from ns_abstract.verify.network import OutputBounds
 
 MODULE = "ns_abstract.cli.certify"
@@ -47,9 +48,11 @@ SWEEP = {"version": 1, "translation": {"x": 0.15}}
 class Case:
     """Files of one certification."""
 
-    def __init__(self, folder: Path, blobs: Inputs, net: Path, prop: Any, spec: Any = SWEEP) -> None:
+    def __init__(
+        self, folder: Path, blobs: Inputs, net: Path, prop: Any, spec: Any = SWEEP, picture: Any = "float"
+    ) -> None:
         folder.mkdir(exist_ok=True)
-        self.blobs, self.net = blobs, net
+        self.blobs, self.net, self.picture = blobs, net, picture
         self.prop = write_json(folder / "prop.json", prop)
         self.spec = None if spec is None else write_json(folder / "spec.json", spec)
 
@@ -57,7 +60,7 @@ class Case:
         found = {
             "load_config": self.blobs.config, "camera_path_filename": self.blobs.path, "model": self.net,
             "property": self.prop, "output_dir": output, "perturbation_filename": self.spec, "frames": (0,),
-            "workers": 1,
+            "workers": 1, "picture": self.picture,
         }  # fmt: skip
         return found | more
 
@@ -77,7 +80,8 @@ class Case:
 
     @property
     def job(self) -> Certification:
-        return open_certification(CertifySettings(self.blobs.config, self.blobs.path, self.net, self.prop, self.spec))
+        files = self.blobs.config, self.blobs.path, self.net, self.prop, self.spec
+        return open_certification(CertifySettings(*files, picture=self.picture))
 
 
 def report(folder: Path) -> dict[str, Any]:
@@ -155,6 +159,7 @@ def attack(case: Case, folder: Path, frame: int = 0, poses: int = 6) -> tuple[in
 
     def compare(image: np.ndarray, values: np.ndarray, proved: float) -> None:
         nonlocal comparisons, violations, slack
+        image = rounded(image) if case.picture == "8-bit" else image
         inputs = job.property.preprocess.apply(torch.from_numpy(image.astype(np.float32))[None]).numpy()
         outputs = torch.from_numpy(session.run(None, {session.get_inputs()[0].name: inputs})[0]).double().reshape(1, -1)
         margin = float(claim.margin(outputs, torch.from_numpy(values)[None])[0])
@@ -223,6 +228,27 @@ def test_counterexamples_are_stored_and_break_the_property(planted: Case, finish
             assert list(found["names"]) == ["x"]
             stored.add(tuple(found["values"].tolist()))
     assert stored == {tuple(json.loads(row[5])) for row in rows}
+
+
+def test_rounded_pictures(planted: Case, tmp_path: Path) -> None:
+    """8 bits: certified cells are attacked, and counterexamples stored, with the pictures of a file."""
+    case = Case(tmp_path / "case", planted.blobs, planted.net, json.loads(planted.prop.read_text()), picture="8-bit")
+    document = case.run(tmp_path / "out")
+    covered = document["coverage"]
+    assert document["picture"] == "8-bit" and covered["certified"] > 0.3 and covered["falsified"] > 0.1
+    comparisons, violations, slack = attack(case, tmp_path / "out")
+    assert comparisons > 100 and violations == 0 and slack < 0.05
+    files = list((tmp_path / "out" / "counterexamples").iterdir())
+    assert files
+    for file in files:
+        with np.load(file, allow_pickle=False) as found:
+            image = found["image"]
+            np.testing.assert_array_equal(image, np.rint(image * 255.0).astype(np.float32) / np.float32(255.0))
+            np.testing.assert_array_equal(case.job.model.outputs(image[None])[0], found["outputs"])
+    # another picture is another search
+    with pytest.raises(InputError, match="picture"):
+        planted.run(tmp_path / "out", resume=True)
+    assert "rounded to 8 bits" in (tmp_path / "out" / "report.html").read_text()
 
 
 def test_random_network(blobs: Inputs, net: Path, tmp_path: Path) -> None:

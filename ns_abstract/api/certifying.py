@@ -31,6 +31,7 @@ from ns_abstract.report.certificate_page import certificate_page
 from ns_abstract.report.picture import preview, to_bytes
 from ns_abstract.report.record import file_stamp
 from ns_abstract.verify.cells import Cell, Grid
+from ns_abstract.verify.eight_bit import Picture
 from ns_abstract.verify.network import NetworkArithmetic
 from ns_abstract.verify.search import Findings
 from ns_abstract.verify.store import Block, Store, fractions
@@ -112,6 +113,7 @@ class CertificateRun:
             fingerprint=job.fingerprint,
             command=command,
             plan=(*job.job.plan, *prop.notes),
+            picture=job.picture,
         )
 
     def open(self, *, resume: bool) -> Store:
@@ -549,6 +551,7 @@ def certify(
     output_dir: str | os.PathLike[str] | None = None,
     arithmetic: str | None = None,
     network_arithmetic: NetworkArithmetic = "float32",
+    picture: Picture = "float",
     resume: bool = False,
     on_progress: Callable[[CertifyProgress], object] | None = None,
     workers: int = 1,
@@ -570,6 +573,7 @@ def certify(
             nothing is kept on disk.
         arithmetic: "float32" or "real", of the pictures; None: float32.
         network_arithmetic: "float32": every float32 evaluation of the network; "real": the exact network alone.
+        picture: "float": the renderer's floats; "8-bit": these rounded to multiples of 1/255, as files have them.
         resume: Whether to go on with what ``output_dir`` holds.
         on_progress: Told about once a second.
         workers: Processes; with more than one, a script needs ``if __name__ == "__main__":``.
@@ -584,6 +588,8 @@ def certify(
         raise InputError(f"found {time_budget}", field="time_budget", fix="give a positive number")
     if workers < 1:
         raise InputError(f"found {workers}", field="workers", fix="give a number of at least 1")
+    if picture not in ("float", "8-bit"):
+        raise InputError(f"found {picture}", field="picture", fix="use float or 8-bit")
     if resume and output_dir is None:
         raise InputError("given without output_dir", field="resume", fix="give the folder to go on with")
     sets = [poses] if isinstance(poses, PoseSet) else list(poses)
@@ -594,8 +600,14 @@ def certify(
     drawn = [question.drawn(entry.of(scene)) for entry in sets]
     memory = network_memory(memory_limit, workers)
     job = Job(scene, drawn, arithmetic=arithmetic)
-    found = Certification(job, question, memory, network_arithmetic=network_arithmetic)
-    settings = {"time_budget": time_budget, "arithmetic": arithmetic, "workers": workers, "engine": engine}
+    found = Certification(job, question, memory, network_arithmetic=network_arithmetic, picture=picture)
+    settings = {
+        "time_budget": time_budget,
+        "arithmetic": arithmetic,
+        "picture": picture,
+        "workers": workers,
+        "engine": engine,
+    }
     with ExitStack() as stack:
         folder = Path(output_dir) if output_dir is not None else Path(
             stack.enter_context(tempfile.TemporaryDirectory(prefix="ns-abstract-"))

@@ -362,11 +362,17 @@ def _frames(document: Mapping[str, Any]) -> str:
     )
 
 
+_PICTURES = {
+    "float": "the float image in [0, 1], not its rounding to 8 bits in a file",
+    "8-bit": "the image rounded to 8 bits, round(255 x) / 255, by any float32 program and either way at a tie",
+}
+
+
 def _guarantee(document: Mapping[str, Any]) -> str:
     lines = [
         f"Images: guarantee <b>{escape(document['guarantee'])}</b>, each {escape(document['guarantee_text'])}.",
-        "What is bounded is the float image in [0, 1], not its rounding to 8 bits in a file; preprocessing in float32 "
-        "is part of it. Resizing means rendering at the network's resolution.",
+        f"What is bounded is {_PICTURES[document['picture']]}; preprocessing in float32 is part of it. Resizing means "
+        "rendering at the network's resolution.",
         "Network: " + escape("; ".join(document["network_guarantee"])) + ".",
         *(escape(limit) for limit in document["limits"]),
     ]
