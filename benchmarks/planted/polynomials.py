@@ -62,9 +62,9 @@ POLYNOMIALS = (
         "0.1 / math.factorial(n + 1) * (1.0 + 8.0 * UNIT64)", _FUNCTIONS + "[0.5]",
     ),
     Fault(
-        "Taylor models: errors of the library's sine are not charged",
-        _TAYLOR, "taylor_cos_sin", "8.0 * UNIT64 * (np.abs(middle) + 2.0) * np.exp(largest)", "0.0 * np.exp(largest)",
-        _FUNCTIONS + "[1e-09]",
+        "Taylor models: the last coefficient of sine and cosine is too small",
+        _TAYLOR, "taylor_cos_sin", "cycle[(k + offset) % 4] / math.factorial(k)",
+        "cycle[(k + offset) % 4] / math.factorial(k + (k == n))", _FUNCTIONS + "[0.5]",
     ),
     Fault(
         "Chebyshev: the grid's largest value bounds the polynomial",
