@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import base64
+import hashlib
 import importlib.util
 import json
 import os
@@ -21,7 +23,6 @@ import pytest
 import torch
 from certifying import classifier, linear
 from conftest import Inputs, write_json
-from nerfs import tiny_scene
 
 from ns_abstract.api import certifying
 from ns_abstract.api.certification import Certification, CertifySettings, examine_block, open_certification
@@ -31,7 +32,6 @@ from ns_abstract.demo.writing import write_demo
 from ns_abstract.execution.engines import Here, Processes
 from ns_abstract.execution.opening import forget
 from ns_abstract.io.errors import InputError
-from ns_abstract.methods.nerf.write import write_nerf_run
 from ns_abstract.methods.splat.method import SplatMethod
 from ns_abstract.methods.splat.reference import Reference
 from ns_abstract.verify import model
@@ -622,7 +622,19 @@ def test_page(finished: Path) -> None:
         "not its rounding to 8 bits", "every float32", "worst certified", "cells.sqlite", "How to reproduce",
     ):  # fmt: skip
         assert part in page, part
-    assert not re.search(r"<script|https?://", page)
+    assert "https://" not in page and "http://" not in page
+    # one script, which the policy names by its hash, and its data
+    scripts = re.findall(r"<script([^>]*)>(.*?)</script>", page, re.DOTALL)
+    (_, data), (_, code) = scripts
+    digest = base64.b64encode(hashlib.sha256(code.encode()).digest()).decode()
+    assert f"script-src 'sha256-{digest}'\"" in page and scripts[0][0] == ' type="application/json" id="cell-data"'
+    # every cell can be chosen, and some show a picture
+    found = json.loads(data)
+    chosen = {int(number) for number in re.findall(r'data-cell="(\d+)"', page)}
+    assert chosen == set(range(len(found["cells"]))) and len(chosen) > 3
+    rows = sqlite3.connect(finished / "cells.sqlite").execute("SELECT verdict, margin FROM cells").fetchall()
+    assert sorted((cell[1], cell[4]) for cell in found["cells"]) == sorted(rows)
+    assert found["pictures"] and {cell[6] for cell in found["cells"]} >= set(range(len(found["pictures"])))
 
 
 def test_ring_strip_plane_and_bars() -> None:
@@ -642,7 +654,12 @@ def test_ring_strip_plane_and_bars() -> None:
         ]
 
     frames = [entry(0, "azimuth"), entry(1, "x"), entry(2, "x", "y"), entry(3, "x", "y", "z")]
-    drawn = page._map({"frames": frames}, {k: rows(max(1, k)) for k in range(4)})
+    drawn = page._map({"frames": frames}, {k: rows(max(1, k)) for k in range(4)}, {})
+    assert "data-cell" not in drawn
+    numbers = page._numbered({"frames": frames}, cells := {k: rows(max(1, k)) for k in range(4)})
+    each = page._map({"frames": frames}, cells, numbers)
+    # every cell of rings, strips and planes; a bar has the first of each verdict
+    assert sorted(map(int, re.findall(r'data-cell="(\d+)"', each))) == [*range(13), 14, 15]
     assert drawn.count("<svg") == 4
     for title in ("Verdicts around the orbit", "Verdicts along x", "Verdicts over two parameters", "Parts of each"):
         assert title in drawn
@@ -711,16 +728,6 @@ def test_partition_that_does_not_fit(
     prop = {"type": "classification", "label": 0, "preprocess": PRE, "partitions": [3, 4]}
     code, said = call(Case(tmp_path / "case", blobs, net, prop).options(tmp_path / "out"))
     assert code == 2 and "prop.json: partitions" in said
-
-
-def test_nerf_is_refused(blobs: Inputs, net: Path, call: Callable[..., tuple[int, str]], tmp_path: Path) -> None:
-    config = write_nerf_run(tiny_scene(0), tmp_path / "runs", timestamp="2026-01-01_000000", experiment_name="tiny")
-    prop = {"type": "classification", "label": 0, "preprocess": PRE}
-    case = Case(tmp_path / "case", Inputs(config, blobs.path, tmp_path / "unused"), net, prop)
-    code, said = call(case.options(tmp_path / "out"))
-    assert code == 2 and said.count("\n") == 1
-    for fragment in ("config.yml", "certificates are for splats", "vanilla NeRF", "give a run of splatfacto"):
-        assert fragment in said
 
 
 def test_scene_variations_are_refused(
