@@ -19,9 +19,7 @@ from ns_abstract.bench.cell import small_cell
 from ns_abstract.bench.sets import open_jobs, pose_set, splat_of
 from ns_abstract.methods.splat.frame import SplatFrame
 
-HEADER = (
-    "| scene | set | cell | order 2 ms | time, order 2 / 1 | gap, order 1 | gap, order 2 | gap, order 2 / 1 |"
-)
+HEADER = "| scene | set | cell | order 2 ms | time, order 2 / 1 | gap, order 1 | gap, order 2 | gap, order 2 / 1 |"
 
 
 def rows(config: Path, sets: list[str], repeats: int, downscale: float) -> list[str]:
