@@ -102,7 +102,7 @@ class LoopJob:
                 fix=f"write one column by output, {self.network.output_size}",
             )
         self.job = Job(scene, [loop.camera.poses(size)], arithmetic=arithmetic)
-        if self.job.method.differentiable(self.job.pose_sets[0]) is None:
+        if self.job.rays:
             raise InputError(
                 f"loops are for splats, this run is a {self.job.method.content}",
                 file=scene.source.file,

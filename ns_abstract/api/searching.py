@@ -29,6 +29,7 @@ def search_blocks(
     stop: StopRequest,
     keep: Callable[[Block, Any], object],
     between: Callable[[float], object],
+    waits: bool = True,
 ) -> None:
     """Examine open blocks until none is left, the time is over or ``stop`` says so.
 
@@ -42,16 +43,16 @@ def search_blocks(
         stop: Asked at least twice a second.
         keep: Given every block and its findings before they are stored.
         between: Told the reading of the clock after results, and twice a second where others work.
+        waits: Whether one block is waited for however late it is, so that resuming with any budget gets on.
     """
     flying: dict[int, Block] = {}
-    finished = 0
+    finished = 0 if waits else 1
 
     def late() -> bool:
         return time.perf_counter() >= deadline
 
     def offer(room: int) -> Iterator[Task]:
-        # one block is always waited for, so that resuming with any budget gets on
-        if late() and flying:
+        if late() and (flying or finished):
             return
         for block in store.pending(set(flying), room):
             flying[block.number] = block
