@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from multiprocessing import Pipe
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -14,6 +15,7 @@ from conftest import Inputs
 
 from ns_abstract.api import compiling
 from ns_abstract.api.files import Settings, open_job
+from ns_abstract.arithmetic.kernel_cache import store
 from ns_abstract.methods.splat import bounds
 
 
@@ -84,8 +86,8 @@ def test_processes_that_fail_leave_the_work_to_this_one(blobs: Inputs, monkeypat
     popen = subprocess.Popen
 
     def failing(command: list[str], **more: Any) -> Any:
-        started.append(command[3:])
-        return popen([sys.executable, "-c", "import sys; sys.stdin.buffer.read(1); sys.exit(3)"], **more)
+        started.append(command[4:])
+        return popen([sys.executable, "-c", "raise SystemExit(3)"], **more)
 
     monkeypatch.setattr(compiling.subprocess, "Popen", failing)
     compiling.compile_beside(job, 0, 2)
@@ -101,17 +103,31 @@ def test_processes_that_fail_leave_the_work_to_this_one(blobs: Inputs, monkeypat
 
 def test_worker_compiles_what_it_is_told(blobs: Inputs, tmp_path: Path) -> None:
     """A process of its own opens the job anew and runs one stage; kernels are there, so nothing is compiled."""
-    import pickle
-
     job = open_job(Settings(blobs.config, blobs.path, blobs.spec))
     job.warm_up(0)
-    from ns_abstract.arithmetic.kernel_cache import store
-
     store().publish()
-    worker = subprocess.Popen(
-        [sys.executable, "-m", "ns_abstract.api.compiling", "moving_colors"],
-        stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE,
-        cwd=Path(compiling.__file__).parents[2],
-    )  # fmt: skip
-    _, said = worker.communicate(pickle.dumps((job.recipe, 0)))
+    here, there = Pipe()
+    with there:
+        worker = subprocess.Popen(
+            [sys.executable, "-m", "ns_abstract.api.compiling", str(there.fileno()), "moving_colors"],
+            pass_fds=[there.fileno()], stderr=subprocess.PIPE, cwd=Path(compiling.__file__).parents[2],
+        )  # fmt: skip
+    with here:
+        here.send((job.recipe, 0))
+        _, said = worker.communicate()
     assert worker.returncode == 0, said.decode()
+
+
+def test_worker_ends_with_the_one_that_started_it() -> None:
+    here, there = Pipe()
+    with there:
+        command = (
+            "from multiprocessing.connection import Connection; from ns_abstract.api import compiling; "
+            f"compiling._watch(Connection({there.fileno()}))"
+        )
+        worker = subprocess.Popen(
+            [sys.executable, "-c", command], pass_fds=[there.fileno()], cwd=Path(compiling.__file__).parents[2]
+        )
+    assert here.recv() >= 0
+    here.close()
+    assert worker.wait() == 1

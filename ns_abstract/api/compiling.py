@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import logging
 import os
-import pickle
 import subprocess
 import sys
 import threading
 import time
 from collections.abc import Sequence
+from contextlib import ExitStack, suppress
+from multiprocessing import Pipe
+from multiprocessing.connection import Connection
 
 from ns_abstract.api.job import Job
 from ns_abstract.arithmetic.kernel_cache import store
@@ -41,61 +43,65 @@ def compile_beside(job: Job, index: int, processes: int | None = None) -> None:
     parts = shares(stages, len(os.sched_getaffinity(0)) if processes is None else processes) if stages else []
     if len(parts) < 2 or not store().empty:
         return
-    order = pickle.dumps((job.recipe, index))
     compiled = [0] * len(parts)
     workers: list[subprocess.Popen[bytes]] = []
-
-    def listen(number: int, worker: subprocess.Popen[bytes]) -> None:
-        assert worker.stdout is not None
-        for line in worker.stdout:
-            if line.strip().isdigit():
-                compiled[number] = int(line)
-
-    try:
-        for number, part in enumerate(parts):
-            # a session of its own: signals are this process' to handle
-            worker = subprocess.Popen(
-                [sys.executable, "-m", "ns_abstract.api.compiling", *part],
-                stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, start_new_session=True,
-            )  # fmt: skip
-            workers.append(worker)
-            assert worker.stdin is not None
-            worker.stdin.write(order)
-            worker.stdin.flush()
-            threading.Thread(target=listen, args=(number, worker), daemon=True).start()
+    lines: list[Connection] = []
+    with ExitStack() as stack, suppress(OSError):
+        # where there is no room for processes, this one compiles
+        for part in parts:
+            here, there = Pipe()
+            lines.append(here)
+            stack.callback(here.close)
+            with there:
+                command = [sys.executable, "-m", "ns_abstract.api.compiling", str(there.fileno()), *part]
+                # a session of its own: signals are this process' to handle
+                workers.append(worker := subprocess.Popen(
+                    command, pass_fds=[there.fileno()], start_new_session=True,
+                    stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
+                ))  # fmt: skip
+            stack.callback(_end, worker)
+            here.send((job.recipe, index))
         said = time.monotonic()
         while running := [part for part, worker in zip(parts, workers, strict=True) if worker.poll() is None]:
             time.sleep(0.1)
+            compiled = [_latest(line, before) for line, before in zip(lines, compiled, strict=True)]
             if time.monotonic() - said > _PACE:
                 said = time.monotonic()
                 names = ", ".join(stage.replace("_", " ") for part in running for stage in part)
                 _log.info("compiling kernels (first use only): %d done; at work: %s", sum(compiled), names)
-    except OSError:
-        # no room for processes: this one compiles
-        pass
-    finally:
-        for worker in workers:
-            worker.kill()
-            worker.wait()
     store().refresh()
 
 
-def _watch() -> None:
+def _end(worker: subprocess.Popen[bytes]) -> None:
+    worker.kill()
+    worker.wait()
+
+
+def _latest(line: Connection, before: int) -> int:
+    """The last number that a worker has sent."""
+    with suppress(EOFError, OSError):
+        while line.poll():
+            before = int(line.recv())
+    return before
+
+
+def _watch(line: Connection) -> None:
     """Say how many kernels are done; end this process with the one that started it."""
     while True:
         time.sleep(1.0)
         try:
-            print(store().compiled, flush=True)
+            line.send(store().compiled)
         except OSError:
             os._exit(1)
 
 
 def main() -> None:
-    """Compile the stages that the command line names, of the job and the frame that stand on stdin."""
-    recipe, index = pickle.load(sys.stdin.buffer)
-    threading.Thread(target=_watch, daemon=True).start()
+    """Compile stages of the job and the frame that come over a pipe; arguments: its file descriptor, the stages."""
+    line = Connection(int(sys.argv[1]))
+    recipe, index = line.recv()
+    threading.Thread(target=_watch, args=(line,), daemon=True).start()
     frame = opened(recipe).frame(index)
-    for stage in sys.argv[1:]:
+    for stage in sys.argv[2:]:
         frame.warm_up(stage)
         store().publish()
 
