@@ -20,6 +20,8 @@ _IMPOSSIBLE = "test_certify_search.py::test_impossible_leaves_are_refused_and_no
 _RESUMED = "test_certify_search.py::test_resumed_store_equals_an_uninterrupted_one"
 
 _ROUNDED = "verify/eight_bit.py"
+_BOXES = "verify/boxes.py"
+_EITHER = "test_vnnlib_runner.py::test_proofs_alone_never_decide_unsafe_instances"
 _LEVELS = "test_eight_bit.py::test_sets_hold_rounded_pictures"
 
 CERTIFICATES = (
@@ -147,6 +149,15 @@ CERTIFICATES = (
         "unsafe sets: of joined assertions the last counts",
         _VNNLIB, "_ways", "[[*old, *new] for old in ways for new in more]", "[[*new] for old in ways for new in more]",
         _UNSAFE,
+    ),
+    Fault(
+        "boxes: one group of rows is enough",
+        _BOXES, "proves", "proved &= positive[:, list(group)].any(1)",
+        "proved = positive[:, list(group)].any(1)", _EITHER,
+    ),
+    Fault(
+        "boxes: a half is dropped",
+        _BOXES, "_Search._cut", "[(lower, left), (right, upper)]", "[(lower, left)]", _EITHER,
     ),
     Fault(
         "search: a bound below 0 is a proof",
