@@ -204,7 +204,7 @@ SPLATS = (
     Fault(
         "order swap raises but does not lower",
         _BLEND,
-        "_blend_quadratic",
+        "blend_quadratic",
         "ends.low - falls",
         "ends.low",
         "test_bounds.py::test_depth_swap[2]",
@@ -380,7 +380,7 @@ SPLATS = (
     Fault(
         "blend drops the radius of alpha",
         _BLEND,
-        "_blend_quadratic",
+        "blend_quadratic",
         "fma(values[at + FORM + 3], size, fma(FRAGMENT_ROUNDING, fma(1.0 + a1 + a2, size, abs(p0)), added))",
         "fma(FRAGMENT_ROUNDING, fma(1.0 + a1 + a2, size, abs(p0)), added)",
         "test_bounds.py::test_linear[x-2]",

@@ -32,6 +32,7 @@ class Settings:
         seed: Of the random witnesses.
         memory_limit: GiB.
         workers: Processes that bound the rays of a NeRF.
+        outputs: "rgb", and what is bounded beside it: "depth", "accumulation".
         occupancy_grid: File of a grid that is declared as part of a NeRF.
         sampling, num_samples, near_plane: Of the rays of a NeRF; None: the method's own.
     """
@@ -51,6 +52,7 @@ class Settings:
     occupancy_grid: Path | None = None
     workers: int = 1
     given_set: Mapping[str, Any] | None = None
+    outputs: tuple[str, ...] = ("rgb",)
 
     @property
     def scene(self) -> SceneSource:
@@ -79,6 +81,7 @@ class PathJob(Job):
                 seed=settings.seed,
                 memory_limit=settings.memory_limit,
                 workers=settings.workers,
+                layers=[name for name in settings.outputs if name != "rgb"],
             )
         except InputError as error:
             # options have no file
