@@ -111,11 +111,11 @@ FIELDS = (
     Fault(
         "compositing: brighter colours take the lower opacity",
         _BOUNDS, "_Work._composited", "np.where(rise > 0.0, most, least)", "np.where(rise > 0.0, least, least)",
-        _SETS + "[plain]", True,
+        _STIFF + "[rough]", True,
     ),
     Fault(
         "compositing: darker colours take the lower opacity",
-        _BOUNDS, "_Work._composited", "np.where(fall < 0.0, most, least)", "least", _SETS + "[plain]", True,
+        _BOUNDS, "_Work._composited", "np.where(fall < 0.0, most, least)", "least", _STIFF + "[rough]", True,
     ),
     Fault(
         "colours: a batch that was given up keeps its numbers",
