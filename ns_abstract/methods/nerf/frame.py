@@ -6,6 +6,7 @@ import itertools
 import secrets
 import time
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from typing import Any
@@ -130,6 +131,9 @@ class NerfFrame:
         self.tiles_at_once = workers * int(np.clip(_WORK // weights, 1, 32))
         self._witness: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None
 
+    #: Few kernels, which are compiled together.
+    stages: tuple[str, ...] = ()
+
     @property
     def tile_count(self) -> int:
         """Number of rays, row by row."""
@@ -142,7 +146,7 @@ class NerfFrame:
     def _pixels(self, tiles: np.ndarray) -> np.ndarray:
         return np.stack([tiles // self.across, tiles % self.across], axis=1)
 
-    def warm_up(self) -> None:
+    def warm_up(self, stage: str | None = None) -> None:
         """Compile the kernels that this frame needs."""
         box = self.box
         for axis in range(box.dimensions):
@@ -160,6 +164,9 @@ class NerfFrame:
     def feasible(self, box: ParameterBox) -> ParameterBox | None:
         """All of ``box``: every parameter in it belongs to a pose of the set."""
         return box
+
+    def depths(self) -> None:
+        """A field is everywhere; nothing in it has a distance of its own."""
 
     def motion(self, box: ParameterBox) -> np.ndarray:
         """[d] pixels that points at a typical distance move by over each parameter's range (an estimate)."""
@@ -302,20 +309,15 @@ class NerfFrame:
         sets = a_lower.reshape(*shape, d), b_lower.reshape(shape), a_upper.reshape(*shape, d), b_upper.reshape(shape)
         return RayBox(lower.reshape(shape), upper.reshape(shape), slopes, None, sets)
 
-    def effort(self) -> tuple[float, int]:
+    def effort(self) -> tuple[float | None, int]:
         """Seconds that one ray takes over one strip of the set, about, and how many strips there are.
 
-        Raises:
-            AbandonedError: There is no time to find out.
+        None: there was no time to find out (`ns_abstract.execution.ending`).
         """
         strips = self._strips
-        try:
+        with suppress(AbandonedError):
             strips.layout()
-        except AbandonedError:
-            if strips.effort is None:
-                raise
-        assert strips.effort is not None
-        return strips.effort
+        return strips.effort, strips.count
 
     def watch(self, tiles: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> None:
         """Take notice of the inner bounds [t, 1, 1, 3] of ``tiles`` [t] in a refinement, which change meanwhile."""
