@@ -6,6 +6,7 @@ import io
 import os
 import tempfile
 import time
+import zipfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass, field
@@ -33,7 +34,7 @@ from ns_abstract.report.record import file_stamp
 from ns_abstract.verify.cells import Cell, Grid
 from ns_abstract.verify.network import NetworkArithmetic
 from ns_abstract.verify.search import Findings
-from ns_abstract.verify.store import Block, Store, fractions
+from ns_abstract.verify.store import IMAGES, Block, Store, fractions
 from ns_abstract.verify.substitution import MODES, STEP, Comparison, compare, gains, spread_by_volume
 
 #: Seconds between notes of progress, and between reports.
@@ -111,7 +112,7 @@ class CertificateRun:
             settings=settings,
             fingerprint=job.fingerprint,
             command=command,
-            plan=(*job.job.plan, *prop.notes),
+            plan=(*job.job.plan, *job.scenes, *prop.notes),
         )
 
     def open(self, *, resume: bool) -> Store:
@@ -277,8 +278,14 @@ class CertificateRun:
                 names=np.array(self.grids[block.frame].box.names, str),
                 camera_to_world=self.job.job.pose_sets[block.frame].pose(values),
                 margin=np.array(np.nan if leaf.margin is None else leaf.margin),
+                **{f"scene_{name}": array for name, array in (leaf.scene or {}).items()},
             )
             store.keep_image(f"frame_{block.frame:05d}_{place}", buffer.getvalue())
+
+    def _kept_image(self, frame: int, pose: np.ndarray) -> np.ndarray | None:
+        """The stored image of a counterexample."""
+        files = sorted((self.folder / IMAGES).glob(f"frame_{frame:05d}_*.npz"))
+        return next((image for file in files if (image := _image_at(file, pose)) is not None), None)
 
     # ---------------------------------------------------------------- weaker bounds
 
@@ -420,9 +427,22 @@ class CertificateRun:
         for title, text, frame, values in wanted:
             pictures = self.job.pictures(frame)
             known = dict(zip(names, values, strict=True))
-            image = pictures.image(np.array([known[name] for name in pictures.box.names]))
+            pose = np.array([known[name] for name in pictures.box.names])
+            # of another scene of the set, maybe
+            image = self._kept_image(frame, pose) if title == "counterexample" else None
+            image = pictures.image(pose) if image is None else image
             found.append({"title": title, "text": text, "png": preview(to_bytes(image), _PIXELS)})
         return found
+
+
+def _image_at(file: Path, pose: np.ndarray) -> np.ndarray | None:
+    """The image of a stored counterexample, if it is that of ``pose``; None also where others have changed the file."""
+    try:
+        with np.load(file, allow_pickle=False) as stored:
+            image = stored["image"] if np.array_equal(stored["values"], pose) else None
+            return None if image is None or image.ndim != 3 or image.dtype != np.float32 else image
+    except (OSError, ValueError, LookupError, zipfile.BadZipFile):
+        return None
 
 
 def _volume(whole: ParameterBox, part: ParameterBox) -> float:

@@ -21,7 +21,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from ns_abstract.verify.network.rows import Rows, full, grid, unflatten
+from ns_abstract.verify.network.rows import Rows, full, grid, spread, unflatten
 
 Shape = tuple[int, ...]
 #: Room for rounding of the lines of an activation, computed with float64: a few operations.
@@ -125,14 +125,28 @@ class Convolution(Linear):
     def magnitude(self, inputs: Sequence[Tensor]) -> Tensor:
         return self._convolve(inputs[0], self.weight.abs())
 
+    @cached_property
+    def _taps(self) -> np.ndarray:
+        """[kh, kw, Cin, C] float64 for `rows.spread`: the stored weights, C a multiple of 4."""
+        weight = self._single.double().permute(2, 3, 1, 0)
+        return functional.pad(weight, (0, -weight.shape[3] % 4)).contiguous().numpy()
+
+    def _spread(self, value: np.ndarray) -> np.ndarray:
+        """Rows through the transpose."""
+        if max(self.stride) == 1 or self.groups > 1 or max(self.dilation) > 1:
+            return functional.conv_transpose2d(
+                torch.from_numpy(value), self._single, stride=self.stride, groups=self.groups, dilation=self.dilation
+            ).numpy()
+        # with strides torch's takes several times as long
+        count, _, h, w = value.shape
+        kh, kw, inputs, _ = self._taps.shape
+        size = (h - 1) * self.stride[0] + kh, (w - 1) * self.stride[1] + kw
+        found = np.empty((count, inputs, *size), np.float32)
+        spread(np.ascontiguousarray(value), self._taps, self.stride, found)
+        return found
+
     def backward(self, rows: Rows) -> list[Rows]:
-        value = functional.conv_transpose2d(
-            torch.from_numpy(rows.value),
-            self._single,
-            stride=self.stride,
-            groups=self.groups,
-            dilation=self.dilation,
-        ).numpy()
+        value = self._spread(rows.value)
         y, x = rows.y * self.stride[0] - self.pads[0], rows.x * self.stride[1] - self.pads[1]
         return [full(Rows(value, y, x), self.input_shapes[0])]
 
