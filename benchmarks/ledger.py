@@ -270,7 +270,7 @@ def evaluated(f: Format, i: Inputs) -> dict[str, Value]:
     opacity = one / (one + (f.given(i.logit) * -1.0).exp())
     found["opacity"] = opacity
     sigma = f.given(i.sigma * -0.555)
-    found["faint"] = opacity * sigma.exp(fast=True)
+    found["exponent_limit"] = opacity * sigma.exp(fast=True)
     found["depth_products"] = dot(turn[2], mean)
     found["depth"] = f.given(i.mean[0]) + f.given(i.mean[1])
     found["viewing_axis"] = dot([f.rounded(v.x, 1.0) for v in pose[2]], [f.given(v) for v in i.mean])
@@ -310,7 +310,7 @@ def _jacobian_row(i: Inputs) -> np.ndarray:
 def allowed(c: Charges, i: Inputs) -> dict[str, np.ndarray]:
     """Errors [n] that the charges ``c`` pay for, for `evaluated`."""
     size = np.abs(i.pose[0])
-    reach = (size * (np.abs(i.mean) + np.abs(i.camera))).sum(axis=0)
+    size_of_terms = (size * (np.abs(i.mean) + np.abs(i.camera))).sum(axis=0)
     u = np.abs(i.across[0] / i.depth)
     world, row = _covariance(i), np.abs(_jacobian_row(i))
     m = np.abs((i.turn * i.scale[None]).astype(np.float32).astype(np.float64))
@@ -327,7 +327,7 @@ def allowed(c: Charges, i: Inputs) -> dict[str, np.ndarray]:
     harmonics = (np.abs(i.sh) * np.array(sizes)[:, None]).sum(axis=0)
     n = np.ones(i.n)
     return {
-        "camera_coordinate": c.camera_coordinate * reach,
+        "camera_coordinate": c.camera_coordinate * size_of_terms,
         "reciprocal_depth": c.reciprocal_depth / i.depth,
         "ratio": c.ratio * u,
         "mean": c.mean * (i.focal * u + np.abs(i.center)),
@@ -348,7 +348,7 @@ def allowed(c: Charges, i: Inputs) -> dict[str, np.ndarray]:
         "near": c.near * 0.01 * n,
         "tile": c.tile * (np.abs(dx) + half) / 16.0,
         "opacity": c.opacity * opacity,
-        "faint": c.faint * opacity * np.exp(-0.555 * i.sigma),
+        "exponent_limit": c.exponent_limit * opacity * np.exp(-0.555 * i.sigma),
         "depth_products": c.depth_products * (np.abs(i.turn[2]) * np.abs(i.mean)).sum(axis=0),
         "depth": c.depth * np.abs(i.mean[0] + i.mean[1]),
         # the products' own rounding is G10's

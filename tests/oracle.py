@@ -15,7 +15,7 @@ import mpmath
 import numpy as np
 from flint import arb, fmpq
 
-from ns_abstract.arithmetic.forms import Basis, Float64Array, FormArray, settle
+from ns_abstract.arithmetic.forms import Basis, Float64Array, FormArray, set_norms
 
 BITS = 200
 _MOST_BITS = 6400
@@ -127,7 +127,7 @@ def random_forms(
     data[1:m, lanes // 4 : lanes // 3] = 0.0
     data[m, lanes // 3 : lanes // 2] = 0.0
     form = FormArray(basis, data, (lanes,))
-    settle(data, basis.dimensions, basis.order, m)
+    set_norms(data, basis.dimensions, basis.order, m)
     if positive:
         data[0] = np.abs(data[0]) + (data[m] + data[m + 1] + data[m + 2]) * (1.0 + generator.uniform(1e-6, 1.0, lanes))
     return form

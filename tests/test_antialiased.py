@@ -19,7 +19,7 @@ from ns_abstract.methods.splat.activate import activate, rotation_matrices
 from ns_abstract.methods.splat.bounds import SplatBounds
 from ns_abstract.methods.splat.constants import GSPLAT_1_4_0
 from ns_abstract.methods.splat.frame import SplatFrame
-from ns_abstract.methods.splat.records import FORMS, OPACITY_HIGH, OPACITY_LOW, WILD, columns
+from ns_abstract.methods.splat.records import FORMS, OPACITY_HIGH, OPACITY_LOW, UNBOUNDED, columns
 from ns_abstract.methods.splat.reference import Reference
 from ns_abstract.methods.splat.render import Renderer
 from ns_abstract.methods.splat.scene import SplatScene
@@ -150,7 +150,7 @@ def compensations(scene: SplatScene, number) -> np.ndarray:
 
 
 def records(scene: SplatScene, poses: PoseSet, order: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Bounds [n] of the compensated opacity in float32, whether each Gaussian is wild, and whether it is drawn."""
+    """Bounds [n] of the compensated opacity in float32, whether each Gaussian is unbounded, and whether it is drawn."""
     bounds = SplatBounds(activate(scene, GSPLAT_1_4_0), GSPLAT_1_4_0, FLOAT32)
     forms = poses.enclosure(poses.box, order)
     bounds.cell(CAMERA, forms, wanted=np.zeros(0, np.int64))
@@ -162,7 +162,7 @@ def records(scene: SplatScene, poses: PoseSet, order: int) -> tuple[np.ndarray, 
     spread = np.abs(form[:, 1:]).sum(axis=1)
     low = found[:, OPACITY_LOW] * np.exp(-form[:, 0] - spread)
     high = found[:, OPACITY_HIGH] * np.exp(-form[:, 0] + spread)
-    return low, high, found[:, WILD] != 0.0, shown
+    return low, high, found[:, UNBOUNDED] != 0.0, shown
 
 
 @pytest.mark.parametrize("name", SETS)
@@ -171,21 +171,21 @@ def test_computed_factor(shape: str, name: str) -> None:
     """What float32 finds for each Gaussian's opacity, in IEEE arithmetic and with errors as large as they may be."""
     scene = scene_of((shape,), 150, seed=len(shape))
     perturbation, order = SETS[name]
-    low, high, wild, shown = records(scene, PoseSet.around(CAMERA, perturbation), order)
-    _, _, wild_without, _ = records(
+    low, high, unbounded, shown = records(scene, PoseSet.around(CAMERA, perturbation), order)
+    _, _, unbounded_without, _ = records(
         replace(scene, rasterize_mode="classic"), PoseSet.around(CAMERA, perturbation), order
     )
-    assert (wild & shown).sum() <= wild_without.sum()
+    assert (unbounded & shown).sum() <= unbounded_without.sum()
     opacity = 1.0 / (1.0 + np.exp(-scene.opacity_logits.astype(np.float64)))
     random = np.random.default_rng(1)
     for number in (Single, *[lambda v: Rounded(v.astype(np.float64), random)] * 6):
         value = opacity * compensations(scene, number)
         assert (value[~shown] < GSPLAT_1_4_0.alpha_min).all()
-        assert (value[shown] <= np.where(wild, 1.0, high)[shown]).all()
-        assert (value[shown] >= np.where(wild, 0.0, low)[shown]).all()
+        assert (value[shown] <= np.where(unbounded, 1.0, high)[shown]).all()
+        assert (value[shown] >= np.where(unbounded, 0.0, low)[shown]).all()
     if name == "one pose":
         # of what is drawn
-        width = (high - low)[shown & ~wild]
+        width = (high - low)[shown & ~unbounded]
         assert width.size == 0 or (np.median(width) < 2e-3 and width.max() < 0.1)
 
 

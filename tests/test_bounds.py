@@ -22,7 +22,7 @@ from ns_abstract.methods.splat.blend import _sort as sort_group
 from ns_abstract.methods.splat.bounds import SplatBounds
 from ns_abstract.methods.splat.constants import GSPLAT_1_4_0, PAPER
 from ns_abstract.methods.splat.frame import SplatFrame
-from ns_abstract.methods.splat.records import FORMS, SPREAD, WILD, columns
+from ns_abstract.methods.splat.records import FORMS, SPREAD, UNBOUNDED, columns
 from ns_abstract.methods.splat.render import Renderer
 from ns_abstract.perturbation.specification import Perturbation
 
@@ -221,7 +221,7 @@ def test_alpha_threshold_of_all(order):
 
 @pytest.mark.parametrize("antialiased", [False, True])
 @pytest.mark.parametrize("order, names", [(1, ("x",)), (2, ("x",)), (1, ("x", "yaw", "roll"))])
-def test_reach_counts_every_error(order, antialiased, names):
+def test_extent_counts_every_error(order, antialiased, names):
     """What a record says of how far its forms may be from their centres covers all terms, the float error too."""
     places = np.random.default_rng(5).uniform(-1.0, 1.0, (70, 2))
     splats = scene(
@@ -235,7 +235,7 @@ def test_reach_counts_every_error(order, antialiased, names):
     m = forms.rotation.basis.monomials
     width = columns(6 if antialiased else 5, m)
     record = bounds._buffer("record", (70, width))
-    assert (record[:, WILD] == 0.0).all() and width % 8 == 0
+    assert (record[:, UNBOUNDED] == 0.0).all() and width % 8 == 0
     for f in range(5):
         form = record[:, FORMS + f * (m + 1) : FORMS + (f + 1) * (m + 1)]
         spread = np.abs(form[:, 1:]).sum(axis=1)
@@ -402,7 +402,7 @@ def test_colors_are_shared_by_cells_that_turn_and_not_by_others():
                     for bounds in (kept, SplatBounds(splats, GSPLAT_1_4_0, FLOAT32))
                 )
                 assert (found.lower == fresh.lower).all() and (found.upper == fresh.upper).all()
-                assert (found.visible == fresh.visible).all() and (found.reach == fresh.reach).all()
+                assert (found.visible == fresh.visible).all() and (found.tile_ranges == fresh.tile_ranges).all()
 
 
 @both_orders

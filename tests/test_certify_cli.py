@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import base64
+import hashlib
 import importlib.util
 import itertools
 import json
@@ -36,6 +38,7 @@ from ns_abstract.methods.nerf.write import write_nerf_run
 from ns_abstract.methods.splat.method import SplatMethod
 from ns_abstract.methods.splat.reference import Reference
 from ns_abstract.verify import model
+from ns_abstract.verify.eight_bit import rounded
 from ns_abstract.verify.network import OutputBounds
 
 MODULE = "ns_abstract.cli.certify"
@@ -48,9 +51,11 @@ SWEEP = {"version": 1, "translation": {"x": 0.15}}
 class Case:
     """Files of one certification."""
 
-    def __init__(self, folder: Path, blobs: Inputs, net: Path, prop: Any, spec: Any = SWEEP) -> None:
+    def __init__(
+        self, folder: Path, blobs: Inputs, net: Path, prop: Any, spec: Any = SWEEP, picture: Any = "float"
+    ) -> None:
         folder.mkdir(exist_ok=True)
-        self.blobs, self.net = blobs, net
+        self.blobs, self.net, self.picture = blobs, net, picture
         self.prop = write_json(folder / "prop.json", prop)
         self.spec = None if spec is None else write_json(folder / "spec.json", spec)
 
@@ -58,7 +63,7 @@ class Case:
         found = {
             "load_config": self.blobs.config, "camera_path_filename": self.blobs.path, "model": self.net,
             "property": self.prop, "output_dir": output, "perturbation_filename": self.spec, "frames": (0,),
-            "workers": 1,
+            "workers": 1, "picture": self.picture,
         }  # fmt: skip
         return found | more
 
@@ -78,7 +83,8 @@ class Case:
 
     @property
     def job(self) -> Certification:
-        return open_certification(CertifySettings(self.blobs.config, self.blobs.path, self.net, self.prop, self.spec))
+        files = self.blobs.config, self.blobs.path, self.net, self.prop, self.spec
+        return open_certification(CertifySettings(*files, picture=self.picture))
 
 
 def report(folder: Path) -> dict[str, Any]:
@@ -156,6 +162,7 @@ def attack(case: Case, folder: Path, frame: int = 0, poses: int = 6) -> tuple[in
 
     def compare(image: np.ndarray, values: np.ndarray, proved: float) -> None:
         nonlocal comparisons, violations, slack
+        image = rounded(image) if case.picture == "8-bit" else image
         inputs = job.property.preprocess.apply(torch.from_numpy(image.astype(np.float32))[None]).numpy()
         outputs = torch.from_numpy(session.run(None, {session.get_inputs()[0].name: inputs})[0]).double().reshape(1, -1)
         margin = float(claim.margin(outputs, torch.from_numpy(values)[None])[0])
@@ -224,6 +231,27 @@ def test_counterexamples_are_stored_and_break_the_property(planted: Case, finish
             assert list(found["names"]) == ["x"]
             stored.add(tuple(found["values"].tolist()))
     assert stored == {tuple(json.loads(row[5])) for row in rows}
+
+
+def test_rounded_pictures(planted: Case, tmp_path: Path) -> None:
+    """8 bits: certified cells are attacked, and counterexamples stored, with the pictures of a file."""
+    case = Case(tmp_path / "case", planted.blobs, planted.net, json.loads(planted.prop.read_text()), picture="8-bit")
+    document = case.run(tmp_path / "out")
+    covered = document["coverage"]
+    assert document["picture"] == "8-bit" and covered["certified"] > 0.3 and covered["falsified"] > 0.1
+    comparisons, violations, slack = attack(case, tmp_path / "out")
+    assert comparisons > 100 and violations == 0 and slack < 0.05
+    files = list((tmp_path / "out" / "counterexamples").iterdir())
+    assert files
+    for file in files:
+        with np.load(file, allow_pickle=False) as found:
+            image = found["image"]
+            np.testing.assert_array_equal(image, np.rint(image * 255.0).astype(np.float32) / np.float32(255.0))
+            np.testing.assert_array_equal(case.job.model.outputs(image[None])[0], found["outputs"])
+    # another picture is another search
+    with pytest.raises(InputError, match="picture"):
+        planted.run(tmp_path / "out", resume=True)
+    assert "rounded to 8 bits" in (tmp_path / "out" / "report.html").read_text()
 
 
 def test_random_network(blobs: Inputs, net: Path, tmp_path: Path) -> None:
@@ -504,7 +532,7 @@ def test_dask_worker_killed(planted: Case, finished: Path, tmp_path: Path) -> No
                 killed = True
                 os.kill(next(iter(client.run(os.getpid).values())), signal.SIGKILL)
             for number, findings in engine.collect(0.5):
-                assert store.settle(flying.pop(number), findings, grid)
+                assert store.close_block(flying.pop(number), findings, grid)
         engine.close()
     assert killed
     store.close()
@@ -597,7 +625,19 @@ def test_page(finished: Path) -> None:
         "not its rounding to 8 bits", "every float32", "worst certified", "cells.sqlite", "How to reproduce",
     ):  # fmt: skip
         assert part in page, part
-    assert not re.search(r"<script|https?://", page)
+    assert "https://" not in page and "http://" not in page
+    # one script, which the policy names by its hash, and its data
+    scripts = re.findall(r"<script([^>]*)>(.*?)</script>", page, re.DOTALL)
+    (_, data), (_, code) = scripts
+    digest = base64.b64encode(hashlib.sha256(code.encode()).digest()).decode()
+    assert f"script-src 'sha256-{digest}'\"" in page and scripts[0][0] == ' type="application/json" id="cell-data"'
+    # every cell can be chosen, and some show a picture
+    found = json.loads(data)
+    chosen = {int(number) for number in re.findall(r'data-cell="(\d+)"', page)}
+    assert chosen == set(range(len(found["cells"]))) and len(chosen) > 3
+    rows = sqlite3.connect(finished / "cells.sqlite").execute("SELECT verdict, margin FROM cells").fetchall()
+    assert sorted((cell[1], cell[4]) for cell in found["cells"]) == sorted(rows)
+    assert found["pictures"] and {cell[6] for cell in found["cells"]} >= set(range(len(found["pictures"])))
 
 
 def test_ring_strip_plane_and_bars() -> None:
@@ -617,7 +657,12 @@ def test_ring_strip_plane_and_bars() -> None:
         ]
 
     frames = [entry(0, "azimuth"), entry(1, "x"), entry(2, "x", "y"), entry(3, "x", "y", "z")]
-    drawn = page._map({"frames": frames}, {k: rows(max(1, k)) for k in range(4)})
+    drawn = page._map({"frames": frames}, {k: rows(max(1, k)) for k in range(4)}, {})
+    assert "data-cell" not in drawn
+    numbers = page._numbered({"frames": frames}, cells := {k: rows(max(1, k)) for k in range(4)})
+    each = page._map({"frames": frames}, cells, numbers)
+    # every cell of rings, strips and planes; a bar has the first of each verdict
+    assert sorted(map(int, re.findall(r'data-cell="(\d+)"', each))) == [*range(13), 14, 15]
     assert drawn.count("<svg") == 4
     for title in ("Verdicts around the orbit", "Verdicts along x", "Verdicts over two parameters", "Parts of each"):
         assert title in drawn

@@ -462,7 +462,7 @@ def fill(store: Store, search: Search, limit: int = 1 << 60) -> int:
         store.begin(0, search.grid, [roots[i : i + BLOCK] for i in range(0, len(roots), BLOCK)])
     count = 0
     while count < limit and (blocks := store.pending(set(), 1)):
-        assert store.settle(blocks[0], search.examine(blocks[0].cells), search.grid)
+        assert store.close_block(blocks[0], search.examine(blocks[0].cells), search.grid)
         count += 1
     return count
 
@@ -536,9 +536,9 @@ def test_result_that_comes_twice_counts_once(tmp_path: Path) -> None:
     fill(store, search, 1)
     block = store.pending(set(), 1)[0]
     findings = search.examine(block.cells)
-    assert store.settle(block, findings, search.grid)
+    assert store.close_block(block, findings, search.grid)
     before = store.tallies(), store.count, store.open_blocks
-    assert not store.settle(block, findings, search.grid)
+    assert not store.close_block(block, findings, search.grid)
     assert (store.tallies(), store.count, store.open_blocks) == before
 
 
@@ -553,7 +553,7 @@ def test_impossible_leaves_are_refused_and_nothing_is_stored(tmp_path: Path) -> 
         Leaf(block.cells[0], "falsified", -1.0, 0.0),
     ):
         with pytest.raises(ValueError, match=r"certified|falsified"):
-            store.settle(block, Findings((leaf,), (), (), 0, 0.0), search.grid)
+            store.close_block(block, Findings((leaf,), (), (), 0, 0.0), search.grid)
         assert store.count == 0 and store.pending(set(), 1) == [block]
 
 
@@ -563,7 +563,7 @@ def test_pending_takes_what_is_nearest_to_a_proof_and_now_and_then_the_largest(t
     blocks = store.pending(set(), 3)
     assert [b.number for b in blocks] == [1, 2, 3]
     parts = tuple((Cell((k,), (k + 1,)),) for k in range(3))
-    store.settle(blocks[0], Findings((), parts, (), 0, 0.0, ranks=(5.0, 2.0, 1e9)), search.grid)
+    store.close_block(blocks[0], Findings((), parts, (), 0, 0.0, ranks=(5.0, 2.0, 1e9)), search.grid)
     # the fourth is the largest, the part with the last rank comes behind all first cells
     assert [b.number for b in store.pending({2}, 10)] == [3, 7, 6, 4, 5, 8]
     assert store.pending({2, 3, 4, 5, 6, 7, 8}, 10) == []

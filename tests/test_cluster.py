@@ -13,6 +13,7 @@ import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import CancelledError
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -247,6 +248,44 @@ def test_tasks_lost_with_the_connection_are_handed_in_again(monkeypatch: pytest.
     engine.submit(5, divmod, 7, 2)
     with pytest.raises(InputError, match="the scheduler is gone"):
         engine.collect(0.1)
+
+
+class Lost:
+    """A finished result whose worker is gone: it cannot be fetched until it was made again."""
+
+    def __init__(self, asked: list[float]) -> None:
+        self.asked = asked
+
+    def result(self, timeout: float) -> int:
+        self.asked.append(timeout)
+        if len(self.asked) < 3:
+            raise TimeoutError
+        return 7
+
+
+def test_a_result_whose_worker_is_gone_is_not_waited_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    import distributed
+
+    asked: list[float] = []
+    client: Any = SimpleNamespace(
+        status="running", nthreads=lambda: {"w": 1}, submit=lambda *arguments, **rest: Lost(asked)
+    )
+    monkeypatch.setattr(distributed, "wait", lambda futures, **rest: type("Waited", (), {"done": set(futures)}))
+    engine = Cluster(client)
+    engine.submit(3, divmod, 7, 1)
+    assert engine.collect(0.1) == []
+    client.nthreads = dict
+    assert engine.collect(0.1) == []
+    assert engine.collect(0.1) == [(3, 7)] and engine.collect(0.1) == []
+    assert asked[0] <= 10.0 and asked == [asked[0], 2.0 * asked[0], 4.0 * asked[0]]
+
+    # nobody is left who could make it again
+    asked.clear()
+    monkeypatch.setattr(engines, "_GONE", 0.0)
+    engine.submit(4, divmod, 7, 1)
+    with pytest.raises(InputError, match="no workers left"):
+        for _ in range(3):
+            engine.collect(0.1)
 
 
 # ---------------------------------------------------------------- TLS

@@ -14,7 +14,7 @@ from numba import njit
 from oracle import escapes, inside, points, rational, value, weights
 
 from ns_abstract.arithmetic.elementary import EXP_HIGHEST, EXP_LOWEST, EXP_RELATIVE_ERROR, exp_kernel
-from ns_abstract.arithmetic.forms import Basis, FormArray, settle
+from ns_abstract.arithmetic.forms import Basis, FormArray, set_norms
 from ns_abstract.arithmetic.rounding import FLOAT32, REAL, UNIT32, UNIT64, arithmetic, gamma
 from ns_abstract.arithmetic.trigonometry import cos_sin
 
@@ -88,7 +88,7 @@ def test_cos_sin(order, noise):
     angle = FormArray.constant(basis, [middle for middle, _ in ANGLES], noise)
     angle.data[1] = [0.75 * half for _, half in ANGLES]
     angle.data[2] = [-0.25 * half for _, half in ANGLES]
-    settle(angle.data, basis.dimensions, basis.order, basis.monomials)
+    set_norms(angle.data, basis.dimensions, basis.order, basis.monomials)
     cosine, sine = cos_sin(angle)
     assert np.isfinite(cosine.radius).all() and np.isfinite(sine.radius).all()
     generator = np.random.default_rng(3)
@@ -103,7 +103,7 @@ def test_cos_sin_dense(order):
     middles = np.linspace(-7.0, 7.0, 141)
     angle = FormArray.constant(basis, middles)
     angle.data[1] = 0.4
-    settle(angle.data, 1, order, basis.monomials)
+    set_norms(angle.data, 1, order, basis.monomials)
     forms = cos_sin(angle)
     for lane in range(middles.size):
         for numerator in range(-4, 5):
@@ -141,7 +141,7 @@ def trigonometric_ratio(order: int) -> float:
     basis = Basis(1, order)
     angle = FormArray.constant(basis, np.linspace(0.3, 1.2, 10))
     angle.data[1] = 0.1
-    settle(angle.data, 1, order, basis.monomials)
+    set_norms(angle.data, 1, order, basis.monomials)
     worst = 0.0
     p = np.linspace(-1.0, 1.0, 2001)[:, None]
     for form, function in zip(cos_sin(angle), (np.cos, np.sin), strict=True):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import math
 from collections.abc import Callable
 from types import SimpleNamespace
 from typing import Any
@@ -16,7 +17,7 @@ from ns_abstract.geometry.box import ParameterBox
 from ns_abstract.geometry.tiles import assemble
 from ns_abstract.refine import engine
 from ns_abstract.refine.engine import Goal, Refinement
-from ns_abstract.refine.result import FrameResult, mean_pixel_gap
+from ns_abstract.refine.result import FrameResult, TracePoint, mean_pixel_gap
 
 SIDE = 4
 FOREVER = 1e9
@@ -176,12 +177,17 @@ def test_bounds_hold_the_exact_range(**c: Any) -> None:
     assert 0 <= len(frame.calls) - result.cells <= (12 if c["dimensions"] == 1 else 1)
 
 
+def after_cover(result: FrameResult) -> TracePoint:
+    """The first point at which the whole set is covered."""
+    return next(point for point in result.trace if point.covered == 1.0)
+
+
 @pytest.mark.parametrize("pace", [0.0, 3.0])
 @pytest.mark.parametrize("slack", [0.03, 0.3, 3.0])
 @pytest.mark.parametrize("ratio", [1.05, 1.2])
 def test_first_cover_of_one_parameter_is_what_the_goal_asks_for(ratio: float, slack: float, pace: float) -> None:
     goal, frame = Goal(ratio, FOREVER), Waves(1, slack=slack, pace=pace)
-    first = refine(frame, goal).trace[0]
+    first = after_cover(refine(frame, goal))
     assert goal.met(first)
 
     def met(count: int) -> bool:
@@ -225,7 +231,7 @@ def test_first_cover_is_rendered_in_every_other_part_until_the_goal_asks_for_mor
         check(frame, result)
         assert (frame.before_splits is not None) == split
         rendered = frame.rendered if frame.before_splits is None else frame.before_splits[0]
-        parts = frame.box.split(0, result.trace[0].cells)
+        parts = frame.box.split(0, after_cover(result).cells)
         assert len(parts) > 4
         seen = sum(float(part.middle[0]) in rendered for part in parts)
         assert seen == len(parts) if split else seen <= len(parts) / 2 + 1
@@ -241,7 +247,35 @@ def test_only_a_cover_that_may_reach_the_goal_is_allowed_to_be_looser() -> None:
         assert first == last == 0.0 and len(before) == looser
         assert refinement.floor == (0.5 * before[0] if looser else 0.0)
         if looser:
-            assert 0.0 < before[0] <= (ratio - 1.0) * result.trace[0].mpg_witness
+            assert 0.0 < before[0] <= (ratio - 1.0) * after_cover(result).mpg_witness
+
+
+@pytest.mark.parametrize("dimensions", [1, 2])
+def test_trace_begins_with_the_first_cells(dimensions: int) -> None:
+    """A set that is not covered yet has nothing but [0, 1], however tight the cells so far are."""
+    frame = Waves(dimensions, pace=4.0)
+    trace = refine(frame, Goal(1.002, FOREVER, 4000)).trace
+    cover = [point for point in trace if point.covered < 1.0]
+    assert [point.covered for point in trace] == sorted(point.covered for point in trace)
+    assert (trace[0].seconds >= 0.0, trace[0].cells, trace[0].covered) == (True, 0, 0.0)
+    assert [point.mpg for point in cover] == [pytest.approx(math.sqrt(3.0))] * len(cover)
+    # the first cells one by one, then some of them
+    count = next(point for point in trace if point.covered == 1.0).cells
+    assert [point.cells for point in cover][: min(count, 9)] == list(range(min(count, 9))) and count >= 4
+    assert len(cover) <= 9 + 32
+
+
+def test_views_of_kept_leaves_are_renders_across_the_set() -> None:
+    for dimensions, count in ((1, 9), (2, 9), (3, 13)):
+        frame = Waves(dimensions)
+        result = refine(frame, Goal(1.5, FOREVER, 40), keep_leaves=True)
+        assert result.views is not None and result.views.values.shape == (count, dimensions)
+        ends = result.views.values.min(axis=0), result.views.values.max(axis=0)
+        np.testing.assert_allclose(ends, (frame.box.lower, frame.box.upper), rtol=1e-15)
+        for values, image in zip(result.views.values, result.views.images, strict=True):
+            np.testing.assert_array_equal(image, assemble(frame.render(values), frame.camera))
+            assert (result.witness_lower <= image).all() and (image <= result.witness_upper).all()
+        assert refine(frame, Goal(1.5, FOREVER, 40)).views is None
 
 
 def test_first_cover_stays_coarse_where_smaller_cells_do_not_help() -> None:
@@ -255,7 +289,7 @@ def test_first_cover_stays_coarse_where_smaller_cells_do_not_help() -> None:
 
     frame.bound = loose  # type: ignore[method-assign]
     result = refine(frame, Goal(1.05, FOREVER, 200))
-    assert result.trace[0].cells <= 7
+    assert after_cover(result).cells <= 7
 
 
 @pytest.mark.parametrize(("dimensions", "ratio", "first"), [(1, 1.002, 1.01), (2, 1.1, 1.3)])
@@ -267,7 +301,7 @@ def test_ratio_falls_to_the_goal(dimensions: int, ratio: float, first: float) ->
     assert all(after <= before for before, after in itertools.pairwise(gaps))
     inner = [point.mpg_witness for point in result.trace]
     assert all(after >= before for before, after in itertools.pairwise(inner))
-    assert gaps[0] > first * inner[0]
+    assert after_cover(result).mpg > first * after_cover(result).mpg_witness
     assert result.trace[-1].mpg <= ratio * result.trace[-1].mpg_witness
     assert result.trace[-1].mpg == pytest.approx(mean_pixel_gap(result.lower, result.upper), rel=1e-12)
     assert result.cells < 4000

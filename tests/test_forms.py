@@ -33,7 +33,7 @@ from ns_abstract.arithmetic.forms import (
     clamp_below,
     logarithm,
     scale_add,
-    settle,
+    set_norms,
 )
 
 BASES = [Basis(d, order) for order in (1, 2) for d in (0, 1, 2, 3, 6)]
@@ -50,7 +50,7 @@ def accumulated(basis: Basis, shape: tuple[int, ...], steps) -> FormArray:
     out = np.zeros((basis.rows, math.prod(shape)))
     for kernel, *operands in steps:
         kernel(*(x.data if isinstance(x, FormArray) else x for x in operands), out, *layout(basis))
-    settle(out, *layout(basis))
+    set_norms(out, *layout(basis))
     return FormArray(basis, out, shape)
 
 
@@ -121,7 +121,7 @@ def test_binary_contains(name, size, basis):
     if size == "cancelling":
         # equal and opposite polynomials: what is left is rounding
         b.data[: basis.monomials] = -a.data[: basis.monomials]
-        settle(b.data, *layout(basis))
+        set_norms(b.data, *layout(basis))
     operation, exact = BINARY[name]
     result = operation(a, b)
     assert np.isfinite(result.radius).all()
@@ -166,7 +166,7 @@ def test_function_near_one(name, order):
     for half in (0.0, 2.0**-52, 1e-9):
         a = FormArray.constant(basis, centers)
         a.data[1] = half
-        settle(a.data, *layout(basis))
+        set_norms(a.data, *layout(basis))
         operation, exact = POSITIVE[name]
         assert escapes(operation(a), exact, [a], generator, 4) == []
 
@@ -194,7 +194,7 @@ def test_crossing_zero(name, order):
     a = FormArray.constant(basis, np.ones(3))
     a.data[1] = [1.0, 0.75, 2.0]
     a.data[2] = [0.0, 0.5, 0.0]
-    settle(a.data, *layout(basis))
+    set_norms(a.data, *layout(basis))
     assert not np.isfinite(POSITIVE[name][0](a).radius).any()
 
 
@@ -218,7 +218,7 @@ def test_bounds(basis):
             # vertices inside the box, on its border, and just outside
             a.data[1, ::3] = 2.0 * a.data[1 + basis.dimensions, ::3]
             a.data[1, 1::3] = 0.0
-            settle(a.data, *layout(basis))
+            set_norms(a.data, *layout(basis))
         low, high = a.bounds()
         for lane in range(LANES):
             for point in points(basis.dimensions, 6, generator):
@@ -230,7 +230,7 @@ def test_bounds(basis):
 def test_bounds_tiny(scale):
     """The vertex of g p + s p^2 where g^2 is denormal or zero."""
     form = FormArray(Basis(1, 2), np.array([[0.0], [0.3 * scale], [scale], [0.0], [0.0], [0.0]]), (1,))
-    settle(form.data, 1, 2, 3)
+    set_norms(form.data, 1, 2, 3)
     low, high = form.bounds()
     assert between(low[0], high[0], lambda: value(form, 0, [rational(-0.15)], fmpq(0)))
 
@@ -251,7 +251,7 @@ def test_function_huge(name, order, center, half):
     """A centre whose powers overflow: the remainder does not vanish."""
     a = FormArray.constant(Basis(1, order), np.array([center]))
     a.data[1] = half
-    settle(a.data, *layout(a.basis))
+    set_norms(a.data, *layout(a.basis))
     operation, exact = POSITIVE[name]
     result = operation(a)
     assert inside(result, 0, [fmpq(-1)], lambda: exact(value(a, 0, [fmpq(-1)], fmpq(0))))
@@ -261,7 +261,7 @@ def test_function_huge(name, order, center, half):
 def test_bounds_exact(linear, quadratic):
     """One parameter and order 2: the bounds are the range, up to rounding."""
     form = FormArray(Basis(1, 2), np.array([[0.5], [linear], [quadratic], [0.0], [0.0], [0.0]]), (1,))
-    settle(form.data, 1, 2, 3)
+    set_norms(form.data, 1, 2, 3)
     low, high = form.bounds()
     bottom, top = sampled_range(form, lambda x: x)
     assert low[0] <= bottom[0] and top[0] <= high[0]
@@ -294,7 +294,7 @@ def test_clamp_sure_and_never():
     basis = Basis(1, 1)
     a = FormArray.constant(basis, np.array([5.0, -5.0]))
     a.data[1] = 0.25
-    settle(a.data, *layout(basis))
+    set_norms(a.data, *layout(basis))
     out = a.data.copy()
     clamp_below(out, 1.0, *a.bounds(), *layout(basis))
     assert np.array_equal(out[:, 0], a.data[:, 0])
@@ -302,7 +302,7 @@ def test_clamp_sure_and_never():
 
 
 @by_basis
-def test_settle(basis):
+def test_set_norms(basis):
     generator = np.random.default_rng([basis.dimensions, basis.order, 6])
     for scale in (1.0, 1e-312, 1e290):
         a = random_forms(basis, LANES, generator, spread=scale)
@@ -421,7 +421,7 @@ def forms(draw, basis: Basis, lanes: int = 3, low: float = -1e3) -> FormArray:
     for lane in range(lanes):
         data[: basis.monomials, lane] = draw(st.lists(coefficients, min_size=basis.monomials, max_size=basis.monomials))
         data[basis.monomials, lane] = draw(st.floats(0.0, 10.0))
-    settle(data, *layout(basis))
+    set_norms(data, *layout(basis))
     return FormArray(basis, data, (lanes,))
 
 
@@ -495,7 +495,7 @@ def test_monotone_in_width(name):
     for half in (0.0, 1e-3, 0.1, 0.3, 0.45):
         a = FormArray.constant(basis, middles)
         a.data[1] = half
-        settle(a.data, *layout(basis))
+        set_norms(a.data, *layout(basis))
         low, high = POSITIVE[name][0](a).bounds()
         if previous is not None:
             assert (low <= previous[0] + 1e-13).all() and (high >= previous[1] - 1e-13).all()
@@ -548,7 +548,7 @@ def width_ratio(name: str, order: int) -> float:
     basis = Basis(1, order)
     a = FormArray.constant(basis, np.linspace(0.5, 3.0, 26))
     a.data[1] = 0.1
-    settle(a.data, *layout(basis))
+    set_norms(a.data, *layout(basis))
     functions = {
         "reciprocal": lambda x: 1 / x,
         "sqrt": np.sqrt,

@@ -18,9 +18,9 @@ PROGRAM = """
 import logging
 import numpy as np
 logging.basicConfig(level=logging.INFO, format="%(message)s")
-from ns_abstract.arithmetic.forms import settle
-settle(np.zeros((4, 3)), 0, 1, 1)
-print(sum(settle.stats.cache_hits.values()), sum(settle.stats.cache_misses.values()))
+from ns_abstract.arithmetic.forms import set_norms
+set_norms(np.zeros((4, 3)), 0, 1, 1)
+print(sum(set_norms.stats.cache_hits.values()), sum(set_norms.stats.cache_misses.values()))
 """
 HIT, MISS = "1 0", "0 1"
 

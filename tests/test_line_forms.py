@@ -8,7 +8,7 @@ from oracle import between, escapes, points, random_forms, rational, value, weig
 from test_forms import BINARY, LANES, POSITIVE, SIZES, layout
 
 from ns_abstract.arithmetic import line_forms
-from ns_abstract.arithmetic.forms import Basis, FormArray, clamp_below, settle
+from ns_abstract.arithmetic.forms import Basis, FormArray, clamp_below, set_norms
 
 BASIS = Basis(1, 2)
 
@@ -19,7 +19,7 @@ def lanes(function, *operands: FormArray, numbers: tuple[np.ndarray, ...] = ()) 
     for lane in range(data.shape[1]):
         forms = [tuple(float(x) for x in form.data[:4, lane]) for form in operands]
         data[:4, lane] = function(*forms, *(float(n[lane]) for n in numbers))
-    settle(data, *layout(BASIS))
+    set_norms(data, *layout(BASIS))
     return FormArray(BASIS, data, operands[0].shape)
 
 
@@ -81,7 +81,7 @@ def test_domain(name):
     """What may be 0 or below, too small, too large or is no number has no finite answer, nor has what comes of it."""
     a = FormArray.constant(BASIS, np.array([0.0, -1.0, 1.0, -1e-300, 1.0, np.nan, 1e-80, 1e80, 1.0]))
     a.data[3, 2], a.data[3, 4], a.data[1, 8] = 1.0, np.inf, 1.0
-    settle(a.data, *layout(BASIS))
+    set_norms(a.data, *layout(BASIS))
     result = lanes(SINGLE[name][0], a)
     assert not np.isfinite(result.radius).any()
     twice = lanes(lambda x: line_forms.combined(x, 1.0, x, 1.0), result)
@@ -96,7 +96,7 @@ def test_ends(size):
     # vertices inside the box, on its border, and just outside
     a.data[1, ::3] = 2.0 * a.data[2, ::3]
     a.data[1, 1::3] = 0.0
-    settle(a.data, *layout(BASIS))
+    set_norms(a.data, *layout(BASIS))
     low, high = a.bounds()
     for lane in range(LANES):
         bottom, top = line_forms.ends(tuple(float(x) for x in a.data[:4, lane]))

@@ -228,16 +228,16 @@ def test_processes_find_what_this_process_finds_and_survive_a_kill() -> None:
     engine = frame_module._processes(2)
     try:
         together = shared.bound(box, tiles)
-        reach = alone.bounds.reach
+        displacement = alone.bounds.displacement
         halves = []
         for part in (tiles[:6], tiles[6:]):
-            alone.bounds.reach = reach
+            alone.bounds.displacement = displacement
             halves.append(alone.bound(box, part))
         for name in ("lower", "upper"):
             assert (getattr(together, name) == np.concatenate([getattr(half, name) for half in halves])).all()
         for pid in engine.pids:
             os.kill(pid, signal.SIGKILL)
-        shared.bounds.reach = reach
+        shared.bounds.displacement = displacement
         again = shared.bound(box, tiles)
         assert (again.lower == together.lower).all() and (again.upper == together.upper).all()
     finally:

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 from nerfs import poses
 
-from ns_abstract.arithmetic.chebyshev import ROUNDING, ChebyshevBasis, bernstein_matrices, chebyshev_values
+from ns_abstract.arithmetic.chebyshev import ChebyshevBasis, bernstein_matrices, chebyshev_values
+from ns_abstract.arithmetic.rounding import CHEBYSHEV_ROUNDING
 from ns_abstract.arithmetic.taylor import TaylorArray, TaylorBasis, taylor_cos_sin
 from ns_abstract.geometry.poses import PoseSet
 
@@ -113,7 +114,7 @@ def test_interpolation_ranges_and_fits(dimensions: int, degree: int, grid: int) 
         place = place * 4 + np.minimum(3, ((points[:, j] + 1.0) * 2.0).astype(int))
     for decay in (0.0, 1.0, 3.0):
         c = rng.normal(size=basis.size) / (1.0 + basis.indices.sum(axis=1)) ** decay
-        slack = ROUNDING * np.abs(c).sum()
+        slack = CHEBYSHEV_ROUNDING * np.abs(c).sum()
         values, on_grid = basis.values(points) @ c, basis.evaluation @ c
         assert np.abs(basis.interpolation[0] @ (basis.values(basis.nodes) @ c) - c).max() < slack
         assert np.abs(basis.fit @ on_grid - c).max() < slack

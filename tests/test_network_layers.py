@@ -319,22 +319,6 @@ def test_a_single_image_has_bounds_of_rounding_size(name: str, tmp_path: Path) -
     assert (bounds.lower[0] >= y - 3e-3 * (1 + np.abs(y))).all()
 
 
-@pytest.mark.parametrize("stride", [(2, 2), (1, 3), (3, 1)])
-@pytest.mark.parametrize("channels", [(3, 2), (8, 5), (1, 4)])
-def test_spread_is_the_transposed_convolution(stride: tuple[int, int], channels: tuple[int, int]) -> None:
-    """Up to one rounding of the result; rows beside full eights and channels beside full fours are not lost."""
-    generator = np.random.default_rng(0)
-    for count, (h, w), (kh, kw) in ((1, (1, 1), (1, 1)), (9, (4, 3), (3, 2)), (16, (2, 5), (2, 5))):
-        weight = torch.from_numpy(generator.normal(size=(*channels, kh, kw))).float().double()
-        shape = (channels[1], (h - 1) * stride[0] + kh, (w - 1) * stride[1] + kw)
-        layer = Convolution((shape,), (channels[0], h, w), weight=weight, stride=stride)
-        value = generator.normal(size=(count, channels[0], h, w)).astype(np.float32)
-        expected = torch.nn.functional.conv_transpose2d(torch.from_numpy(value).double(), weight, stride=stride).numpy()
-        found = layer._spread(value)
-        assert found.shape == expected.shape and found.dtype == np.float32
-        np.testing.assert_allclose(found, expected, rtol=2.0**-23, atol=1e-12)
-
-
 # ---------------------------------------------------------------- mutants: the attack finds wrong rules
 
 
@@ -387,18 +371,7 @@ def _narrow_magnitude(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(Convolution, "magnitude", lambda self, inputs: 0.0 * self.apply(inputs))
 
 
-def _lost_taps(monkeypatch: pytest.MonkeyPatch) -> None:
-    def taps(self):
-        found = original.func(self).copy()
-        found[-1] = 0.0
-        return found
-
-    original = Convolution._taps
-    monkeypatch.setattr(Convolution, "_taps", property(taps))
-
-
 MUTANTS = {
-    "taps left out of a transpose with strides": (_lost_taps, "residual"),
     "chord without offset": (_lines_without_gap, "plain"),
     "lower line too high": (_steep_lower_line, "plain"),
     "bias forgotten": (_lost_bias, "gemm"),

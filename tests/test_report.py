@@ -377,7 +377,10 @@ def test_report_end_to_end(tmp_path):
     assert report.missing == [1] and report.pending == [1, 2]
     for entry in document["frames"]:
         assert entry["ratio"] == entry["mpg"] / entry["mpg_witness"]
-        assert entry["trace"][1] == {"seconds": 0.1 * 3.0, "cells": 2, "mpg": 0.25, "mpg_witness": 0.1}
+        second = {"seconds": 0.1 * 3.0, "cells": 2, "mpg": 0.25, "mpg_witness": 0.1, "covered": 1.0}
+        assert entry["trace"][1] == second
+        # 0.17 / 0.2 is the first ratio below
+        assert entry["seconds_to_ratio"] == dict.fromkeys(("1.5", "1.25", "1.1", "1.05"), 0.1 * 3.0**2)
         assert entry["parameters"][3] == {"name": "yaw", "unit": "rad", "lower": -0.01, "upper": 0.01}
         for file in entry["files"].values():
             assert (folder / file).stat().st_size > 0
@@ -565,7 +568,7 @@ class Reader(html.parser.HTMLParser):
 
     def handle_starttag(self, tag, attrs):
         self.seen.append(tag)
-        if tag not in ("meta", "img", "br", "line", "circle", "rect", "path"):
+        if tag not in ("meta", "img", "br", "line", "circle", "rect", "path", "input"):
             self.open.append(tag)
         for name, value in attrs:
             assert value is None or ("NaN" not in value and "nan" not in value.split())
@@ -615,7 +618,7 @@ def test_page_of_many_frames(tmp_path, count):
     reader = written(tmp_path, results, frames=asked)
     title = {0: "No bounds yet: 0 of 1 frame", 1: "Bounds for the frame"}.get(count, f"Bounds for all {count} frames")
     assert title in reader.text and "program was not run on a GPU" in reader.text
-    assert reader.seen.count("img") == 5 * count and reader.seen.count("svg") == count + (count > 1)
+    assert reader.seen.count("img") == 5 * count and reader.seen.count("svg") == count + 2 * (count > 1)
     assert reader.seen.count("details") == count
 
 

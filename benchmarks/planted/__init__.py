@@ -3,8 +3,11 @@
 from planted.certificates import CERTIFICATES
 from planted.fault import Fault, apply
 from planted.fields import FIELDS
+from planted.forms import FORMS
 from planted.polynomials import POLYNOMIALS
+from planted.splats import SPLATS
+from planted.verdicts import VERDICTS
 
-FAULTS = (*POLYNOMIALS, *FIELDS, *CERTIFICATES)
+FAULTS = (*FORMS, *POLYNOMIALS, *FIELDS, *VERDICTS, *CERTIFICATES, *SPLATS)
 
 __all__ = ["FAULTS", "Fault", "apply"]

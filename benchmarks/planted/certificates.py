@@ -21,7 +21,27 @@ _SCENES = "test_certify_search.py::test_scenes_of_a_set"
 _IMPOSSIBLE = "test_certify_search.py::test_impossible_leaves_are_refused_and_nothing_is_stored"
 _RESUMED = "test_certify_search.py::test_resumed_store_equals_an_uninterrupted_one"
 
+_ROUNDED = "verify/eight_bit.py"
+_LEVELS = "test_eight_bit.py::test_sets_hold_rounded_pictures"
+
 CERTIFICATES = (
+    Fault(
+        "8 bits: linear sets are not widened",
+        _ROUNDED, "rounded_sets", "(0.5 + _STEP_ERROR) / _STEPS + _QUOTIENT", "0.0", _LEVELS,
+    ),
+    Fault(
+        "8 bits: the rounding of 255 x is not charged",
+        _ROUNDED, "", "_STEP_ERROR = 2.0**-14", "_STEP_ERROR = 0.0", _LEVELS,
+    ),
+    Fault(
+        "8 bits: the level above the lower bound",
+        _ROUNDED, "rounded_sets", "np.ceil(low - 0.5 - _STEP_ERROR)", "np.floor(low + 0.5 + _STEP_ERROR)", _LEVELS,
+    ),
+    Fault(
+        "8 bits: bounds that cross become one level",
+        _ROUNDED, "rounded_sets", "np.where(lower <= upper, least, np.nan)", "least",
+        "test_eight_bit.py::test_wrong_bounds_stay_wrong",
+    ),
     Fault(
         "preprocessing: rounding is not charged",
         _PREPROCESS, "Preprocess.sets.move", "_ROUNDINGS * _UNIT32 * size + 8.0 * UNIT64 * np.abs(b * factor)",
@@ -132,7 +152,7 @@ CERTIFICATES = (
     ),
     Fault(
         "search: a bound below 0 is a proof",
-        _SEARCH, "Search._settle", "bound is not None and bound > 0.0", "bound is not None and bound > -0.05",
+        _SEARCH, "Search._verdicts", "bound is not None and bound > 0.0", "bound is not None and bound > -0.05",
         _VERDICTS + "[1-0.43]",
     ),
     Fault(
@@ -207,7 +227,7 @@ CERTIFICATES = (
     ),
     Fault(
         "store: what comes twice counts twice",
-        _STORE, "Store.settle", "if gone is None:\n    return False", "pass",
+        _STORE, "Store.close_block", "if gone is None:\n    return False", "pass",
         "test_certify_search.py::test_result_that_comes_twice_counts_once",
     ),
     Fault(

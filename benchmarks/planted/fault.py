@@ -30,11 +30,21 @@ class Fault:
     compiled: bool = False
 
 
+_DEFINITIONS = (ast.FunctionDef, ast.AsyncFunctionDef, ast.ClassDef)
+
+
+def _defined(node: ast.AST) -> list[ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef]:
+    """What is defined in ``node``, but for what is defined in that."""
+    found = []
+    for child in ast.iter_child_nodes(node):
+        found += [child] if isinstance(child, _DEFINITIONS) else _defined(child)
+    return found
+
+
 def _definition(tree: ast.Module, place: str) -> ast.AST:
     found: ast.AST = tree
     for part in place.split(".") if place else []:
-        kinds = (ast.FunctionDef, ast.AsyncFunctionDef, ast.ClassDef)
-        inside = [node for node in ast.walk(found) if isinstance(node, kinds) and node.name == part]
+        inside = [node for node in _defined(found) if node.name == part]
         if len(inside) != 1:
             raise ValueError(f"{part} of {place} is defined {len(inside)} times, not once")
         found = inside[0]

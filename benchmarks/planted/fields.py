@@ -41,13 +41,13 @@ FIELDS = (
         _ZONOTOPE, "FieldBounds._relu_torch", "high <= -(e + r)", "low <= -(e + r)", _SEVERAL, True,
     ),
     Fault(
-        "fields: the reach of a unit forgets its columns",
+        "fields: the radius of a unit forgets its columns",
         _ZONOTOPE, "FieldBounds._relu_torch", "spread + rho + box", "0.2 * spread + 0.0 * rho + box", _SEVERAL, True,
     ),
     Fault(
         "fields: the line's error is a quarter of what it is",
-        _ZONOTOPE, "FieldBounds._relu_torch", "(0.5 * line * -bottom + 4.0 * slack) * _UP",
-        "(0.25 * line * -bottom + 4.0 * slack) * _UP", _SEVERAL, True,
+        _ZONOTOPE, "FieldBounds._relu_torch", "(0.5 * line * -bottom + 4.0 * slack) * FIELD_UP",
+        "(0.25 * line * -bottom + 4.0 * slack) * FIELD_UP", _SEVERAL, True,
     ),
     Fault(
         "fields: the fit is not shifted to its middle",
@@ -65,8 +65,8 @@ FIELDS = (
     ),
     Fault(
         "compiled units: the line's error is a quarter of what it is",
-        _RELU, "relu", "line_error = (0.5 * line * -bottom + 4.0 * slack) * _UP",
-        "line_error = (0.25 * line * -bottom + 4.0 * slack) * _UP", _FIELDS, True,
+        _RELU, "relu", "line_error = (0.5 * line * -bottom + 4.0 * slack) * FIELD_UP",
+        "line_error = (0.25 * line * -bottom + 4.0 * slack) * FIELD_UP", _FIELDS, True,
     ),
     Fault(
         "compiled units: the fit is not shifted to its middle",
@@ -74,8 +74,9 @@ FIELDS = (
     ),
     Fault(
         "compiled units: columns are halved without their error",
-        _RELU, "relu", "(0.5 * (most - least) + ROUNDING * (sum_q + absolute) + 0.5 * e + 2.0 * slack) * _UP",
-        "(0.5 * (most - least) + ROUNDING * (sum_q + absolute) + 2.0 * slack) * _UP", _FIELDS, True,
+        _RELU, "relu",
+        "(0.5 * (most - least) + CHEBYSHEV_ROUNDING * (sum_q + absolute) + 0.5 * e + 2.0 * slack) * FIELD_UP",
+        "(0.5 * (most - least) + CHEBYSHEV_ROUNDING * (sum_q + absolute) + 2.0 * slack) * FIELD_UP", _FIELDS, True,
     ),
     Fault(
         "compiled units: an open unit counts as dead",
@@ -120,7 +121,8 @@ FIELDS = (
     ),
     Fault(
         "bounds of parts: the network's own error is left out",
-        _BOUNDS, "_parts", "(error + ROUNDING * (value.poly.abs().sum(dim=1) * bernstein.abs().amax()))[:, None]",
+        _BOUNDS, "_parts",
+        "(error + CHEBYSHEV_ROUNDING * (value.poly.abs().sum(dim=1) * bernstein.abs().amax()))[:, None]",
         "(0.0 * error)[:, None]", _STIFF, True,
     ),
     Fault(
@@ -159,7 +161,7 @@ FIELDS = (
     ),
     Fault(
         "hue: rounding is not charged",
-        _HSV, "shifted_bounds", "least + (value_low - least) * share_low - _ROUNDING",
+        _HSV, "shifted_bounds", "least + (value_low - least) * share_low - HUE_ROUNDING",
         "least + (value_low - least) * share_low + 0.0", _COLORS,
     ),
 )  # fmt: skip

@@ -23,22 +23,23 @@ POLYNOMIALS = (
     ),
     Fault(
         "Taylor models: a sum forgets one operand's radius",
-        _TAYLOR, "TaylorArray.__add__", "a.radius + b.radius + UNIT64 * np.abs(total).sum(axis=0) * _UP",
-        "a.radius + 0.0 * b.radius + UNIT64 * np.abs(total).sum(axis=0) * _UP", _POSES,
+        _TAYLOR, "TaylorArray.__add__", "a.radius + b.radius + UNIT64 * np.abs(total).sum(axis=0) * TAYLOR_UP",
+        "a.radius + 0.0 * b.radius + UNIT64 * np.abs(total).sum(axis=0) * TAYLOR_UP", _POSES,
     ),
     Fault(
         "Taylor models: composition forgets Lagrange's remainder",
-        _TAYLOR, "TaylorArray.compose", "slack + last * reach ** (self.basis.degree + 1)", "slack + 0.0 * last",
+        _TAYLOR, "TaylorArray.compose", "slack + last * largest ** (self.basis.degree + 1)", "slack + 0.0 * last",
         _FUNCTIONS + "[0.5]",
     ),
     Fault(
         "Taylor models: the remainder's power is one too high",
-        _TAYLOR, "TaylorArray.compose", "reach ** (self.basis.degree + 1)", "reach ** (self.basis.degree + 2)",
+        _TAYLOR, "TaylorArray.compose", "largest ** (self.basis.degree + 1)", "largest ** (self.basis.degree + 2)",
         _FUNCTIONS + "[0.01]",
     ),
     Fault(
-        "Taylor models: the reach forgets the radius",
-        _TAYLOR, "TaylorArray.compose", "(step.size + step.radius) * _UP", "0.5 * step.size", _FUNCTIONS + "[3.0]",
+        "Taylor models: the largest step forgets the radius",
+        _TAYLOR, "TaylorArray.compose", "(step.size + step.radius) * TAYLOR_UP",
+        "0.5 * step.size", _FUNCTIONS + "[3.0]",
     ),
     Fault(
         "Taylor models: the root's last derivative is taken at the centre",
@@ -62,7 +63,7 @@ POLYNOMIALS = (
     ),
     Fault(
         "Taylor models: errors of the library's sine are not charged",
-        _TAYLOR, "taylor_cos_sin", "8.0 * UNIT64 * (np.abs(middle) + 2.0) * np.exp(reach)", "0.0 * np.exp(reach)",
+        _TAYLOR, "taylor_cos_sin", "8.0 * UNIT64 * (np.abs(middle) + 2.0) * np.exp(largest)", "0.0 * np.exp(largest)",
         _FUNCTIONS + "[1e-09]",
     ),
     Fault(

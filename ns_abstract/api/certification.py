@@ -29,6 +29,7 @@ from ns_abstract.perturbation.specification import Perturbation
 from ns_abstract.refine.protocol import Frame, Member, Method
 from ns_abstract.report.record import file_stamp
 from ns_abstract.verify.cells import Cell, Grid, coarse_parts
+from ns_abstract.verify.eight_bit import Picture, rounded, rounded_sets
 from ns_abstract.verify.model import NetworkModel, parametric
 from ns_abstract.verify.network import NetworkArithmetic, load_network
 from ns_abstract.verify.properties import Claim, LinearClaim, Property, parse_property
@@ -94,9 +95,11 @@ class FramePictures:
     Args:
         method: The scene and its program.
         poses: The frame's set.
+        picture: Whether the network is shown floats or rounded pictures.
     """
 
-    def __init__(self, method: Method, poses: PoseSet) -> None:
+    def __init__(self, method: Method, poses: PoseSet, picture: Picture = "float") -> None:
+        self._rounded = picture == "8-bit"
         self.frame: Frame = method.frame(poses)
         self.box = self.frame.box
         self._method = method
@@ -109,7 +112,8 @@ class FramePictures:
 
     def image(self, values: np.ndarray, member: Member | None = None) -> np.ndarray:
         render = self.frame.render if member is None else member
-        return assemble(render(np.asarray(values, np.float64), None), self.frame.camera)
+        image = assemble(render(np.asarray(values, np.float64), None), self.frame.camera)
+        return rounded(image) if self._rounded else image
 
     def members(self, seed: int) -> Iterator[Member]:
         return self.frame.members(seed)
@@ -118,7 +122,10 @@ class FramePictures:
         found = self.frame.bound(box, self._tiles, keep_linear=True)
         assert found.linear is not None
         whole = [assemble(part, self.frame.camera) for part in (*found.linear, found.lower, found.upper)]
-        return tuple(whole[:4]), whole[4], whole[5], found.slopes
+        linear, lower, upper = (whole[0], whole[1], whole[2], whole[3]), whole[4], whole[5]
+        if self._rounded:
+            linear, lower, upper = rounded_sets(linear, lower, upper)
+        return linear, lower, upper, found.slopes
 
     @cached_property
     def _differentiable(self) -> Callable[[torch.Tensor], torch.Tensor]:
@@ -127,6 +134,7 @@ class FramePictures:
         return found
 
     def differentiable(self, values: torch.Tensor) -> torch.Tensor:
+        """The floats before any rounding, which has no slope."""
         return self._differentiable(values)
 
 
@@ -166,6 +174,7 @@ class Certification:
         memory: Bytes for the network's bounds of one process.
         origin: File that the sets come from, for errors.
         network_arithmetic: Whether every float32 evaluation of the network is meant, or the exact one alone.
+        picture: Whether the network is shown floats or pictures of 8 bits.
 
     Raises:
         InputError: The question does not go with the sets, or the platform's arithmetic is not sound.
@@ -178,8 +187,10 @@ class Certification:
         memory: int = MEMORY,
         origin: Path | None = None,
         network_arithmetic: NetworkArithmetic = "float32",
+        picture: Picture = "float",
     ) -> None:
         self.job, self.question = job, question
+        self.picture: Picture = picture
         self.network, self.property = question.network, question.property
         if job.method.differentiable(job.pose_sets[0]) is None:
             raise InputError(
@@ -215,6 +226,7 @@ class Certification:
             question.source.absolute(),
             self.model.memory,
             self.model.arithmetic,
+            self.picture,
         )
         return Recipe(again, self.fingerprint, self.job.source.file)
 
@@ -257,12 +269,13 @@ class Certification:
             "model": file_stamp(self.question.model)["sha256"],
             "property": hashlib.sha256(text.encode()).hexdigest(),
             "network_arithmetic": self.model.arithmetic,
+            **({} if self.picture == "float" else {"picture": self.picture}),
             "rules": _RULES,
         }
 
     def pictures(self, index: int) -> FramePictures:
         """Frame ``index``, ready to be rendered and bounded."""
-        return FramePictures(self.job.method, self.job.pose_sets[index])
+        return FramePictures(self.job.method, self.job.pose_sets[index], self.picture)
 
     def claim(self, pictures: FramePictures) -> Claim:
         """What is to hold in a frame.
@@ -355,9 +368,15 @@ class Certification:
 
 
 def _open(
-    open_job: Callable[[], Job], model: Path, source: PropertySource, memory: int, arithmetic: NetworkArithmetic
+    open_job: Callable[[], Job],
+    model: Path,
+    source: PropertySource,
+    memory: int,
+    arithmetic: NetworkArithmetic,
+    picture: Picture,
 ) -> Certification:
-    return Certification(open_job(), Question(model, source), memory, network_arithmetic=arithmetic)
+    question = Question(model, source)
+    return Certification(open_job(), question, memory, network_arithmetic=arithmetic, picture=picture)
 
 
 def examine_block(recipe: Recipe[Certification], index: int, grid: Grid, cells: tuple[Cell, ...]) -> Findings:
@@ -393,6 +412,7 @@ class CertifySettings:
         gsplat_version: Of gsplat's rules; None: 1.4.0.
         arithmetic: "float32" or "real"; None: float32.
         network_arithmetic: The same of the network.
+        picture: Whether the network is shown floats or pictures of 8 bits.
         memory: Bytes for the bounds of one process.
     """
 
@@ -405,6 +425,7 @@ class CertifySettings:
     gsplat_version: str | None = None
     arithmetic: str | None = None
     network_arithmetic: NetworkArithmetic = "float32"
+    picture: Picture = "float"
     memory: int = MEMORY
 
 
@@ -431,4 +452,4 @@ def open_certification(settings: CertifySettings) -> Certification:
         job = Job(scene, sets, arithmetic=settings.arithmetic)
     except InputError as error:
         raise error.within(origin) if error.field and not error.field.startswith("--") else error from None
-    return Certification(job, question, settings.memory, origin, settings.network_arithmetic)
+    return Certification(job, question, settings.memory, origin, settings.network_arithmetic, settings.picture)

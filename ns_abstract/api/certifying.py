@@ -32,6 +32,7 @@ from ns_abstract.report.certificate_page import certificate_page
 from ns_abstract.report.picture import preview, to_bytes
 from ns_abstract.report.record import file_stamp
 from ns_abstract.verify.cells import Cell, Grid
+from ns_abstract.verify.eight_bit import Picture
 from ns_abstract.verify.network import NetworkArithmetic
 from ns_abstract.verify.search import Findings
 from ns_abstract.verify.store import IMAGES, Block, Store, fractions
@@ -42,6 +43,8 @@ _TRACE, _REPORT = 1.0, 30.0
 #: Counterexamples in report.json by frame, and images of each kind on the page.
 _EXAMPLES, _IMAGES = 5, 6
 _PIXELS = 256
+#: Cells whose picture the page shows when they are chosen, and its longest side.
+_SEEN, _SEEN_PIXELS = 64, 96
 #: Cells that are bounded in weaker ways besides, part of the time for it, and seconds that it may always take.
 _COMPARED, _COMPARE_SHARE, _COMPARE_LEAST = 5, 0.03, 1.0
 
@@ -95,6 +98,7 @@ class CertificateRun:
         self.job, self.frames, self.folder = job, tuple(frames), folder
         self.grids: dict[int, Grid] = {}
         self.shown: list[dict[str, Any]] = []
+        self.seen: dict[tuple[int, int], dict[str, Any]] = {}
         self.rows: dict[int, list[dict[str, Any]]] = {}
         prop = job.property
         self.about = CertifiedRun(
@@ -113,6 +117,7 @@ class CertificateRun:
             fingerprint=job.fingerprint,
             command=command,
             plan=(*job.job.plan, *job.scenes, *prop.notes),
+            picture=job.picture,
         )
 
     def open(self, *, resume: bool) -> Store:
@@ -190,7 +195,7 @@ class CertificateRun:
                 if findings is None:
                     continue
                 self._keep_images(store, block, findings)
-                store.settle(block, findings, self.grids[block.frame])
+                store.close_block(block, findings, self.grids[block.frame])
                 finished += 1
             now = time.perf_counter()
             if now - traced >= _TRACE:
@@ -351,7 +356,11 @@ class CertificateRun:
         # kernels may have to be compiled for others
         if state != "interrupted":
             self.shown = self._pictures(rows)
-        write_certificate(self.folder, document, certificate_page(document, rows, self.shown))
+            # positions of cells change while they are split
+            self.seen = {} if state == "running" else self._cell_pictures(rows)
+        elif self.seen:
+            self.seen = {}
+        write_certificate(self.folder, document, certificate_page(document, rows, self.shown, self.seen))
         return document
 
     def _entry(self, tally: Any, rows: list[dict[str, Any]]) -> dict[str, Any]:
@@ -423,15 +432,36 @@ class CertificateRun:
             margin = row["margin"]
             text = f"frame {frame}, margin {'not a number' if margin is None else f'{margin:.4g}'}"
             wanted.append(("counterexample", text, frame, row["counterexample"]))
-        found = []
-        for title, text, frame, values in wanted:
-            pictures = self.job.pictures(frame)
-            known = dict(zip(names, values, strict=True))
-            pose = np.array([known[name] for name in pictures.box.names])
-            # of another scene of the set, maybe
-            image = self._kept_image(frame, pose) if title == "counterexample" else None
-            image = pictures.image(pose) if image is None else image
-            found.append({"title": title, "text": text, "png": preview(to_bytes(image), _PIXELS)})
+        return [
+            {"title": title, "text": text, "png": self._drawn(frame, values, _PIXELS)}
+            for title, text, frame, values in wanted
+        ]
+
+    def _drawn(self, frame: int, values: Sequence[float], side: int) -> bytes:
+        """PNG of the picture at parameter values in the order of all parameters."""
+        known = dict(zip((name for name, _ in self.job.parameters), values, strict=True))
+        pictures = self.job.pictures(frame)
+        pose = np.array([known[name] for name in pictures.box.names])
+        # of another scene of the set, maybe
+        image = self._kept_image(frame, pose) if pictures.pose_set.perturbation.scene else None
+        return preview(to_bytes(pictures.image(pose) if image is None else image), side)
+
+    def _cell_pictures(self, rows: Mapping[int, list[dict[str, Any]]]) -> dict[tuple[int, int], dict[str, Any]]:
+        """By frame and position, a picture of some cells: the same number of each verdict, evenly spread."""
+        kinds = {
+            kind: [(frame, k) for frame, found in rows.items() for k, row in enumerate(found) if row["verdict"] == kind]
+            for kind in ("certified", "falsified", "unknown")
+        }
+        share = _SEEN // max(1, sum(map(bool, kinds.values())))
+        wanted = [key for keys in kinds.values() for key in keys[:: max(1, -(-len(keys) // share))]]
+        found = {}
+        for frame, k in wanted:
+            row = rows[frame][k]
+            values, text = row["counterexample"], "the counterexample's picture"
+            if values is None:
+                values = [0.5 * (a + b) for a, b in zip(row["lower"], row["upper"], strict=True)]
+                text = "one picture, at the cell's middle"
+            found[frame, k] = {"png": self._drawn(frame, values, _SEEN_PIXELS), "text": text}
         return found
 
 
@@ -569,6 +599,7 @@ def certify(
     output_dir: str | os.PathLike[str] | None = None,
     arithmetic: str | None = None,
     network_arithmetic: NetworkArithmetic = "float32",
+    picture: Picture = "float",
     resume: bool = False,
     on_progress: Callable[[CertifyProgress], object] | None = None,
     workers: int = 1,
@@ -590,6 +621,7 @@ def certify(
             nothing is kept on disk.
         arithmetic: "float32" or "real", of the pictures; None: float32.
         network_arithmetic: "float32": every float32 evaluation of the network; "real": the exact network alone.
+        picture: "float": the renderer's floats; "8-bit": these rounded to multiples of 1/255, as files have them.
         resume: Whether to go on with what ``output_dir`` holds.
         on_progress: Told about once a second.
         workers: Processes; with more than one, a script needs ``if __name__ == "__main__":``.
@@ -604,6 +636,8 @@ def certify(
         raise InputError(f"found {time_budget}", field="time_budget", fix="give a positive number")
     if workers < 1:
         raise InputError(f"found {workers}", field="workers", fix="give a number of at least 1")
+    if picture not in ("float", "8-bit"):
+        raise InputError(f"found {picture}", field="picture", fix="use float or 8-bit")
     if resume and output_dir is None:
         raise InputError("given without output_dir", field="resume", fix="give the folder to go on with")
     sets = [poses] if isinstance(poses, PoseSet) else list(poses)
@@ -614,8 +648,14 @@ def certify(
     drawn = [question.drawn(entry.of(scene)) for entry in sets]
     memory = network_memory(memory_limit, workers)
     job = Job(scene, drawn, arithmetic=arithmetic)
-    found = Certification(job, question, memory, network_arithmetic=network_arithmetic)
-    settings = {"time_budget": time_budget, "arithmetic": arithmetic, "workers": workers, "engine": engine}
+    found = Certification(job, question, memory, network_arithmetic=network_arithmetic, picture=picture)
+    settings = {
+        "time_budget": time_budget,
+        "arithmetic": arithmetic,
+        "picture": picture,
+        "workers": workers,
+        "engine": engine,
+    }
     with ExitStack() as stack:
         folder = Path(output_dir) if output_dir is not None else Path(
             stack.enter_context(tempfile.TemporaryDirectory(prefix="ns-abstract-"))

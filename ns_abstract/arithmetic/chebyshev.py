@@ -1,7 +1,7 @@
 """Polynomials of ``[-1, 1]^d`` in Chebyshev's basis: interpolation, ranges and fits with certified errors.
 
 A polynomial of total degree ``D`` is its coefficients in ``T_k(p) = prod_j T_{k_j}(p_j)``, ``|k| <= D``
-(design.md, F2). The functions here only build matrices; whoever applies them adds `ROUNDING` times the sum of
+(design.md, F2). The functions here only build matrices; whoever applies them adds `CHEBYSHEV_ROUNDING` times the sum of
 absolute coefficients.
 """
 
@@ -16,10 +16,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ns_abstract.arithmetic.forms import Float64Array
-
-#: Relative to the sum of absolute coefficients: more than the float64 rounding of the matrices' entries
-#: (arguments and cosines: 40 units of degree at most 32) and of products with them (at most 2^11 terms).
-ROUNDING = 2.0**-41
 
 
 def chebyshev_values(points: Float64Array, degree: int) -> Float64Array:

@@ -29,19 +29,14 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from ns_abstract.arithmetic.rounding import UNDERFLOW64, UNIT64
+from ns_abstract.arithmetic.rounding import FORM_ROUNDING, UNDERFLOW64, UP
 
 Float64Array = NDArray[np.float64]
 
 #: Largest number of parameters of a set.
 MAX_DIMENSIONS = 8
-# A coefficient is a sum of at most four products, the centre of an order-1 product one of 1 + d <= 9:
-# 10 roundings. Radii are sums of at most 40 non-negative terms, so one factor covers their own rounding.
-_COEFFICIENT = 12.0 * UNIT64
-_UP = 1.0 + 128.0 * UNIT64
-_TINY = UNDERFLOW64
 # Between these, fourth powers and their reciprocals neither overflow nor lose digits to underflow.
-_SMALLEST, _LARGEST = 1e-75, 1e75
+SMALLEST, LARGEST = 1e-75, 1e75
 
 
 @dataclass(frozen=True)
@@ -77,7 +72,7 @@ class Basis:
 
 
 @njit(cache=True, error_model="numpy")
-def settle(out, d, order, m):
+def set_norms(out, d, order, m):
     """Recompute the rows ``sum |g|`` and ``sum |q|`` of ``out`` [rows, n] (design.md, A1)."""
     n = out.shape[1]
     for q in range(n):
@@ -90,8 +85,8 @@ def settle(out, d, order, m):
         for q in range(n):
             out[m + 2, q] += abs(out[k, q])
     for q in range(n):
-        out[m + 1, q] *= _UP
-        out[m + 2, q] *= _UP
+        out[m + 1, q] *= UP
+        out[m + 2, q] *= UP
 
 
 @njit(cache=True, error_model="numpy")
@@ -109,13 +104,13 @@ def scale_add(a, s, b, t, shift, out, d, order, m):
             + absolute_t * (abs(b[0, q]) + b[m + 1, q] + b[m + 2, q])
             + abs(shift)
         )
-        out[m, q] = (absolute_s * a[m, q] + absolute_t * b[m, q] + _COEFFICIENT * magnitude) * _UP + _TINY
+        out[m, q] = (absolute_s * a[m, q] + absolute_t * b[m, q] + FORM_ROUNDING * magnitude) * UP + UNDERFLOW64
     for q in range(n):
         out[0, q] = s * a[0, q] + t * b[0, q] + shift
     for k in range(1, m):
         for q in range(n):
             out[k, q] = s * a[k, q] + t * b[k, q]
-    settle(out, d, order, m)
+    set_norms(out, d, order, m)
 
 
 @njit(cache=True, error_model="numpy")
@@ -125,7 +120,7 @@ def multiply(a, b, out, d, order, m):
     for q in range(n):
         pa = abs(a[0, q]) + a[m + 1, q] + a[m + 2, q]
         pb = abs(b[0, q]) + b[m + 1, q] + b[m + 2, q]
-        out[m, q] = pa * b[m, q] + pb * a[m, q] + a[m, q] * b[m, q] + _COEFFICIENT * (pa * pb)
+        out[m, q] = pa * b[m, q] + pb * a[m, q] + a[m, q] * b[m, q] + FORM_ROUNDING * (pa * pb)
         out[0, q] = a[0, q] * b[0, q]
     for k in range(1, m):
         for q in range(n):
@@ -152,8 +147,8 @@ def multiply(a, b, out, d, order, m):
                 out[0, q] += half
                 out[m, q] -= abs(half)
     for q in range(n):
-        out[m, q] = out[m, q] * _UP + _TINY
-    settle(out, d, order, m)
+        out[m, q] = out[m, q] * UP + UNDERFLOW64
+    set_norms(out, d, order, m)
 
 
 @njit(cache=True, error_model="numpy")
@@ -176,12 +171,12 @@ def compose(a, f0, f1, f2_low, f2_high, f3, out, d, order, m):
             l = a[m + 1, q]
             b = a[m + 2, q]
             r = a[m, q]
-            e = (l + b + r) * _UP
+            e = (l + b + r) * UP
             c2 = abs(f2_low[q])
-            rounding = _COEFFICIENT * (abs(f0[q]) + abs(f1[q]) * (l + b) + c2 * l * l)
+            rounding = FORM_ROUNDING * (abs(f0[q]) + abs(f1[q]) * (l + b) + c2 * l * l)
             out[m, q] = (
                 abs(f1[q]) * r + c2 * (2.0 * l * b + b * b + r * (2.0 * (l + b) + r)) + f3[q] * e * e * e + rounding
-            ) * _UP + _TINY
+            ) * UP + UNDERFLOW64
             out[0, q] = f0[q]
         for k in range(1, m):
             for q in range(n):
@@ -199,17 +194,17 @@ def compose(a, f0, f1, f2_low, f2_high, f3, out, d, order, m):
         for q in range(n):
             l = a[m + 1, q]
             r = a[m, q]
-            e = (l + r) * _UP
+            e = (l + r) * UP
             low = min(0.0, f2_low[q]) * (e * e)
             high = max(0.0, f2_high[q]) * (e * e)
             middle = 0.5 * (low + high)
-            rounding = _COEFFICIENT * (abs(f1[q]) * l + abs(f0[q]) + abs(middle))
-            out[m, q] = (abs(f1[q]) * r + 0.5 * (high - low) + rounding) * _UP + _TINY
+            rounding = FORM_ROUNDING * (abs(f1[q]) * l + abs(f0[q]) + abs(middle))
+            out[m, q] = (abs(f1[q]) * r + 0.5 * (high - low) + rounding) * UP + UNDERFLOW64
             out[0, q] = f0[q] + middle
         for k in range(1, m):
             for q in range(n):
                 out[k, q] = f1[q] * a[k, q]
-    settle(out, d, order, m)
+    set_norms(out, d, order, m)
 
 
 @njit(cache=True, error_model="numpy")
@@ -225,17 +220,17 @@ def square(a, out, d, order, m):
         c = a[0, q]
         half = 0.5 * (l * l)
         p = abs(c) + l
-        out[m, q] = ((2.0 * p + r) * r + half + _COEFFICIENT * (p * p)) * _UP + _TINY
+        out[m, q] = ((2.0 * p + r) * r + half + FORM_ROUNDING * (p * p)) * UP + UNDERFLOW64
         out[0, q] = c * c + half
     for k in range(1, m):
         for q in range(n):
             out[k, q] = 2.0 * (a[0, q] * a[k, q])
-    settle(out, d, order, m)
+    set_norms(out, d, order, m)
 
 
 @njit(cache=True, error_model="numpy")
 def add_product(a, b, sign, out, d, order, m):
-    """``out += sign * a * b`` except for the rows ``sum |.|`` of ``out``; `settle` must follow.
+    """``out += sign * a * b`` except for the rows ``sum |.|`` of ``out``; `set_norms` must follow.
 
     ``sign`` is 1 or -1. Charges its own share of the rounding of up to three such additions.
     """
@@ -247,7 +242,7 @@ def add_product(a, b, sign, out, d, order, m):
     for q in range(n):
         pa = out[m + 1, q]
         pb = out[m + 2, q]
-        out[m, q] += pa * b[m, q] + pb * a[m, q] + a[m, q] * b[m, q] + 4.0 * _COEFFICIENT * (pa * pb)
+        out[m, q] += pa * b[m, q] + pb * a[m, q] + a[m, q] * b[m, q] + 4.0 * FORM_ROUNDING * (pa * pb)
     for q in range(n):
         out[0, q] += sign * (a[0, q] * b[0, q])
     for k in range(1, m):
@@ -276,12 +271,12 @@ def add_product(a, b, sign, out, d, order, m):
             for q in range(n):
                 out[m, q] -= abs(out[m + 1, q])
     for q in range(n):
-        out[m, q] = out[m, q] * _UP + _TINY
+        out[m, q] = out[m, q] * UP + UNDERFLOW64
 
 
 @njit(cache=True, error_model="numpy")
 def add_square(a, out, d, order, m):
-    """``out += a * a`` except for the rows ``sum |.|`` of ``out``; `settle` must follow."""
+    """``out += a * a`` except for the rows ``sum |.|`` of ``out``; `set_norms` must follow."""
     if order == 2:
         add_product(a, a, 1.0, out, d, order, m)
         return
@@ -291,7 +286,7 @@ def add_square(a, out, d, order, m):
         r = a[m, q]
         half = 0.5 * (l * l)
         p = abs(a[0, q]) + l
-        out[m, q] = (out[m, q] + (2.0 * p + r) * r + half + 4.0 * _COEFFICIENT * (p * p)) * _UP + _TINY
+        out[m, q] = (out[m, q] + (2.0 * p + r) * r + half + 4.0 * FORM_ROUNDING * (p * p)) * UP + UNDERFLOW64
     for q in range(n):
         out[0, q] += a[0, q] * a[0, q] + 0.5 * (a[m + 1, q] * a[m + 1, q])
     for k in range(1, m):
@@ -305,14 +300,14 @@ def bounds(a, low, high, d, order, m):
     n = a.shape[1]
     if order == 1:
         for q in range(n):
-            spread = (a[m + 1, q] + a[m, q] + _COEFFICIENT * abs(a[0, q])) * _UP
+            spread = (a[m + 1, q] + a[m, q] + FORM_ROUNDING * abs(a[0, q])) * UP
             low[q] = a[0, q] - spread
             high[q] = a[0, q] + spread
         return
     for q in range(n):
-        spread = a[m, q] + 8.0 * _COEFFICIENT * (abs(a[0, q]) + a[m + 1, q] + a[m + 2, q])
-        low[q] = -spread * _UP
-        high[q] = spread * _UP
+        spread = a[m, q] + 8.0 * FORM_ROUNDING * (abs(a[0, q]) + a[m + 1, q] + a[m + 2, q])
+        low[q] = -spread * UP
+        high[q] = spread * UP
     row = d + 1
     for k in range(1, d + 1):
         for q in range(n):
@@ -346,20 +341,20 @@ def reciprocal(a, work, out, d, order, m):
     """``out = 1 / a`` for ``a > 0`` (1e-75 to 1e75); ``work`` is [5, n] scratch."""
     for q in range(out.shape[1]):
         c = a[0, q]
-        e = (a[m + 1, q] + a[m + 2, q] + a[m, q]) * _UP
-        low = (c - e) * (1.0 - _COEFFICIENT)
-        inside = _SMALLEST < low < _LARGEST
+        e = (a[m + 1, q] + a[m + 2, q] + a[m, q]) * UP
+        low = (c - e) * (1.0 - FORM_ROUNDING)
+        inside = SMALLEST < low < LARGEST
         f0 = 1.0 / c if inside else 1.0
         work[0, q] = f0
         work[1, q] = -f0 * f0
         if order == 2:
             work[2, q] = f0 * f0 * f0
             low2 = low * low
-            work[4, q] = 1.0 / (low2 * low2) * _UP if inside else np.inf
+            work[4, q] = 1.0 / (low2 * low2) * UP if inside else np.inf
         else:
-            high = (c + e) * _UP
-            work[2, q] = 1.0 / (high * high * high) * (1.0 - _COEFFICIENT) if inside else 0.0
-            work[3, q] = 1.0 / (low * low * low) * _UP if inside else np.inf
+            high = (c + e) * UP
+            work[2, q] = 1.0 / (high * high * high) * (1.0 - FORM_ROUNDING) if inside else 0.0
+            work[3, q] = 1.0 / (low * low * low) * UP if inside else np.inf
     compose(a, work[0], work[1], work[2], work[3], work[4], out, d, order, m)
 
 
@@ -368,19 +363,19 @@ def square_root(a, work, out, d, order, m):
     """``out = sqrt(a)`` for ``a > 0``; ``work`` is [5, n] scratch."""
     for q in range(out.shape[1]):
         c = a[0, q]
-        e = (a[m + 1, q] + a[m + 2, q] + a[m, q]) * _UP
-        low = (c - e) * (1.0 - _COEFFICIENT)
-        inside = _SMALLEST < low < _LARGEST
+        e = (a[m + 1, q] + a[m + 2, q] + a[m, q]) * UP
+        low = (c - e) * (1.0 - FORM_ROUNDING)
+        inside = SMALLEST < low < LARGEST
         f0 = np.sqrt(c) if inside else 1.0
         work[0, q] = f0
         work[1, q] = 0.5 / f0
         if order == 2:
             work[2, q] = -0.125 / (f0 * f0 * f0)
-            work[4, q] = 0.0625 / (low * low * np.sqrt(low)) * _UP if inside else np.inf
+            work[4, q] = 0.0625 / (low * low * np.sqrt(low)) * UP if inside else np.inf
         else:
-            high = (c + e) * _UP
-            work[2, q] = -0.125 / (low * np.sqrt(low)) * _UP if inside else -np.inf
-            work[3, q] = -0.125 / (high * np.sqrt(high)) * (1.0 - 4.0 * _COEFFICIENT) if inside else np.inf
+            high = (c + e) * UP
+            work[2, q] = -0.125 / (low * np.sqrt(low)) * UP if inside else -np.inf
+            work[3, q] = -0.125 / (high * np.sqrt(high)) * (1.0 - 4.0 * FORM_ROUNDING) if inside else np.inf
     compose(a, work[0], work[1], work[2], work[3], work[4], out, d, order, m)
 
 
@@ -389,20 +384,20 @@ def reciprocal_square_root(a, work, out, d, order, m):
     """``out = 1 / sqrt(a)`` for ``a > 0``; ``work`` is [5, n] scratch."""
     for q in range(out.shape[1]):
         c = a[0, q]
-        e = (a[m + 1, q] + a[m + 2, q] + a[m, q]) * _UP
-        low = (c - e) * (1.0 - _COEFFICIENT)
-        inside = _SMALLEST < low < _LARGEST
+        e = (a[m + 1, q] + a[m + 2, q] + a[m, q]) * UP
+        low = (c - e) * (1.0 - FORM_ROUNDING)
+        inside = SMALLEST < low < LARGEST
         f0 = 1.0 / np.sqrt(c) if inside else 1.0
         f2 = f0 * f0
         work[0, q] = f0
         work[1, q] = -0.5 * f0 * f2
         if order == 2:
             work[2, q] = 0.375 * f0 * f2 * f2
-            work[4, q] = 0.3125 / (low * low * low * np.sqrt(low)) * _UP if inside else np.inf
+            work[4, q] = 0.3125 / (low * low * low * np.sqrt(low)) * UP if inside else np.inf
         else:
-            high = (c + e) * _UP
-            work[2, q] = 0.375 / (high * high * np.sqrt(high)) * (1.0 - 4.0 * _COEFFICIENT) if inside else -np.inf
-            work[3, q] = 0.375 / (low * low * np.sqrt(low)) * _UP if inside else np.inf
+            high = (c + e) * UP
+            work[2, q] = 0.375 / (high * high * np.sqrt(high)) * (1.0 - 4.0 * FORM_ROUNDING) if inside else -np.inf
+            work[3, q] = 0.375 / (low * low * np.sqrt(low)) * UP if inside else np.inf
     compose(a, work[0], work[1], work[2], work[3], work[4], out, d, order, m)
 
 
@@ -415,22 +410,22 @@ def logarithm(a, work, out, d, order, m):
     """
     for q in range(out.shape[1]):
         c = a[0, q]
-        e = (a[m + 1, q] + a[m + 2, q] + a[m, q]) * _UP
-        low = (c - e) * (1.0 - _COEFFICIENT)
-        inside = _SMALLEST < low < _LARGEST
+        e = (a[m + 1, q] + a[m + 2, q] + a[m, q]) * UP
+        low = (c - e) * (1.0 - FORM_ROUNDING)
+        inside = SMALLEST < low < LARGEST
         inverse = 1.0 / c if inside else 1.0
         work[0, q] = np.log(c) if inside else 0.0
         work[1, q] = inverse
         if order == 2:
             work[2, q] = -0.5 * inverse * inverse
-            work[4, q] = 1.0 / (3.0 * low * low * low) * _UP if inside else np.inf
+            work[4, q] = 1.0 / (3.0 * low * low * low) * UP if inside else np.inf
         else:
-            high = (c + e) * _UP
-            work[2, q] = -0.5 / (low * low) * _UP if inside else -np.inf
-            work[3, q] = -0.5 / (high * high) * (1.0 - 4.0 * _COEFFICIENT) if inside else np.inf
+            high = (c + e) * UP
+            work[2, q] = -0.5 / (low * low) * UP if inside else -np.inf
+            work[3, q] = -0.5 / (high * high) * (1.0 - 4.0 * FORM_ROUNDING) if inside else np.inf
     compose(a, work[0], work[1], work[2], work[3], work[4], out, d, order, m)
     for q in range(out.shape[1]):
-        out[m, q] += _COEFFICIENT
+        out[m, q] += FORM_ROUNDING
 
 
 @njit(cache=True, error_model="numpy")
@@ -452,12 +447,12 @@ def clamp_below(a, floor, low, high, d, order, m):
         s = above / (above + below)
         shift = 0.5 * (s * below)
         magnitude = abs(a[0, q]) + a[m + 1, q] + a[m + 2, q] + abs(floor)
-        a[m, q] = (s * a[m, q] + shift + _COEFFICIENT * (magnitude + shift)) * _UP + _TINY
+        a[m, q] = (s * a[m, q] + shift + FORM_ROUNDING * (magnitude + shift)) * UP + UNDERFLOW64
         a[0, q] = floor + s * (a[0, q] - floor) + shift
         for k in range(1, m):
             a[k, q] *= s
-        a[m + 1, q] *= s * _UP
-        a[m + 2, q] *= s * _UP
+        a[m + 1, q] *= s * UP
+        a[m + 2, q] *= s * UP
 
 
 @njit(cache=True, error_model="numpy")
@@ -498,7 +493,7 @@ class FormArray:
         """The scalar form ``middle + half_width * p_index``."""
         form = cls.constant(basis, middle)
         form.data[1 + index] = half_width
-        settle(form.data, *form._layout)
+        set_norms(form.data, *form._layout)
         return form
 
     @property

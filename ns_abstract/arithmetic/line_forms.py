@@ -11,11 +11,12 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from ns_abstract.arithmetic.forms import _COEFFICIENT, _LARGEST, _SMALLEST, _TINY, _UP
+from ns_abstract.arithmetic.forms import LARGEST, SMALLEST
+from ns_abstract.arithmetic.rounding import FORM_ROUNDING, UNDERFLOW64, UP
 
 
 @njit(cache=True, error_model="numpy", inline="always")
-def size(a):
+def magnitude(a):
     """Upper bound of the polynomial's absolute value, up to rounding."""
     return abs(a[0]) + abs(a[1]) + abs(a[2])
 
@@ -23,15 +24,15 @@ def size(a):
 @njit(cache=True, error_model="numpy", inline="always")
 def combined(a, s, b, t):
     """``s a + t b`` for numbers ``s``, ``t`` (`forms.scale_add`)."""
-    magnitude = abs(s) * size(a) + abs(t) * size(b)
-    radius = (abs(s) * a[3] + abs(t) * b[3] + _COEFFICIENT * magnitude) * _UP + _TINY
+    total = abs(s) * magnitude(a) + abs(t) * magnitude(b)
+    radius = (abs(s) * a[3] + abs(t) * b[3] + FORM_ROUNDING * total) * UP + UNDERFLOW64
     return s * a[0] + t * b[0], s * a[1] + t * b[1], s * a[2] + t * b[2], radius
 
 
 @njit(cache=True, error_model="numpy", inline="always")
 def scaled(a, s):
     """``s a`` for a number ``s`` (`forms.scale_add`)."""
-    return s * a[0], s * a[1], s * a[2], (abs(s) * (a[3] + _COEFFICIENT * size(a))) * _UP + _TINY
+    return s * a[0], s * a[1], s * a[2], (abs(s) * (a[3] + FORM_ROUNDING * magnitude(a))) * UP + UNDERFLOW64
 
 
 @njit(cache=True, error_model="numpy", inline="always")
@@ -41,12 +42,12 @@ def multiplied(a, b):
     h, w = abs(b[1]), abs(b[2])
     pa = abs(a[0]) + l + m
     pb = abs(b[0]) + h + w
-    radius = pa * b[3] + pb * a[3] + a[3] * b[3] + _COEFFICIENT * (pa * pb) + l * w + m * (h + w)
+    radius = pa * b[3] + pb * a[3] + a[3] * b[3] + FORM_ROUNDING * (pa * pb) + l * w + m * (h + w)
     return (
         a[0] * b[0],
         a[0] * b[1] + b[0] * a[1],
         a[0] * b[2] + b[0] * a[2] + a[1] * b[1],
-        radius * _UP + _TINY,
+        radius * UP + UNDERFLOW64,
     )
 
 
@@ -54,18 +55,18 @@ def multiplied(a, b):
 def composed(a, f0, f1, f2, f3):
     """``f(a)`` from value, slope, half curvature and a bound of ``|f'''|/6`` over the range (A3; `forms.compose`)."""
     l, b, r = abs(a[1]), abs(a[2]), a[3]
-    e = (l + b + r) * _UP
+    e = (l + b + r) * UP
     c2 = abs(f2)
-    rounding = _COEFFICIENT * (abs(f0) + abs(f1) * (l + b) + c2 * l * l)
+    rounding = FORM_ROUNDING * (abs(f0) + abs(f1) * (l + b) + c2 * l * l)
     radius = abs(f1) * r + c2 * (2.0 * l * b + b * b + r * (2.0 * (l + b) + r)) + f3 * e * e * e + rounding
-    return f0, f1 * a[1], f1 * a[2] + f2 * (a[1] * a[1]), radius * _UP + _TINY
+    return f0, f1 * a[1], f1 * a[2] + f2 * (a[1] * a[1]), radius * UP + UNDERFLOW64
 
 
 @njit(cache=True, error_model="numpy", inline="always")
 def _least(a):
     """Lower bound of a positive quantity, and whether it lies where the functions below are evaluated."""
-    low = (a[0] - (abs(a[1]) + abs(a[2]) + a[3]) * _UP) * (1.0 - _COEFFICIENT)
-    return low, (low > _SMALLEST) & (low < _LARGEST)
+    low = (a[0] - (abs(a[1]) + abs(a[2]) + a[3]) * UP) * (1.0 - FORM_ROUNDING)
+    return low, (low > SMALLEST) & (low < LARGEST)
 
 
 @njit(cache=True, error_model="numpy", inline="always")
@@ -74,7 +75,7 @@ def inverse(a):
     low, inside = _least(a)
     f0 = 1.0 / (a[0] if inside else 1.0)
     low2 = low * low
-    f3 = 1.0 / (low2 * low2) * _UP if inside else np.inf
+    f3 = 1.0 / (low2 * low2) * UP if inside else np.inf
     return composed(a, f0, -f0 * f0, f0 * f0 * f0, f3)
 
 
@@ -84,7 +85,7 @@ def inverse_root(a):
     low, inside = _least(a)
     f0 = 1.0 / np.sqrt(a[0] if inside else 1.0)
     f2 = f0 * f0
-    f3 = 0.3125 / (low * low * low * np.sqrt(low if inside else 1.0)) * _UP if inside else np.inf
+    f3 = 0.3125 / (low * low * low * np.sqrt(low if inside else 1.0)) * UP if inside else np.inf
     return composed(a, f0, -0.5 * f0 * f2, 0.375 * f0 * f2 * f2, f3)
 
 
@@ -92,7 +93,7 @@ def inverse_root(a):
 def ends(a):
     """Bounds of ``a`` over the box, rounded outward (A4; `forms.bounds`)."""
     g, s = abs(a[1]), a[2]
-    spread = (a[3] + 8.0 * _COEFFICIENT * (abs(a[0]) + g + abs(s))) * _UP
+    spread = (a[3] + 8.0 * FORM_ROUNDING * (abs(a[0]) + g + abs(s))) * UP
     # g p + s p^2 over [-1, 1]: the ends, and the vertex where it lies inside
     vertex = -(g / (4.0 * (s if s != 0.0 else 1.0))) * g
     inside = g < 2.0 * abs(s)
@@ -111,7 +112,7 @@ def raised(a, floor, low, high):
     # floor + s t, s = chord slope of max(t, 0) over t = a - floor in [low - floor, high - floor]
     s = above / (above + below if crosses else 1.0)
     shift = 0.5 * (s * below)
-    radius = (s * a[3] + shift + _COEFFICIENT * (size(a) + abs(floor) + shift)) * _UP + _TINY
+    radius = (s * a[3] + shift + FORM_ROUNDING * (magnitude(a) + abs(floor) + shift)) * UP + UNDERFLOW64
     c = floor + s * (a[0] - floor) + shift
     s = s if crosses else (0.0 if under else 1.0)
     return (
@@ -123,15 +124,15 @@ def raised(a, floor, low, high):
 
 
 @njit(cache=True, error_model="numpy", inline="always")
-def load(s, first, lanes, q):
-    """The form of lane ``q`` from four rows of ``lanes`` numbers, the first of which starts at ``first``."""
-    return s[first + q], s[first + lanes + q], s[first + 2 * lanes + q], s[first + 3 * lanes + q]
+def load(s, first, stride, q):
+    """The form of lane ``q`` from four rows of ``stride`` numbers, the first of which starts at ``first``."""
+    return s[first + q], s[first + stride + q], s[first + 2 * stride + q], s[first + 3 * stride + q]
 
 
 @njit(cache=True, error_model="numpy", inline="always")
-def store(a, s, first, lanes, q):
+def store(a, s, first, stride, q):
     """Write a form to where `load` reads it."""
     s[first + q] = a[0]
-    s[first + lanes + q] = a[1]
-    s[first + 2 * lanes + q] = a[2]
-    s[first + 3 * lanes + q] = a[3]
+    s[first + stride + q] = a[1]
+    s[first + 2 * stride + q] = a[2]
+    s[first + 3 * stride + q] = a[3]

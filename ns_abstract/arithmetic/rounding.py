@@ -22,6 +22,34 @@ UNDERFLOW64 = 2.0**-1060
 #: adds to a short sum of products (one operation: 2**-126).
 UNDERFLOW32 = 2.0**-116
 
+# What the package's own float64 evaluation is charged with: relative to the sum of absolute terms, if nothing else is
+# said. Names in ``UP`` are factors of sums of numbers that are not negative.
+
+#: Radii of forms: sums of at most 40 terms of at most 3 roundings each.
+UP = 1.0 + 128.0 * UNIT64
+#: A rule of `forms`: a coefficient is a sum of at most four products, the centre of an order-1 product one of
+#: 1 + d <= 9: 10 roundings; 2 to spare.
+FORM_ROUNDING = 12.0 * UNIT64
+#: Three products, their sum and the sum with an offset, 6; 2 to spare.
+SUM_ROUNDING = 8.0 * UNIT64
+#: A whitened offset, an alpha or a blend of forms, 12 at most; 4 to spare.
+FRAGMENT_ROUNDING = 16.0 * UNIT64
+#: Pixels, tiles and radii that are computed from bounds: at most 2^20 roundings.
+REGION = 1.0 + 2.0**-30
+#: Taylor models: radii are sums of fewer than 2^10 terms, of two roundings each.
+TAYLOR_UP = 1.0 + 2.0**11 * UNIT64
+#: Polynomials in Chebyshev's basis: more than the rounding of the matrices' entries (arguments and cosines: 40 units of
+#: degree at most 32) and of products with them (at most 2^11 terms).
+CHEBYSHEV_ROUNDING = 2.0**-41
+#: Fields of NeRFs: sums over a layer, in any order; at most 2^12 terms.
+FIELD_UP = 1.0 + 2.0**-40
+#: A shifted colour, and its hue in sixths of a turn: at most 2^8 roundings.
+HUE_ROUNDING = 2.0**-44
+#: Activations and compositing, absolute, by sample: at most 2^8 roundings of numbers up to 2.
+COMPOSITE_ROUNDING = 2.0**-44
+#: A pose: fewer than 64 roundings of numbers of its size, five rotations. Sums of up to ten products likewise.
+POSE_ROUNDING = 64.0 * UNIT64
+
 
 @dataclass(frozen=True)
 class Arithmetic:
@@ -101,7 +129,7 @@ class Charges(NamedTuple):
     near: float
     tile: float
     opacity: float
-    faint: float
+    exponent_limit: float
     depth_products: float
     depth: float
     viewing_axis: float
@@ -179,7 +207,7 @@ def charges(a: Arithmetic) -> Charges:
         # G9: a sigmoid is an exponential, a sum and a division; 3 to spare
         opacity=(a.exp + 1.0 + a.division + 3.0) * u,
         # G9: __expf of at most 5.55, below 18, the product, the opacity; 33 to spare
-        faint=64.0 * u,
+        exponent_limit=64.0 * u,
         # G10: a product and two sums, 3, on |R||mu|; the last sum, 1, on z; second order
         depth_products=4.2 * u,
         depth=1.1 * u,

@@ -19,10 +19,7 @@ from typing import Any
 import numpy as np
 
 from ns_abstract.arithmetic.forms import Float64Array
-from ns_abstract.arithmetic.rounding import UNDERFLOW64, UNIT64
-
-# radii are sums of fewer than 2^10 non-negative terms
-_UP = 1.0 + 2.0**11 * UNIT64
+from ns_abstract.arithmetic.rounding import TAYLOR_UP, UNDERFLOW64, UNIT64
 
 
 @dataclass(frozen=True)
@@ -92,11 +89,11 @@ class TaylorArray:
     @property
     def size(self) -> Float64Array:
         """[*shape] bound of the polynomial's absolute value."""
-        return np.abs(self.coefficients).sum(axis=0) * _UP
+        return np.abs(self.coefficients).sum(axis=0) * TAYLOR_UP
 
     def widened(self, radius: Float64Array | float) -> TaylorArray:
         """The same with ``radius`` added."""
-        return TaylorArray(self.basis, self.coefficients, (self.radius + radius) * _UP)
+        return TaylorArray(self.basis, self.coefficients, (self.radius + radius) * TAYLOR_UP)
 
     def _lift(self, other: TaylorArray | Float64Array | float) -> TaylorArray:
         return other if isinstance(other, TaylorArray) else TaylorArray.constant(self.basis, other)
@@ -109,8 +106,8 @@ class TaylorArray:
         rank = max(len(a.shape), len(b.shape))
         parts = [x.coefficients.reshape(-1, *(1,) * (rank - len(x.shape)), *x.shape) for x in (a, b)]
         total = parts[0] + parts[1]
-        radius = a.radius + b.radius + UNIT64 * np.abs(total).sum(axis=0) * _UP
-        return TaylorArray(self.basis, total, radius * _UP + UNDERFLOW64)
+        radius = a.radius + b.radius + UNIT64 * np.abs(total).sum(axis=0) * TAYLOR_UP
+        return TaylorArray(self.basis, total, radius * TAYLOR_UP + UNDERFLOW64)
 
     __radd__ = __add__
 
@@ -136,7 +133,7 @@ class TaylorArray:
         # a coefficient is a sum of at most as many products as there are monomials
         rounding = (len(self.basis.exponents) + 2.0) * UNIT64 * a.size * b.size
         radius = a.size * b.radius + b.size * a.radius + a.radius * b.radius + dropped + rounding
-        return TaylorArray(self.basis, total, radius * _UP + UNDERFLOW64)
+        return TaylorArray(self.basis, total, radius * TAYLOR_UP + UNDERFLOW64)
 
     __rmul__ = __mul__
 
@@ -167,13 +164,13 @@ class TaylorArray:
             last: Upper bound of ``|f^(degree + 1)| / (degree + 1)!`` over the range.
         """
         step = self - self.center
-        reach = (step.size + step.radius) * _UP
+        largest = (step.size + step.radius) * TAYLOR_UP
         total = TaylorArray.constant(self.basis, derivatives[-1])
         for value in reversed(derivatives[:-1]):
             total = total * step + value
-        slack = sum(np.abs(v) * reach**k for k, v in enumerate(derivatives)) * (64.0 * UNIT64)
-        # powers of the reach take up to degree + 1 roundings
-        return total.widened((slack + last * reach ** (self.basis.degree + 1)) * (1.0 + 128.0 * UNIT64))
+        slack = sum(np.abs(v) * largest**k for k, v in enumerate(derivatives)) * (64.0 * UNIT64)
+        # powers of the largest take up to degree + 1 roundings
+        return total.widened((slack + last * largest ** (self.basis.degree + 1)) * (1.0 + 128.0 * UNIT64))
 
     def rsqrt(self) -> TaylorArray:
         """``1 / sqrt(x)``; not finite where ``x`` may be 0 or below."""
@@ -200,8 +197,8 @@ def taylor_cos_sin(angle: TaylorArray) -> tuple[TaylorArray, TaylorArray]:
     cycle = (cosine, -sine, -cosine, sine)
     last = np.full(angle.shape, 1.0 / math.factorial(n + 1) * (1.0 + 8.0 * UNIT64))
     # an absolute error of the centre's function moves every derivative
-    reach = np.minimum(angle.size - np.abs(middle) + angle.radius, 700.0)
-    slack = 8.0 * UNIT64 * (np.abs(middle) + 2.0) * np.exp(reach)
+    largest = np.minimum(angle.size - np.abs(middle) + angle.radius, 700.0)
+    slack = 8.0 * UNIT64 * (np.abs(middle) + 2.0) * np.exp(largest)
     found = []
     for offset in (0, 3):
         derivatives = [cycle[(k + offset) % 4] / math.factorial(k) for k in range(n + 1)]

@@ -8,6 +8,7 @@ from ns_abstract.api.files import PathJob
 from ns_abstract.geometry.poses import PoseSet
 from ns_abstract.refine.engine import Refinement
 from ns_abstract.refine.result import FrameResult, max_pixel_gap
+from ns_abstract.report.figures import seconds_to
 
 #: Ratios whose time is reported.
 MARKS = (1.5, 1.25, 1.1, 1.05, 1.02, 1.01)
@@ -35,7 +36,4 @@ def summary(job: PathJob, name: str, result: FrameResult) -> dict[str, object]:
         "witness MPG": last.mpg_witness,
         "ratio": last.mpg / last.mpg_witness if last.mpg_witness else float("nan"),
     }
-    for mark in MARKS:
-        reached = [p.seconds for p in result.trace if p.mpg <= mark * p.mpg_witness]
-        row[f"s to {mark:g}"] = reached[0] if reached else None
-    return row
+    return row | {f"s to {mark:g}": seconds for mark, seconds in seconds_to(result.trace, MARKS).items()}

@@ -52,6 +52,9 @@ class Certify:
     evaluation."""
     network_arithmetic: Literal["float32", "real"] = "float32"
     """float32: every float32 evaluation of the network (the default). real: the exact function of its weights alone."""
+    picture: Literal["float", "8-bit"] = "float"
+    """float: the renderer's floats (the default). 8-bit: these rounded to multiples of 1/255, as files and cameras
+    have them."""
     engine: Literal["local", "dask"] = "local"
     """dask: spread the cells over a Dask cluster (needs the extra "cluster")."""
     scheduler_address: str | None = None

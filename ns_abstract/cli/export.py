@@ -93,6 +93,10 @@ class VnnLib:
     """gsplat: what Nerfstudio shows. paper: Algorithm 1 of "Abstract Rendering" (no thresholds, RGB)."""
     arithmetic: Literal["float32", "real"] = "float32"
     """float32: images of every float32 evaluation. real: the real-number renderer and its float64 evaluation."""
+    gsplat_version: Literal["1.4.0", "1.5.3", "1.6.0"] | None = None
+    """Whose rules are bounded. Default: 1.4.0, which nerfstudio 1.1.5 asks for."""
+    picture: Literal["float", "8-bit"] = "float"
+    """float: the renderer's floats. 8-bit: these rounded to multiples of 1/255."""
     form: Literal["slice", "gemm"] = "slice"
     """slice: small files. gemm: no operators in front but Gemm and Reshape, for verifiers that know little."""
     timeout: int = 300

@@ -96,14 +96,14 @@ class NerfNetwork(nn.Module):
 def fit_field(
     network: NerfNetwork,
     field: AnalyticField,
-    reach: float,
+    radius: float,
     steps: int,
     *,
     batch: int = 2048,
     rate: float = 8e-4,
     seed: int = 0,
 ) -> None:
-    """Fit a network to an analytic field over the ball of radius ``reach``, and more coarsely around it.
+    """Fit a network to an analytic field over the ball of radius ``radius``, and more coarsely around it.
 
     Densities are compared before the softplus and squeezed, so that neither empty nor dense space dominates;
     colours where there is something.
@@ -115,7 +115,7 @@ def fit_field(
             group["lr"] = rate * min(1.0, (step + 1) / 40) * 0.5 * (1.0 + math.cos(math.pi * step / steps)) + 1e-5
         x = torch.randn(batch, 3, generator=generator)
         # rays begin far outside of what there is to see
-        around = torch.where(torch.arange(batch)[:, None] % 4 == 0, _FAR * reach, reach)
+        around = torch.where(torch.arange(batch)[:, None] % 4 == 0, _FAR * radius, radius)
         x *= around * torch.rand(batch, 1, generator=generator).sqrt() / x.norm(dim=1, keepdim=True)
         direction = functional.normalize(torch.randn(batch, 3, generator=generator), dim=1)
         density, color = field(x, direction)

@@ -35,6 +35,8 @@ _LOOPBACK = "127.0.0.1"
 _CONNECT = "10s"
 #: Seconds that a cluster without workers, or a scheduler that does not answer, is waited for.
 _GONE = 30.0
+#: Seconds that the first try to fetch a finished result may take; each further one has twice as many.
+_FETCH = 5.0
 #: Variables that make numerical libraries use one thread; read when they are imported.
 _THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
 #: Makes torch give memory back and fault it in again for every cell, 1.6 times slower.
@@ -274,6 +276,7 @@ class Cluster:
         self._tasks: dict[int, Task] = {}
         self._losses = 0
         self._threads = 1
+        self._patience = _FETCH
 
     @property
     def threads(self) -> int:
@@ -318,15 +321,17 @@ class Cluster:
 
     def collect(self, seconds: float) -> list[tuple[int, Any]]:
         from distributed import KilledWorker
+        from distributed import TimeoutError as LateError
         from distributed import wait as wait_for
         from distributed.comm.core import CommClosedError
 
         if not self._futures:
             return []
+        results: list[tuple[int, Any]] = []
         try:
             waited: Any = wait_for(list(self._futures), timeout=seconds, return_when="FIRST_COMPLETED")
-            results = [(self._futures[future], future.result()) for future in waited.done]
-        except TimeoutError:
+            fetched = [future for future in waited.done if self._fetch(future, results)]
+        except LateError:
             self._look()
             return []
         except KilledWorker:
@@ -337,10 +342,28 @@ class Cluster:
         except (CancelledError, CommClosedError):
             self._again()
             return []
+        if not fetched:
+            self._look()
+            return []
         self._lost_since = None
-        for future in waited.done:
+        for future in fetched:
             del self._tasks[self._futures.pop(future)]
         return results
+
+    def _fetch(self, future: Any, results: list[tuple[int, Any]]) -> bool:
+        """Append a result; False if it does not come, because the worker that held it is gone: it is made anew."""
+        # the built-in one from Python 3.11 on
+        from distributed import TimeoutError as LateError
+
+        try:
+            value = future.result(timeout=self._patience)
+        except LateError:
+            # a large result over a slow line needs longer, and would never come whole
+            self._patience *= 2.0
+            return False
+        self._patience = _FETCH
+        results.append((self._futures[future], value))
+        return True
 
     def _again(self) -> None:
         """Hand everything in once more: with the connection its tasks were lost.
@@ -384,7 +407,9 @@ class Cluster:
 
     def close(self) -> None:
         if self.client.status == "running":
-            with suppress(CancelledError, OSError, TimeoutError):
+            from distributed import TimeoutError as LateError
+
+            with suppress(CancelledError, OSError, LateError):
                 self.client.cancel(list(self._futures), force=True)
         self._futures.clear()
 

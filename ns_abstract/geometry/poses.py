@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from ns_abstract.arithmetic.forms import Basis, Float64Array, FormArray
-from ns_abstract.arithmetic.rounding import UNIT64
+from ns_abstract.arithmetic.rounding import POSE_ROUNDING, UNIT64
 from ns_abstract.arithmetic.taylor import TaylorArray, TaylorBasis, taylor_cos_sin
 from ns_abstract.arithmetic.trigonometry import cos_sin
 from ns_abstract.geometry.box import ParameterBox
@@ -28,10 +28,6 @@ _CAMERA_AXES = {"yaw": (0.0, 1.0, 0.0), "pitch": (1.0, 0.0, 0.0), "roll": (0.0, 
 COLOR_SHIFTS = ("hue", "saturation")
 #: OpenGL to OpenCV camera axes.
 _FLIP = np.array([1.0, -1.0, -1.0])
-# Evaluating a pose in float64 takes fewer than 64 roundings of numbers of this size: five rotations.
-_POSE_ROUNDING = 64.0 * UNIT64
-# Sums of up to ten products in float64.
-_SHEAR_ROUNDING = 64.0 * UNIT64
 
 
 def _cross_matrix(axis: Float64Array) -> Float64Array:
@@ -182,7 +178,7 @@ class PoseSet:
                 sorted((factor * self.box.lower[i], factor * self.box.upper[i]))
                 for i, factor in ((self.box.names.index(other), factor) for other, factor in factors.items())
             ]
-            room = _SHEAR_ROUNDING * (abs(low) + abs(high) + sum(abs(end) for pair in ends for end in pair))
+            room = POSE_ROUNDING * (abs(low) + abs(high) + sum(abs(end) for pair in ends for end in pair))
             box = box.replace(axis, low - sum(b for _, b in ends) - room, high - sum(a for a, _ in ends) + room)
         return replace(self, box=box, shear=shear)
 
@@ -195,7 +191,7 @@ class PoseSet:
             low, high = self.perturbation.rotation[name]
             terms = {box.names.index(name): 1.0} | {box.names.index(other): f for other, f in factors.items()}
             ends = {i: sorted((f * box.lower[i], f * box.upper[i])) for i, f in terms.items()}
-            room = _SHEAR_ROUNDING * (abs(low) + abs(high) + sum(abs(end) for pair in ends.values() for end in pair))
+            room = POSE_ROUNDING * (abs(low) + abs(high) + sum(abs(end) for pair in ends.values() for end in pair))
             least, most = sum(a for a, _ in ends.values()), sum(b for _, b in ends.values())
             if least > high + room or most < low - room:
                 return None
@@ -266,11 +262,11 @@ class PoseSet:
     def _rounding(self) -> tuple[float, float]:
         """What the concrete pose's float64 evaluation may add to a rotation's and a position's entry."""
         start, displacement = self._base[1], self._base[4]
-        reach = sum(max(map(abs, limits)) for limits in self.perturbation.translation.values())
-        shift = _POSE_ROUNDING * (1.0 + reach + np.abs(start).max() + np.abs(displacement).max())
+        farthest = sum(max(map(abs, limits)) for limits in self.perturbation.translation.values())
+        shift = POSE_ROUNDING * (1.0 + farthest + np.abs(start).max() + np.abs(displacement).max())
         if self.perturbation.orbit is not None:
-            shift += _POSE_ROUNDING * (1.0 + 2.0 * np.abs(self.perturbation.orbit.target).max())
-        return _POSE_ROUNDING, shift
+            shift += POSE_ROUNDING * (1.0 + 2.0 * np.abs(self.perturbation.orbit.target).max())
+        return POSE_ROUNDING, shift
 
     def _enclosed(self, box: ParameterBox, basis: Any, kind: Any, trigonometry: Callable[[Any], tuple]) -> tuple:
         """Camera-to-world rotation and position over ``box`` in the arithmetic ``kind``, without rounding of `pose`."""

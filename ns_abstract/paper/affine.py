@@ -12,7 +12,7 @@ from typing import Any, overload
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ns_abstract.arithmetic.forms import Basis, Float64Array, FormArray, settle
+from ns_abstract.arithmetic.forms import Basis, Float64Array, FormArray, set_norms
 from ns_abstract.paper import lines
 from ns_abstract.paper.interval import BoolArray, Interval
 
@@ -99,7 +99,7 @@ class Enclosure:
         middle, radius = box.middle.ravel(), box.radius.ravel()
         form = FormArray.constant(basis, middle)
         form.data[1 + np.arange(count), np.arange(count)] = radius
-        settle(form.data, basis.dimensions, basis.order, basis.monomials)
+        set_norms(form.data, basis.dimensions, basis.order, basis.monomials)
         return cls(FormArray(basis, form.data, box.shape), box)
 
     @classmethod

@@ -140,7 +140,7 @@ class LinearBounds:
         x, y = self.range.broadcast_to(shape), other.range.broadcast_to(shape)
         bounded = np.isfinite(x.magnitude) & np.isfinite(y.magnitude)
         if not np.all(bounded):
-            # lanes without planes are multiplied as zeros and widened afterwards
+            # elements without planes are multiplied as zeros and widened afterwards
             zero, unknown = np.zeros(shape), np.where(bounded, 0.0, np.inf)
             known = [
                 LinearBounds(*(_select(bounded, side.broadcast_to(shape), zero) for side in (v.lower, v.upper)))

@@ -101,10 +101,10 @@ def matrix_inverse(
         return _unbounded(x)
     identity = np.eye(n)
     difference = identity - x @ inverse
-    reach, scale = matrix_norm(_range(difference), norm), matrix_norm(Interval(inverse), norm)
-    if not (reach < 1.0 and scale < np.inf):
+    distance, scale = matrix_norm(_range(difference), norm), matrix_norm(Interval(inverse), norm)
+    if not (distance < 1.0 and scale < np.inf):
         return _unbounded(x)
-    size = Interval(reach)
+    size = Interval(distance)
     remainder = (Interval(scale) * size.power(order + 1) / (1.0 - size)).upper
     if not remainder < np.inf:
         return _unbounded(x)

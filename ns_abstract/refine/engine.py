@@ -22,7 +22,7 @@ import numpy as np
 from ns_abstract.execution.ending import AbandonedError, abandoning
 from ns_abstract.geometry.box import ParameterBox
 from ns_abstract.refine.protocol import Bounds, Context, Frame, Render
-from ns_abstract.refine.result import FrameResult, Leaves, PartResult, TracePoint, gap, joined
+from ns_abstract.refine.result import FrameResult, Leaves, PartResult, TracePoint, Views, gap, joined
 
 #: Part of the whole excess that one round of splitting takes on.
 _ROUND_SHARE = 0.8
@@ -49,6 +49,10 @@ _COVER_SHARE = 0.5
 _COVER_CELLS = 4096
 #: Part of the gap beyond the witnesses that a goal allows which parts of a frame share by their pixels.
 _SLACK_SHARE = 0.1
+#: Points of the trace while the first cover is made: each of the first cells, then so many by the whole cover.
+_FIRST_POINTS, _COVER_POINTS = 8, 32
+#: Poses that are rendered where leaves are kept: across the range of one parameter, along each axis of several.
+_VIEWS, _AXIS_VIEWS = 9, 4
 #: Cells that may still be bounded where their number is not limited.
 _PLENTY = 1 << 60
 
@@ -220,6 +224,7 @@ class Refinement:
         self._kept_bytes = 0
         self._held_bytes = 0
         self._numbers = itertools.count()
+        self._views: list[tuple[np.ndarray, np.ndarray]] = []
 
     # --- tiles ---------------------------------------------------------------------------------
 
@@ -306,7 +311,7 @@ class Refinement:
         last = part.last & (~part.first | (self.random.random(box.dimensions) < 0.5))
         return np.where(last, box.upper, np.where(part.first, box.lower, box.middle))
 
-    def _settle(self, tiles: np.ndarray, changes: dict[int, _Change] | None = None) -> None:
+    def _update_outer(self, tiles: np.ndarray, changes: dict[int, _Change] | None = None) -> None:
         """Update the outer bound of ``tiles``, given what has changed since the round began."""
         for t in tiles:
             self.outer_lower[t], self.outer_upper[t] = self.tiles[t].outer(None if changes is None else changes[t])
@@ -326,9 +331,11 @@ class Refinement:
             self._mpg(self.witness_lower, self.witness_upper),
         )
 
-    def _record(self, share: float) -> TracePoint:
-        point = self.point()
-        self.trace.append(point)
+    def _record(self, share: float, keep: bool = True) -> TracePoint:
+        """Tell where the work stands; ``share`` of the set is covered."""
+        point = replace(self.point(), covered=share)
+        if keep:
+            self.trace.append(point)
         self.progress(point, share)
         return point
 
@@ -362,6 +369,7 @@ class Refinement:
         with abandoning(self.stopped):
             self.image = self._witness(box.middle)
         self.start = time.perf_counter()
+        self._record(0.0)
         # where the whole set costs nothing, or rays may be left at [0, 1], the cover keeps to the time
         with abandoning(self._late if self.frame.tilewise else self.stopped), suppress(AbandonedError):
             corners = self._begin()
@@ -375,7 +383,17 @@ class Refinement:
                     if self._over():
                         break
                 self._refine()
-        return self._record(1.0)
+                self._look_around()
+        return self._record(1.0 if self.covered else self.trace[-1].covered)
+
+    def _look_around(self) -> None:
+        """Render poses across the set, for those who look at what leaves say of them."""
+        if not self.keep_leaves:
+            return
+        for values in _across(self.frame.box):
+            if self.stopped():
+                return
+            self._views.append((values, self._witness(values)))
 
     def _begin(self) -> np.ndarray:
         """What the first cover asks for; returns the corners of the set that are left for later."""
@@ -435,7 +453,10 @@ class Refinement:
                 self._witness(part.box.middle)
             elif len(parts) > 1:
                 self._unseen.append(part.box.middle)
-            self.progress(self.point(), (number + 1) / len(parts))
+            if number + 1 < len(parts):
+                share = (number + 1) / len(parts)
+                due = int(share * _COVER_POINTS) > int(number / len(parts) * _COVER_POINTS)
+                self._record(share, keep=number < _FIRST_POINTS or due)
         for t in everything:
             cells, lowers, uppers = zip(*((cell, lower[t], upper[t]) for cell, lower, upper in leaves), strict=True)
             self.tiles[t].replace(_Change([], list(cells), list(lowers), list(uppers)))
@@ -444,7 +465,7 @@ class Refinement:
         told = [numbers for numbers in elements if numbers is not None]
         if len(told) == len(elements):
             self.shown = np.unique(np.concatenate(told))
-        self._settle(everything)
+        self._update_outer(everything)
         self._record(1.0)
         return True
 
@@ -544,7 +565,7 @@ class Refinement:
                 fresh.update(rows)
                 # by number, not by time: where a round ends must not depend on the machine
                 if (number + 1) % look == 0 and number + 1 < len(jobs):
-                    self._settle(np.array(sorted(fresh), np.int64), changes)
+                    self._update_outer(np.array(sorted(fresh), np.int64), changes)
                     fresh.clear()
                     if self.goal.met(self._record(1.0)):
                         break
@@ -552,7 +573,7 @@ class Refinement:
                 return
             for t, change in changes.items():
                 self.tiles[t].replace(change)
-            self._settle(np.array(sorted(changes), np.int64))
+            self._update_outer(np.array(sorted(changes), np.int64))
 
     def _choose(self) -> tuple[list[tuple[_Cell, dict[int, int]]], int]:
         """The cells to split in the next round, each with its row by tile, and into how many parts."""
@@ -714,7 +735,16 @@ class Refinement:
             shown=self.shown,
             floor=self.floor,
             leaves=self._leaves() if self.covered else None,
+            views=self._seen() if self.covered else None,
         )
+
+    def _seen(self) -> Views | None:
+        if not self.keep_leaves:
+            return None
+        values = [values for values, _ in self._views]
+        images = [picture for _, picture in self._views]
+        whole = np.stack(images) if images else np.zeros((0, *self.image.shape), np.float32)
+        return Views(np.array(values, np.float64).reshape(len(values), self.frame.box.dimensions), whole)
 
 
 def groups(frame: Frame, count: int) -> list[np.ndarray]:
@@ -749,6 +779,16 @@ def spread(frame: Frame, index: int, seed: int) -> float:
     pictures = [frame.render(values) for values in (frame.box.middle, *corners[[0, -1]])]
     least, most = np.minimum.reduce(pictures), np.maximum.reduce(pictures)
     return float(gap(least, most)[_pixels_inside(frame)].mean())
+
+
+def _across(box: ParameterBox) -> Iterator[np.ndarray]:
+    """Poses [d] across a set: evenly along one parameter; along each of several, the others at their middles."""
+    count = _VIEWS if box.dimensions == 1 else _AXIS_VIEWS + 1
+    for axis in range(box.dimensions):
+        for step in np.linspace(-1.0, 1.0, count):
+            # the middle of several belongs to all axes
+            if step or not axis:
+                yield box.at(np.where(np.arange(box.dimensions) == axis, step, 0.0))
 
 
 def _first_corners(box: ParameterBox, random: np.random.Generator) -> np.ndarray:

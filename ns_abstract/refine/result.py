@@ -20,12 +20,17 @@ Float64Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class TracePoint:
-    """The state after ``seconds`` of work on a frame and ``cells`` bounded cells."""
+    """The state after ``seconds`` of work on a frame and ``cells`` bounded cells.
+
+    ``covered`` is the part of the set that the cells cover; nothing but [0, 1] holds of a pixel while that is below 1,
+    and ``mpg`` says so.
+    """
 
     seconds: float
     cells: int
     mpg: float
     mpg_witness: float
+    covered: float = 1.0
 
 
 @dataclass(frozen=True)
@@ -52,6 +57,19 @@ class Leaves:
 
 
 @dataclass(frozen=True)
+class Views:
+    """Concrete renders of some poses of a frame's set.
+
+    Attributes:
+        values: [n, d] parameter values, in the parameters' units.
+        images: [n, H, W, 3] float32; of a part of a frame [n, t, side, side, 3].
+    """
+
+    values: Float64Array
+    images: Float32Array
+
+
+@dataclass(frozen=True)
 class FrameResult:
     """One frame's abstract image.
 
@@ -67,6 +85,7 @@ class FrameResult:
         plan: What was left out for this frame and why, one sentence each.
         bounded: False while no bound but [0, 1] is known (the budget ended first).
         leaves: The leaf cells' linear sets, if they were asked for.
+        views: Concrete renders across the set, where leaves are kept.
     """
 
     index: int
@@ -82,6 +101,7 @@ class FrameResult:
     plan: tuple[str, ...] = ()
     bounded: bool = True
     leaves: Leaves | None = field(default=None, repr=False)
+    views: Views | None = field(default=None, repr=False)
 
 
 @dataclass(frozen=True)
@@ -113,6 +133,11 @@ class PartResult:
     shown: NDArray[np.int64] | None
     floor: float = 0.0
     leaves: Leaves | None = field(default=None, repr=False)
+    views: Views | None = field(default=None, repr=False)
+
+
+#: Of a part that has no point yet: [0, 1] everywhere.
+_NOTHING = TracePoint(0.0, 0, math.sqrt(3.0), 0.0, 0.0)
 
 
 def joined(parts: Sequence[PartResult], camera: Any) -> FrameResult:
@@ -150,30 +175,39 @@ def joined(parts: Sequence[PartResult], camera: Any) -> FrameResult:
         trace=_joined_trace(parts),
         bounded=bounded,
         leaves=_joined_leaves([part.leaves for part in parts]) if bounded else None,
+        views=_joined_views([part.views for part in parts], order, camera) if bounded else None,
     )
 
 
 def _joined_trace(parts: Sequence[PartResult]) -> tuple[TracePoint, ...]:
-    """Sums of cells and means by pixels, from when every part has a first point, whenever one has a new point."""
+    """Sums of cells and means by pixels, whenever a part has a new point; before its first one, nothing is known."""
     if len(parts) == 1:
         return parts[0].trace
     times = [[point.seconds for point in part.trace] for part in parts]
-    if not all(times):
-        return ()
-    begin = max(t[0] for t in times)
+    weights = [part.pixels / sum(p.pixels for p in parts) for part in parts]
     points = []
-    for now in sorted({second for t in times for second in t if second >= begin}):
-        latest = [part.trace[bisect.bisect_right(t, now) - 1] for part, t in zip(parts, times, strict=True)]
-        weights = [part.pixels / sum(p.pixels for p in parts) for part in parts]
-        points.append(
-            TracePoint(
-                now,
-                sum(point.cells for point in latest),
-                math.fsum(w * point.mpg for w, point in zip(weights, latest, strict=True)),
-                math.fsum(w * point.mpg_witness for w, point in zip(weights, latest, strict=True)),
-            )
-        )
+    for now in sorted({second for t in times for second in t}):
+        places = [bisect.bisect_right(t, now) - 1 for t in times]
+        latest = [part.trace[k] if k >= 0 else _NOTHING for part, k in zip(parts, places, strict=True)]
+
+        def mean(name: str, latest: Sequence[TracePoint] = latest) -> float:
+            return math.fsum(w * getattr(point, name) for w, point in zip(weights, latest, strict=True))
+
+        cells = sum(point.cells for point in latest)
+        points.append(TracePoint(now, cells, mean("mpg"), mean("mpg_witness"), min(1.0, mean("covered"))))
     return tuple(points)
+
+
+def _joined_views(parts: Sequence[Views | None], order: NDArray[np.intp], camera: Any) -> Views | None:
+    """The poses that every part has rendered, in their common order."""
+    known = [part for part in parts if part is not None]
+    if len(known) < len(parts):
+        return None
+    count = min(part.values.shape[0] for part in known)
+    tiles = np.concatenate([part.images[:count] for part in known], axis=1)[:, order]
+    images = [assemble(picture, camera) for picture in tiles]
+    shape = (0, camera.height, camera.width, 3)
+    return Views(known[0].values[:count], np.stack(images) if images else np.zeros(shape, np.float32))
 
 
 def _joined_leaves(parts: Sequence[Leaves | None]) -> Leaves | None:

@@ -53,6 +53,7 @@ class CertifiedRun:
         command: The command line.
         plan: What was left out and why, one sentence each.
         limits: Conditions on the guarantee, one sentence each.
+        picture: "float" or "8-bit": what the network is shown.
     """
 
     guarantee: str
@@ -67,6 +68,7 @@ class CertifiedRun:
     command: tuple[str, ...]
     plan: tuple[str, ...] = ()
     limits: tuple[str, ...] = ()
+    picture: str = "float"
     started: str = field(default_factory=now)
 
 
@@ -125,6 +127,7 @@ def certificate_document(
             "guarantee": run.guarantee,
             "guarantee_text": guarantee_text(run.guarantee, run.renderer["name"]),
             "network_guarantee": run.network_guarantee,
+            "picture": run.picture,
             "renderer": run.renderer,
             "scene": run.scene,
             "model": run.model,

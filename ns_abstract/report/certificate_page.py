@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Mapping, Sequence
 from html import escape
 from typing import Any
 
 from ns_abstract.report.figures import interval, number
-from ns_abstract.report.page import Axis, counted, draw_line, draw_plot, reproduce, uri, whole_page
+from ns_abstract.report.page import Axis, counted, draw_line, draw_plot, reproduce, script, uri, whole_page
+from ns_abstract.report.record import plain
 
 _STYLE = """
 svg .certified { fill: var(--good); } svg .falsified { fill: var(--bad); } svg .unknown { fill: #9aa0a6; }
@@ -18,13 +20,20 @@ svg path.c-certified { stroke: var(--good); } svg path.c-falsified { stroke: var
 svg path.c-unknown { stroke: #9aa0a6; }
 .key i { display: inline-block; width: .8em; height: .8em; margin: 0 .35em 0 1em; border-radius: 2px; }
 .certified-back { background: var(--good); } .falsified-back { background: var(--bad); }
-.unknown-back { background: #9aa0a6; }
+.unknown-back { background: #9aa0a6; } .certified-ink { color: var(--good); } .falsified-ink { color: var(--bad); }
+svg [data-cell] { cursor: pointer; } svg [data-cell].chosen { stroke: var(--ink); stroke-width: 2.5; }
+#cell { background: var(--card); border: 1px solid var(--line); border-radius: 6px; padding: .8rem 1.2rem;
+  flex: 1 1 20rem; }
+#cell img { width: 16rem; max-width: 100%; } #cell h3 { margin: 0 0 .4rem; font-size: 1rem; }
+#cell button { font: inherit; font-size: .85rem; margin-right: .5rem; }
 """
 _VERDICTS = ("certified", "falsified", "unknown")
 _COLUMNS = ("cells certified", "falsified", "unknown", "open", "sampled right", "least proven margin")
 #: Most frames drawn one by one.
 _MOST_ROWS = 200
 _MOST_POINTS = 400
+#: Most cells that can be chosen one by one; neighbours of one verdict are drawn as one where there are more.
+_MOST_CELLS = 4000
 
 
 def percent(part: float | None) -> str:
@@ -43,6 +52,7 @@ def certificate_page(
     document: Mapping[str, Any],
     cells: Mapping[int, Sequence[Mapping[str, Any]]],
     pictures: Sequence[Mapping[str, Any]],
+    seen: Mapping[tuple[int, int], Mapping[str, Any]] | None = None,
 ) -> str:
     """The page of a certificate.
 
@@ -50,14 +60,17 @@ def certificate_page(
         document: Content of report.json.
         cells: By frame, rows lower, upper, verdict in the order of ``document``'s parameters.
         pictures: ``title``, ``text`` and ``png`` of images to show, in order.
+        seen: ``text`` and ``png`` of a pose in a cell, by frame and position of the cell in it.
 
     Returns:
         HTML, self-contained; every text of the document is escaped.
     """
     name = str(document["scene"].get("name", "scene"))
+    numbers = _numbered(document, cells)
     body = [
         _verdict(document, name),
-        _map(document, cells),
+        _map(document, cells, numbers),
+        _cell_data(document, cells, numbers, seen or {}) if numbers else "",
         _pictures(pictures),
         _counterexamples(document),
         _time(document),
@@ -67,7 +80,48 @@ def certificate_page(
         _files(),
         reproduce(document),
     ]
-    return whole_page(f"Certificate of {name}", body, _STYLE)
+    return whole_page(f"Certificate of {name}", body, _STYLE, script("cells.js") if numbers else "")
+
+
+def _numbered(
+    document: Mapping[str, Any], cells: Mapping[int, Sequence[Mapping[str, Any]]]
+) -> dict[tuple[int, int], int]:
+    """Numbers of the cells that can be chosen, by frame and position; none where there are too many."""
+    found: dict[tuple[int, int], int] = {}
+    for entry in document["frames"][:_MOST_ROWS]:
+        for position in range(len(cells.get(entry["index"], ()))):
+            found[entry["index"], position] = len(found)
+    return found if len(found) <= _MOST_CELLS else {}
+
+
+def _cell_data(
+    document: Mapping[str, Any],
+    cells: Mapping[int, Sequence[Mapping[str, Any]]],
+    numbers: Mapping[tuple[int, int], int],
+    seen: Mapping[tuple[int, int], Mapping[str, Any]],
+) -> str:
+    """What the script needs to tell about a cell, as JSON that ends no tag."""
+    pictures: list[tuple[str, str]] = []
+    rows = []
+    for frame, position in numbers:
+        row, picture = cells[frame][position], seen.get((frame, position))
+        number_of = None
+        if picture is not None:
+            number_of = len(pictures)
+            pictures.append((uri(picture["png"]), picture["text"]))
+        example = row.get("counterexample")
+        rows.append((frame, row["verdict"], row["lower"], row["upper"], row.get("margin"), example, number_of))
+    first = document["frames"][0]["parameters"]
+    data = {"parameters": [(p["name"], p["unit"]) for p in first], "cells": rows, "pictures": pictures}
+    text = json.dumps(plain(data), allow_nan=False).replace("<", "\\u003c")
+    return f'<script type="application/json" id="cell-data">{text}</script>'
+
+
+_CELL = (
+    '<div id="cell" hidden><h3 id="cell-title"></h3><table><tbody id="cell-values"></tbody></table>'
+    '<p><img id="cell-picture" class="pixels" alt="a picture of the cell" hidden></p><p id="cell-caption" '
+    'class="soft"></p><button id="cell-before">cell before</button><button id="cell-next">next cell</button></div>'
+)
 
 
 def _verdict(document: Mapping[str, Any], name: str) -> str:
@@ -134,7 +188,28 @@ def _merged(rows: Sequence[Mapping[str, Any]], axis: int) -> list[tuple[float, f
     return spans
 
 
-def _map(document: Mapping[str, Any], cells: Mapping[int, Sequence[Mapping[str, Any]]]) -> str:
+#: A part of a map: first and past end, verdict, and the number of the cell if it can be chosen.
+_Span = tuple[float, float, str, "int | None"]
+
+
+def _spans(rows: Sequence[Mapping[str, Any]], axis: int, frame: int, numbers: Mapping[Any, int]) -> list[_Span]:
+    """The cells along one parameter, one by one if they have numbers."""
+    if numbers:
+        return [
+            (row["lower"][axis], row["upper"][axis], row["verdict"], numbers[frame, k]) for k, row in enumerate(rows)
+        ]
+    return [(low, high, kind, None) for low, high, kind in _merged(rows, axis)]
+
+
+def _chosen(number_of: int | None) -> str:
+    return "" if number_of is None else f' data-cell="{number_of}"'
+
+
+def _map(
+    document: Mapping[str, Any],
+    cells: Mapping[int, Sequence[Mapping[str, Any]]],
+    numbers: Mapping[tuple[int, int], int],
+) -> str:
     """Where: rings of one azimuth, strips of one other parameter, maps of two, bars of more."""
     frames = document["frames"][:_MOST_ROWS]
     drawn, bars = [], []
@@ -142,19 +217,28 @@ def _map(document: Mapping[str, Any], cells: Mapping[int, Sequence[Mapping[str, 
         free = [k for k, p in enumerate(entry["parameters"]) if p["lower"] < p["upper"]]
         rows, parameters = cells.get(entry["index"], ()), entry["parameters"]
         if rows and len(free) == 1 and parameters[free[0]]["name"] == "azimuth":
-            drawn.append(_figure(_ring(_merged(rows, free[0]), parameters[free[0]]), entry, "seen from the axis's tip"))
+            drawn.append(
+                _figure(
+                    _ring(_spans(rows, free[0], entry["index"], numbers), parameters[free[0]]),
+                    entry,
+                    "seen from the axis's tip",
+                )
+            )
         elif rows and len(free) == 1:
-            drawn.append(_figure(_strip(_merged(rows, free[0]), parameters[free[0]]), entry, ""))
+            drawn.append(
+                _figure(_strip(_spans(rows, free[0], entry["index"], numbers), parameters[free[0]]), entry, "")
+            )
         elif rows and len(free) == 2:
-            drawn.append(_figure(_plane(rows, [parameters[k] for k in free], free), entry, ""))
+            drawn.append(_figure(_plane(rows, [parameters[k] for k in free], free, entry["index"], numbers), entry, ""))
         else:
             bars.append(entry)
     text = "".join(drawn)
     if bars:
-        text += _bars(bars)
+        text += _bars(bars, numbers, cells)
     more = len(document["frames"]) - len(frames)
     note = f"<p>{counted(more, 'further frame')} in the table below.</p>" if more > 0 else ""
-    return f'<h2>Where</h2><div class="below">{text}</div>{note}'
+    hint = '<p class="soft" id="cell-hint" hidden>Click a cell for its margin and a picture.</p>' if numbers else ""
+    return f'<h2>Where</h2>{hint}<div class="below">{text}{_CELL if numbers else ""}</div>{note}'
 
 
 def _figure(svg: str, entry: Mapping[str, Any], note: str) -> str:
@@ -170,11 +254,11 @@ def _svg(width: int, height: int, title: str, marks: str) -> str:
     )
 
 
-def _ring(spans: Sequence[tuple[float, float, str]], parameter: Mapping[str, Any]) -> str:
+def _ring(spans: Sequence[_Span], parameter: Mapping[str, Any]) -> str:
     """Azimuth 0 to the right, counter-clockwise."""
     middle, inner, outer = 170.0, 92.0, 138.0
     marks = []
-    for low, high, kind in spans:
+    for low, high, kind, number_of in spans:
         pieces = max(1, math.ceil((high - low) / 2.0))
         for k in range(pieces):
             start = low + (high - low) * k / pieces
@@ -185,8 +269,8 @@ def _ring(spans: Sequence[tuple[float, float, str]], parameter: Mapping[str, Any
             ]
             (a, b), (c, d), (e, f), (g, h) = corners
             marks.append(
-                f'<path class="{kind}" d="M{a:.2f},{b:.2f}A{outer},{outer} 0 0 0 {c:.2f},{d:.2f}L{e:.2f},{f:.2f}'
-                f'A{inner},{inner} 0 0 1 {g:.2f},{h:.2f}Z"/>'
+                f'<path class="{kind}"{_chosen(number_of)} d="M{a:.2f},{b:.2f}A{outer},{outer} 0 0 0 '
+                f'{c:.2f},{d:.2f}L{e:.2f},{f:.2f}A{inner},{inner} 0 0 1 {g:.2f},{h:.2f}Z"/>'
             )
     for degrees in range(0, 360, 45):
         angle = math.radians(degrees)
@@ -196,12 +280,13 @@ def _ring(spans: Sequence[tuple[float, float, str]], parameter: Mapping[str, Any
     return _svg(340, 340, "Verdicts around the orbit", "".join(marks))
 
 
-def _strip(spans: Sequence[tuple[float, float, str]], parameter: Mapping[str, Any]) -> str:
+def _strip(spans: Sequence[_Span], parameter: Mapping[str, Any]) -> str:
     low, high = parameter["lower"], parameter["upper"]
     axis = Axis(low, high, 20, 700, log=False)
     marks = [
-        f'<rect class="{kind}" x="{axis(a):.2f}" y="8" width="{max(0.3, axis(b) - axis(a)):.2f}" height="34"/>'
-        for a, b, kind in spans
+        f'<rect class="{kind}"{_chosen(n)} x="{axis(a):.2f}" y="8" width="{max(0.3, axis(b) - axis(a)):.2f}" '
+        'height="34"/>'
+        for a, b, kind, n in spans
     ]
     marks += [
         f'<text x="{axis(tick):.1f}" y="58" text-anchor="middle">{number(tick, 3)}</text>' for tick in axis.ticks()
@@ -211,22 +296,33 @@ def _strip(spans: Sequence[tuple[float, float, str]], parameter: Mapping[str, An
     return _svg(720, 80, f"Verdicts along {parameter['name']}", "".join(marks))
 
 
-def _plane(rows: Sequence[Mapping[str, Any]], parameters: Sequence[Mapping[str, Any]], free: Sequence[int]) -> str:
+def _plane(
+    rows: Sequence[Mapping[str, Any]],
+    parameters: Sequence[Mapping[str, Any]],
+    free: Sequence[int],
+    frame: int,
+    numbers: Mapping[tuple[int, int], int],
+) -> str:
     x = Axis(parameters[0]["lower"], parameters[0]["upper"], 52, 340, log=False)
     y = Axis(parameters[1]["lower"], parameters[1]["upper"], 300, 20, log=False)
     i, j = free
     marks = "".join(
-        f'<rect class="{row["verdict"]}" x="{x(row["lower"][i]):.2f}" y="{y(row["upper"][j]):.2f}" '
+        f'<rect class="{row["verdict"]}"{_chosen(numbers.get((frame, k)))} x="{x(row["lower"][i]):.2f}" '
+        f'y="{y(row["upper"][j]):.2f}" '
         f'width="{x(row["upper"][i]) - x(row["lower"][i]):.2f}" '
         f'height="{y(row["lower"][j]) - y(row["upper"][j]):.2f}"/>'
-        for row in rows
+        for k, row in enumerate(rows)
     )
     labels = (escape(parameters[0]["name"]), escape(parameters[1]["name"]))
     return draw_plot(x, y, labels, marks, size=(352, 340), title="Verdicts over two parameters")
 
 
-def _bars(entries: Sequence[Mapping[str, Any]]) -> str:
-    """One stacked bar by frame."""
+def _bars(
+    entries: Sequence[Mapping[str, Any]],
+    numbers: Mapping[tuple[int, int], int],
+    cells: Mapping[int, Sequence[Mapping[str, Any]]],
+) -> str:
+    """One stacked bar by frame; a part stands for its cell of the least margin."""
     step, width = 14, 600
     marks = []
     for row, entry in enumerate(entries):
@@ -234,12 +330,21 @@ def _bars(entries: Sequence[Mapping[str, Any]]) -> str:
         marks.append(f'<text x="54" y="{row * step + 11}" text-anchor="end">{entry["index"]}</text>')
         for kind in _VERDICTS:
             size = width * entry["coverage"][kind]
+            least = _least(cells.get(entry["index"], ()), kind)
+            chosen = _chosen(None if least is None else numbers.get((entry["index"], least)))
             marks.append(
-                f'<rect class="{kind}" x="{left:.2f}" y="{row * step + 1}" width="{size:.2f}" height="{step - 2}"/>'
+                f'<rect class="{kind}"{chosen} x="{left:.2f}" y="{row * step + 1}" width="{size:.2f}" '
+                f'height="{step - 2}"/>'
             )
             left += size
     svg = _svg(680, len(entries) * step + 4, "Parts of each frame's set", "".join(marks))
     return f"<figure>{svg}<figcaption>parts of each frame's set, by frame</figcaption></figure>"
+
+
+def _least(rows: Sequence[Mapping[str, Any]], kind: str) -> int | None:
+    """The cell of a verdict whose margin is the least; one without a margin if all are."""
+    found = [k for k, row in enumerate(rows) if row["verdict"] == kind]
+    return min(found, key=lambda k: math.inf if (m := rows[k].get("margin")) is None else m, default=None)
 
 
 def _pictures(pictures: Sequence[Mapping[str, Any]]) -> str:
@@ -362,11 +467,17 @@ def _frames(document: Mapping[str, Any]) -> str:
     )
 
 
+_PICTURES = {
+    "float": "the float image in [0, 1], not its rounding to 8 bits in a file",
+    "8-bit": "the image rounded to 8 bits, round(255 x) / 255, by any float32 program and either way at a tie",
+}
+
+
 def _guarantee(document: Mapping[str, Any]) -> str:
     lines = [
         f"Images: guarantee <b>{escape(document['guarantee'])}</b>, each {escape(document['guarantee_text'])}.",
-        "What is bounded is the float image in [0, 1], not its rounding to 8 bits in a file; preprocessing in float32 "
-        "is part of it. Resizing means rendering at the network's resolution.",
+        f"What is bounded is {_PICTURES[document['picture']]}; preprocessing in float32 is part of it. Resizing means "
+        "rendering at the network's resolution.",
         "Network: " + escape("; ".join(document["network_guarantee"])) + ".",
         *(escape(limit) for limit in document["limits"]),
     ]

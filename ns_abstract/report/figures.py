@@ -3,8 +3,12 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
-from ns_abstract.refine.result import FrameResult, max_pixel_gap, mean_pixel_gap
+from ns_abstract.refine.result import FrameResult, TracePoint, max_pixel_gap, mean_pixel_gap
+
+#: Ratios whose times are told.
+MARKS = (1.5, 1.25, 1.1, 1.05)
 
 
 def metrics(result: FrameResult) -> dict[str, float | None]:
@@ -25,6 +29,15 @@ def metrics(result: FrameResult) -> dict[str, float | None]:
         "xpg_witness": max_pixel_gap(result.witness_lower, result.witness_upper),
         "ratio": ratio if math.isfinite(ratio) else None,
     }
+
+
+def seconds_to(trace: Sequence[TracePoint], marks: Sequence[float] = MARKS) -> dict[float, float | None]:
+    """Seconds of work after which MPG was at most each of ``marks`` times the witness MPG; None: never."""
+    found: dict[float, float | None] = {}
+    for mark in marks:
+        reached = (p.seconds for p in trace if p.covered == 1.0 and p.mpg <= mark * p.mpg_witness)
+        found[mark] = next(reached, None)
+    return found
 
 
 def number(value: float | None, digits: int = 4) -> str:

@@ -21,7 +21,7 @@ from ns_abstract.io.atomic import write_atomic
 from ns_abstract.io.errors import InputError
 from ns_abstract.io.jsonio import parse_json
 from ns_abstract.methods.runs import check_memory
-from ns_abstract.refine.result import FrameResult, Leaves, TracePoint
+from ns_abstract.refine.result import FrameResult, Leaves, TracePoint, Views
 
 FORMAT = "ns-abstract frame"
 VERSION = 1
@@ -29,6 +29,8 @@ VERSION = 1
 IMAGES = ("lower", "upper", "witness_lower", "witness_upper", "image")
 #: Arrays of a frame file with leaf cells.
 LEAVES = tuple(field.name for field in fields(Leaves))
+#: Arrays of a frame file with leaf cells: poses of the set, and what was rendered there.
+VIEWS = ("view_values", "view_images")
 
 _NAME = re.compile(r"frame_(\d{5,})\.npz")
 _IGNORED = "the frame is computed again"
@@ -84,8 +86,25 @@ def check_frame(result: FrameResult) -> None:
     numbers = [result.seconds, *(v for p in result.trace for v in (p.seconds, p.mpg, p.mpg_witness))]
     if not all(math.isfinite(v) and v >= 0.0 for v in numbers):
         raise fail("times and gaps must be finite and not negative")
+    if not all(0.0 <= point.covered <= 1.0 for point in result.trace):
+        raise fail("a part of the set that is covered lies between 0 and 1")
     if result.leaves is not None:
         _check_leaves(result.leaves, box.dimensions, fail)
+    if result.views is not None:
+        _check_views(result, result.views, fail)
+
+
+def _check_views(result: FrameResult, views: Views, fail: Callable[[str], ValueError]) -> None:
+    values, images, box = views.values, views.images, result.box
+    if values.dtype != np.float64 or values.ndim != 2 or values.shape[1] != box.dimensions:
+        raise fail(f"views: values are {values.dtype} {list(values.shape)}, not float64 [n, {box.dimensions}]")
+    if images.dtype != np.float32 or images.shape != (values.shape[0], *result.lower.shape):
+        raise fail(f"views: images are {images.dtype} {list(images.shape)}")
+    # the polarity refuses NaN too
+    if not ((values >= np.array(box.lower)).all() and (values <= np.array(box.upper)).all()):
+        raise fail("views: a pose is not one of the set")
+    if not ((images >= result.lower).all() and (images <= result.upper).all()):
+        raise fail("views: a render lies outside the bounds; the bounds are not sound")
 
 
 def _check_leaves(leaves: Leaves, d: int, fail: Callable[[str], ValueError]) -> None:
@@ -124,7 +143,8 @@ def save_frame(
 
     The file holds ``lower``, ``upper``, ``witness_lower``, ``witness_upper`` and ``image`` [H, W, 3]
     float32, ``parameters`` [d] (fields name, unit, lower, upper), ``record`` (a JSON text) and, where
-    the result has leaves, the arrays of `ns_abstract.refine.result.Leaves` under their own names.
+    the result has leaves, the arrays of `ns_abstract.refine.result.Leaves` under their own names, and
+    ``view_values`` [n, d] and ``view_images`` [n, H, W, 3], renders across the set.
 
     Args:
         path: The file; replaced if it exists.
@@ -146,7 +166,9 @@ def save_frame(
         "seconds": float(result.seconds),
         "cells": int(result.cells),
         "plan": list(result.plan),
-        "trace": [[float(p.seconds), int(p.cells), float(p.mpg), float(p.mpg_witness)] for p in result.trace],
+        "trace": [
+            [float(p.seconds), int(p.cells), float(p.mpg), float(p.mpg_witness), float(p.covered)] for p in result.trace
+        ],
         "about": dict(about or {}),
     }
     arrays: dict[str, np.ndarray] = {name: getattr(result, name) for name in IMAGES}
@@ -154,6 +176,8 @@ def save_frame(
     arrays["record"] = np.array(json.dumps(record, allow_nan=False))
     if result.leaves is not None:
         arrays |= {name: getattr(result.leaves, name) for name in LEAVES}
+    if result.views is not None:
+        arrays |= dict(zip(VIEWS, (result.views.values, result.views.images), strict=True))
 
     def write(stream: BinaryIO) -> None:
         with zipfile.ZipFile(stream, "w", zipfile.ZIP_DEFLATED, compresslevel=_COMPRESSION) as archive:
@@ -240,7 +264,8 @@ def _check_declared(archive: Archive, size: tuple[int, int] | None, leaves: bool
         rows, kind = archive.declared[name]
         if math.prod(rows) * kind.itemsize > most:
             raise InputError(f"{name} has {math.prod(rows) * kind.itemsize:,} bytes")
-    wanted = (*IMAGES, *(LEAVES if leaves else ()))
+    more = (*LEAVES, *(name for name in VIEWS if name in archive.declared)) if leaves else ()
+    wanted = (*IMAGES, *more)
     needed = sum(math.prod(archive.declared[name][0]) * archive.declared[name][1].itemsize for name in wanted)
     check_memory(2 * needed, path, "the frame")
 
@@ -266,10 +291,17 @@ def _parse(archive: Archive, has_leaves: bool, read_leaves: bool) -> StoredFrame
         **{name: archive.read(name) for name in IMAGES},
         seconds=float(record["seconds"]),
         cells=_integer(record["cells"]),
-        trace=tuple(TracePoint(float(s), _integer(c), float(m), float(w)) for s, c, m, w in record["trace"]),
+        # files of earlier versions say nothing of what was covered: all of it
+        trace=tuple(
+            TracePoint(float(s), _integer(c), float(m), float(w), *map(float, rest))
+            for s, c, m, w, *rest in record["trace"]
+        ),
         plan=tuple(map(str, record["plan"])),
         bounded=record["bounded"] is True,
         leaves=Leaves(**{name: archive.read(name) for name in LEAVES}) if has_leaves and read_leaves else None,
+        views=Views(*(archive.read(name) for name in VIEWS))
+        if read_leaves and set(VIEWS) <= set(archive.declared)
+        else None,
     )
     if record["status"] not in ("done", "partial", "missing"):
         raise InputError("the status is not one of done, partial, missing")

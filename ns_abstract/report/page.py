@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import base64
+import hashlib
 import math
 import shlex
 from collections.abc import Mapping, Sequence
+from functools import cache
 from html import escape
+from pathlib import Path
 from statistics import median
 from typing import Any
 
-from ns_abstract.report.figures import interval, number
+from ns_abstract.report.figures import MARKS, interval, number
 
 #: Points drawn of one curve.
 _CURVE_POINTS = 200
@@ -44,7 +47,7 @@ p, ul { margin: .5rem 0; max-width: 50rem; } a { color: var(--inner); } h1, p, l
   font-size: 1.25rem; font-variant-numeric: tabular-nums; } .stat span { font-size: .85rem; } .stat small { display: block;
   font-size: .8rem; line-height: 1.35; } svg { max-width: 100%; height: auto; } svg text { fill: var(--soft); font-size: 11px; }
 svg .axis { stroke: var(--line); } svg .outer { stroke: var(--outer); } svg .inner { stroke: var(--inner); }
-svg path.outer, svg path.inner { fill: none; stroke-width: 2; } svg circle.outer { fill: var(--outer); stroke: none; }
+svg path.outer, svg path.inner { fill: none; stroke-width: 2; } svg path.one { stroke-width: 1; opacity: .35; } svg circle.outer { fill: var(--outer); stroke: none; }
 svg circle.inner { fill: var(--inner); stroke: none; } svg .band { fill: var(--band); } svg text.outer { fill: var(--outer);
   stroke: none; } svg text.inner { fill: var(--inner); stroke: none; } .wide { overflow-x: auto; } table { border-collapse: collapse;
   font-size: .88rem; font-variant-numeric: tabular-nums; width: 100%; } th, td { text-align: right; padding: .28rem .6rem;
@@ -52,7 +55,13 @@ svg circle.inner { fill: var(--inner); stroke: none; } svg .band { fill: var(--b
 pre { background: var(--card); border: 1px solid var(--line); border-radius: 6px; padding: .8rem 1rem; overflow-x: auto;
   font: 13px/1.5 ui-monospace, "SF Mono", Menlo, Consolas, monospace; white-space: pre-wrap; overflow-wrap: anywhere; }
 dl { display: grid; grid-template-columns: max-content 1fr; gap: .15rem 1.2rem; } code { font: .9em ui-monospace, "SF Mono", Menlo, Consolas, monospace; } dt { font-weight: 600; } dd { margin: 0; }
-@media print { details { break-inside: avoid; } }
+#play { background: var(--card); border: 1px solid var(--line); border-radius: 6px; padding: 1rem 1.2rem; display: grid;
+  grid-template-columns: minmax(16rem, 26rem) minmax(16rem, 1fr); gap: .6rem 1.6rem; } #play[hidden], #play [hidden] { display: none; }
+#play canvas { width: 100%; } #play-curve { max-width: 30rem; } #play-picture { image-rendering: pixelated; border: 1px solid var(--line); cursor: crosshair; touch-action: none; }
+#play label { display: block; font-size: .9rem; } #play .choice label { display: inline-block; margin-right: .9rem; }
+#play-sliders input { width: 100%; } #play-caption { min-height: 2.8em; } #play-values td { text-align: right; }
+@media (max-width: 44rem) { #play { grid-template-columns: 1fr; } }
+@media print { #play { display: none; } details { break-inside: avoid; } }
 """
 
 _STATS = (
@@ -74,12 +83,17 @@ def shown_frames(frames: Sequence[Mapping[str, Any]], most: int) -> list[Mapping
     return sorted(widest, key=lambda entry: entry["index"])
 
 
-def render_page(document: Mapping[str, Any], pictures: Mapping[int, Mapping[str, bytes]]) -> str:
+def render_page(
+    document: Mapping[str, Any],
+    pictures: Mapping[int, Mapping[str, bytes]],
+    plays: Mapping[int, str] | None = None,
+) -> str:
     """The page of a report.
 
     Args:
         document: Content of report.json (`ns_abstract.report.record.Report.document`).
         pictures: For the frames shown, by number: PNGs lower, upper, gap, witness and image.
+        plays: Frames to play with, by number, as `ns_abstract.report.play.play_data` gives them.
 
     Returns:
         HTML, self-contained; every text of the document is escaped.
@@ -88,8 +102,11 @@ def render_page(document: Mapping[str, Any], pictures: Mapping[int, Mapping[str,
     frames = document["frames"]
     sampled = document["guarantee"] == "sampled"
     body = [_verdict(document, name)]
+    plays = {} if document["guarantee"] == "sampled" else plays or {}
+    if plays:
+        body.append(_play(plays))
     if frames:
-        body.append(_overview(document))
+        body += [_overview(document), _path_curve(frames)]
     shown = [entry for entry in frames if entry["index"] in pictures]
     if shown:
         body.append("<h2>Frames</h2>")
@@ -100,20 +117,65 @@ def render_page(document: Mapping[str, Any], pictures: Mapping[int, Mapping[str,
             for position, entry in enumerate(shown)
         ]
     body += [_plan(document), _table(document), _numbers(document), _files(document), reproduce(document)]
-    return whole_page(f"Abstract images of {name}", body)
+    return whole_page(f"Abstract images of {name}", body, script=script("play.js") if plays else "")
 
 
-def whole_page(title: str, body: Sequence[str], more_style: str = "") -> str:
-    """A page of ``body``'s parts, with the style sheet and no way to load anything."""
+@cache
+def script(name: str) -> str:
+    """A script that lies beside this module."""
+    return (Path(__file__).parent / name).read_text(encoding="utf-8")
+
+
+def whole_page(title: str, body: Sequence[str], more_style: str = "", script: str = "") -> str:
+    """A page of ``body``'s parts, with the style sheet and no way to load anything.
+
+    The only code that the browser runs in it is ``script``, which the page's policy names by its hash.
+    """
+    digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
+    allowed = f"; script-src 'sha256-{digest}'" if script else ""
     return (
         '<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
         '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
-        # the browser itself then refuses scripts and everything from elsewhere
+        # the browser itself then refuses other scripts and everything from elsewhere
         '<meta http-equiv="Content-Security-Policy" content="default-src \'none\'; img-src data:; '
-        "style-src 'unsafe-inline'\">\n"
+        f"style-src 'unsafe-inline'{allowed}\">\n"
         f"<title>{escape(title)}</title>\n<style>{STYLE}{more_style}</style>\n</head>\n<body>\n"
         + "\n".join(part for part in body if part)
+        + (f"\n<script>{script}</script>" if script else "")
         + "\n</body>\n</html>\n"
+    )
+
+
+_SHOWN = (("lower", "lower"), ("upper", "upper"), ("gap", "gap"), ("witness", "witness gap"), ("image", "render"))
+
+
+def _play(plays: Mapping[int, str]) -> str:
+    """Bounds at a pose that the reader chooses; `play.js` brings it to life and shows it."""
+    from ns_abstract.report.picture import color_table
+
+    options = "".join(f'<option value="{k}">frame {index}</option>' for k, index in enumerate(plays))
+    shown = "".join(
+        f'<label><input type="radio" name="play-shown" value="{key}"{" checked" if key == "lower" else ""}> '
+        f"{text}</label>"
+        for key, text in _SHOWN
+    )
+    data = "".join(f'<script type="text/plain" class="play-data">{text}</script>' for text in plays.values())
+    heads = "".join(f"<th>{text}</th>" for text in ("", "lower", "upper", "least rendered", "largest rendered"))
+    return (
+        f'<h2>Move the camera</h2><div id="play" hidden data-colors="{color_table()}"><div>'
+        '<canvas id="play-picture" tabindex="0" width="1" height="1" aria-label="the picture; arrow keys move '
+        'the pixel that is told about"></canvas><p id="play-caption" class="soft"></p></div><div>'
+        f'<label{" hidden" if len(plays) == 1 else ""}>show <select id="play-frame">{options}</select></label>'
+        f'<p class="choice">{shown}</p><div id="play-pose"><div id="play-sliders"></div><label><input type="checkbox" '
+        'id="play-whole"> the whole set at once</label></div><p id="play-none" class="soft" hidden>Bounds of single '
+        "poses are not in this page: they need <code>--save-cells</code>, and room.</p>"
+        f'<p id="play-where" class="soft"></p><table><thead><tr>{heads}</tr></thead><tbody id="play-values"></tbody>'
+        '</table><label id="play-axis-label" hidden>over <select id="play-axis"></select></label>'
+        '<canvas id="play-curve" width="480" height="230" hidden aria-label="bounds of the pixel over one parameter; '
+        'dots are renders"></canvas></div></div>'
+        "<p>Lower and upper bound at the sliders' pose are those of the cell around it, which are linear in the "
+        "parameters; numbers are rounded outward to the last digit shown. The render is the nearest one that was made.</p>"
+        + data
     )
 
 
@@ -234,7 +296,7 @@ def _frame(entry: Mapping[str, Any], pictures: Mapping[str, bytes], *, sampled: 
         f'<div class="images">{images}</div>'
         f'<div class="scale">gap 0 <i style="background: linear-gradient(90deg, {_gradient()})"></i> '
         f"{number(entry['xpg'])}</div>"
-        f'<div class="below"><div class="stats">{stats}</div>{_curve(entry["trace"])}</div>'
+        f'<div class="below"><div class="stats">{stats}</div>{_curve(entry)}</div>'
         + (f"<p>Left out for this frame:</p><ul>{plan}</ul>" if plan else "")
         + f'<p class="soft">{links}</p></details>'
     )
@@ -307,9 +369,11 @@ def draw_plot(
     )
 
 
-def draw_line(points: list[tuple[float, float]], kind: str, dots: bool) -> str:
-    """A curve through points in SVG units, of a class of the style sheet."""
-    path = f'<path class="{kind}" d="M' + "L".join(f"{a:.1f},{b:.1f}" for a, b in points) + '"/>' if points else ""
+def draw_line(points: list[tuple[float, float]], kind: str, dots: bool, *, joined: bool = True) -> str:
+    """A curve through points in SVG units, of a class of the style sheet; ``dots`` marks them."""
+    path = ""
+    if points and joined:
+        path = f'<path class="{kind}" d="M' + "L".join(f"{a:.1f},{b:.1f}" for a, b in points) + '"/>'
     if dots:
         path += "".join(f'<circle class="{kind}" cx="{a:.1f}" cy="{b:.1f}" r="3"/>' for a, b in points)
     return path
@@ -324,28 +388,113 @@ def draw_legend(entries: Sequence[tuple[str, str]], right: float) -> str:
     return "".join(parts)
 
 
-def _curve(trace: Sequence[Mapping[str, float]]) -> str:
-    """Error against run time, both axes logarithmic; zero has no place on them and is left out."""
+def _stairs(points: Sequence[tuple[float, float]], end: float) -> list[tuple[float, float]]:
+    """What is known between the points: a bound holds until a better one is there."""
+    found: list[tuple[float, float]] = []
+    stops = [*(start for start, _ in points[1:]), end]
+    for (start, value), stop in zip(points, stops, strict=False):
+        found += [(start, value), (stop, value)]
+    return found
+
+
+def _thinned(trace: Sequence[Mapping[str, float]]) -> list[Mapping[str, float]]:
+    """Points after the first moment, some of many, the last one always."""
     stride = max(1, math.ceil(len(trace) / _CURVE_POINTS))
     kept = [point for k, point in enumerate(trace) if k % stride == 0 or k == len(trace) - 1]
-    kept = [point for point in kept if point["seconds"] > 0.0]
+    return [point for point in kept if point["seconds"] > 0.0]
+
+
+def _curve(entry: Mapping[str, Any]) -> str:
+    """Error against run time, both axes logarithmic; zero has no place on them and is left out."""
+    kept = _thinned(entry["trace"])
     outer = [(point["seconds"], point["mpg"]) for point in kept if point["mpg"] > 0.0]
     inner = [(point["seconds"], point["mpg_witness"]) for point in kept if point["mpg_witness"] > 0.0]
     if not outer:
         return '<p class="soft">No progress over time was recorded for this frame.</p>'
     values = [value for _, value in outer + inner]
-    x = Axis(min(t for t, _ in outer + inner), max(t for t, _ in outer + inner), 52, 408, log=True)
+    end = max(t for t, _ in outer + inner)
+    x = Axis(min(t for t, _ in outer + inner), end, 52, 408, log=True)
     y = Axis(min(values), max(values), 216, 26, log=True)
-    upper = [(x(t), y(v)) for t, v in outer]
-    lower = [(x(t), y(v)) for t, v in inner]
+    upper = [(x(t), y(v)) for t, v in _stairs(outer, end)]
+    lower = [(x(t), y(v)) for t, v in _stairs(inner, end)]
     band = ""
-    if len(upper) > 1 and len(lower) > 1:
+    if len(upper) > 2 and len(lower) > 2:
         band = '<path class="band" d="M' + "L".join(f"{a:.1f},{b:.1f}" for a, b in upper + lower[::-1]) + 'Z"/>'
-    dots = len(kept) <= 25
-    marks = band + draw_line(upper, "outer", dots) + draw_line(lower, "inner", dots)
+    marks = band + draw_line(upper, "outer", False) + draw_line(lower, "inner", False)
+    if len(kept) <= 25:
+        marks += draw_line([(x(t), y(v)) for t, v in outer], "outer", True, joined=False)
+        marks += draw_line([(x(t), y(v)) for t, v in inner], "inner", True, joined=False)
     marks += draw_legend((("outer", "bounds (MPG)"), ("inner", "witness MPG")), 408)
     labels = ("seconds of work (log)", "mean pixel gap (log)")
-    return draw_plot(x, y, labels, marks, size=(420, 256), title="Mean pixel gap against run time")
+    plot = draw_plot(x, y, labels, marks, size=(420, 256), title="Mean pixel gap against run time")
+    return f"<div>{plot}{_times(entry)}</div>"
+
+
+def _times(entry: Mapping[str, Any]) -> str:
+    """Seconds to each ratio."""
+    reached = entry.get("seconds_to_ratio") or {}
+    parts = [
+        f"{mark} after {number(seconds, 3)} s" if seconds is not None else f"{mark} not reached"
+        for mark, seconds in reached.items()
+    ]
+    return f'<p class="soft">Ratio {", ".join(parts)}.</p>' if parts else ""
+
+
+def _path_curve(frames: Sequence[Mapping[str, Any]]) -> str:
+    """Error against run time of the whole path: every frame on its own clock, and their mean."""
+    traces = [kept for entry in frames if len(kept := _thinned(entry["trace"])) > 1]
+    if len(traces) < 2:
+        return ""
+    times = sorted({point["seconds"] for trace in traces for point in trace})
+    every = max(1, math.ceil(len(times) / _CURVE_POINTS))
+    times = [*times[::every], times[-1]]
+
+    def at(trace: Sequence[Mapping[str, float]], key: str, before: float) -> list[float]:
+        found, position, value = [], 0, before
+        for time in times:
+            while position < len(trace) and trace[position]["seconds"] <= time:
+                value = trace[position][key]
+                position += 1
+            found.append(value)
+        return found
+
+    end = times[-1]
+    lines: dict[str, list[list[float]]] = {
+        "outer": [at(trace, "mpg", math.sqrt(3.0)) for trace in traces],
+        "inner": [at(trace, "mpg_witness", 0.0) for trace in traces],
+    }
+    positive = [v for found in lines.values() for values in found for v in values if v > 0.0]
+    if not positive:
+        return ""
+    x, y = Axis(times[0], end, 52, 988, log=True), Axis(min(positive), max(positive), 236, 26, log=True)
+    marks = ""
+    for kind, found in lines.items():
+        for values, strength in (*((values, " one") for values in found), (_means(found), "")):
+            points = [(t, v) for t, v in zip(times, values, strict=True) if v > 0.0]
+            if points:
+                marks += draw_line([(x(t), y(v)) for t, v in _stairs(points, end)], f"{kind}{strength}", False)
+    marks += draw_legend((("outer", "bounds (MPG)"), ("inner", "witness MPG")), 988)
+    labels = ("seconds of work on each frame (log)", "mean pixel gap (log)")
+    plot = draw_plot(x, y, labels, marks, size=(1000, 276), title="Mean pixel gap of the path against run time")
+    rows = "".join(
+        f"<li>ratio {mark:g}: {_reached(frames, f'{mark:g}')}</li>" for mark in MARKS if "seconds_to_ratio" in frames[0]
+    )
+    return (
+        "<h2>Error against run time</h2><p>Thin lines are frames, each from its own beginning, the strong ones their "
+        "mean. Until its set is covered once, a frame has nothing but [0, 1], a mean gap of √3.</p>"
+        f"{plot}<ul>{rows}</ul>"
+    )
+
+
+def _means(lines: Sequence[Sequence[float]]) -> list[float]:
+    return [sum(values) / len(values) for values in zip(*lines, strict=True)]
+
+
+def _reached(frames: Sequence[Mapping[str, Any]], mark: str) -> str:
+    found = [seconds for entry in frames if (seconds := entry["seconds_to_ratio"].get(mark)) is not None]
+    if not found:
+        return "no frame"
+    return f"{len(found)} of {counted(len(frames), 'frame')}, after {number(median(found), 3)} s (median)"
 
 
 def _overview(document: Mapping[str, Any]) -> str:

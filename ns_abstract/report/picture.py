@@ -197,6 +197,11 @@ def color_stops(count: int = 9) -> list[str]:
     return [to_hex(colormaps[GAP_COLORS](k / (count - 1))) for k in range(count)]
 
 
+def color_table() -> str:
+    """The 256 colours of the gap scale as hexadecimal digits, six by colour."""
+    return heat(np.arange(256)[None] / 255.0, 1.0).tobytes().hex()
+
+
 def preview(image: NDArray[np.uint8], side: int) -> bytes:
     """PNG of ``image`` [H, W, 3], made smaller (area average) where a side exceeds ``side`` pixels."""
     from PIL import Image

@@ -21,7 +21,7 @@ from ns_abstract.io.errors import InputError
 from ns_abstract.io.folder import remove_parts, unwritable
 from ns_abstract.io.jsonio import file_size, is_number, load_json
 from ns_abstract.refine.result import FrameResult, TracePoint
-from ns_abstract.report.figures import metrics
+from ns_abstract.report.figures import metrics, seconds_to
 from ns_abstract.report.files import (
     StoredFrame,
     check_frame,
@@ -42,6 +42,9 @@ _PAGE_SECONDS, _PAGE_SHARE = 10.0, 20.0
 _PREVIEW_PIXELS = 256
 #: Most frames that the page shows pictures of; its table has all.
 PAGE_FRAMES = 60
+#: Characters of the page that its numbers may take, all frames together, and most bytes of a frame file that is read
+#: again for them.
+_PLAY_CHARACTERS, _PLAY_FILE = 10_000_000, 512 << 20
 _CHUNK = 2**20
 
 METRICS = {
@@ -51,6 +54,8 @@ METRICS = {
     "xpg_witness": "xpg of the same",
     "ratio": "mpg / mpg_witness; null where that is no finite number; never below 1 for sound bounds",
     "seconds": "wall time spent on the frame",
+    "seconds_to_ratio": "seconds after which mpg was at most so many times mpg_witness; null: never",
+    "covered": "part of the set that the cells of a trace point cover; nothing but [0, 1] holds of a pixel below 1",
     "cells": "cells (boxes of parameters) bounded",
     "sha256": "of the npz files; a file that is another one is not continued with --resume, nor exported",
     "images": "RGB in [0, 1], so gaps lie in [0, sqrt(3)]",
@@ -206,12 +211,14 @@ def merged(older: FrameResult, newer: FrameResult) -> FrameResult:
         raise ValueError(f"frame {newer.index}: the stored result is of another set of images")
     outer = min((point.mpg for point in older.trace), default=math.inf)
     inner = max((point.mpg_witness for point in older.trace), default=0.0)
+    covered = max((point.covered for point in older.trace), default=0.0)
     later = tuple(
         TracePoint(
             older.seconds + point.seconds,
             older.cells + point.cells,
             min(outer, point.mpg),
             max(inner, point.mpg_witness),
+            max(covered, point.covered),
         )
         for point in newer.trace
     )
@@ -273,6 +280,7 @@ class Report:
         self._before: dict[int, tuple[float, int, tuple[TracePoint, ...]]] = {}
         self._digests: dict[str, str] = {}
         self._previews: dict[int, Mapping[str, bytes]] = {}
+        self._plays: dict[int, str | None] = {}
         self._undrawn: set[int] = set()
         self._state = "running"
         self._started = _now()
@@ -404,6 +412,7 @@ class Report:
             self._digests[path.name] = file_stamp(path)["sha256"]
             self._entries[index] = self._entry(result, status)
             self._previews.pop(index, None)
+            self._plays[index] = self._played(result)
             self._undrawn.add(index)
             if picture:
                 self._draw(result)
@@ -451,9 +460,16 @@ class Report:
                 "seconds": result.seconds,
                 "cells": result.cells,
                 "trace": [
-                    {"seconds": p.seconds, "cells": p.cells, "mpg": p.mpg, "mpg_witness": p.mpg_witness}
+                    {
+                        "seconds": p.seconds,
+                        "cells": p.cells,
+                        "mpg": p.mpg,
+                        "mpg_witness": p.mpg_witness,
+                        "covered": p.covered,
+                    }
                     for p in result.trace
                 ],
+                "seconds_to_ratio": {f"{mark:g}": seconds for mark, seconds in seconds_to(result.trace).items()},
                 "status": status,
                 "parameters": [
                     {"name": name, "unit": unit, "lower": low, "upper": high}
@@ -517,10 +533,25 @@ class Report:
         pictures = {}
         for entry in shown_frames(document["frames"], PAGE_FRAMES):
             pictures[entry["index"]] = self._preview(entry["index"])
-        text = render_page(document, pictures)
+        plays = {index: play for index in pictures if (play := self._play(index)) is not None}
+        text = render_page(document, pictures, plays)
         write_atomic(self.folder / "report.html", lambda stream: stream.write(text.encode()))
         took = time.monotonic() - begin
         self._page_due = time.monotonic() + max(_PAGE_SECONDS, _PAGE_SHARE * took)
+
+    def _played(self, result: FrameResult) -> str | None:
+        from ns_abstract.report.play import play_data
+
+        if not result.bounded:
+            return None
+        return play_data(result, _PLAY_CHARACTERS // max(1, min(len(self.run.frames), PAGE_FRAMES)))
+
+    def _play(self, index: int) -> str | None:
+        if index not in self._plays:
+            path = self.folder / frame_name(index, "npz")
+            kept = path.stat().st_size <= _PLAY_FILE
+            self._plays[index] = self._played(load_frame(path, leaves=True).result) if kept else None
+        return self._plays[index]
 
     def _preview(self, index: int) -> Mapping[str, bytes]:
         if index not in self._previews:

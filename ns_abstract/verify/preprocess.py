@@ -1,7 +1,6 @@
 """From rendered pictures to a network's input: concretely, and for linear sets of pictures.
 
-Resizing is done by the renderer, which draws at the network's resolution. What is bounded is the float
-image in [0, 1] that the renderer gives, not its rounding to 8 bits in a file (docs/design.md, V1).
+Resizing is done by the renderer, which draws at the network's resolution (docs/design.md, V1).
 """
 
 from __future__ import annotations

@@ -269,8 +269,8 @@ class RegressionClaim(Claim):
             return float(min(self.absolute)) * (1.0 - _CHARGE) - length * (1.0 + _CHARGE)
         assert self.relative is not None
         nearest = np.where((low <= 0.0) & (high >= 0.0), 0.0, np.minimum(np.abs(low), np.abs(high)))
-        reach = self.relative * float(np.sqrt((nearest * nearest).sum())) * (1.0 - _CHARGE)
-        return reach - length - _CHARGE * (reach + length)
+        radius = self.relative * float(np.sqrt((nearest * nearest).sum())) * (1.0 - _CHARGE)
+        return radius - length - _CHARGE * (radius + length)
 
 
 @dataclass(frozen=True)

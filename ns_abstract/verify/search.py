@@ -274,7 +274,7 @@ class Search:
         self._ascend(failing)
         if self.varies:
             self._vary(failing)
-        leaves, children = self._settle(seen, bounded, reasons, slopes, costs)
+        leaves, children = self._verdicts(seen, bounded, reasons, slopes, costs)
         seconds = time.perf_counter() - begin
         # cells of one rank are examined together
         children.sort(key=lambda child: child[0])
@@ -507,7 +507,7 @@ class Search:
 
     # ---------------------------------------------------------------- verdicts
 
-    def _settle(
+    def _verdicts(
         self,
         seen: Sequence[_Seen],
         bounded: dict[int, float],

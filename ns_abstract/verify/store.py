@@ -416,7 +416,7 @@ class Store:
         """Number of blocks that are not examined yet."""
         return self._base.execute("SELECT COUNT(*) FROM search_blocks").fetchone()[0]
 
-    def settle(self, block: Block, findings: Findings, grid: Grid) -> bool:
+    def close_block(self, block: Block, findings: Findings, grid: Grid) -> bool:
         """Store what became of a block; false, and nothing changes, if that was stored before."""
         with self._transaction():
             query = f"SELECT {_BLOCK} FROM search_blocks WHERE id = ?"

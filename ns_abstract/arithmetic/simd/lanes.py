@@ -264,14 +264,14 @@ def _transposed(builder, rows):
         return builder.shuffle_vector(a, b, ir.Constant(ir.VectorType(_INT32, 8), [_INT32(p) for p in picks]))
 
     # pairs of rows, then of pairs, then of fours
-    for reach in (1, 2, 4):
+    for step in (1, 2, 4):
         done = list(rows)
         for low in range(8):
-            if low & reach:
+            if low & step:
                 continue
-            a, b = rows[low], rows[low + reach]
-            done[low] = mixed(a, b, [p if not p & reach else 8 + (p ^ reach) for p in range(8)])
-            done[low + reach] = mixed(a, b, [p | reach if not p & reach else 8 + p for p in range(8)])
+            a, b = rows[low], rows[low + step]
+            done[low] = mixed(a, b, [p if not p & step else 8 + (p ^ step) for p in range(8)])
+            done[low + step] = mixed(a, b, [p | step if not p & step else 8 + p for p in range(8)])
         rows = done
     return rows
 

@@ -5,6 +5,9 @@ row ``sum |q|`` has no meaning where there are no terms of order 2. A rule takes
 result begin, and `size` tells how long a form is. The array kernels of `forms` take four times as long, for they pass
 over memory once for every term of a sum. Each function names its kernel by its own name; results may be written over
 no operand unless it says so.
+
+What is linear is there for both orders, because Gaussians are culled over cells of one parameter with it; products and
+functions are there for order 1, where ``m`` says all: their one-parameter kin is `line_forms`.
 """
 
 from __future__ import annotations
@@ -15,7 +18,8 @@ import numpy as np
 from numba import njit
 
 from ns_abstract.arithmetic.elementary import fma
-from ns_abstract.arithmetic.forms import _COEFFICIENT, _LARGEST, _SMALLEST, _TINY, _UP
+from ns_abstract.arithmetic.forms import LARGEST, SMALLEST
+from ns_abstract.arithmetic.rounding import FORM_ROUNDING, UNDERFLOW64, UP
 from ns_abstract.arithmetic.simd.lanes import bits, load8, maximum, minimum, root, store, where
 
 
@@ -26,7 +30,7 @@ def size(m):
 
 
 @njit(cache=True, error_model="numpy", forceinline=True)
-def _lengths(w, a, order, m):
+def _norms(w, a, m, order):
     """The rows ``sum |g|`` and ``sum |q|``."""
     linear = load8(w, a + 8 * (m + 1))
     if order == 2:
@@ -35,36 +39,37 @@ def _lengths(w, a, order, m):
 
 
 @njit(cache=True, error_model="numpy", forceinline=True)
-def reach(w, a, order, m):
+def magnitude(w, a, m, order=1):
     """Upper bound of the polynomial's absolute value, up to rounding."""
-    linear, curved = _lengths(w, a, order, m)
+    linear, curved = _norms(w, a, m, order)
     return abs(load8(w, a)) + linear + curved
 
 
 @njit(cache=True, error_model="numpy", forceinline=True)
-def settle(w, out, d, order, m):
-    """`forms.settle`."""
+def set_norms(w, out, m, order=1, d=0):
+    """`forms.set_norms`; the number of parameters ``d`` matters for order 2 alone."""
+    last = d + 1 if order == 2 else m
     total = 0.0 * load8(w, out)
-    for k in range(1, d + 1):
+    for k in range(1, last):
         total = total + abs(load8(w, out + 8 * k))
-    store(w, out + 8 * (m + 1), total * _UP)
+    store(w, out + 8 * (m + 1), total * UP)
     if order == 2:
         total = 0.0 * total
         for k in range(d + 1, m):
             total = total + abs(load8(w, out + 8 * k))
-        store(w, out + 8 * (m + 2), total * _UP)
+        store(w, out + 8 * (m + 2), total * UP)
 
 
 @njit(cache=True, error_model="numpy")
-def scale_add(w, a, s, b, t, shift, out, d, order, m):
+def scale_add(w, a, s, b, t, shift, out, m):
     """`forms.scale_add`; ``out`` may be ``a`` or ``b``."""
-    magnitude = abs(s) * reach(w, a, order, m) + abs(t) * reach(w, b, order, m) + abs(shift)
-    radius = abs(s) * load8(w, a + 8 * m) + abs(t) * load8(w, b + 8 * m) + _COEFFICIENT * magnitude
+    total = abs(s) * magnitude(w, a, m) + abs(t) * magnitude(w, b, m) + abs(shift)
+    radius = abs(s) * load8(w, a + 8 * m) + abs(t) * load8(w, b + 8 * m) + FORM_ROUNDING * total
     store(w, out, s * load8(w, a) + t * load8(w, b) + shift)
     for k in range(1, m):
         store(w, out + 8 * k, s * load8(w, a + 8 * k) + t * load8(w, b + 8 * k))
-    store(w, out + 8 * m, radius * _UP + _TINY)
-    settle(w, out, d, order, m)
+    store(w, out + 8 * m, radius * UP + UNDERFLOW64)
+    set_norms(w, out, m)
 
 
 @njit(cache=True, error_model="numpy", forceinline=True)
@@ -87,65 +92,43 @@ def _before(w, at, fresh):
 
 
 @njit(cache=True, error_model="numpy", forceinline=True)
-def _accumulate(w, a, b, sign, out, coefficient, fresh, d, order, m):
-    """``out = sign a b`` or, not ``fresh``, ``out += sign a b``, but for the rows that `settle` writes."""
+def _accumulate(w, a, b, sign, out, coefficient, fresh, m):
+    """``out = sign a b`` or, not ``fresh``, ``out += sign a b``, but for the rows that `set_norms` writes."""
     ca, cb = load8(w, a), load8(w, b)
     ra, rb = load8(w, a + 8 * m), load8(w, b + 8 * m)
-    la, qa = _lengths(w, a, order, m)
-    lb, qb = _lengths(w, b, order, m)
-    pa, pb = abs(ca) + la + qa, abs(cb) + lb + qb
+    la, lb = load8(w, a + 8 * (m + 1)), load8(w, b + 8 * (m + 1))
+    pa, pb = abs(ca) + la, abs(cb) + lb
     center = _before(w, out, fresh) + sign * (ca * cb)
     radius = _before(w, out + 8 * m, fresh) + (pa * rb + pb * ra + ra * rb + coefficient * (pa * pb))
     ca, cb = sign * ca, sign * cb
-    if order == 2:
-        radius = radius + (la * qb + qa * (lb + qb))
-        for k in range(1, m):
-            at = out + 8 * k
-            store(w, at, _before(w, at, fresh) + fma(ca, load8(w, b + 8 * k), cb * load8(w, a + 8 * k)))
-        _add_bends(w, a, b, sign, out, d)
-    else:
-        # sum g_k h_k p_k^2 lies in [0, 1] * (.), so half of it moves to the centre
-        radius = radius + la * lb
-        for k in range(1, m):
-            ga, gb, at = load8(w, a + 8 * k), load8(w, b + 8 * k), out + 8 * k
-            store(w, at, _before(w, at, fresh) + fma(ca, gb, cb * ga))
-            half = 0.5 * (ga * gb)
-            center = center + sign * half
-            radius = radius - abs(half)
+    # sum g_k h_k p_k^2 lies in [0, 1] * (.), so half of it moves to the centre
+    radius = radius + la * lb
+    for k in range(1, m):
+        ga, gb, at = load8(w, a + 8 * k), load8(w, b + 8 * k), out + 8 * k
+        store(w, at, _before(w, at, fresh) + fma(ca, gb, cb * ga))
+        half = 0.5 * (ga * gb)
+        center = center + sign * half
+        radius = radius - abs(half)
     store(w, out, center)
-    store(w, out + 8 * m, radius * _UP + _TINY)
-
-
-@njit(cache=True, error_model="numpy", forceinline=True)
-def _add_bends(w, a, b, sign, out, d):
-    """Add the products of linear terms to the quadratic ones."""
-    row = d + 1
-    for k in range(1, d + 1):
-        ga, gb = load8(w, a + 8 * k), load8(w, b + 8 * k)
-        store(w, out + 8 * row, load8(w, out + 8 * row) + sign * (ga * gb))
-        row += 1
-        for l in range(k + 1, d + 1):
-            mixed = ga * load8(w, b + 8 * l) + gb * load8(w, a + 8 * l)
-            store(w, out + 8 * row, load8(w, out + 8 * row) + sign * mixed)
-            row += 1
+    store(w, out + 8 * m, radius * UP + UNDERFLOW64)
 
 
 @njit(cache=True, error_model="numpy")
-def add_product(w, a, b, sign, out, d, order, m):
-    """`forms.add_product`; `settle` must follow."""
-    _accumulate(w, a, b, sign, out, 4.0 * _COEFFICIENT, False, d, order, m)
+def add_product(w, a, b, sign, out, m):
+    """`forms.add_product`; `set_norms` must follow."""
+    _accumulate(w, a, b, sign, out, 4.0 * FORM_ROUNDING, False, m)
 
 
 @njit(cache=True, error_model="numpy")
-def multiply(w, a, b, out, d, order, m):
+def multiply(w, a, b, out, m):
     """`forms.multiply` (design.md, A2)."""
-    _accumulate(w, a, b, 1.0, out, _COEFFICIENT, True, d, order, m)
-    settle(w, out, d, order, m)
+    _accumulate(w, a, b, 1.0, out, FORM_ROUNDING, True, m)
+    set_norms(w, out, m)
 
 
 @njit(cache=True, error_model="numpy", forceinline=True)
 def _accumulate_square(w, a, out, coefficient, fresh, m):
-    """``out = a a`` or, not ``fresh``, ``out += a a`` of order 1, but for the rows that `settle` writes."""
+    """``out = a a`` or, not ``fresh``, ``out += a a``, but for the rows that `set_norms` writes."""
     c, r, l = load8(w, a), load8(w, a + 8 * m), load8(w, a + 8 * (m + 1))
     half = 0.5 * (l * l)
     p = abs(c) + l
@@ -153,37 +136,31 @@ def _accumulate_square(w, a, out, coefficient, fresh, m):
     store(w, out, _before(w, out, fresh) + (c * c + half))
     for k in range(1, m):
         store(w, out + 8 * k, fma(2.0 * c, load8(w, a + 8 * k), _before(w, out + 8 * k, fresh)))
-    store(w, out + 8 * m, radius * _UP + _TINY)
+    store(w, out + 8 * m, radius * UP + UNDERFLOW64)
 
 
 @njit(cache=True, error_model="numpy")
-def add_square(w, a, out, d, order, m):
-    """`forms.add_square`; `settle` must follow."""
-    if order == 2:
-        add_product(w, a, a, 1.0, out, d, order, m)
-    else:
-        _accumulate_square(w, a, out, 4.0 * _COEFFICIENT, False, m)
+def add_square(w, a, out, m):
+    """`forms.add_square`; `set_norms` must follow."""
+    _accumulate_square(w, a, out, 4.0 * FORM_ROUNDING, False, m)
 
 
 @njit(cache=True, error_model="numpy")
-def square(w, a, out, d, order, m):
+def square(w, a, out, m):
     """`forms.square`."""
-    if order == 2:
-        multiply(w, a, a, out, d, order, m)
-    else:
-        _accumulate_square(w, a, out, _COEFFICIENT, True, m)
-        settle(w, out, d, order, m)
+    _accumulate_square(w, a, out, FORM_ROUNDING, True, m)
+    set_norms(w, out, m)
 
 
 @njit(cache=True, error_model="numpy", forceinline=True)
-def bounds(w, a, d, order, m):
+def bounds(w, a, m, order=1, d=0):
     """Lower and upper bounds over the box, rounded outward (`forms.bounds`; design.md, A4)."""
     c, r = load8(w, a), load8(w, a + 8 * m)
-    linear, curved = _lengths(w, a, order, m)
+    linear, curved = _norms(w, a, m, order)
     if order == 1:
-        spread = (linear + r + _COEFFICIENT * abs(c)) * _UP
+        spread = (linear + r + FORM_ROUNDING * abs(c)) * UP
         return c - spread, c + spread
-    high = (r + 8.0 * _COEFFICIENT * (abs(c) + linear + curved)) * _UP
+    high = (r + 8.0 * FORM_ROUNDING * (abs(c) + linear + curved)) * UP
     low = -high
     row = d + 1
     for k in range(1, d + 1):
@@ -202,86 +179,56 @@ def bounds(w, a, d, order, m):
 
 
 @njit(cache=True, error_model="numpy", forceinline=True)
-def _compose(w, a, f0, f1, f2_low, f2_high, f3, out, d, order, m):
+def _compose(w, a, f0, f1, f2_low, f2_high, out, m):
     """`forms.compose` (design.md, A3)."""
-    r = load8(w, a + 8 * m)
-    l, b = _lengths(w, a, order, m)
-    if order == 2:
-        e = (l + b + r) * _UP
-        c2 = abs(f2_low)
-        rounding = _COEFFICIENT * (abs(f0) + abs(f1) * (l + b) + c2 * l * l)
-        radius = abs(f1) * r + c2 * (2.0 * l * b + b * b + r * (2.0 * (l + b) + r)) + f3 * e * e * e + rounding
-        store(w, out, f0)
-        for k in range(1, m):
-            store(w, out + 8 * k, f1 * load8(w, a + 8 * k))
-        row = d + 1
-        for k in range(1, d + 1):
-            g = load8(w, a + 8 * k)
-            store(w, out + 8 * row, load8(w, out + 8 * row) + f2_low * (g * g))
-            row += 1
-            for l_ in range(k + 1, d + 1):
-                mixed = 2.0 * f2_low * (g * load8(w, a + 8 * l_))
-                store(w, out + 8 * row, load8(w, out + 8 * row) + mixed)
-                row += 1
-    else:
-        e = (l + r) * _UP
-        low = minimum(f2_low, 0.0) * (e * e)
-        high = maximum(f2_high, 0.0) * (e * e)
-        middle = 0.5 * (low + high)
-        rounding = _COEFFICIENT * (abs(f1) * l + abs(f0) + abs(middle))
-        radius = abs(f1) * r + 0.5 * (high - low) + rounding
-        store(w, out, f0 + middle)
-        for k in range(1, m):
-            store(w, out + 8 * k, f1 * load8(w, a + 8 * k))
-    store(w, out + 8 * m, radius * _UP + _TINY)
-    settle(w, out, d, order, m)
+    r, l = load8(w, a + 8 * m), load8(w, a + 8 * (m + 1))
+    e = (l + r) * UP
+    low = minimum(f2_low, 0.0) * (e * e)
+    high = maximum(f2_high, 0.0) * (e * e)
+    middle = 0.5 * (low + high)
+    rounding = FORM_ROUNDING * (abs(f1) * l + abs(f0) + abs(middle))
+    radius = abs(f1) * r + 0.5 * (high - low) + rounding
+    store(w, out, f0 + middle)
+    for k in range(1, m):
+        store(w, out + 8 * k, f1 * load8(w, a + 8 * k))
+    store(w, out + 8 * m, radius * UP + UNDERFLOW64)
+    set_norms(w, out, m)
 
 
 @njit(cache=True, error_model="numpy", forceinline=True)
-def _ends(w, a, order, m):
+def _ends(w, a, m):
     """Lower and upper bounds of a positive quantity, and whether functions of it are evaluated there."""
     c = load8(w, a)
-    linear, curved = _lengths(w, a, order, m)
-    e = (linear + curved + load8(w, a + 8 * m)) * _UP
-    low = (c - e) * (1.0 - _COEFFICIENT)
-    return low, (c + e) * _UP, (low > _SMALLEST) & (low < _LARGEST)
+    e = (load8(w, a + 8 * (m + 1)) + load8(w, a + 8 * m)) * UP
+    low = (c - e) * (1.0 - FORM_ROUNDING)
+    return low, (c + e) * UP, (low > SMALLEST) & (low < LARGEST)
 
 
 @njit(cache=True, error_model="numpy")
-def reciprocal(w, a, out, d, order, m):
+def reciprocal(w, a, out, m):
     """`forms.reciprocal`."""
-    low, high, inside = _ends(w, a, order, m)
+    low, high, inside = _ends(w, a, m)
     f0 = 1.0 / where(inside, load8(w, a), 1.0)
-    if order == 2:
-        low2 = low * low
-        f3 = where(inside, 1.0 / (low2 * low2) * _UP, np.inf)
-        _compose(w, a, f0, -f0 * f0, f0 * f0 * f0, f0, f3, out, d, order, m)
-    else:
-        least = where(inside, 1.0 / (high * high * high) * (1.0 - _COEFFICIENT), 0.0)
-        most = where(inside, 1.0 / (low * low * low) * _UP, np.inf)
-        _compose(w, a, f0, -f0 * f0, least, most, f0, out, d, order, m)
+    least = where(inside, 1.0 / (high * high * high) * (1.0 - FORM_ROUNDING), 0.0)
+    most = where(inside, 1.0 / (low * low * low) * UP, np.inf)
+    _compose(w, a, f0, -f0 * f0, least, most, out, m)
 
 
 @njit(cache=True, error_model="numpy")
-def reciprocal_square_root(w, a, out, d, order, m):
+def reciprocal_square_root(w, a, out, m):
     """`forms.reciprocal_square_root`."""
-    low, high, inside = _ends(w, a, order, m)
+    low, high, inside = _ends(w, a, m)
     low, high = where(inside, low, 1.0), where(inside, high, 1.0)
     f0 = 1.0 / root(where(inside, load8(w, a), 1.0))
-    f2 = f0 * f0
-    if order == 2:
-        f3 = where(inside, 0.3125 / (low * low * low * root(low)) * _UP, np.inf)
-        _compose(w, a, f0, -0.5 * f0 * f2, 0.375 * f0 * f2 * f2, f0, f3, out, d, order, m)
-    else:
-        least = where(inside, 0.375 / (high * high * root(high)) * (1.0 - 4.0 * _COEFFICIENT), -np.inf)
-        most = where(inside, 0.375 / (low * low * root(low)) * _UP, np.inf)
-        _compose(w, a, f0, -0.5 * f0 * f2, least, most, f0, out, d, order, m)
+    least = where(inside, 0.375 / (high * high * root(high)) * (1.0 - 4.0 * FORM_ROUNDING), -np.inf)
+    most = where(inside, 0.375 / (low * low * root(low)) * UP, np.inf)
+    _compose(w, a, f0, -0.5 * f0 * (f0 * f0), least, most, out, m)
 
 
 @njit(cache=True, error_model="numpy")
-def logarithm(w, a, out, d, order, m):
+def logarithm(w, a, out, m):
     """`forms.logarithm`; ``out`` has room for one more form, which is scratch."""
-    low, high, inside = _ends(w, a, order, m)
+    low, high, inside = _ends(w, a, m)
     center = where(inside, load8(w, a), 1.0)
     scratch = out + size(m)
     store(w, scratch, center)
@@ -289,28 +236,24 @@ def logarithm(w, a, out, d, order, m):
         w[scratch + lane] = math.log(w[scratch + lane])
     f0 = load8(w, scratch)
     f1 = 1.0 / center
-    if order == 2:
-        f3 = where(inside, 1.0 / (3.0 * low * low * low) * _UP, np.inf)
-        _compose(w, a, f0, f1, -0.5 * f1 * f1, f0, f3, out, d, order, m)
-    else:
-        least = where(inside, -0.5 / (low * low) * _UP, -np.inf)
-        most = where(inside, -0.5 / (high * high) * (1.0 - 4.0 * _COEFFICIENT), np.inf)
-        _compose(w, a, f0, f1, least, most, f0, out, d, order, m)
-    store(w, out + 8 * m, load8(w, out + 8 * m) + _COEFFICIENT)
+    least = where(inside, -0.5 / (low * low) * UP, -np.inf)
+    most = where(inside, -0.5 / (high * high) * (1.0 - 4.0 * FORM_ROUNDING), np.inf)
+    _compose(w, a, f0, f1, least, most, out, m)
+    store(w, out + 8 * m, load8(w, out + 8 * m) + FORM_ROUNDING)
 
 
 @njit(cache=True, error_model="numpy")
-def clamp(w, a, limit_low, limit_high, low, high, order, m):
+def clamp(w, a, limit_low, limit_high, low, high, m):
     """Replace ``a`` by ``min(limit_high, max(limit_low, a))`` given its bounds (`forms.clamp_below`; design.md, A5)."""
     if bits(low < limit_low) != 0:
-        _raise(w, a, 1.0, limit_low, low, high, order, m)
+        _raise(w, a, 1.0, limit_low, low, high, m)
         low, high = maximum(low, limit_low), maximum(high, limit_low)
     if bits(high > limit_high) != 0:
-        _raise(w, a, -1.0, -limit_high, -high, -low, order, m)
+        _raise(w, a, -1.0, -limit_high, -high, -low, m)
 
 
 @njit(cache=True, error_model="numpy")
-def _raise(w, a, sign, floor, low, high, order, m):
+def _raise(w, a, sign, floor, low, high, m):
     """Replace ``sign * a`` by its maximum with ``floor``, given its bounds."""
     crosses = (low < floor) & (high > floor)
     under = (low < floor) & (high <= floor)
@@ -319,16 +262,13 @@ def _raise(w, a, sign, floor, low, high, order, m):
     s = above / where(crosses, above + below, 1.0)
     shift = 0.5 * (s * below)
     center = sign * load8(w, a)
-    linear, curved = _lengths(w, a, order, m)
-    magnitude = abs(center) + linear + curved + abs(floor)
-    radius = (s * load8(w, a + 8 * m) + shift + _COEFFICIENT * (magnitude + shift)) * _UP + _TINY
+    linear = load8(w, a + 8 * (m + 1))
+    total = abs(center) + linear + abs(floor)
+    radius = (s * load8(w, a + 8 * m) + shift + FORM_ROUNDING * (total + shift)) * UP + UNDERFLOW64
     raised = floor + s * (center - floor) + shift
     store(w, a, sign * where(crosses, raised, where(under, floor, center)))
     store(w, a + 8 * m, where(crosses, radius, where(under, 0.0, load8(w, a + 8 * m))))
     s = where(crosses, s, where(under, 0.0, 1.0))
     for k in range(1, m):
         store(w, a + 8 * k, s * load8(w, a + 8 * k))
-    up = where(crosses, _UP, 1.0)
-    store(w, a + 8 * (m + 1), s * up * linear)
-    if order == 2:
-        store(w, a + 8 * (m + 2), s * up * curved)
+    store(w, a + 8 * (m + 1), s * where(crosses, UP, 1.0) * linear)

@@ -16,8 +16,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ns_abstract.arithmetic.chebyshev import ROUNDING, ChebyshevBasis
-from ns_abstract.arithmetic.rounding import UNIT64
+from ns_abstract.arithmetic.chebyshev import ChebyshevBasis
+from ns_abstract.arithmetic.rounding import CHEBYSHEV_ROUNDING, COMPOSITE_ROUNDING, UNIT64
 from ns_abstract.arithmetic.taylor import TaylorArray
 from ns_abstract.execution.ending import checkpoint
 from ns_abstract.geometry.box import ParameterBox
@@ -56,8 +56,6 @@ _ROUNDS = 32
 _NUMBERS = 1 << 21
 #: Light from a sample whose colour's shift is not looked at.
 _UNSEEN = 1e-5
-#: Absolute rounding of activations and compositing, by sample.
-_COMPOSITE = 2.0**-44
 
 
 #: Intervals of hue and saturation.
@@ -136,14 +134,14 @@ class RayBounds:
         lower, upper: [n, 3] float64 bounds of the colours.
         alpha: [n, samples] float32 upper bounds of the opacity of every sample over the box.
         cells: Cells of the network that were bounded.
-        reach: Half the way of a sample over a cell that the network's bounds bear, as far as these rays tell.
+        displacement: Half the way of a sample over a cell that the network's bounds bear, as far as these rays tell.
     """
 
     lower: np.ndarray
     upper: np.ndarray
     alpha: np.ndarray
     cells: int
-    reach: float
+    displacement: float
 
 
 @dataclass
@@ -259,8 +257,8 @@ class NerfBounds:
         self.distances = 0.5 * (edges[1:] + edges[:-1])
         self.lengths = edges[1:] - edges[:-1]
         self.taylor = min(_TAYLOR, max(1, self.basis.degree))
-        #: Where to begin to look for `RayBounds.reach`.
-        self.reach = 0.02
+        #: Where to begin to look for `RayBounds.displacement`.
+        self.displacement = 0.02
 
     def rays(
         self,
@@ -287,7 +285,7 @@ class NerfBounds:
         moves = pencil.displacement(self.distances, self.lengths)
         division = self._division(moves)
         if division is None or not (np.isfinite(pencil.direction).all() and np.isfinite(pencil.direction_radius).all()):
-            return RayBounds(np.zeros((n, 3)), np.ones((n, 3)), np.ones((n, samples), np.float32), 0, self.reach)
+            return RayBounds(np.zeros((n, 3)), np.ones((n, 3)), np.ones((n, samples), np.float32), 0, self.displacement)
         if n > 1 and n * samples * math.prod(division.parts) > _NUMBERS:
             halves = []
             for which in (slice(0, n // 2), slice(n // 2, n)):
@@ -297,7 +295,7 @@ class NerfBounds:
             lower, upper, alpha = (
                 np.concatenate([getattr(half, name) for half in halves]) for name in ("lower", "upper", "alpha")
             )
-            return RayBounds(lower, upper, alpha, halves[0].cells + halves[1].cells, typical_reach(halves))
+            return RayBounds(lower, upper, alpha, halves[0].cells + halves[1].cells, typical_displacement(halves))
         return _Work(self, pencil, division, moves, tolerance, known, aim).run(shifts or [])
 
     def _division(self, moves: np.ndarray) -> Division | None:
@@ -309,7 +307,7 @@ class NerfBounds:
         if not np.isfinite(widest).all():
             return None
         axes: list[int] = []
-        while widest.sum() > self.reach and len(axes) < 40:
+        while widest.sum() > self.displacement and len(axes) < 40:
             axis = int(np.argmax(widest))
             axes.append(axis)
             widest[axis] *= 0.5
@@ -324,9 +322,9 @@ class NerfBounds:
         return Division(tuple(axes), d, finer)
 
 
-def typical_reach(parts: Sequence[RayBounds]) -> float:
+def typical_displacement(parts: Sequence[RayBounds]) -> float:
     """The geometric mean of what ``parts`` tell; the order in which they were worked on plays no part."""
-    return math.exp(sum(math.log(part.reach) for part in parts) / len(parts))
+    return math.exp(sum(math.log(part.displacement) for part in parts) / len(parts))
 
 
 class _Work:
@@ -353,13 +351,13 @@ class _Work:
         self.level = np.full((samples, n, parts), -1, np.int8)
         # light that reaches a sample, and what all samples so far let through
         self.before, self.light = np.ones((samples, n, parts), np.float32), np.ones((n, parts))
-        self.cells, self.reach = 0, owner.reach
+        self.cells, self.displacement = 0, owner.displacement
         inverse = [1.0 / np.array(division.counts(level), np.float64) for level in range(division.levels + 1)]
         # the first level whose cells are narrow enough for the sample
-        reach = [moves @ row for row in inverse]
+        displacement = [moves @ row for row in inverse]
         self.start = np.zeros((n, samples), np.int64)
         for level in range(division.levels):
-            self.start[(self.start == level) & (reach[level] > owner.reach)] = level + 1
+            self.start[(self.start == level) & (displacement[level] > owner.displacement)] = level + 1
         self.quiet = np.zeros((n, samples), bool)
         if known is not None:
             self.quiet = known <= _QUIET * tolerance
@@ -388,7 +386,7 @@ class _Work:
                 found.append(self._composite())
             lower, upper = np.min([low for low, _ in found], axis=0), np.max([high for _, high in found], axis=0)
         alpha = self.alpha_high.max(axis=2).T.astype(np.float32)
-        return RayBounds(lower, upper, np.nextafter(alpha, np.float32(2.0)), self.cells, self.reach)
+        return RayBounds(lower, upper, np.nextafter(alpha, np.float32(2.0)), self.cells, self.displacement)
 
     @property
     def _dark(self) -> float:
@@ -396,7 +394,7 @@ class _Work:
         return 0.1 * self.tolerance
 
     @property
-    def _faint(self) -> float:
+    def _negligible(self) -> float:
         """Light from a sample, at most, whose colour does not matter."""
         return (0.1 if self.owner.swept else 0.5) * self.tolerance
 
@@ -455,9 +453,9 @@ class _Work:
     def _learn(self, lost: float, widen: bool) -> None:
         """Cells should have started narrower if many of them were ``lost``, wider if few were and ``widen``."""
         if lost > 0.2:
-            self.reach *= 0.85
+            self.displacement *= 0.85
         elif widen and lost < 0.1:
-            self.reach *= 1.08
+            self.displacement *= 1.08
 
     def _improve(self) -> None:
         """Halve cells that leave colours open beyond the aim, round after round, on the parts where they do."""
@@ -496,7 +494,7 @@ class _Work:
         light = np.ones_like(alpha_low)
         np.cumprod(1.0 - alpha_low[:-1], axis=0, out=light[1:])
         self.before[:, rays] = light
-        color_low, color_high, faint = self._mixtures(rays, True)
+        color_low, color_high, rest = self._mixtures(rays, True)
         span = np.empty_like(alpha_low)
         low, high = self._background(len(rays)), self._background(len(rays))
         for k in range(len(span) - 1, -1, -1):
@@ -504,7 +502,7 @@ class _Work:
             span[k] = np.maximum(color_high[k] - low, high - color_low[k]).max(axis=-1)
             high += np.where(rise > 0.0, top[k][..., None], alpha_low[k][..., None]) * rise
             low += np.where(fall < 0.0, top[k][..., None], alpha_low[k][..., None]) * fall
-        return low - faint, high + faint, light * (self.open[:, rays] * span + alpha_high * self.vague[:, rays])
+        return low - rest, high + rest, light * (self.open[:, rays] * span + alpha_high * self.vague[:, rays])
 
     def _anywhere(self, values: np.ndarray, end: np.ufunc, axis: int = -1) -> np.ndarray:
         """Where samples lie anywhere in their bins: the ``end`` of ``values`` by parts over the parts of the bin."""
@@ -518,17 +516,17 @@ class _Work:
     def _mixtures(self, rays: np.ndarray | slice, apart: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray | float]:
         """Bounds of the colours that samples or bins contribute, and what must be added to the result's (F10).
 
-        ``apart``: what is faint in a bin is added instead of mixed in.
+        ``apart``: what is negligible in a bin is added instead of mixed in.
         """
         low, high = self.color_low[:, rays], self.color_high[:, rays]
         if not self.owner.swept:
             return low, high, 0.0
         weight = self.before[:, rays] * self.alpha_high[:, rays]
-        faint = (weight <= self._faint) & apart
-        alone = self._anywhere(faint, np.logical_and)[..., None]
-        low = self._anywhere(np.where(faint[..., None], np.inf, low), np.minimum, -2)
-        high = self._anywhere(np.where(faint[..., None], -np.inf, high), np.maximum, -2)
-        rest = self._anywhere(np.where(faint & ~alone[..., 0], weight, 0.0), np.maximum).sum(axis=0)
+        dim = (weight <= self._negligible) & apart
+        alone = self._anywhere(dim, np.logical_and)[..., None]
+        low = self._anywhere(np.where(dim[..., None], np.inf, low), np.minimum, -2)
+        high = self._anywhere(np.where(dim[..., None], -np.inf, high), np.maximum, -2)
+        rest = self._anywhere(np.where(dim & ~alone[..., 0], weight, 0.0), np.maximum).sum(axis=0)
         # the light before a sample is kept in float32
         return np.where(alone, 0.0, low), np.where(alone, 1.0, high), (rest * (1.0 + 2.0**-20))[..., None]
 
@@ -608,7 +606,7 @@ class _Work:
         self.open[rows] = np.minimum(self.open[rows], open_)
         self.level[rows] = level
         halve = (open_ * light).max(axis=1) > coarse
-        shines = (high_a * light).max(axis=1) > self._faint
+        shines = (high_a * light).max(axis=1) > self._negligible
         # what is halved gets its colours from the halves, if there are any
         final = ~halve | (level == self.division.levels)
         coloured = np.flatnonzero(shines & final & ~density.failed.cpu().numpy())
@@ -634,8 +632,8 @@ class _Work:
         color = field.color(pieces.select(index), *encoded)
         low, high, error = _parts(color, bernstein)
         bad = color.failed[:, None, None]
-        low = torch.where(bad, 0.0, torch.sigmoid(low) * (1.0 - _COMPOSITE)).cpu().numpy()
-        high = torch.where(bad, 1.0, (torch.sigmoid(high) * (1.0 + _COMPOSITE)).clamp(max=1.0)).cpu().numpy()
+        low = torch.where(bad, 0.0, torch.sigmoid(low) * (1.0 - COMPOSITE_ROUNDING)).cpu().numpy()
+        high = torch.where(bad, 1.0, (torch.sigmoid(high) * (1.0 + COMPOSITE_ROUNDING)).clamp(max=1.0)).cpu().numpy()
         where = rows[0][which], rows[1][which], rows[2][which]
         self._keep(self.color_low, self.color_high, where, low, high)
         slack = 2.0 * torch.tanh(0.25 * error.amax(dim=1))
@@ -671,15 +669,15 @@ class _Work:
     def _composited(self, apart: bool) -> tuple[np.ndarray, np.ndarray]:
         """[n, parts, 3] bounds by parts; ``apart``: see `_mixtures`."""
         low, high = self._background(len(self.light)), self._background(len(self.light))
-        color_low, color_high, faint = self._mixtures(slice(None), apart)
+        color_low, color_high, rest = self._mixtures(slice(None), apart)
         for k in range(self.alpha_low.shape[0] - 1, -1, -1):
             least = self._anywhere(self.alpha_low[k], np.minimum)[..., None]
             most = self._anywhere(self.alpha_high[k], np.maximum)[..., None]
             rise, fall = color_high[k] - high, color_low[k] - low
             high += np.where(rise > 0.0, most, least) * rise
             low += np.where(fall < 0.0, most, least) * fall
-        slack = 4.0 * _COMPOSITE * (self.alpha_low.shape[0] + self.owner.sampling.importance + 5)
-        low, high = low - faint - slack, high + faint + slack
+        slack = 4.0 * COMPOSITE_ROUNDING * (self.alpha_low.shape[0] + self.owner.sampling.importance + 5)
+        low, high = low - rest - slack, high + rest + slack
         return np.clip(low, 0.0, 1.0), np.clip(high, 0.0, 1.0)
 
 
@@ -692,7 +690,7 @@ def _parts(value: Affine, bernstein: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     middle = value.poly[:, :1]
     low = torch.maximum(controls.amin(dim=2), middle - spread)
     high = torch.minimum(controls.amax(dim=2), middle + spread)
-    slack = (error + ROUNDING * (value.poly.abs().sum(dim=1) * bernstein.abs().amax()))[:, None]
+    slack = (error + CHEBYSHEV_ROUNDING * (value.poly.abs().sum(dim=1) * bernstein.abs().amax()))[:, None]
     return low - slack, high + slack, error
 
 

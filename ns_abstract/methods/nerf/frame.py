@@ -18,7 +18,7 @@ from ns_abstract.execution.engines import Processes
 from ns_abstract.geometry.box import ParameterBox
 from ns_abstract.geometry.poses import COLOR_SHIFTS, PoseSet
 from ns_abstract.geometry.tiles import tile_grid
-from ns_abstract.methods.nerf.bounds import NerfBounds, RayBounds, Shifts, typical_reach
+from ns_abstract.methods.nerf.bounds import NerfBounds, RayBounds, Shifts, typical_displacement
 from ns_abstract.methods.nerf.hsv import color_shift
 from ns_abstract.methods.nerf.render import NerfRenderer, Sampling
 from ns_abstract.methods.nerf.scene import NerfScene
@@ -84,12 +84,12 @@ def _processes(count: int) -> Processes:
 _here: dict[bytes, NerfBounds] = {}
 
 
-def _bound_share(frame: bytes, bounds: tuple[Any, ...], reach: float, arguments: tuple[Any, ...]) -> RayBounds:
+def _bound_share(frame: bytes, bounds: tuple[Any, ...], displacement: float, arguments: tuple[Any, ...]) -> RayBounds:
     """`NerfBounds.rays` in another process; ``bounds`` are the constructor's arguments."""
     if frame not in _here:
         _here.clear()
         _here[frame] = NerfBounds(*bounds)
-    _here[frame].reach = reach
+    _here[frame].displacement = displacement
     return _here[frame].rays(*arguments)
 
 
@@ -219,7 +219,7 @@ class NerfFrame:
     def _unknown(self, count: int) -> RayBounds:
         """What holds of any ``count`` rays."""
         alpha = np.ones((count, self.bounds.distances.size), np.float32)
-        return RayBounds(np.zeros((count, 3)), np.ones((count, 3)), alpha, 0, self.bounds.reach)
+        return RayBounds(np.zeros((count, 3)), np.ones((count, 3)), alpha, 0, self.bounds.displacement)
 
     def _batch(self, box: ParameterBox, tiles: np.ndarray, known: np.ndarray | None) -> list[RayBounds]:
         """Bounds of rays that are worked on together, in one share for every worker."""
@@ -242,7 +242,7 @@ class NerfFrame:
         else:
             engine = _processes(self.workers)
             for number, share in enumerate(shares):
-                engine.submit(number, _bound_share, self._token, self._recipe, self.bounds.reach, share)
+                engine.submit(number, _bound_share, self._token, self._recipe, self.bounds.displacement, share)
             done: dict[int, RayBounds] = {}
             patience = None
             try:
@@ -262,7 +262,7 @@ class NerfFrame:
                     engine.close()
                 raise
             found = [done[number] for number in range(len(shares))]
-        self.bounds.reach = typical_reach(found)
+        self.bounds.displacement = typical_displacement(found)
         return found
 
     def watch(self, tiles: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> None:

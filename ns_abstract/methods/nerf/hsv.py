@@ -9,13 +9,11 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from ns_abstract.arithmetic.rounding import HUE_ROUNDING
 from ns_abstract.geometry.poses import COLOR_SHIFTS, PoseSet
 
 Float64Array = NDArray[np.float64]
 Range = tuple[float, float]
-
-#: More than the rounding of a shifted colour, and of its hue in sixths of a turn.
-_ROUNDING = 2.0**-44
 
 
 def color_shift(pose_set: PoseSet, values: Any) -> tuple[Any, Any] | None:
@@ -75,7 +73,7 @@ def _hues(low: Float64Array, high: Float64Array) -> tuple[Float64Array, Float64A
                 starts = [part(c[:, i], low[:, up], high[:, down]) for c in (low, high)]
             first[sure] = centre + np.clip(np.minimum(*starts), -1.0, 1.0)[sure]
             last[sure] = centre + np.clip(np.maximum(*ends), -1.0, 1.0)[sure]
-    return first - 4.0 * _ROUNDING, last + 4.0 * _ROUNDING
+    return first - 4.0 * HUE_ROUNDING, last + 4.0 * HUE_ROUNDING
 
 
 def shifted_bounds(
@@ -90,13 +88,13 @@ def shifted_bounds(
     most = np.clip(high.min(axis=1)[:, None] - np.minimum(*given), 0.0, value_high)
     centre = np.array([0.0, 2.0, 4.0])
     start = (first + 6.0 * hue[0])[:, None] - centre
-    width = (last - first + 6.0 * (hue[1] - hue[0]) + 8.0 * _ROUNDING)[:, None]
-    start = np.mod(start - 4.0 * _ROUNDING + 3.0, 6.0) - 3.0
+    width = (last - first + 6.0 * (hue[1] - hue[0]) + 8.0 * HUE_ROUNDING)[:, None]
+    start = np.mod(start - 4.0 * HUE_ROUNDING + 3.0, 6.0) - 3.0
     end = start + width
     far = np.where(end >= 3.0, 3.0, np.maximum(np.abs(start), np.abs(end)))
     near = np.minimum(np.abs(start), np.abs(np.where(end >= 3.0, end - 6.0, end)))
     near = np.where(((start <= 0.0) & (end >= 0.0)) | (end >= 6.0), 0.0, near)
     share_low, share_high = np.clip(2.0 - far, 0.0, 1.0), np.clip(2.0 - near, 0.0, 1.0)
-    down = least + (value_low - least) * share_low - _ROUNDING
-    up = most + (value_high - most) * share_high + _ROUNDING
+    down = least + (value_low - least) * share_low - HUE_ROUNDING
+    up = most + (value_high - most) * share_high + HUE_ROUNDING
     return np.clip(down, 0.0, 1.0), np.clip(up, 0.0, 1.0)

@@ -8,10 +8,7 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from ns_abstract.arithmetic.chebyshev import ROUNDING
-from ns_abstract.arithmetic.rounding import UNIT64
-
-_UP = 1.0 + 2.0**-40
+from ns_abstract.arithmetic.rounding import CHEBYSHEV_ROUNDING, FIELD_UP, UNIT64
 
 
 @njit(cache=True, error_model="numpy")
@@ -110,14 +107,14 @@ def relu(poly, rho, box, failed, half, fit_even, fit_odd, chord, norming, slope,
                 spread[j] += abs(poly[b, k, j])
         begin = found
         for j in range(n):
-            reach = (spread[j] * _UP + rho[b, j] + box[b, j]) * _UP
+            radius = (spread[j] * FIELD_UP + rho[b, j] + box[b, j]) * FIELD_UP
             middle = poly[b, 0, j]
             whole = abs(middle) + spread[j] + rho[b, j]
-            if middle >= reach:
+            if middle >= radius:
                 slope[b, j] = 1.0
-                size[b, j] = whole * _UP
+                size[b, j] = whole * FIELD_UP
                 continue
-            if middle <= -reach:
+            if middle <= -radius:
                 slope[b, j] = 0.0
                 size[b, j] = 0.0
                 box[b, j] = 0.0
@@ -131,7 +128,7 @@ def relu(poly, rho, box, failed, half, fit_even, fit_odd, chord, norming, slope,
             for i in range(points):
                 trial[i] = -values[i]
             high = -_smallest(trial, scratch)
-            slack = ROUNDING * absolute
+            slack = CHEBYSHEV_ROUNDING * absolute
             centre = 0.5 * (low + high)
             width = 0.5 * (high - low) * norming + slack
             low = centre - width
@@ -140,7 +137,7 @@ def relu(poly, rho, box, failed, half, fit_even, fit_odd, chord, norming, slope,
             r = box[b, j]
             if low >= e + r:
                 slope[b, j] = 1.0
-                size[b, j] = whole * _UP
+                size[b, j] = whole * FIELD_UP
                 continue
             if high <= -(e + r):
                 slope[b, j] = 0.0
@@ -169,11 +166,11 @@ def relu(poly, rho, box, failed, half, fit_even, fit_odd, chord, norming, slope,
                 second = (-fitted[i] if fitted[i] > fitted[i + 1] else -fitted[i + 1]) - below
                 trial[i] = first if first > second else second
             least = _smallest(trial[: points - 1], scratch)
-            new = (0.5 * (most - least) + ROUNDING * (sum_q + absolute) + 0.5 * e + 2.0 * slack) * _UP
+            new = (0.5 * (most - least) + CHEBYSHEV_ROUNDING * (sum_q + absolute) + 0.5 * e + 2.0 * slack) * FIELD_UP
             bottom = low - e - r
             top = high + e + r
             line = top / (top - bottom)
-            line_error = (0.5 * line * -bottom + 4.0 * slack) * _UP
+            line_error = (0.5 * line * -bottom + 4.0 * slack) * FIELD_UP
             if line_error + line * r < new + r:
                 kept = line
                 new = line_error
@@ -190,8 +187,8 @@ def relu(poly, rho, box, failed, half, fit_even, fit_odd, chord, norming, slope,
                 sum_q += abs(q[k])
             new += 8.0 * UNIT64 * (sum_q + e)
             slope[b, j] = kept
-            size[b, j] = (sum_q + kept * e + new) * _UP
-            box[b, j] *= _UP
+            size[b, j] = (sum_q + kept * e + new) * FIELD_UP
+            box[b, j] *= FIELD_UP
             which[found] = b
             neuron[found] = j
             error[found] = new

@@ -19,13 +19,11 @@ import torch
 from numba import njit
 from torch import Tensor
 
-from ns_abstract.arithmetic.chebyshev import ROUNDING, ChebyshevBasis
-from ns_abstract.arithmetic.rounding import UNIT64, gamma
+from ns_abstract.arithmetic.chebyshev import ChebyshevBasis
+from ns_abstract.arithmetic.rounding import CHEBYSHEV_ROUNDING, FIELD_UP, UNIT64, gamma
 from ns_abstract.methods.nerf.relu_kernel import relu
 from ns_abstract.methods.nerf.scene import Encoding, FieldWeights, Layer
 
-# covers the rounding of sums of non-negative numbers over a layer
-_UP = 1.0 + 2.0**-40
 #: Radii of Bernstein ellipses that are tried for the remainder of an encoding.
 _ELLIPSES = (1.05, 1.15, 1.3, 1.6, 2.0, 2.6, 3.5, 5.0, 8.0, 14.0, 30.0, 80.0, 300.0)
 
@@ -129,7 +127,7 @@ class Affine:
     @property
     def radius(self) -> Tensor:
         """[B, n] columns and box together."""
-        return (column_sums(self.columns, self.owner, self.poly.shape[0]) + self.box) * _UP
+        return (column_sums(self.columns, self.owner, self.poly.shape[0]) + self.box) * FIELD_UP
 
 
 class FieldBounds:
@@ -198,8 +196,8 @@ class FieldBounds:
         for j in range(self.basis.dimensions):
             # the parts of x above the degree belong to the highest power that the basis has
             tops = self._imaginary[:, j].max(dim=1).values
-            reach = torch.einsum("em,bmi->bie", self._imaginary[:, j], x.abs()) + rest[..., None] * tops
-            exponent = omega[:, None] * (reach * (1.0 + 2.0**-30) + 2.0**-40)[..., None, :]
+            phase = torch.einsum("em,bmi->bie", self._imaginary[:, j], x.abs()) + rest[..., None] * tops
+            exponent = omega[:, None] * (phase * (1.0 + 2.0**-30) + 2.0**-40)[..., None, :]
             growth = torch.where(exponent < 600.0, torch.cosh(exponent.clamp(max=600.0)), torch.inf)
             error = (growth * self._decay).amin(dim=-1).clamp(max=1.0 + lebesgue)
             remainder = remainder + lebesgue**j * error
@@ -208,7 +206,7 @@ class FieldBounds:
         rounding = lebesgue**self.basis.dimensions * (16.0 * UNIT64 * (omega * (largest[..., None] + 1.0)) + 2.0**-44)
         waves = (remainder + omega * radius[..., None] + rounding).flatten(-2)
         plain = radius + rest + 2.0**-44 * (1.0 + largest) * lebesgue**self.basis.dimensions
-        return poly, (torch.cat([waves, waves, plain], dim=-1) + dropped) * _UP
+        return poly, (torch.cat([waves, waves, plain], dim=-1) + dropped) * FIELD_UP
 
     # --- layers --------------------------------------------------------------------------------
 
@@ -231,7 +229,7 @@ class FieldBounds:
         moved = right[pieces.new_neuron] * pieces.new_size[:, None]
         columns = torch.cat([pieces.columns @ right, moved]) if pieces.columns.shape[0] else moved
         owner = torch.cat([pieces.owner, pieces.new_owner])
-        return Affine(poly, columns, owner, box * _UP, pieces.failed, pieces.count)
+        return Affine(poly, columns, owner, box * FIELD_UP, pieces.failed, pieces.count)
 
     def _first(self, poly: Tensor, remainder: Tensor, layer: tuple[Tensor, Tensor, Tensor]) -> Affine:
         """A linear layer on polynomials and remainders alone."""
@@ -245,14 +243,14 @@ class FieldBounds:
             out,
             torch.zeros(0, weight.shape[1], dtype=torch.float64, device=self.device),
             torch.zeros(0, dtype=torch.int64, device=self.device),
-            box * _UP,
+            box * FIELD_UP,
             torch.zeros(pieces, dtype=torch.bool, device=self.device),
             torch.zeros(pieces, dtype=torch.int64, device=self.device),
         )
 
     def _relu(self, z: Affine) -> Pieces:
         """max(0, z) (design.md, F5)."""
-        rho = column_sums(z.columns, z.owner, z.poly.shape[0]) * _UP
+        rho = column_sums(z.columns, z.owner, z.poly.shape[0]) * FIELD_UP
         found = self._relu_compiled(z, rho) if self._compiled else self._relu_torch(z, rho)
         poly, box, size, slope, which, neuron, error = found
         columns, owner = z.columns, z.owner
@@ -283,17 +281,17 @@ class FieldBounds:
     def _relu_torch(self, z: Affine, rho: Tensor) -> tuple[Tensor, ...]:
         """New polynomials, box and sizes, slopes of the columns, and piece, neuron and size of new error terms."""
         poly, box = z.poly, z.box
-        spread = poly[:, 1:].abs().sum(dim=1) * _UP
-        reach = spread + rho + box
+        spread = poly[:, 1:].abs().sum(dim=1) * FIELD_UP
+        radius = spread + rho + box
         middle = poly[:, 0]
-        active = middle >= reach
-        open_ = ~active & (middle > -reach) & ~z.failed[:, None]
+        active = middle >= radius
+        open_ = ~active & (middle > -radius) & ~z.failed[:, None]
         slope = active.to(torch.float64)
         which, neuron = torch.nonzero(open_, as_tuple=True)
         p = poly[which, :, neuron]
         values = p @ self._evaluation.T
         low, high = values.amin(dim=1), values.amax(dim=1)
-        slack = ROUNDING * p.abs().sum(dim=1)
+        slack = CHEBYSHEV_ROUNDING * p.abs().sum(dim=1)
         centre, half = 0.5 * (low + high), 0.5 * (high - low) * self.basis.norming + slack
         low, high = centre - half, centre + half
         e, r = rho[which, neuron], box[which, neuron]
@@ -305,11 +303,11 @@ class FieldBounds:
         )
         # a polynomial in place of max(0, p); columns by half
         q, error = self._fitted(p, values)
-        error = (error + 0.5 * e + 2.0 * slack) * _UP
+        error = (error + 0.5 * e + 2.0 * slack) * FIELD_UP
         # or a line through the whole range
         bottom, top = (low - e - r), (high + e + r)
         line = top / (top - bottom)
-        line_error = (0.5 * line * -bottom + 4.0 * slack) * _UP
+        line_error = (0.5 * line * -bottom + 4.0 * slack) * FIELD_UP
         use_line = line_error + line * r < error + r
         q = torch.where(use_line[:, None], p * line[:, None], q)
         q[:, 0] += torch.where(use_line, 0.5 * line * -bottom, 0.0)
@@ -324,7 +322,7 @@ class FieldBounds:
         slope[which, neuron] = kept
         size = (middle.abs() + spread + rho) * slope
         size[which, neuron] = q.abs().sum(dim=1) + kept * e + error
-        return poly, box * _UP, size * _UP, slope, which, neuron, error
+        return poly, box * FIELD_UP, size * FIELD_UP, slope, which, neuron, error
 
     def _fitted(self, p: Tensor, values: Tensor) -> tuple[Tensor, Tensor]:
         """Polynomials q [k, m] and errors [k]: ``|max(0, p) - q| <= error`` over the cell (design.md, F5)."""
@@ -339,7 +337,7 @@ class FieldBounds:
             self._least(values - fitted) - above[:, None], self._least(-fitted) - below[:, None]
         ).amin(dim=1)
         shift = 0.5 * (most + least)
-        error = 0.5 * (most - least) + ROUNDING * (q.abs().sum(dim=1) + p.abs().sum(dim=1))
+        error = 0.5 * (most - least) + CHEBYSHEV_ROUNDING * (q.abs().sum(dim=1) + p.abs().sum(dim=1))
         q[:, 0] += shift
         return q, error
 

@@ -11,10 +11,11 @@ from typing import Any, NamedTuple
 from numba import njit
 
 from ns_abstract.arithmetic.elementary import EXP_RELATIVE_ERROR, exp_kernel, fma
+from ns_abstract.arithmetic.rounding import FRAGMENT_ROUNDING, UP
 from ns_abstract.arithmetic.simd.intrinsics import signed
 from ns_abstract.arithmetic.simd.lanes import bits, load8, maximum, minimum, store, store_columns, where
-from ns_abstract.methods.splat.block import ALPHA_HIGH, ALPHA_LOW, FORM, ROUND, UP, parabola, set_unknown
-from ns_abstract.methods.splat.records import FAINT, FORMS, KAPPA, OPACITY_HIGH, OPACITY_LOW, WILD
+from ns_abstract.methods.splat.block import ALPHA_HIGH, ALPHA_LOW, FORM, parabola, set_unknown
+from ns_abstract.methods.splat.records import EXPONENT_LIMIT, FORMS, KAPPA, OPACITY_HIGH, OPACITY_LOW, UNBOUNDED
 
 #: Half-width of the exponent's range up to which exp(-t) is fitted by a polynomial.
 _FIT_LIMIT = 2.0
@@ -97,7 +98,7 @@ def _square_sum_range(c1, c2, e1, e2, k_low, k_high):
     near2 = maximum(0.0, c2 - e2)
     far1 = c1 + e1
     far2 = c2 + e2
-    low = fma(0.5 * (1.0 - ROUND), fma(near1, near1, near2 * near2), k_low)
+    low = fma(0.5 * (1.0 - FRAGMENT_ROUNDING), fma(near1, near1, near2 * near2), k_low)
     return low, fma(0.5, fma(far1, far1, far2 * far2), k_high) * UP
 
 
@@ -112,7 +113,7 @@ def _form(record, number, antialiased):
     """Form ``number`` of order 2 of a record, its radius with the centre's rounding; K is 0 unless ``antialiased``."""
     at = FORMS + 4 * number
     if number < 5:
-        return record[at], record[at + 1], record[at + 2], record[at + 3] + ROUND * abs(record[at])
+        return record[at], record[at + 1], record[at + 2], record[at + 3] + FRAGMENT_ROUNDING * abs(record[at])
     if antialiased:
         return record[at], record[at + 1], record[at + 2], record[at + 3]
     return 0.0, 0.0, 0.0, 0.0
@@ -149,18 +150,18 @@ def _quadratic_alphas(record, begin, n, given, block, limits, charges, antialias
         b2 = abs(b2)
         y1 = abs(y1)
         y2 = abs(y2)
-        r1 = fma(pr, abs(ax), fma(cr, abs(ay), fma(ROUND, l1 + b1, vr)))
-        r2 = fma(gr, abs(ay), fma(ROUND, l2 + b2, wr))
+        r1 = fma(pr, abs(ax), fma(cr, abs(ay), fma(FRAGMENT_ROUNDING, l1 + b1, vr)))
+        r2 = fma(gr, abs(ay), fma(FRAGMENT_ROUNDING, l2 + b2, wr))
         e1 = l1 + b1 + r1
         e2 = l2 + b2 + r2
         size = fma(y1, e1, fma(y2, e2, s0)) + k_high
         radius = _quadratic_radius(y1, l1, b1, r1) + _quadratic_radius(y2, l2, b2, r2)
-        radius = (radius + fma(ROUND, size, kr)) * UP
+        radius = (radius + fma(FRAGMENT_ROUNDING, size, kr)) * UP
         low, high = _square_sum_range(y1, y2, e1, e2, k_low, k_high)
         s0 = s0 + k0
         slope = abs(linear)
         bend = abs(quadratic)
-        rounding = ROUND * (slope + bend + abs(s0))
+        rounding = FRAGMENT_ROUNDING * (slope + bend + abs(s0))
         bottom, top = parabola(slope, quadratic)
         low = maximum(low, s0 + bottom - radius - rounding)
         if bits(low > limits.sigma_max) == _ALL:
@@ -196,11 +197,11 @@ def _affine_forms(record, m, antialiased):
         s=g,
         w1=w1,
         w2=w2,
-        p_radius=record[FORMS + m] + ROUND * abs(p),
-        q_radius=record[FORMS + stride + m] + ROUND * abs(c),
-        s_radius=record[FORMS + 2 * stride + m] + ROUND * abs(g),
-        w1_radius=record[FORMS + 3 * stride + m] + ROUND * abs(w1),
-        w2_radius=record[FORMS + 4 * stride + m] + ROUND * abs(w2),
+        p_radius=record[FORMS + m] + FRAGMENT_ROUNDING * abs(p),
+        q_radius=record[FORMS + stride + m] + FRAGMENT_ROUNDING * abs(c),
+        s_radius=record[FORMS + 2 * stride + m] + FRAGMENT_ROUNDING * abs(g),
+        w1_radius=record[FORMS + 3 * stride + m] + FRAGMENT_ROUNDING * abs(w1),
+        w2_radius=record[FORMS + 4 * stride + m] + FRAGMENT_ROUNDING * abs(w2),
         k=k_middle,
         k_radius=k_radius,
         k_low=max(0.0, k_middle - k_spread - k_radius),
@@ -229,8 +230,8 @@ def _affine_exponent(record, f, ax, ay, rows, m, antialiased):
         sl = sl + abs(slope)
     c1 = abs(c1)
     c2 = abs(c2)
-    r1 = f.p_radius * abs(ax) + f.q_radius * abs(ay) + f.w1_radius + ROUND * l1
-    r2 = f.s_radius * abs(ay) + f.w2_radius + ROUND * l2
+    r1 = f.p_radius * abs(ax) + f.q_radius * abs(ay) + f.w1_radius + FRAGMENT_ROUNDING * l1
+    r2 = f.s_radius * abs(ay) + f.w2_radius + FRAGMENT_ROUNDING * l2
     s0 = 0.5 * (c1 * c1 + c2 * c2)
     # (g.p)^2 / 2 lies in [0, l^2 / 2]: half centre, half radius
     curve = 0.25 * (l1 * l1 + l2 * l2)
@@ -240,9 +241,9 @@ def _affine_exponent(record, f, ax, ay, rows, m, antialiased):
     first = fma(c1, r1, r1 * (l1 + 0.5 * r1))
     second = fma(c2, r2, r2 * (l2 + 0.5 * r2))
     size = fma(c1, e1, fma(c2, e2, s0)) + f.k_high
-    radius = (first + second + (curve + fma(ROUND, size, f.k_radius))) * UP
+    radius = (first + second + (curve + fma(FRAGMENT_ROUNDING, size, f.k_radius))) * UP
     low, high = _square_sum_range(c1, c2, e1, e2, f.k_low, f.k_high)
-    spread = (sl + radius + ROUND * center) * UP
+    spread = (sl + radius + FRAGMENT_ROUNDING * center) * UP
     return _Exponent(maximum(low, center - spread), minimum(high, center + spread), center, radius, sl, 0.0 * sl)
 
 
@@ -288,7 +289,7 @@ def _fitted_exponential(sigma, limits, charges, quadratic):
     )  # fmt: skip
     l, b = sigma.slope, sigma.bend
     opacity = 0.5 * (opacity_low + opacity_high)
-    opacity_spread = 0.5 * (opacity_high - opacity_low) * UP + ROUND * opacity
+    opacity_spread = 0.5 * (opacity_high - opacity_low) * UP + FRAGMENT_ROUNDING * opacity
     low = minimum(maximum(0.0, sigma.low * (1.0 - kappa)), _EXPONENT_LIMIT)
     high = maximum(low, sigma.high * (1.0 + kappa))
     # float evaluation moves the exponent by kappa
@@ -319,7 +320,7 @@ def _fitted_exponential(sigma, limits, charges, quadratic):
     spread = sr + l + b
     size = fma(abs(t0), 4.0 + abs(t0), fma(spread, 1.0 + spread, 4.0))
     bent = fma(b, fma(2.0, l, b), sr * fma(2.0, l + b, sr))
-    error = fma(abs(weight), sr, fma(k2, bent, fma(ROUND + 2.0 * EXP_RELATIVE_ERROR, size, fit)))
+    error = fma(abs(weight), sr, fma(k2, bent, fma(FRAGMENT_ROUNDING + 2.0 * EXP_RELATIVE_ERROR, size, fit)))
     radius = fma(scale, error, 1.01 * e_low * fma(opacity_high, slack, opacity_spread))
     center = scale * fma(t0, fma(k2, t0, -k1), k0)
     # alpha_max
@@ -354,7 +355,7 @@ def alphas(record, begin, n, given, sure, block, inputs):
     rules, charges, shape = inputs.rules, inputs.charges, inputs.shape
     alpha_min = rules.alpha_min * (1.0 - charges.threshold)
     found = 0
-    if record[WILD] != 0.0:
+    if record[UNBOUNDED] != 0.0:
         high = min(record[OPACITY_HIGH], rules.alpha_max) * (1.0 + charges.threshold)
         if high >= alpha_min:
             for q in range(n):
@@ -365,7 +366,7 @@ def alphas(record, begin, n, given, sure, block, inputs):
         room = rules.tile_room
         missed = 8.0 * record[KAPPA] + 0.125 * room * charges.tile if room > 0.0 else 0.0
         limits = _Limits(
-            record[OPACITY_LOW], record[OPACITY_HIGH], record[KAPPA], record[FAINT], alpha_min,
+            record[OPACITY_LOW], record[OPACITY_HIGH], record[KAPPA], record[EXPONENT_LIMIT], alpha_min,
             rules.alpha_min * (1.0 + charges.threshold + missed), rules.alpha_max, 1.0 if sure else 0.0,
         )  # fmt: skip
         if shape.order == 2:

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 from numba import njit
 
 from ns_abstract.arithmetic.elementary import fma
-from ns_abstract.arithmetic.rounding import UNIT64
+from ns_abstract.arithmetic.rounding import FRAGMENT_ROUNDING, UNIT64, UP
 from ns_abstract.arithmetic.simd.intrinsics import advanced, lowest_bit
 from ns_abstract.arithmetic.simd.lanes import bits, load4, load8, maximum, minimum, store, where
 from ns_abstract.methods.splat.block import (
@@ -21,8 +21,6 @@ from ns_abstract.methods.splat.block import (
     LISTED,
     OPEN,
     RHO,
-    ROUND,
-    UP,
     color_ends,
     color_size,
     listed_fragment,
@@ -254,7 +252,7 @@ def _blend_quadratic(begin, end, fragments, palette, moves, t):
         v1 = v1 + v2
         size = abs(v0) + v1
         added = fma(values[at + ALPHA_HIGH], load4(colors, key + 4 * forms), fma(a1, v2, a2 * v1))
-        added = fma(values[at + FORM + 3], size, fma(ROUND, fma(1.0 + a1 + a2, size, abs(p0)), added))
+        added = fma(values[at + FORM + 3], size, fma(FRAGMENT_ROUNDING, fma(1.0 + a1 + a2, size, abs(p0)), added))
         r = fma(1.0 - values[at + ALPHA_LOW], r, added)
         ends = _blend_interval(ends, values, at, colors, key + color_ends(forms))
         if move != 0:
@@ -296,7 +294,7 @@ def _step_affine(r, at, key, fragments, palette, t, m):
     store(t, 0, middle)
     size = abs(value) + change_size
     added = fma(values[at + ALPHA_HIGH], load4(colors, key + 4 * forms), fma(steep, change_size, -curves))
-    added = fma(values[at + FORM + m], size, fma(ROUND, fma(1.0 + steep, size, abs(middle)), added))
+    added = fma(values[at + FORM + m], size, fma(FRAGMENT_ROUNDING, fma(1.0 + steep, size, abs(middle)), added))
     return fma(1.0 - values[at + ALPHA_LOW], r, added)
 
 
@@ -335,7 +333,7 @@ def _form_range(t, r, order, m):
     else:
         low, high = parabola(abs(load4(t, 4)), load4(t, 8))
         bottom, top = bottom + low, top + high
-    room = 8.0 * ROUND * (abs(middle) + size) + r * UP
+    room = 8.0 * FRAGMENT_ROUNDING * (abs(middle) + size) + r * UP
     return bottom - room, top + room
 
 
@@ -345,7 +343,7 @@ def _slack(q, ends, block, inputs, u):
 
     ``u`` is scratch for 8 numbers.
     """
-    lanes, palette, cutoffs, charges = block.fragments.lanes, block.palette, inputs.cutoffs, inputs.charges
+    per_pixel, palette, cutoffs, charges = block.fragments.per_pixel, block.palette, inputs.cutoffs, inputs.charges
     unseen = palette.unseen
     behind = load4(palette.background, 0)
     store(u, 0, ends.darkest)
@@ -356,11 +354,11 @@ def _slack(q, ends, block, inputs, u):
     rounding = charges.blend_fragment * block.fragments.lengths[q] + charges.blend_pixel
     slack = rounding * bright * 1.01 + inputs.colors.error + cutoffs.negligible * bright
     # a stop that was ignored shows the background in place of what lies behind
-    rho = lanes[RHO + q] * (1.0 + charges.lost_light)
+    rho = per_pixel[RHO + q] * (1.0 + charges.lost_light)
     fall = rho * maximum(0.0, light - behind)
     rise = rho * maximum(0.0, behind - dark)
     # or else fragments that are missing show in place of the background
-    passed = lanes[OPEN + q] * (1.0 + charges.lost_light)
+    passed = per_pixel[OPEN + q] * (1.0 + charges.lost_light)
     if passed > 0.0:
         faded = cutoffs.fade * max(bright, unseen[4], unseen[5], unseen[6])
         fall = maximum(fall, fma(passed, behind - load4(unseen, 0), faded))
@@ -373,8 +371,8 @@ def shade(left, above, reordered, block, inputs, bounds):
     """Blend every pixel's fragments and write its bounds (design.md, B7-B9).
 
     The block begins at column ``left`` and row ``above`` of its tile, whose parts of `PixelBounds` are ``bounds``;
-    ``reordered`` tells whether fragments may move. Row OPEN of the lanes bounds the light that comes to fragments that
-    are missing and have colours between the two of `Palette.unseen`.
+    ``reordered`` tells whether fragments may move. Row OPEN of `Fragments.per_pixel` bounds the light that comes to
+    fragments that are missing and have colours between the two of `Palette.unseen`.
     """
     fragments, palette, moves, t = block.fragments, block.palette, block.reordering.moves, block.sums
     lower, upper, linear, slopes = bounds.lower, bounds.upper, bounds.linear, bounds.slopes
@@ -382,7 +380,7 @@ def shade(left, above, reordered, block, inputs, bounds):
     # behind the polynomials: scratch, then sums of absolute linear coefficients
     u = advanced(t, 4 * m)
     sums = advanced(t, 4 * m + 16)
-    scratch = _Scratch(u, block.entries.reach, block.entries.first)
+    scratch = _Scratch(u, block.entries.depth_radius, block.entries.first)
     for k in range(d):
         store(sums, 4 * k, 0.0 * load4(palette.background, 0))
     for q in range(PIXELS):

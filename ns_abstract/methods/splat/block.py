@@ -14,15 +14,13 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
-from ns_abstract.arithmetic.rounding import UNIT64
+from ns_abstract.arithmetic.rounding import UP
 from ns_abstract.arithmetic.simd.intrinsics import pointer
 from ns_abstract.arithmetic.simd.lanes import bits, maximum, minimum, where
 from ns_abstract.methods.splat.lists import BLOCK, PIXELS
 
 assert PIXELS == 64 and BLOCK == 8
 
-ROUND = 16.0 * UNIT64
-UP = 1.0 + 128.0 * UNIT64
 
 #: List entries that are looked at together: no step waits for the one before.
 BATCH = 8
@@ -31,7 +29,7 @@ BATCH = 8
 # that passes the fragments listed so far at its least and most; last list position that may still change places; what
 # a stop that is ignored may hide, and what any stop so far may leave; light that comes to what is missing; what stops
 # at fragments of uncertain order may leave; 0, 1, 2, ...
-TLO, THI, REACH, RHO, LOST, OPEN, HIDDEN, NUMBERS = range(0, 8 * PIXELS, PIXELS)
+TLO, THI, LAST, RHO, LOST, OPEN, HIDDEN, NUMBERS = range(0, 8 * PIXELS, PIXELS)
 ROWS = 8
 #: Columns of a fragment: bounds of alpha, transmittance behind it at its least and before it at its most, alpha's
 #: coefficients and then its radius.
@@ -64,7 +62,7 @@ class Fragments(NamedTuple):
         lists: [PIXELS, capacity, LISTED] each pixel's fragments, nearest first.
         lengths: [PIXELS] of the lists.
         capacity: Fragments that each list has room for.
-        lanes: [ROWS, PIXELS] what is known of each pixel.
+        per_pixel: [ROWS, PIXELS] what is known of each pixel.
     """
 
     values: np.ndarray
@@ -72,7 +70,7 @@ class Fragments(NamedTuple):
     lists: np.ndarray
     lengths: np.ndarray
     capacity: int
-    lanes: np.ndarray
+    per_pixel: np.ndarray
 
 
 class Palette(NamedTuple):
@@ -97,7 +95,7 @@ class Entries(NamedTuple):
     Attributes:
         pixels: The set of the block's pixels that may be reached; valid where ``asked`` is 1.
         asked: Whether ``pixels`` was found.
-        reach: How far in depth the Gaussian may move against the block's central ray (O1).
+        depth_radius: How far in depth the Gaussian may move against the block's central ray (O1).
         depth: At the cell's middle.
         far: Positions that reach further than most, in order; later the group that a position belongs to (O4).
         first, last: Nearest and farthest position whose depth order against this one is uncertain, or itself.
@@ -105,7 +103,7 @@ class Entries(NamedTuple):
 
     pixels: np.ndarray
     asked: np.ndarray
-    reach: np.ndarray
+    depth_radius: np.ndarray
     depth: np.ndarray
     far: np.ndarray
     first: np.ndarray
@@ -173,7 +171,7 @@ class Block(NamedTuple):
 class Buffers(NamedTuple):
     """Memory of a thread's blocks; the fields are those of `Block` and its parts."""
 
-    lanes: np.ndarray
+    per_pixel: np.ndarray
     offsets: np.ndarray
     pixels: np.ndarray
     batch: np.ndarray
@@ -211,13 +209,13 @@ def _aligned(size):
 @njit(cache=True, error_model="numpy")
 def new_buffers(m, forms, pair_limit, background):
     """Memory for fragments of ``m`` coefficients, colours of ``forms`` and ``pair_limit`` pairs."""
-    lanes = np.zeros(ROWS * PIXELS)
-    lanes[NUMBERS : NUMBERS + BLOCK] = np.arange(BLOCK)
+    per_pixel = np.zeros(ROWS * PIXELS)
+    per_pixel[NUMBERS : NUMBERS + BLOCK] = np.arange(BLOCK)
     behind = np.zeros(4)
     behind[:3] = background
     width = fragment_width(m)
     return Buffers(
-        lanes=lanes,
+        per_pixel=per_pixel,
         offsets=np.zeros((2, BATCH * PIXELS + 8)),
         pixels=np.empty(BATCH * PIXELS, np.uint8),
         batch=np.empty((2, BATCH + 1), np.int64),
@@ -254,7 +252,7 @@ def resized(old, positions, capacity, m, forms):
         of_slots = np.empty((2 * capacity, PIXELS), np.uint32)
         moves = np.empty((32 * capacity, MOVES))
     return Buffers(
-        lanes=old.lanes,
+        per_pixel=old.per_pixel,
         offsets=old.offsets,
         pixels=old.pixels,
         batch=old.batch,
@@ -286,7 +284,7 @@ def block_of(buffers, m, forms):
         pointer(buffers.lists),
         pointer(buffers.lengths),
         buffers.lists.shape[1],
-        pointer(buffers.lanes),
+        pointer(buffers.per_pixel),
     )
     palette = Palette(pointer(buffers.palette), forms, pointer(buffers.background), pointer(buffers.unseen))
     entries = Entries(

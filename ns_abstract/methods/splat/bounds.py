@@ -13,12 +13,12 @@ from ns_abstract.geometry.camera_path import Camera
 from ns_abstract.geometry.poses import PoseForms
 from ns_abstract.geometry.tiles import tile_grid
 from ns_abstract.methods.splat.activate import Splats
-from ns_abstract.methods.splat.colors import color_reach, fixed_colors, gathered, moving_colors
+from ns_abstract.methods.splat.colors import color_magnitudes, fixed_colors, gathered, moving_colors
 from ns_abstract.methods.splat.constants import Rasteriser, raster_rules
 from ns_abstract.methods.splat.gaussians import covariance_noise, gaussian_stage
 from ns_abstract.methods.splat.lists import TileLists, depth_order, marked, tile_lists, tile_mask
 from ns_abstract.methods.splat.pixels import pixel_stage
-from ns_abstract.methods.splat.records import columns, faint_exponents
+from ns_abstract.methods.splat.records import columns, exponent_limits
 from ns_abstract.methods.splat.stage_data import (
     CellPoses,
     Colors,
@@ -44,7 +44,7 @@ class CellBounds:
         wanted: [t] tile numbers, row-major.
         lower, upper: [t, side, side, 3] float64 enclosures of every image of the cell.
         visible: [n] scene indices of the Gaussians that some pose of the cell may show in these tiles.
-        reach: [n, 4] their ranges of tiles: columns first and past, rows first and past.
+        tile_ranges: [n, 4] their ranges of tiles: columns first and past, rows first and past.
         linear: [t, side, side, 3, m + 1] polynomial coefficients and radius, or None.
         slopes: [d] mean absolute linear coefficients.
         statistics: Blocks, layers, uncertain pairs, blocks that gave up on order, pixels with results that were not
@@ -55,7 +55,7 @@ class CellBounds:
     lower: np.ndarray
     upper: np.ndarray
     visible: np.ndarray
-    reach: np.ndarray
+    tile_ranges: np.ndarray
     linear: np.ndarray | None
     slopes: np.ndarray
     statistics: np.ndarray
@@ -83,13 +83,13 @@ class SplatBounds:
         self.charges = charges(arithmetic)
         self._buffers: dict[str, np.ndarray] = {}
         self._least_step: float | None = None
-        self._faint = faint_exponents(self.varied.opacity_high, self.rules.alpha_min, self.charges)
+        self._exponent_limits = exponent_limits(self.varied.opacity_high, self.rules.alpha_min, self.charges)
         self._extents = np.sqrt(np.square(splats.axes).sum(axis=1).max(axis=1, initial=0.0))
         self._noise = covariance_noise(splats.axes, self.charges)
         self._color_radius = (
             self.charges.plain_color * float(np.abs(splats.sh).max(initial=1.0)) if splats.degree == 0 else 0.0
         )
-        self._color_reach = color_reach(splats.sh, splats.degree) if splats.degree > 0 else None
+        self._color_magnitudes = color_magnitudes(splats.sh, splats.degree) if splats.degree > 0 else None
         self._seen_from: tuple[tuple[float, ...], np.ndarray] | None = None
         self._plain_colors = _shifted_colors(self.varied, self.charges) if splats.degree == 0 else None
 
@@ -145,9 +145,9 @@ class SplatBounds:
         view = camera.intrinsics
         rotation, offset = forms.rotation.data, forms.offset.data
         low, high = forms.rotation.bounds()
-        rotation_reach = np.maximum(np.abs(low), np.abs(high)).ravel()
+        rotation_magnitude = np.maximum(np.abs(low), np.abs(high)).ravel()
         low, high = forms.position.bounds()
-        camera_reach = np.maximum(np.abs(low), np.abs(high))
+        camera_magnitude = np.maximum(np.abs(low), np.abs(high))
         gaussians = ProjectedGaussians(
             record=self._buffer("record", (n, columns(6 if splats.antialiased else 5, m))),
             box=self._buffer("box", (n, 4)),
@@ -165,17 +165,17 @@ class SplatBounds:
             noise=self._noise,
             opacity_low=self.varied.opacity_low,
             opacity_high=self.varied.opacity_high,
-            faint=self._faint,
+            exponent_limits=self._exponent_limits,
         )
-        poses = CellPoses(rotation, offset, forms.origin, camera_reach, rotation_reach)
+        poses = CellPoses(rotation, offset, forms.origin, camera_magnitude, rotation_magnitude)
         gaussian_stage(candidates, scene, poses, view, self.rules, self.charges, shape, gaussians, state)
         alive = np.flatnonzero(state)
-        colors = self._colors(forms, camera_reach, candidates, alive, n)
+        colors = self._colors(forms, camera_magnitude, candidates, alive, n)
         mask = tile_mask(wanted, across * down)
         offsets, entries = tile_lists(depth_order(alive, gaussians.depth), gaussians.tiles, mask, across)
         # the third row of the rotation; its float32 rounding is the same for every Gaussian
         slope = np.ascontiguousarray(rotation[:, 6:9])
-        slope[m] += self.charges.viewing_axis * rotation_reach[6:9]
+        slope[m] += self.charges.viewing_axis * rotation_magnitude[6:9]
         pixels = (wanted.size, self.side, self.side, 3)
         found = PixelBounds(
             lower=np.zeros(pixels),
@@ -216,7 +216,7 @@ class SplatBounds:
         return Cutoffs(floor, fade, self.rasteriser.alpha_negligible * self.splats.count, PAIR_LIMIT)
 
     def _colors(
-        self, forms: PoseForms, camera_reach: np.ndarray, candidates: np.ndarray, alive: np.ndarray, n: int
+        self, forms: PoseForms, camera_magnitude: np.ndarray, candidates: np.ndarray, alive: np.ndarray, n: int
     ) -> np.ndarray:
         """Colours of the visible Gaussians: [n, 3], [n, 6] (centre, radius) or forms."""
         splats, varied = self.splats, self.varied
@@ -226,14 +226,14 @@ class SplatBounds:
             if n == splats.count:
                 return np.ascontiguousarray(splats.sh[:, 0])
             return splats.sh[candidates, 0]
-        assert self._color_reach is not None
+        assert self._color_magnitudes is not None
         # torch.inverse of the view matrix, of 1 + |T| (design.md, C3)
-        position_error = self.charges.camera_position * (1.0 + float(camera_reach.sum()))
+        position_error = self.charges.camera_position * (1.0 + float(camera_magnitude.sum()))
         if self.rasteriser.eye_from_view:
-            position_error += _gram_deviation(forms) * float(camera_reach.sum())
+            position_error += _gram_deviation(forms) * float(camera_magnitude.sum())
         scene = SceneColors(
             varied.mean_middle, varied.mean_radius, varied.color_low, varied.color_high, splats.sh,
-            self._color_reach, splats.degree,
+            self._color_magnitudes, splats.degree,
         )  # fmt: skip
         position = forms.position
         if not np.any(position.linear) and float(position.radius.max()) < 1e-9:

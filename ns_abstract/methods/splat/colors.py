@@ -8,16 +8,14 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit, prange
 
-from ns_abstract.arithmetic.forms import bounds, clamp_below, settle
-from ns_abstract.arithmetic.rounding import UNIT64
+from ns_abstract.arithmetic.forms import bounds, clamp_below, set_norms
+from ns_abstract.arithmetic.rounding import SUM_ROUNDING, UP
 from ns_abstract.arithmetic.simd.intrinsics import advanced, borrowed, pointer
 from ns_abstract.arithmetic.simd.wide_forms import size
 from ns_abstract.methods.splat.form_colors import WORKSPACE, form_colors
 from ns_abstract.methods.splat.line_colors import accumulate_line, basis_line, directions_line
 from ns_abstract.methods.splat.records import LANES
 
-_COEFFICIENT = 8.0 * UNIT64
-_UP = 1.0 + 128.0 * UNIT64
 _CHUNK = 1024
 
 #: Largest change of each basis function per unit change of the direction, rounded up.
@@ -47,15 +45,15 @@ class _Scratch(NamedTuple):
     angle: np.ndarray
 
 
-def color_reach(sh: np.ndarray, degree: int) -> np.ndarray:
+def color_magnitudes(sh: np.ndarray, degree: int) -> np.ndarray:
     """[N, 6] by channel: most that ``sh`` [N, K, 3] can add up to, and most that it changes by with the direction."""
-    reach = np.zeros((sh.shape[0], 6))
+    found = np.zeros((sh.shape[0], 6))
     for k in range((degree + 1) * (degree + 1)):
         sizes = np.abs(sh[:, k])
-        reach[:, :3] += _SIZE[k] * sizes
-        reach[:, 3:] += _SLOPE[k] * sizes
+        found[:, :3] += _SIZE[k] * sizes
+        found[:, 3:] += _SLOPE[k] * sizes
     # rounding of the sums
-    return reach * (1.0 + 2.0**-40)
+    return found * (1.0 + 2.0**-40)
 
 
 @njit(cache=True, error_model="numpy")
@@ -102,7 +100,7 @@ def sh_color(sh, direction, degree, basis, out):
 
 @njit(cache=True, error_model="numpy")
 def _color_error(size, change, charges, direction_error):
-    """Float error of one colour, see `color_reach` (design.md, C3)."""
+    """Float error of one colour, see `color_magnitudes` (design.md, C3)."""
     return charges.color_sum + charges.harmonics * size + direction_error * change
 
 
@@ -115,16 +113,16 @@ def _direction_error(length, position_error, means, mean_radius, i, charges):
     See design.md, C3.
     """
     size = abs(means[i, 0]) + abs(means[i, 1]) + abs(means[i, 2])
-    reach = 0.0
+    spread = 0.0
     if mean_radius.shape[0] > 0:
         r0, r1, r2 = mean_radius[i, 0], mean_radius[i, 1], mean_radius[i, 2]
-        reach = math.sqrt(r0 * r0 + r1 * r1 + r2 * r2) * _UP
+        spread = math.sqrt(r0 * r0 + r1 * r1 + r2 * r2) * UP
         size += r0 + r1 + r2
-    distance = length - position_error - reach
+    distance = length - position_error - spread
     if not distance > 0.0:
         return 2.0
-    error = (position_error + reach + charges.direction_mean * size) / distance + charges.direction
-    if reach > 0.0:
+    error = (position_error + spread + charges.direction_mean * size) / distance + charges.direction
+    if spread > 0.0:
         # from a chord to the arc, along which the basis functions' slopes hold (design.md, S4)
         error = 2.0 * math.asin(min(1.0, 0.5 * error)) * (1.0 + 2.0**-40)
     return min(error, 2.0)
@@ -142,7 +140,7 @@ def fixed_colors(scene, position, position_error, charges, colors):
     """
     count = scene.means.shape[0]
     for chunk in prange((count + _CHUNK - 1) // _CHUNK):
-        means, mean_radius, reach = borrowed(scene.means), borrowed(scene.mean_radius), borrowed(scene.reach)
+        means, mean_radius, magnitudes = borrowed(scene.means), borrowed(scene.mean_radius), borrowed(scene.magnitudes)
         color_low, color_high, sh = borrowed(scene.low), borrowed(scene.high), borrowed(scene.sh)
         basis = np.empty(16)
         color = np.empty(3)
@@ -154,14 +152,14 @@ def fixed_colors(scene, position, position_error, charges, colors):
             sh_color(sh[i], direction, scene.degree, basis, color)
             error = _direction_error(length, position_error, means, mean_radius, i, charges)
             for c in range(3):
-                radius = _color_error(reach[i, c], reach[i, 3 + c], charges, error)
+                radius = _color_error(magnitudes[i, c], magnitudes[i, 3 + c], charges, error)
                 if color_low.shape[0] > 0 and (color_low[i, c] != 0.0 or color_high[i, c] != 0.0):
                     size = color[c] + radius + max(abs(color_low[i, c]), abs(color_high[i, c]))
                     rounding = charges.shifted_color * size
                     low = max(0.0, max(0.0, color[c] - radius) + color_low[i, c] - rounding)
                     high = max(0.0, color[c] + radius + color_high[i, c] + rounding)
                     color[c] = 0.5 * (low + high)
-                    radius = 0.5 * (high - low) * _UP + _COEFFICIENT * high
+                    radius = 0.5 * (high - low) * UP + SUM_ROUNDING * high
                 colors[i, 2 * c] = color[c]
                 colors[i, 2 * c + 1] = radius
 
@@ -188,13 +186,13 @@ def _set_directions(work, numbers, scene, position, origin, m):
         for q in range(LANES):
             i = numbers[q]
             form[0, q] = (means[i, axis] - origin[axis]) + (origin[axis] - position[0, axis])
-            form[m, q] = position[m, axis] + _COEFFICIENT * (
+            form[m, q] = position[m, axis] + SUM_ROUNDING * (
                 abs(means[i, axis] - origin[axis]) + abs(origin[axis] - position[0, axis])
             )
 
 
 @njit(cache=True, error_model="numpy")
-def _set_bands(work, numbers, lanes, scratch, scene, shape):
+def _set_bands(work, numbers, filled, scratch, scene, shape):
     """Forms 16 to 18 of ``work``: the three channels, from the directions; ``scratch.low``: squared lengths."""
     d, order, m = shape
     sh, low, weights = borrowed(scene.sh), scratch.low, scratch.weights
@@ -205,7 +203,7 @@ def _set_bands(work, numbers, lanes, scratch, scene, shape):
                 form[k, q] = 0.0
         for q in range(LANES):
             form[0, q] = 0.2820947917738781 * sh[numbers[q], 0, channel] + 0.5
-            form[m, q] = _COEFFICIENT * (abs(sh[numbers[q], 0, channel]) + 1.0)
+            form[m, q] = SUM_ROUNDING * (abs(sh[numbers[q], 0, channel]) + 1.0)
     if order == 2:
         s = scratch.rows
         directions_line(s, low.shape[0], scene.degree, low)
@@ -217,23 +215,31 @@ def _set_bands(work, numbers, lanes, scratch, scene, shape):
                 accumulate_line(s, low.shape[0], weights, channel)
         return
     for axis in range(3):
-        settle(work[axis], d, order, m)
-    for q in range(0, lanes, 8):
+        set_norms(work[axis], d, order, m)
+    for q in range(0, filled, 8):
         form_colors(
             pointer(scratch.wide), advanced(pointer(scratch.rows), q), advanced(pointer(low), q), sh, pointer(weights),
-            advanced(pointer(numbers), q), scene.degree, d, order, m,
+            advanced(pointer(numbers), q), scene.degree, m,
         )  # fmt: skip
 
 
 @njit(cache=True, error_model="numpy")
-def _clamp_channel(form, channel, numbers, lanes, scratch, scene, charges, shape):
+def _clamp_at_zero(form, low, high, shape):
+    """Replace ``form`` by its maximum with 0; ``low`` and ``high`` [LANES] are scratch."""
+    d, order, m = shape
+    bounds(form, low, high, d, order, m)
+    clamp_below(form, 0.0, low, high, d, order, m)
+
+
+@njit(cache=True, error_model="numpy")
+def _clamp_channel(form, channel, numbers, filled, scratch, scene, charges, shape):
     """Charge a channel's form for float evaluation, clamp it and add the scene's range (design.md, C3, S4)."""
     d, order, m = shape
-    reach, least_of, most_of = borrowed(scene.reach), borrowed(scene.low), borrowed(scene.high)
+    magnitudes, least_of, most_of = borrowed(scene.magnitudes), borrowed(scene.low), borrowed(scene.high)
     low, high, angle = scratch.low, scratch.high, scratch.angle
-    settle(form, d, order, m)
-    for q in range(lanes):
-        most, change = reach[numbers[q], channel], reach[numbers[q], 3 + channel]
+    set_norms(form, d, order, m)
+    for q in range(filled):
+        most, change = magnitudes[numbers[q], channel], magnitudes[numbers[q], 3 + channel]
         form[m, q] += _color_error(most, change, charges, angle[q])
         # a camera that may stand in the Gaussian's centre: any direction
         if not form[m, q] + form[m + 1, q] + form[m + 2, q] <= 2.0 * most + 1.0:
@@ -241,21 +247,19 @@ def _clamp_channel(form, channel, numbers, lanes, scratch, scene, charges, shape
                 form[r, q] = 0.0
             form[0, q] = 0.5
             form[m, q] = most * 1.01 + _color_error(most, change, charges, 2.0)
-    bounds(form, low, high, d, order, m)
-    clamp_below(form, 0.0, low, high, d, order, m)
+    _clamp_at_zero(form, low, high, shape)
     if least_of.shape[0] == 0:
         return
-    for q in range(lanes):
+    for q in range(filled):
         least, most = least_of[numbers[q], channel], most_of[numbers[q], channel]
         if least != 0.0 or most != 0.0:
             middle = 0.5 * (least + most)
             total = abs(form[0, q]) + form[m + 1, q] + form[m + 2, q] + form[m, q]
             form[0, q] += middle
-            form[m, q] += max(most - middle, middle - least) * _UP + (charges.shifted_color + _COEFFICIENT) * (
+            form[m, q] += max(most - middle, middle - least) * UP + (charges.shifted_color + SUM_ROUNDING) * (
                 total + max(abs(least), abs(most))
             )
-    bounds(form, low, high, d, order, m)
-    clamp_below(form, 0.0, low, high, d, order, m)
+    _clamp_at_zero(form, low, high, shape)
 
 
 @njit(cache=True, error_model="numpy")
@@ -274,18 +278,18 @@ def _color_chunk(chunk, indices, scene, position, origin, position_error, charge
     )  # fmt: skip
     means, mean_radius, low = borrowed(scene.means), borrowed(scene.mean_radius), scratch.low
     for first in range(chunk * _CHUNK, min(n, (chunk + 1) * _CHUNK), LANES):
-        lanes = min(LANES, min(n, (chunk + 1) * _CHUNK) - first)
+        filled = min(LANES, min(n, (chunk + 1) * _CHUNK) - first)
         for q in range(LANES):
-            numbers[q] = indices[first + min(q, lanes - 1), 1]
+            numbers[q] = indices[first + min(q, filled - 1), 1]
         _set_directions(work, numbers, scene, position, origin, m)
-        _set_bands(work, numbers, lanes, scratch, scene, shape)
-        for q in range(lanes):
-            distance = math.sqrt(low[q]) * (1.0 - _COEFFICIENT) if low[q] > 0.0 else 0.0
+        _set_bands(work, numbers, filled, scratch, scene, shape)
+        for q in range(filled):
+            distance = math.sqrt(low[q]) * (1.0 - SUM_ROUNDING) if low[q] > 0.0 else 0.0
             scratch.angle[q] = _direction_error(distance, position_error, means, mean_radius, numbers[q], charges)
         for channel in range(3):
             form = work[16 + channel]
-            _clamp_channel(form, channel, numbers, lanes, scratch, scene, charges, shape)
-            for q in range(lanes):
+            _clamp_channel(form, channel, numbers, filled, scratch, scene, charges, shape)
+            for q in range(filled):
                 for k in range(m + 1):
                     colors[indices[first + q, 0], channel * (m + 1) + k] = form[k, q]
     # the owners of the borrowed arrays live to here

@@ -1,4 +1,4 @@
-"""Signed steps of a pose and of all Gaussians at once, by the reference renderer (design.md, V10)."""
+"""Signed steps of a pose and of all Gaussians at once, by the reference renderer (design.md, V11)."""
 
 from __future__ import annotations
 

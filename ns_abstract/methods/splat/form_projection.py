@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from numba import njit
 
-from ns_abstract.arithmetic.rounding import UNIT64
+from ns_abstract.arithmetic.rounding import SUM_ROUNDING, UP
 from ns_abstract.arithmetic.simd.lanes import load8, store
 from ns_abstract.arithmetic.simd.wide_forms import (
     add_product,
@@ -13,20 +13,17 @@ from ns_abstract.arithmetic.simd.wide_forms import (
     clamp,
     clear,
     logarithm,
+    magnitude,
     multiply,
-    reach,
     reciprocal,
     reciprocal_square_root,
     scale_add,
-    settle,
+    set_norms,
     size,
     square,
 )
 from ns_abstract.methods.splat import records as row
 from ns_abstract.methods.splat.records import LANES
-
-_COEFFICIENT = 8.0 * UNIT64
-_UP = 1.0 + 128.0 * UNIT64
 
 # numbers of the forms in the workspace; behind _LOG stands the logarithm's scratch
 (
@@ -60,21 +57,21 @@ def rotate(w, rotation, r, v, offset, shifted, spread, out, shape):
     if shifted:
         radius = radius + offset[3 * m + r]
         rounding = rounding + (abs(offset[r]) + offset[3 * (m + 1) + r] + offset[3 * (m + 2) + r])
-    store(w, out + 8 * m, (radius + _COEFFICIENT * rounding) * _UP + spread)
-    settle(w, out, d, order, m)
+    store(w, out + 8 * m, (radius + SUM_ROUNDING * rounding) * UP + spread)
+    set_norms(w, out, m, order, d)
 
 
 @njit(cache=True, error_model="numpy", forceinline=True)
-def _keep_bounds(w, a, s, low, high, q, d, order, m):
+def _keep_bounds(w, a, s, low, high, q, m):
     """Write the bounds of a form to two rows; returns them."""
-    bottom, top = bounds(w, a, d, order, m)
+    bottom, top = bounds(w, a, m)
     store(s, low + q, bottom)
     store(s, high + q, top)
     return bottom, top
 
 
 @njit(cache=True, error_model="numpy", forceinline=True)
-def _pixels(w, a, z, ratio, focal, out, d, order, m):
+def _pixels(w, a, z, ratio, focal, out, m):
     """``focal a - (focal ratio) z``, which vanishes at the middle of the cell: a pixel offset times depth.
 
     ``ratio`` is a form; returns the focal length times its centre.
@@ -83,20 +80,20 @@ def _pixels(w, a, z, ratio, focal, out, d, order, m):
     shift = focal * load8(w, ratio)
     for k in range(m):
         store(w, out + 8 * k, focal * load8(w, a + 8 * k) - shift * load8(w, z + 8 * k))
-    rounding = focal * reach(w, a, order, m) + abs(shift) * reach(w, z, order, m)
-    radius = focal * load8(w, a + 8 * m) + abs(shift) * load8(w, z + 8 * m) + _COEFFICIENT * rounding
-    store(w, out + 8 * m, radius * _UP)
-    settle(w, out, d, order, m)
+    rounding = focal * magnitude(w, a, m) + abs(shift) * magnitude(w, z, m)
+    radius = focal * load8(w, a + 8 * m) + abs(shift) * load8(w, z + 8 * m) + SUM_ROUNDING * rounding
+    store(w, out + 8 * m, radius * UP)
+    set_norms(w, out, m)
     return shift
 
 
 @njit(cache=True, error_model="numpy")
-def _lower(w, a, b, out, d, order, m):
+def _lower(w, a, b, out, m):
     """``out -= a b``."""
     # the subtraction's own rounding, for what it starts from
-    store(w, out + 8 * m, load8(w, out + 8 * m) + _COEFFICIENT * reach(w, out, order, m))
-    add_product(w, a, b, -1.0, out, d, order, m)
-    settle(w, out, d, order, m)
+    store(w, out + 8 * m, load8(w, out + 8 * m) + SUM_ROUNDING * magnitude(w, out, m))
+    add_product(w, a, b, -1.0, out, m)
+    set_norms(w, out, m)
 
 
 @njit(cache=True, error_model="numpy", forceinline=True)
@@ -108,13 +105,13 @@ def _keep(w, a, s, f, q, m):
 
 @njit(cache=True, error_model="numpy")
 def project_forms(w, s, rotation, offset, camera, rules, shape):
-    """`line_projection.project_line` for any number of parameters and order, and its `compensate_line`.
+    """`line_projection.project_line` with forms of order 1 in any number of parameters, and its `compensate_line`.
 
     See design.md, G1, G4.
 
     ``w`` is scratch for `WORKSPACE` forms; the forms of a record go to the rows from FP, m + 1 each.
     """
-    d, order, m = shape
+    m = shape.monomials
     one = size(m)
     x, y, z, inverse, u, v = _X * one, _Y * one, _Z * one, _RZ * one, _U * one, _V * one
     dx, dy, deep = _DX * one, _DY * one, _W2 * one
@@ -127,22 +124,22 @@ def project_forms(w, s, rotation, offset, camera, rules, shape):
         rotate(w, rotation, 0, mean, offset, True, load8(s, row.SX + q), x, shape)
         rotate(w, rotation, 1, mean, offset, True, load8(s, row.SY + q), y, shape)
         rotate(w, rotation, 2, mean, offset, True, load8(s, row.SZ + q), z, shape)
-        _keep_bounds(w, z, s, row.ZLO, row.ZHI, q, d, order, m)
+        _keep_bounds(w, z, s, row.ZLO, row.ZHI, q, m)
         store(s, row.Z0 + q, load8(w, z))
         # u = x / z, v = y / z
-        reciprocal(w, z, inverse, d, order, m)
-        multiply(w, x, inverse, u, d, order, m)
-        multiply(w, y, inverse, v, d, order, m)
-        u_low, u_high = _keep_bounds(w, u, s, row.ULO, row.UHI, q, d, order, m)
-        v_low, v_high = _keep_bounds(w, v, s, row.VLO, row.VHI, q, d, order, m)
-        store(s, row.X0 + q, _pixels(w, x, z, u, fx, dx, d, order, m))
-        store(s, row.Y0 + q, _pixels(w, y, z, v, fy, dy, d, order, m))
+        reciprocal(w, z, inverse, m)
+        multiply(w, x, inverse, u, m)
+        multiply(w, y, inverse, v, m)
+        u_low, u_high = _keep_bounds(w, u, s, row.ULO, row.UHI, q, m)
+        v_low, v_high = _keep_bounds(w, v, s, row.VLO, row.VHI, q, m)
+        store(s, row.X0 + q, _pixels(w, x, z, u, fx, dx, m))
+        store(s, row.Y0 + q, _pixels(w, y, z, v, fy, dy, m))
         # the Jacobian's clamped ratios
         if margin >= 0.0:
             extra = margin * 0.5 * width / fx
-            clamp(w, u, -(cx / fx + extra), (width - cx) / fx + extra, u_low, u_high, order, m)
+            clamp(w, u, -(cx / fx + extra), (width - cx) / fx + extra, u_low, u_high, m)
             extra = margin * 0.5 * height / fy
-            clamp(w, v, -(cy / fy + extra), (height - cy) / fy + extra, v_low, v_high, order, m)
+            clamp(w, v, -(cy / fy + extra), (height - cy) / fy + extra, v_low, v_high, m)
         # w = R B, then n0 = w0 - u w2, n1 = w1 - v w2
         none = 0.0 * mean[0]
         for column in range(3):
@@ -152,74 +149,74 @@ def project_forms(w, s, rotation, offset, camera, rules, shape):
             rotate(w, rotation, 0, axis, offset, False, none, n0, shape)
             rotate(w, rotation, 1, axis, offset, False, none, n1, shape)
             rotate(w, rotation, 2, axis, offset, False, none, deep, shape)
-            store(s, row.DEEP0 + column * LANES + q, reach(w, deep, order, m) + load8(w, deep + 8 * m))
-            _lower(w, u, deep, n0, d, order, m)
-            _lower(w, v, deep, n1, d, order, m)
+            store(s, row.DEEP0 + column * LANES + q, magnitude(w, deep, m) + load8(w, deep + 8 * m))
+            _lower(w, u, deep, n0, m)
+            _lower(w, v, deep, n1, m)
         # a' = fx^2 |n0|^2 + eps z^2, c' = fy^2 |n1|^2 + eps z^2, b' = fx fy n0.n1 (covariance times z^2)
-        square(w, z, z2, d, order, m)
+        square(w, z, z2, m)
         clear(w, a, m)
         clear(w, b, m)
         clear(w, c, m)
         for column in range(3):
             n0, n1 = (_N0 + column) * one, (_N3 + column) * one
-            add_square(w, n0, a, d, order, m)
-            add_square(w, n1, c, d, order, m)
-            add_product(w, n0, n1, 1.0, b, d, order, m)
-        settle(w, a, d, order, m)
-        settle(w, b, d, order, m)
-        settle(w, c, d, order, m)
-        scale_add(w, b, fx * fy, b, 0.0, 0.0, b, d, order, m)
+            add_square(w, n0, a, m)
+            add_square(w, n1, c, m)
+            add_product(w, n0, n1, 1.0, b, m)
+        set_norms(w, a, m)
+        set_norms(w, b, m)
+        set_norms(w, c, m)
+        scale_add(w, b, fx * fy, b, 0.0, 0.0, b, m)
         # det' = fx^2 fy^2 |n0 x n1|^2 + eps z^2 (fx^2 |n0|^2 + fy^2 |n1|^2) + eps^2 z^4, sums of squares only
         clear(w, k, m)
         for column in range(3):
             i, j = (column + 1) % 3, (column + 2) % 3
             clear(w, t0, m)
-            add_product(w, (_N0 + i) * one, (_N3 + j) * one, 1.0, t0, d, order, m)
-            add_product(w, (_N0 + j) * one, (_N3 + i) * one, -1.0, t0, d, order, m)
-            settle(w, t0, d, order, m)
-            add_square(w, t0, k, d, order, m)
-        settle(w, k, d, order, m)
-        scale_add(w, k, (fx * fy) * (fx * fy), k, 0.0, 0.0, k, d, order, m)
-        scale_add(w, a, fx * fx, c, fy * fy, 0.0, t0, d, order, m)
-        scale_add(w, t0, eps2d, z2, eps2d * eps2d, 0.0, t1, d, order, m)
-        scale_add(w, k, 1.0, k, 0.0, 0.0, det, d, order, m)
-        add_product(w, t1, z2, 1.0, det, d, order, m)
-        settle(w, det, d, order, m)
-        scale_add(w, a, fx * fx, z2, eps2d, 0.0, a, d, order, m)
-        scale_add(w, c, fy * fy, z2, eps2d, 0.0, c, d, order, m)
-        _keep_bounds(w, a, s, row.ALO, row.AHI, q, d, order, m)
-        _keep_bounds(w, c, s, row.CLO, row.CHI, q, d, order, m)
-        _keep_bounds(w, b, s, row.BLO, row.BHI, q, d, order, m)
-        _keep_bounds(w, det, s, row.DLO, row.DHI, q, d, order, m)
+            add_product(w, (_N0 + i) * one, (_N3 + j) * one, 1.0, t0, m)
+            add_product(w, (_N0 + j) * one, (_N3 + i) * one, -1.0, t0, m)
+            set_norms(w, t0, m)
+            add_square(w, t0, k, m)
+        set_norms(w, k, m)
+        scale_add(w, k, (fx * fy) * (fx * fy), k, 0.0, 0.0, k, m)
+        scale_add(w, a, fx * fx, c, fy * fy, 0.0, t0, m)
+        scale_add(w, t0, eps2d, z2, eps2d * eps2d, 0.0, t1, m)
+        scale_add(w, k, 1.0, k, 0.0, 0.0, det, m)
+        add_product(w, t1, z2, 1.0, det, m)
+        set_norms(w, det, m)
+        scale_add(w, a, fx * fx, z2, eps2d, 0.0, a, m)
+        scale_add(w, c, fy * fy, z2, eps2d, 0.0, c, m)
+        _keep_bounds(w, a, s, row.ALO, row.AHI, q, m)
+        _keep_bounds(w, c, s, row.CLO, row.CHI, q, m)
+        _keep_bounds(w, b, s, row.BLO, row.BHI, q, m)
+        _keep_bounds(w, det, s, row.DLO, row.DHI, q, m)
         # (a' - c')/2, for the radius
-        scale_add(w, a, 0.5, c, -0.5, 0.0, t1, d, order, m)
-        _keep_bounds(w, t1, s, row.LO, row.HI, q, d, order, m)
+        scale_add(w, a, 0.5, c, -0.5, 0.0, t1, m)
+        _keep_bounds(w, t1, s, row.LO, row.HI, q, m)
         # S' = 1/sqrt(c'), P' = sqrt(c'/det'), Q' = P' b'/c'
-        reciprocal_square_root(w, c, root, d, order, m)
-        reciprocal_square_root(w, det, t0, d, order, m)
-        multiply(w, c, root, t1, d, order, m)
-        multiply(w, t1, t0, p, d, order, m)
-        multiply(w, b, root, t0, d, order, m)
-        multiply(w, t0, root, t1, d, order, m)
-        multiply(w, p, t1, across, d, order, m)
+        reciprocal_square_root(w, c, root, m)
+        reciprocal_square_root(w, det, t0, m)
+        multiply(w, c, root, t1, m)
+        multiply(w, t1, t0, p, m)
+        multiply(w, b, root, t0, m)
+        multiply(w, t0, root, t1, m)
+        multiply(w, p, t1, across, m)
         if rules.antialiased:
             # K = -log(compensation), compensation^2 = |n0 x n1|^2 / det'
-            reciprocal(w, det, t0, d, order, m)
-            multiply(w, k, t0, t1, d, order, m)
-            _keep_bounds(w, t1, s, row.SQLO, row.SQHI, q, d, order, m)
-            logarithm(w, t1, _LOG * one, d, order, m)
-            scale_add(w, _LOG * one, -0.5, _LOG * one, 0.0, 0.0, k, d, order, m)
+            reciprocal(w, det, t0, m)
+            multiply(w, k, t0, t1, m)
+            _keep_bounds(w, t1, s, row.SQLO, row.SQHI, q, m)
+            logarithm(w, t1, _LOG * one, m)
+            scale_add(w, _LOG * one, -0.5, _LOG * one, 0.0, 0.0, k, m)
             _keep(w, k, s, 5, q, m)
         # P = P' z, Q = Q' z, S = S' z, W1 = P' X^ - Q' Y^, W2 = S' Y^
-        multiply(w, p, z, t0, d, order, m)
+        multiply(w, p, z, t0, m)
         _keep(w, t0, s, 0, q, m)
-        multiply(w, across, z, t0, d, order, m)
+        multiply(w, across, z, t0, m)
         _keep(w, t0, s, 1, q, m)
-        multiply(w, root, z, t0, d, order, m)
+        multiply(w, root, z, t0, m)
         _keep(w, t0, s, 2, q, m)
         clear(w, t0, m)
-        add_product(w, p, dx, 1.0, t0, d, order, m)
-        add_product(w, across, dy, -1.0, t0, d, order, m)
+        add_product(w, p, dx, 1.0, t0, m)
+        add_product(w, across, dy, -1.0, t0, m)
         _keep(w, t0, s, 3, q, m)
-        multiply(w, root, dy, t0, d, order, m)
+        multiply(w, root, dy, t0, m)
         _keep(w, t0, s, 4, q, m)

@@ -12,6 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
+from ns_abstract.arithmetic.rounding import FRAGMENT_ROUNDING, REGION, UP
 from ns_abstract.arithmetic.simd.intrinsics import advanced, lowest_bit, pointer, prefetch, signed
 from ns_abstract.arithmetic.simd.lanes import load8, maximum, minimum, root, spans, store, where
 from ns_abstract.methods.splat.alphas import alphas
@@ -20,6 +21,7 @@ from ns_abstract.methods.splat.block import (
     ALPHA_LOW,
     BATCH,
     HIDDEN,
+    LAST,
     LEFT,
     LIGHT,
     LISTED,
@@ -27,22 +29,17 @@ from ns_abstract.methods.splat.block import (
     MOVES,
     NUMBERS,
     OPEN,
-    REACH,
     RHO,
-    ROUND,
     THI,
     TLO,
-    UP,
     color_ends,
     color_size,
     longest_list,
     set_unknown,
 )
 from ns_abstract.methods.splat.lists import AHEAD, BLOCK, PIXELS
-from ns_abstract.methods.splat.records import FAINT, FORMS, MEAN_X, MEAN_Y, SPREAD, WILD
+from ns_abstract.methods.splat.records import EXPONENT_LIMIT, FORMS, MEAN_X, MEAN_Y, SPREAD, UNBOUNDED
 
-#: Room for rounding where pixels are left out.
-_ROOM = 1.0 + 2.0**-30
 #: Pixel q of a block lies in row q >> _ROW_SHIFT; sets of pixels are the bits of an int64.
 _ROW_SHIFT = BLOCK.bit_length() - 1
 # what a block may answer in place of a number of pairs
@@ -81,11 +78,11 @@ class _Window(NamedTuple):
     """How far apart in depth list positions may change places (O1).
 
     Attributes:
-        room: Positions i, j keep their order where ``room |depth_i - depth_j| > reach_i + reach_j``; if not positive,
+        room: Positions i, j keep their order where ``room |depth_i - depth_j| > radius_i + radius_j``; if not positive,
             nothing is known.
-        largest: Largest reach of all but the few positions in ``far``.
+        largest: Largest `Entries.depth_radius` of all but the few positions in ``far``.
         far: How many these are.
-        farthest: Their largest reach.
+        farthest: Their largest one.
     """
 
     room: float
@@ -122,19 +119,19 @@ def _uncertain(i, j, listed):
         spread += abs(slope[3 * k] * x + slope[3 * k + 1] * y + slope[3 * k + 2] * z)
     size = abs(delta[3 * i]) + abs(delta[3 * j]) + abs(delta[3 * i + 1]) + abs(delta[3 * j + 1])
     size += abs(delta[3 * i + 2]) + abs(delta[3 * j + 2])
-    rounding = ROUND * size * 2.0
+    rounding = FRAGMENT_ROUNDING * size * 2.0
     radius = slope[3 * m] * abs(x) + slope[3 * m + 1] * abs(y) + slope[3 * m + 2] * abs(z)
     return not (abs(center) > (spread + radius) * UP + rounding + depth_error[i] + depth_error[j])
 
 
 @njit(cache=True, error_model="numpy")
-def _depth_reach(numbers, gaussians, slope, ray, m, entries):
+def _depth_radii(numbers, gaussians, slope, ray, m, entries):
     """How far in depth each entry may move against the block's central ray (design.md, O1).
 
-    Fills ``entries.reach`` and ``entries.depth``; returns `_Window.room` and `_Window.largest`.
+    Fills ``entries.depth_radius`` and ``entries.depth``; returns `_Window.room` and `_Window.largest`.
     """
     depth, delta, depth_error = gaussians.depth, gaussians.delta, gaussians.depth_error
-    reach, deep = entries.reach, entries.depth
+    radii, deep = entries.depth_radius, entries.depth
     count = numbers.size
     along = 0.0
     for k in range(1, m):
@@ -156,8 +153,8 @@ def _depth_reach(numbers, gaussians, slope, ray, m, entries):
         for row in range(1, m):
             e += abs(slope[row, 0] * x + slope[row, 1] * y + slope[row, 2] * z)
         size = abs(delta[i, 0]) + abs(delta[i, 1]) + abs(delta[i, 2]) + abs(depth[i]) * (1.0 + along)
-        reach[k] = e * UP + 4.0 * ROUND * size + depth_error[i]
-        total += reach[k]
+        radii[k] = e * UP + 4.0 * FRAGMENT_ROUNDING * size + depth_error[i]
+        total += radii[k]
     room = (1.0 - along) * (1.0 - 2.0**-30)
     if not total < np.inf:
         room = -1.0
@@ -165,24 +162,24 @@ def _depth_reach(numbers, gaussians, slope, ray, m, entries):
     typical = 4.0 * total / max(count, 1)
     largest = 0.0
     for k in range(count):
-        if reach[k] <= typical:
-            largest = max(largest, reach[k])
+        if radii[k] <= typical:
+            largest = max(largest, radii[k])
     return room, largest
 
 
 @njit(cache=True, error_model="numpy", forceinline=True)
 def _start(numbers, inputs, block):
     """Set what is known of pixels and list positions to what it is before the first; the `_Window`."""
-    entries, lanes, lengths = block.entries, block.fragments.lanes, block.fragments.lengths
+    entries, per_pixel, lengths = block.entries, block.fragments.per_pixel, block.fragments.lengths
     for q in range(PIXELS):
-        lanes[TLO + q] = 1.0
-        lanes[THI + q] = 1.0
-        lanes[REACH + q] = -1.0
-        lanes[RHO + q] = 0.0
-        lanes[LOST + q] = 0.0
-        lanes[OPEN + q] = 0.0
+        per_pixel[TLO + q] = 1.0
+        per_pixel[THI + q] = 1.0
+        per_pixel[LAST + q] = -1.0
+        per_pixel[RHO + q] = 0.0
+        per_pixel[LOST + q] = 0.0
+        per_pixel[OPEN + q] = 0.0
         lengths[q] = 0
-    room, largest = _depth_reach(
+    room, largest = _depth_radii(
         numbers, inputs.gaussians, inputs.axes.depth, block.ray, inputs.shape.monomials, entries
     )
     far = 0
@@ -192,10 +189,10 @@ def _start(numbers, inputs, block):
         entries.last[k] = k
         block.reordering.slots[k] = -1
         entries.asked[k] = 0
-        if entries.reach[k] > largest:
+        if entries.depth_radius[k] > largest:
             entries.far[far] = k
             far += 1
-            farthest = max(farthest, entries.reach[k])
+            farthest = max(farthest, entries.depth_radius[k])
     # row 0 is for fragments that do not move
     for r in range(MOVES):
         block.reordering.moves[r] = 0.0
@@ -203,17 +200,17 @@ def _start(numbers, inputs, block):
 
 
 @njit(cache=True, error_model="numpy")
-def _reached(record, ox, oy, left, right, top, bottom, m, lanes):
+def _pixels_within(record, ox, oy, left, right, top, bottom, m, per_pixel):
     """The set of pixels of a range where the exponent may stay low enough for the threshold.
 
     Row by row, sigma >= (near1^2 + near2^2)/2 bounds the columns, where near1 and near2 are what the forms' spread
     leaves of |y1| and |y2| (design.md, B2). (ox, oy) is the offset of the block's first pixel from the mean.
     """
     inside = ((2 << (bottom * BLOCK + BLOCK - 1)) - 1) & ~((1 << (top * BLOCK)) - 1)
-    wild = record[WILD] != 0.0
+    unbounded = record[UNBOUNDED] != 0.0
     p, c, g, w1, w2 = 0.0, 0.0, 0.0, 0.0, 0.0
     spread1, spread2 = np.inf, np.inf
-    if not wild:
+    if not unbounded:
         stride = m + 1
         p = record[FORMS]
         c = record[FORMS + stride]
@@ -222,27 +219,27 @@ def _reached(record, ox, oy, left, right, top, bottom, m, lanes):
         w2 = record[FORMS + 4 * stride]
         x = max(abs(ox + left), abs(ox + right))
         y = max(abs(oy + top), abs(oy + bottom))
-        spread1 = (record[SPREAD] * x + record[SPREAD + 1] * y + record[SPREAD + 3]) * _ROOM
-        spread2 = (record[SPREAD + 2] * y + record[SPREAD + 4]) * _ROOM
+        spread1 = (record[SPREAD] * x + record[SPREAD + 1] * y + record[SPREAD + 3]) * REGION
+        spread2 = (record[SPREAD + 2] * y + record[SPREAD + 4]) * REGION
     # without a bound on the columns the whole rows are taken
-    numbers = load8(lanes, NUMBERS)
+    numbers = load8(per_pixel, NUMBERS)
     start = float(left) + 0.0 * numbers
     stop = float(right) + 0.0 * numbers
     if p > 0.0 and spread1 < np.inf and spread2 < np.inf:
         inverse = 1.0 / p
         ay = oy + numbers
         near = maximum(0.0, abs(g * ay - w2) - spread2)
-        rest = 2.0 * record[FAINT] * _ROOM - near * near * (2.0 - _ROOM)
-        half = (root(maximum(rest, 0.0)) + spread1) * inverse * _ROOM
+        rest = 2.0 * record[EXPONENT_LIMIT] * REGION - near * near * (2.0 - REGION)
+        half = (root(maximum(rest, 0.0)) + spread1) * inverse * REGION
         center = (c * ay + w1) * inverse - ox
-        slack = (_ROOM - 1.0) * (abs(center) + abs(ox) + half)
+        slack = (REGION - 1.0) * (abs(center) + abs(ox) + half)
         start = maximum(start, center - half - slack)
         stop = where(rest >= 0.0, minimum(stop, center + half + slack), -1.0)
     return spans(minimum(float(BLOCK), start), maximum(-1.0, stop)) & inside
 
 
 @njit(cache=True, error_model="numpy")
-def _pixels_of(record, box, x0, y0, m, lanes):
+def _pixels_of(record, box, x0, y0, m, per_pixel):
     """The set of a block's pixels on which a Gaussian may reach the threshold."""
     left = int(math.ceil(min(max(box[0] - 0.5 - x0, 0.0), float(BLOCK))))
     right = int(math.floor(min(max(box[1] - 0.5 - x0, -1.0), BLOCK - 1.0)))
@@ -251,18 +248,18 @@ def _pixels_of(record, box, x0, y0, m, lanes):
     if top > bottom or left > right:
         return 0
     ox, oy = x0 + 0.5 - record[MEAN_X], y0 + 0.5 - record[MEAN_Y]
-    return signed(_reached(record, ox, oy, left, right, top, bottom, m, lanes))
+    return signed(_pixels_within(record, ox, oy, left, right, top, bottom, m, per_pixel))
 
 
 @njit(cache=True, error_model="numpy", forceinline=True)
-def _pixels_once(k, listed, entries, lanes):
+def _pixels_once(k, listed, entries, per_pixel):
     """`_pixels_of` list position k, found when first asked for."""
     if entries.asked[k] == 0:
         entries.asked[k] = 1
         i = listed.numbers[k]
         entries.pixels[k] = _pixels_of(
             advanced(listed.record, i * listed.columns), advanced(listed.box, 4 * i), listed.x0, listed.y0, listed.m,
-            lanes,
+            per_pixel,
         )  # fmt: skip
     return entries.pixels[k]
 
@@ -278,16 +275,16 @@ def _pixels_at(found, pixels):
 
 
 @njit(cache=True, error_model="numpy", forceinline=True)
-def _find_pairs(k, found, pixels, listed, entries, lanes, window, reordering, count):
+def _find_pairs(k, found, pixels, listed, entries, per_pixel, window, reordering, count):
     """Append the pairs (k, later entry) that share a pixel and are of uncertain order; widen ``first``, ``last``.
 
     ``pixels`` in the lanes ``found`` are k's. Returns the number of pairs, or -1 where there is no room for them.
     """
-    reach, deep, far, pairs = entries.reach, entries.depth, entries.far, reordering.pairs
+    radii, deep, far, pairs = entries.depth_radius, entries.depth, entries.far, reordering.pairs
     i = listed.numbers[k]
     shown = 0
     beyond = listed.length
-    near = reach[k] + window.largest
+    near = radii[k] + window.largest
     # those within the window, then those that reach far
     other = k
     f = 0
@@ -306,13 +303,13 @@ def _find_pairs(k, found, pixels, listed, entries, lanes, window, reordering, co
                 break
             other = far[f]
             f += 1
-            if (deep[other] - deep[k]) * window.room > reach[k] + window.farthest:
+            if (deep[other] - deep[k]) * window.room > radii[k] + window.farthest:
                 break
-        if (deep[other] - deep[k]) * window.room > reach[k] + reach[other]:
+        if (deep[other] - deep[k]) * window.room > radii[k] + radii[other]:
             continue
         if shown == 0:
             shown = _pixels_at(found, pixels)
-        theirs = _pixels_once(other, listed, entries, lanes)
+        theirs = _pixels_once(other, listed, entries, per_pixel)
         if shown & int(theirs) == 0 or not _uncertain(i, listed.numbers[other], listed):
             continue
         if count >= reordering.pair_limit:
@@ -341,11 +338,11 @@ def _still_live(found, pixels, live):
 def _append(number, q, k, t_low, t_high, fragments):
     """Append fragment ``number`` to pixel q's list, with the light that it leaves; returns its place there."""
     at = number * fragments.width
-    lanes, lists = fragments.lanes, fragments.lists
+    per_pixel, lists = fragments.per_pixel, fragments.lists
     fragments.values[at + LEFT] = t_low
-    fragments.values[at + LIGHT] = lanes[THI + q]
-    lanes[TLO + q] = t_low
-    lanes[THI + q] = t_high
+    fragments.values[at + LIGHT] = per_pixel[THI + q]
+    per_pixel[TLO + q] = t_low
+    per_pixel[THI + q] = t_high
     count = fragments.lengths[q]
     entry = LISTED * (q * fragments.capacity + count)
     lists[entry] = number
@@ -361,7 +358,7 @@ def _keep_drawn(found, pixels, number, k, fragments, stop):
 
     Lane b is fragment ``number + b`` on the pixel ``pixels[b]``. Returns the other lanes.
     """
-    lanes, values = fragments.lanes, fragments.values
+    per_pixel, values = fragments.per_pixel, fragments.values
     bright = max(stop.high, stop.floor)
     rest = 0
     while found != 0:
@@ -369,11 +366,11 @@ def _keep_drawn(found, pixels, number, k, fragments, stop):
         found &= found - 1
         q = int(pixels[lane])
         at = (number + lane) * fragments.width
-        t_low = lanes[TLO + q] * (1.0 - values[at + ALPHA_HIGH]) * stop.shrink
+        t_low = per_pixel[TLO + q] * (1.0 - values[at + ALPHA_HIGH]) * stop.shrink
         if not t_low > bright:
             rest |= 1 << lane
             continue
-        t_high = lanes[THI + q] * (1.0 - values[at + ALPHA_LOW]) * stop.grow
+        t_high = per_pixel[THI + q] * (1.0 - values[at + ALPHA_LOW]) * stop.grow
         _append(number + lane, q, k, t_low, t_high, fragments)
     return rest
 
@@ -384,7 +381,7 @@ def _keep_alone(found, pixels, number, k, fragments, stop, live, dim, m):
 
     Returns ``live`` without the pixels that surely stop, and ``dim`` with those that get too little light.
     """
-    lanes, values = fragments.lanes, fragments.values
+    per_pixel, values = fragments.per_pixel, fragments.values
     dark = max(stop.low, stop.floor)
     while found != 0:
         lane = lowest_bit(found)
@@ -392,8 +389,8 @@ def _keep_alone(found, pixels, number, k, fragments, stop, live, dim, m):
         q = int(pixels[lane])
         at = (number + lane) * fragments.width
         high = values[at + ALPHA_HIGH]
-        before = lanes[THI + q]
-        t_low = lanes[TLO + q] * (1.0 - high) * stop.shrink
+        before = per_pixel[THI + q]
+        t_low = per_pixel[TLO + q] * (1.0 - high) * stop.shrink
         t_high = before * (1.0 - values[at + ALPHA_LOW]) * stop.grow
         if t_high <= stop.low:
             # surely the stop: neither this fragment nor any behind it is drawn
@@ -401,11 +398,11 @@ def _keep_alone(found, pixels, number, k, fragments, stop, live, dim, m):
             continue
         if t_low <= stop.high:
             # LOST is the most that any stop so far may leave of the light
-            lanes[LOST + q] = max(lanes[LOST + q], min(before, stop.high / (1.0 - high)))
-            if lanes[LOST + q] >= before:
+            per_pixel[LOST + q] = max(per_pixel[LOST + q], min(before, stop.high / (1.0 - high)))
+            if per_pixel[LOST + q] >= before:
                 set_unknown(values, at, high, m)
             else:
-                lanes[RHO + q] = lanes[LOST + q]
+                per_pixel[RHO + q] = per_pixel[LOST + q]
         _append(number + lane, q, k, t_low, t_high, fragments)
         if t_high <= dark:
             dim = signed(dim | (1 << q))
@@ -416,7 +413,7 @@ def _keep_alone(found, pixels, number, k, fragments, stop, live, dim, m):
 def _keep_moving(found, pixels, number, k, slot, block, stop, dim, moved):
     """Keep the fragments of slot ``slot``, whose place is uncertain; ``dim`` and the number of moves with theirs."""
     fragments, entries, reordering = block.fragments, block.entries, block.reordering
-    lanes, values = fragments.lanes, fragments.values
+    per_pixel, values = fragments.per_pixel, fragments.values
     dark = max(stop.low, stop.floor)
     reordering.slots[k] = slot
     reordering.owners[slot] = k
@@ -426,19 +423,19 @@ def _keep_moving(found, pixels, number, k, slot, block, stop, dim, moved):
         found &= found - 1
         q = int(pixels[lane])
         at = (number + lane) * fragments.width
-        t_low = lanes[TLO + q] * (1.0 - values[at + ALPHA_HIGH]) * stop.shrink
-        t_high = lanes[THI + q] * (1.0 - values[at + ALPHA_LOW]) * stop.grow
+        t_low = per_pixel[TLO + q] * (1.0 - values[at + ALPHA_HIGH]) * stop.shrink
+        t_high = per_pixel[THI + q] * (1.0 - values[at + ALPHA_LOW]) * stop.grow
         count = _append(number + lane, q, k, t_low, t_high, fragments)
         if t_high <= dark:
             dim = signed(dim | (1 << q))
         fragments.lists[LISTED * (q * fragments.capacity + count) + 2] = moved
         for r in range(MOVES * moved, MOVES * (moved + 1), 8):
-            store(reordering.moves, r, 0.0 * load8(lanes, NUMBERS))
+            store(reordering.moves, r, 0.0 * load8(per_pixel, NUMBERS))
         moved += 1
         drawn = signed(drawn | (1 << q))
         reordering.places[slot * PIXELS + q] = count
         # fragments up to the last one whose order is uncertain may still come first
-        lanes[REACH + q] = max(lanes[REACH + q], float(entries.last[k]))
+        per_pixel[LAST + q] = max(per_pixel[LAST + q], float(entries.last[k]))
     reordering.drawn[slot] = drawn
     return dim, moved
 
@@ -503,7 +500,7 @@ def _place_batch(start, some, live, listed, inputs, block):
         prefetch(gaussians.record, ahead, 8 * listed.columns - 8)
         for byte in range(0, 8 * colors.shape[1], 64):
             prefetch(colors, ahead, byte)
-        _pixels_once(start + b, listed, block.entries, block.fragments.lanes)
+        _pixels_once(start + b, listed, block.entries, block.fragments.per_pixel)
     end = 0
     for b in range(some):
         row = advanced(listed.record, listed.numbers[start + b] * listed.columns)
@@ -549,14 +546,14 @@ def _hide_dim(dim, k, length, live, missing, fragments, stop_low):
 
     Returns ``live`` without these and the first position that is ``missing`` in any of them (B6).
     """
-    lanes = fragments.lanes
+    per_pixel = fragments.per_pixel
     while dim != 0:
         q = lowest_bit(dim)
         dim = signed(dim & (dim - 1))
-        if lanes[REACH + q] <= k:
+        if per_pixel[LAST + q] <= k:
             live = signed(live & ~(1 << q))
-            if lanes[THI + q] > stop_low and k + 1 < length:
-                lanes[OPEN + q] = lanes[THI + q]
+            if per_pixel[THI + q] > stop_low and k + 1 < length:
+                per_pixel[OPEN + q] = per_pixel[THI + q]
                 missing = min(missing, k + 1)
     return live, missing
 
@@ -570,9 +567,9 @@ def collect_fragments(numbers, place, inputs, block, marks_):
     slots; or GIVE_UP where more pairs are uncertain than there is room for, or GROW where another buffer is too small.
 
     A list may end where no pose leaves more light than ``inputs.cutoffs.floor``. All that is missing lies behind what
-    it holds, and row OPEN of the lanes bounds the light that comes there, `Palette.unseen` the colours. OPEN is 0 where
-    nothing is missing, as if the floor is negative. Row RHO receives how much transmittance may be lost to a stop that
-    the kept fragments ignore.
+    it holds, and row OPEN of `Fragments.per_pixel` bounds the light that comes there, `Palette.unseen` the colours.
+    OPEN is 0 where nothing is missing, as if the floor is negative. Row RHO receives how much transmittance may be lost
+    to a stop that the kept fragments ignore.
     """
     fragments, entries, reordering, batch = block.fragments, block.entries, block.reordering, block.batch
     gaussians, charges, m = inputs.gaussians, inputs.charges, inputs.shape.monomials
@@ -610,7 +607,7 @@ def collect_fragments(numbers, place, inputs, block, marks_):
                 continue
             k = start + b
             i = listed.numbers[k]
-            pairs = _find_pairs(k, found, pixels, listed, entries, fragments.lanes, window, reordering, pairs)
+            pairs = _find_pairs(k, found, pixels, listed, entries, fragments.per_pixel, window, reordering, pairs)
             if pairs < 0:
                 return GIVE_UP, 0
             # threads share these bytes: written no more than once each
@@ -635,21 +632,21 @@ def collect_fragments(numbers, place, inputs, block, marks_):
 
 
 @njit(cache=True, error_model="numpy")
-def settle_stops(slots, block, inputs):
+def apply_stops(slots, block, inputs):
     """Drop or weaken the fragments of uncertain depth order that the stop may hide (design.md, B6).
 
     ``slots`` is their number.
     """
     fragments, entries, reordering = block.fragments, block.entries, block.reordering
-    values, width, lists, lanes = fragments.values, fragments.width, fragments.lists, fragments.lanes
+    values, width, lists, per_pixel = fragments.values, fragments.width, fragments.lists, fragments.per_pixel
     m, stop, step = inputs.shape.monomials, inputs.rules.transmittance_min, inputs.charges.transmittance
     stop_low = stop * (1.0 - step)
     stop_high = stop * (1.0 + step)
     # the stop is out of reach of most pixels
     dark = 0
     for q in range(PIXELS):
-        lanes[HIDDEN + q] = 0.0
-        if not lanes[TLO + q] > stop_high:
+        per_pixel[HIDDEN + q] = 0.0
+        if not per_pixel[TLO + q] > stop_high:
             dark |= 1 << q
     if dark == 0:
         return
@@ -680,27 +677,27 @@ def settle_stops(slots, block, inputs):
             high = values[at + ALPHA_HIGH]
             lost = min(light, stop_high / (1.0 - high))
             if t_high <= stop_low:
-                lanes[HIDDEN + q] = max(lanes[HIDDEN + q], lost)
+                per_pixel[HIDDEN + q] = max(per_pixel[HIDDEN + q], lost)
                 set_unknown(values, at, 0.0, m)
             elif lost < light:
                 # kept; what the stop may leave of the light is added at the end
-                lanes[RHO + q] = max(lanes[RHO + q], lost, lanes[LOST + q])
+                per_pixel[RHO + q] = max(per_pixel[RHO + q], lost, per_pixel[LOST + q])
             else:
-                lanes[HIDDEN + q] = max(lanes[HIDDEN + q], lost)
+                per_pixel[HIDDEN + q] = max(per_pixel[HIDDEN + q], lost)
                 set_unknown(values, at, high, m)
     # a stop at a dropped or weakened fragment also hides the kept fragments behind it
     for q in range(PIXELS):
-        if lanes[RHO + q] > 0.0:
-            lanes[RHO + q] = max(lanes[RHO + q], lanes[HIDDEN + q])
+        if per_pixel[RHO + q] > 0.0:
+            per_pixel[RHO + q] = max(per_pixel[RHO + q], per_pixel[HIDDEN + q])
 
 
 @njit(cache=True, error_model="numpy")
 def number_groups(length, entries):
     """Number the groups of list positions into ``entries.far``: no uncertain pair spans two groups (design.md, O4)."""
     group = 0
-    reach = -1
+    last = -1
     for k in range(length):
-        if k > reach:
+        if k > last:
             group += 1
         entries.far[k] = group
-        reach = max(reach, entries.last[k])
+        last = max(last, entries.last[k])

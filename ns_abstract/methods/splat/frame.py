@@ -47,16 +47,16 @@ class Context:
 
     Attributes:
         visible: [n] scene indices.
-        reach: [n, 4] first and past tile columns, first and past tile rows.
+        tile_ranges: [n, 4] first and past tile columns, first and past tile rows.
     """
 
     visible: np.ndarray
-    reach: np.ndarray
+    tile_ranges: np.ndarray
 
     @property
     def nbytes(self) -> int:
         """Memory that it holds."""
-        return self.visible.nbytes + self.reach.nbytes
+        return self.visible.nbytes + self.tile_ranges.nbytes
 
     @property
     def shown(self) -> np.ndarray:
@@ -246,7 +246,7 @@ class SplatFrame:
         lower, upper = outward(cell.lower, cell.upper)
         # hardly smaller: not worth its memory
         kept = within is not None and cell.visible.size > _WORTH_KEEPING * within.visible.size
-        context = within if within is not None and kept else Context(cell.visible, cell.reach)
+        context = within if within is not None and kept else Context(cell.visible, cell.tile_ranges)
         linear = None
         if keep_linear:
             assert cell.linear is not None
@@ -259,7 +259,7 @@ class SplatFrame:
         if tiles.size == self.tile_count:
             return within.visible
         mask = tile_mask(tiles, self.tile_count)
-        return within.visible[touching(np.arange(within.visible.size), within.reach, mask, self.across)]
+        return within.visible[touching(np.arange(within.visible.size), within.tile_ranges, mask, self.across)]
 
     def _shear(self) -> dict[str, dict[str, float]]:
         """For each rotation, how much of it undoes what one unit of another parameter moves typical Gaussians by."""

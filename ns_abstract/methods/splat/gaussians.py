@@ -12,10 +12,10 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit, prange
 
-from ns_abstract.arithmetic.rounding import UNIT64, Charges
+from ns_abstract.arithmetic.rounding import SUM_ROUNDING, Charges
 from ns_abstract.arithmetic.simd.intrinsics import borrowed, pointer
 from ns_abstract.arithmetic.simd.lanes import bits, load8, scatter_columns, store, where
-from ns_abstract.arithmetic.simd.wide_forms import bounds, reach, size
+from ns_abstract.arithmetic.simd.wide_forms import bounds, magnitude, size
 from ns_abstract.methods.splat import records as row
 from ns_abstract.methods.splat.form_projection import WORKSPACE, project_forms, rotate
 from ns_abstract.methods.splat.line_projection import compensate_line, project_line
@@ -33,8 +33,6 @@ from ns_abstract.methods.splat.records import (
 from ns_abstract.methods.splat.stage_data import CellPoses, ProjectedGaussians, ProjectionInputs, SceneGaussians
 
 _CHUNK = 1024
-_COEFFICIENT = 8.0 * UNIT64
-_UP = 1.0 + 128.0 * UNIT64
 
 
 def covariance_noise(axes: np.ndarray, charges: Charges) -> np.ndarray:
@@ -68,13 +66,13 @@ class _Scratch(NamedTuple):
     Attributes:
         work: Forms of eight, flat; see `form_projection`.
         rows: Rows of lanes, flat; see `records`.
-        lanes: [17, LANES] for `line_projection.compensate_line`.
+        logarithms: [17, LANES] for `line_projection.compensate_line`.
         places: [LANES] where records go.
     """
 
     work: np.ndarray
     rows: np.ndarray
-    lanes: np.ndarray
+    logarithms: np.ndarray
     places: np.ndarray
 
 
@@ -83,11 +81,12 @@ def _borrowed_inputs(scene, poses, camera, rules, charges, shape):
     """The `ProjectionInputs` without references to the arrays' owners."""
     scene = SceneGaussians(
         borrowed(scene.means), borrowed(scene.mean_radius), borrowed(scene.axes), borrowed(scene.extents),
-        borrowed(scene.noise), borrowed(scene.opacity_low), borrowed(scene.opacity_high), borrowed(scene.faint),
+        borrowed(scene.noise), borrowed(scene.opacity_low), borrowed(scene.opacity_high),
+        borrowed(scene.exponent_limits),
     )  # fmt: skip
     poses = CellPoses(
-        borrowed(poses.rotation), borrowed(poses.offset), borrowed(poses.origin), borrowed(poses.camera_reach),
-        borrowed(poses.rotation_reach),
+        borrowed(poses.rotation), borrowed(poses.offset), borrowed(poses.origin), borrowed(poses.camera_magnitude),
+        borrowed(poses.rotation_magnitude),
     )  # fmt: skip
     return ProjectionInputs(scene, poses, camera, rules, charges, shape)
 
@@ -106,7 +105,7 @@ def _stage_chunk(chunk, candidates_, inputs, out, state_):
         np.empty((17, LANES)),
         np.empty(LANES, np.int64),
     )
-    scratch = _Scratch(borrowed(owned.work), borrowed(owned.rows), borrowed(owned.lanes), borrowed(owned.places))
+    scratch = _Scratch(borrowed(owned.work), borrowed(owned.rows), borrowed(owned.logarithms), borrowed(owned.places))
     start = chunk * _CHUNK
     stop = min(candidates.shape[0], start + _CHUNK)
     alive_ = np.empty(_CHUNK, np.int64)
@@ -114,12 +113,12 @@ def _stage_chunk(chunk, candidates_, inputs, out, state_):
     alive, everyone = borrowed(alive_), borrowed(everyone_)
     count = 0
     for first in range(start, stop, LANES):
-        lanes = min(LANES, stop - first)
-        block = everyone[first - start : first - start + lanes]
+        filled = min(LANES, stop - first)
+        block = everyone[first - start : first - start + filled]
         count = _cull_block(candidates, block, inputs, scratch, state, alive, count)
     for first in range(0, count, LANES):
-        lanes = min(LANES, count - first)
-        _project_block(candidates, alive[first : first + lanes], inputs, scratch, out, state)
+        filled = min(LANES, count - first)
+        _project_block(candidates, alive[first : first + filled], inputs, scratch, out, state)
     # the owners of the borrowed arrays live to here
     return len(owned) + alive_.size + everyone_.size
 
@@ -154,10 +153,10 @@ def _cull_block(candidates, block, inputs, scratch, state, alive, count):
     fx, fy, cx, cy, width, height = inputs.camera
     margin = rules.view_margin
     gather_means(candidates, block, scene, poses.origin, s_)
-    lanes = block.shape[0]
+    filled = block.shape[0]
     extents, opacity_high = scene.extents, scene.opacity_high
     for q in range(LANES):
-        i = candidates[block[min(q, lanes - 1)]]
+        i = candidates[block[min(q, filled - 1)]]
         s[row.EXTENT + q] = extents[i]
         s[row.OPHIGH + q] = opacity_high[i]
     coordinate_errors(s_, LANES, poses, charges)
@@ -174,10 +173,10 @@ def _cull_block(candidates, block, inputs, scratch, state, alive, count):
     modelled = projected_stretch(rules, inputs.camera)
     most = charges.overflow / max(1.0, modelled / rules.near)
     z = 2 * size(m)
-    for first in range(0, lanes, 8):
+    for first in range(0, filled, 8):
         v = load8(s, row.V0 + first), load8(s, row.V1 + first), load8(s, row.V2 + first)
         rotate(work, rotation, 2, v, offset, True, 0.0 * v[0], z, inputs.shape)
-        nearest, farthest = bounds(work, z, d, order, m)
+        nearest, farthest = bounds(work, z, m, order, d)
         spread_z = load8(s, row.SZ + first) + load8(s, row.EZ + first)
         # a bound that is not a number keeps the Gaussian
         gone = (farthest + spread_z < rules.near) | (nearest - spread_z > rules.far)
@@ -185,7 +184,7 @@ def _cull_block(candidates, block, inputs, scratch, state, alive, count):
         tame = (largest * modelled < safe) & (largest * largest < most)
         # antialiased, rounding may raise it: see `regions`
         if not rules.antialiased:
-            gone = gone | (tame & (load8(s, row.OPHIGH + first) * (1.0 + charges.faint) < rules.alpha_min))
+            gone = gone | (tame & (load8(s, row.OPHIGH + first) * (1.0 + charges.exponent_limit) < rules.alpha_min))
         extent = rules.radius_sigmas * stretch * largest * REGION
         for axis in range(2):
             a = axis * size(m)
@@ -198,7 +197,7 @@ def _cull_block(candidates, block, inputs, scratch, state, alive, count):
             behind = _linear_top(work, a, -focal, z, length - center + blur, order, m) + error
             gone = gone | (tame & ((before * REGION < 0.0) | (behind * REGION < 0.0)))
         hidden = bits(gone)
-        for lane in range(min(8, lanes - first)):
+        for lane in range(min(8, filled - first)):
             index = block[first + lane]
             if hidden & (1 << lane) != 0:
                 state[index] = 0
@@ -215,33 +214,33 @@ def _linear_top(w, a, s, b, t, order, m):
     top = s * load8(w, a) + t * load8(w, b) + abs(s) * load8(w, a + 8 * m) + abs(t) * load8(w, b + 8 * m)
     for k in range(1, m):
         top = top + abs(s * load8(w, a + 8 * k) + t * load8(w, b + 8 * k))
-    return top + 8.0 * _COEFFICIENT * (abs(s) * reach(w, a, order, m) + abs(t) * reach(w, b, order, m))
+    return top + 8.0 * SUM_ROUNDING * (abs(s) * magnitude(w, a, m, order) + abs(t) * magnitude(w, b, m, order))
 
 
 @njit(cache=True, error_model="numpy")
 def _project_block(candidates, block, inputs, scratch, out, state):
     """Records of up to `LANES` Gaussians (design.md, G4-G11)."""
     scene, poses, camera, rules, charges, shape = inputs
-    s, lanes = scratch.rows, scratch.lanes
+    s, logarithms = scratch.rows, scratch.logarithms
     # loops of a length that the compiler does not know become vector code
-    n = lanes.shape[1]
+    n = logarithms.shape[1]
     gather(candidates, block, scene, poses.origin, s)
     coordinate_errors(s, n, poses, charges)
     if shape.order == 2:
         project_line(s, n, poses.rotation, poses.offset, camera, rules)
         if rules.antialiased:
-            compensate_line(s, n, lanes[:6], lanes[6:11], lanes[11:])
+            compensate_line(s, n, logarithms[:6], logarithms[6:11], logarithms[11:])
     else:
         project_forms(
             pointer(scratch.work), pointer(s), pointer(poses.rotation), pointer(poses.offset), camera, rules, shape
         )
-    float_errors(s, n, rules, camera, charges, poses.rotation_reach)
+    float_errors(s, n, rules, camera, charges, poses.rotation_magnitude)
     if rules.antialiased:
         compensations(s, n, rules, charges)
     regions(s, n, rules, camera, charges)
     _fill_records(pointer(s), camera.cx, camera.cy, 6 if rules.antialiased else 5, shape.monomials)
     _scatter_records(block, s, scratch.places, out.record)
-    _set_outputs(block, s, poses.rotation_reach, charges, out, state)
+    _set_outputs(block, s, poses.rotation_magnitude, charges, out, state)
 
 
 @njit(cache=True, error_model="numpy")
@@ -251,23 +250,23 @@ def _scatter_records(block, s, places, record):
     for q in range(LANES):
         places[q] = block[min(q, last)]
     width = record.shape[1]
-    lanes, out, to = pointer(s), pointer(record), pointer(places)
+    rows, out, to = pointer(s), pointer(record), pointer(places)
     for q in range(0, LANES, 8):
         for column in range(0, width, 8):
             at = row.RECORD + column * LANES + q
             # lanes in excess repeat the last one
             scatter_columns(
-                out, to, q, width, column, load8(lanes, at), load8(lanes, at + LANES),
-                load8(lanes, at + 2 * LANES), load8(lanes, at + 3 * LANES), load8(lanes, at + 4 * LANES),
-                load8(lanes, at + 5 * LANES), load8(lanes, at + 6 * LANES), load8(lanes, at + 7 * LANES),
+                out, to, q, width, column, load8(rows, at), load8(rows, at + LANES),
+                load8(rows, at + 2 * LANES), load8(rows, at + 3 * LANES), load8(rows, at + 4 * LANES),
+                load8(rows, at + 5 * LANES), load8(rows, at + 6 * LANES), load8(rows, at + 7 * LANES),
             )  # fmt: skip
 
 
 @njit(cache=True, error_model="numpy")
-def _set_outputs(block, s, rotation_reach, charges, out, state):
+def _set_outputs(block, s, rotation_magnitude, charges, out, state):
     """Write what `ProjectedGaussians` hold beside records, and the state (design.md, G10, S3)."""
     depth, depth_error, delta, box, tiles = out.depth, out.depth_error, out.delta, out.box, out.tiles
-    r0, r1, r2 = rotation_reach[6], rotation_reach[7], rotation_reach[8]
+    r0, r1, r2 = rotation_magnitude[6], rotation_magnitude[7], rotation_magnitude[8]
     for q in range(block.shape[0]):
         index = block[q]
         if s[row.GONE + q] != 0.0:
@@ -309,7 +308,7 @@ def _fill_records(s, cx, cy, count, m):
             start = row.FP + f * stride * LANES + q
             first = abs(load8(s, start))
             # with 16 units for the rounding of what the pixel stage adds up
-            spread = 2.0 * _COEFFICIENT * first
+            spread = 2.0 * SUM_ROUNDING * first
             for k in range(1, stride):
                 spread = spread + abs(load8(s, start + k * LANES))
             if f == 3 or f == 4:
@@ -319,5 +318,5 @@ def _fill_records(s, cx, cy, count, m):
                 store(s, row.R_SPREAD + f * LANES + q, spread)
             total = total + first + spread
         tame = (load8(s, row.KNOWN + q) == 1.0) & (total < np.inf)
-        store(s, row.R_WILD + q, where(tame, 0.0, 1.0))
-        store(s, row.R_FAINT + q, where(tame, load8(s, row.R_FAINT + q), -1.0))
+        store(s, row.R_UNBOUNDED + q, where(tame, 0.0, 1.0))
+        store(s, row.R_EXPONENT_LIMIT + q, where(tame, load8(s, row.R_EXPONENT_LIMIT + q), -1.0))

@@ -4,12 +4,10 @@ from __future__ import annotations
 
 from numba import njit
 
-from ns_abstract.arithmetic.line_forms import combined, ends, inverse_root, load, multiplied, scaled, size, store
-from ns_abstract.arithmetic.rounding import UNIT64
+from ns_abstract.arithmetic.line_forms import combined, ends, inverse_root, load, magnitude, multiplied, scaled, store
+from ns_abstract.arithmetic.rounding import SUM_ROUNDING, UP
 from ns_abstract.methods.splat.records import LANES
 
-_COEFFICIENT = 8.0 * UNIT64
-_UP = 1.0 + 128.0 * UNIT64
 # Slots of the scratch of `colors.moving_colors` in one row; a slot has 6 rows of lanes.
 _X, _Y, _Z, _Z2, _C1, _S1, _C2, _S2, _BASIS, _SPARE, _RED = range(6 * 6 * LANES, 17 * 6 * LANES, 6 * LANES)
 _SLOT = 6 * LANES
@@ -123,6 +121,6 @@ def _accumulated(s, n, weights, target):
         c, g, b = (
             found[0] + weights[q] * basis[0], found[1] + weights[q] * basis[1], found[2] + weights[q] * basis[2],
         )  # fmt: skip
-        reach = w * size(basis)
-        radius = (found[3] + w * basis[3] + _COEFFICIENT * (reach + abs(c) + reach)) * _UP
+        added = w * magnitude(basis)
+        radius = (found[3] + w * basis[3] + SUM_ROUNDING * (added + abs(c) + added)) * UP
         store((c, g, b, radius), s, target, LANES, q)

@@ -12,18 +12,15 @@ from ns_abstract.arithmetic.line_forms import (
     inverse,
     inverse_root,
     load,
+    magnitude,
     multiplied,
     raised,
     scaled,
-    size,
     store,
 )
-from ns_abstract.arithmetic.rounding import UNIT64
+from ns_abstract.arithmetic.rounding import SUM_ROUNDING, UP
 from ns_abstract.methods.splat import records as row
 from ns_abstract.methods.splat.records import LANES
-
-_COEFFICIENT = 8.0 * UNIT64
-_UP = 1.0 + 128.0 * UNIT64
 
 
 @njit(cache=True, error_model="numpy", inline="always")
@@ -46,12 +43,12 @@ def _rotated(r, x, y, z, shift, shift_size, spread):
     """``r . (x, y, z) + shift`` for exact x, y, z and a form ``shift``, widened (`form_projection.rotate`)."""
     a, b, c = abs(x), abs(y), abs(z)
     radius = r[9] * a + r[10] * b + r[11] * c + shift[3]
-    radius += _COEFFICIENT * (r[12] * a + r[13] * b + r[14] * c + shift_size)
+    radius += SUM_ROUNDING * (r[12] * a + r[13] * b + r[14] * c + shift_size)
     return (
         r[0] * x + r[1] * y + r[2] * z + shift[0],
         r[3] * x + r[4] * y + r[5] * z + shift[1],
         r[6] * x + r[7] * y + r[8] * z + shift[2],
-        radius * _UP + spread,
+        radius * UP + spread,
     )
 
 
@@ -69,8 +66,8 @@ def _pixels(a, z, ratio, focal):
     """``focal a - (focal ratio) z``, which vanishes at the middle of the cell: a pixel offset times depth."""
     # the pixel offset used later is exactly focal * ratio in float64
     shift = focal * ratio
-    radius = focal * a[3] + abs(shift) * z[3] + _COEFFICIENT * (focal * size(a) + abs(shift) * size(z))
-    return focal * a[0] - shift * z[0], focal * a[1] - shift * z[1], focal * a[2] - shift * z[2], radius * _UP
+    radius = focal * a[3] + abs(shift) * z[3] + SUM_ROUNDING * (focal * magnitude(a) + abs(shift) * magnitude(z))
+    return focal * a[0] - shift * z[0], focal * a[1] - shift * z[1], focal * a[2] - shift * z[2], radius * UP
 
 
 @njit(cache=True, error_model="numpy", inline="always")
@@ -106,7 +103,7 @@ def project_line(s, n, rotation, offset, camera, rules):
     offset_x = (offset[0, 0], offset[1, 0], offset[2, 0], offset[3, 0])
     offset_y = (offset[0, 1], offset[1, 1], offset[2, 1], offset[3, 1])
     offset_z = (offset[0, 2], offset[1, 2], offset[2, 2], offset[3, 2])
-    size_x, size_y, size_z = size(offset_x), size(offset_y), size(offset_z)
+    size_x, size_y, size_z = magnitude(offset_x), magnitude(offset_y), magnitude(offset_z)
     still = (0.0, 0.0, 0.0, 0.0)
     left, right, top, bottom = np.inf, np.inf, np.inf, np.inf
     if margin >= 0.0:
@@ -133,17 +130,17 @@ def project_line(s, n, rotation, offset, camera, rules):
         # w = R B, then n0 = w0 - u w2, n1 = w1 - v w2
         b0, b1, b2 = s[row.B00 + q], s[row.B10 + q], s[row.B20 + q]
         deep = _rotated(r2, b0, b1, b2, still, 0.0, 0.0)
-        s[row.DEEP0 + q] = size(deep) + deep[3]
+        s[row.DEEP0 + q] = magnitude(deep) + deep[3]
         n00 = _lowered(_rotated(r0, b0, b1, b2, still, 0.0, 0.0), u, deep)
         n10 = _lowered(_rotated(r1, b0, b1, b2, still, 0.0, 0.0), v, deep)
         b0, b1, b2 = s[row.B01 + q], s[row.B11 + q], s[row.B21 + q]
         deep = _rotated(r2, b0, b1, b2, still, 0.0, 0.0)
-        s[row.DEEP1 + q] = size(deep) + deep[3]
+        s[row.DEEP1 + q] = magnitude(deep) + deep[3]
         n01 = _lowered(_rotated(r0, b0, b1, b2, still, 0.0, 0.0), u, deep)
         n11 = _lowered(_rotated(r1, b0, b1, b2, still, 0.0, 0.0), v, deep)
         b0, b1, b2 = s[row.B02 + q], s[row.B12 + q], s[row.B22 + q]
         deep = _rotated(r2, b0, b1, b2, still, 0.0, 0.0)
-        s[row.DEEP2 + q] = size(deep) + deep[3]
+        s[row.DEEP2 + q] = magnitude(deep) + deep[3]
         n02 = _lowered(_rotated(r0, b0, b1, b2, still, 0.0, 0.0), u, deep)
         n12 = _lowered(_rotated(r1, b0, b1, b2, still, 0.0, 0.0), v, deep)
         # a' = fx^2 |n0|^2 + eps z^2, c' = fy^2 |n1|^2 + eps z^2, b' = fx fy n0.n1 (covariance times z^2)

@@ -14,7 +14,7 @@ from numba import njit, prange
 from ns_abstract.arithmetic.simd.intrinsics import borrowed, pointer, taken
 from ns_abstract.methods.splat.blend import shade, swap_bounds
 from ns_abstract.methods.splat.block import Place, block_of, longest_list, new_buffers, resized
-from ns_abstract.methods.splat.fragments import GIVE_UP, GROW, collect_fragments, number_groups, settle_stops
+from ns_abstract.methods.splat.fragments import GIVE_UP, GROW, apply_stops, collect_fragments, number_groups
 from ns_abstract.methods.splat.lists import BLOCK, PIXELS, block_lists, longest_first
 from ns_abstract.methods.splat.stage_data import Colors, PixelBounds, PixelInputs, ProjectedGaussians, ViewingAxes
 
@@ -59,7 +59,7 @@ def _bound_block(numbers, place, inputs, block, bounds):
         return True
     if slots > 0:
         swap_bounds(pairs, slots, block)
-        settle_stops(slots, block, inputs)
+        apply_stops(slots, block, inputs)
         number_groups(numbers.size, block.entries)
     bounds.statistics[1] += longest_list(block.fragments.lengths)
     bounds.statistics[2] += pairs

@@ -5,8 +5,8 @@ For every Gaussian that some pose of the cell may show, one record is written:
     0, 1   mean in pixels at the cell's middle (the point pixel offsets are taken from)
     2, 3   lower and upper opacity
     4      kappa: relative error of the exponent that float evaluation may add
-    5      1 where nothing but the opacity is known ("wild"), else 0
-    6      exponent from which on alpha is below the threshold, however it is evaluated (B4); -1 if wild
+    5      1 where nothing but the opacity is known ("unbounded"), else 0
+    6      exponent from which on alpha is below the threshold, however it is evaluated (B4); -1 if unbounded
     7 ..   of the forms P, Q, S, W1, W2: how far each may be from its centre, for pixels that surely see nothing
     12 ..  forms P, Q, S, W1, W2 (and K if antialiased; 0 where the opacity is compensated), each m coefficients and
            a radius
@@ -21,18 +21,15 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from ns_abstract.arithmetic.rounding import UNIT64, Charges
+from ns_abstract.arithmetic.rounding import REGION, UNIT64, UP, Charges
 
 #: Lanes of one block of the compiled stage.
 LANES = 32
-_UP = 1.0 + 128.0 * UNIT64
 #: The squared compensation from which on its logarithm is used.
 _LEAST_SQUARE = 1e-60
-#: Room for rounding where a region of pixels or tiles is computed from bounds.
-REGION = 1.0 + 2.0**-30
 
 # columns of a record before its forms
-MEAN_X, MEAN_Y, OPACITY_LOW, OPACITY_HIGH, KAPPA, WILD, FAINT, SPREAD = range(8)
+MEAN_X, MEAN_Y, OPACITY_LOW, OPACITY_HIGH, KAPPA, UNBOUNDED, EXPONENT_LIMIT, SPREAD = range(8)
 FORMS = SPREAD + 5
 
 
@@ -51,11 +48,11 @@ def columns(count, m):
     N0, N1, N2, N3, N4, N5, N6, N7, N8, N9, N10, N11,
     M0, M1, M2, R0, R1, R2,
     # ends of the opacity's range, exponent at which it reaches the threshold
-    OPLOW, OPHIGH, OPFAINT,
+    OPLOW, OPHIGH, OPLIMIT,
     # largest standard deviation
     EXTENT,
     # bounds that the projection leaves: depth, ratios, scaled covariance entries, determinant, half difference,
-    # squared compensation, reach of the third row of rotation times axes
+    # squared compensation, magnitude of the third row of rotation times axes
     ZLO, ZHI, ULO, UHI, VLO, VHI, ALO, AHI, CLO, CHI, BLO, BHI, DLO, DHI, LO, HI, SQLO, SQHI, DEEP0, DEEP1, DEEP2,
     # depth and mean in pixels from the middle of the view, at the cell's middle
     Z0, X0, Y0,
@@ -72,8 +69,9 @@ def columns(count, m):
 ) = range(0, 106 * LANES, LANES)  # fmt: skip
 # a record, column by column
 RECORD = T7 + LANES
-R_MEAN_X, R_MEAN_Y, R_OPACITY_LOW, R_OPACITY_HIGH, R_KAPPA, R_WILD, R_FAINT, R_SPREAD = (
-    RECORD + column * LANES for column in (MEAN_X, MEAN_Y, OPACITY_LOW, OPACITY_HIGH, KAPPA, WILD, FAINT, SPREAD)
+R_MEAN_X, R_MEAN_Y, R_OPACITY_LOW, R_OPACITY_HIGH, R_KAPPA, R_UNBOUNDED, R_EXPONENT_LIMIT, R_SPREAD = (
+    RECORD + column * LANES
+    for column in (MEAN_X, MEAN_Y, OPACITY_LOW, OPACITY_HIGH, KAPPA, UNBOUNDED, EXPONENT_LIMIT, SPREAD)
 )
 # its forms, four rows each where there is one parameter, and behind them the determinant
 FP, FQ, FS, FW1, FW2, FK, FD = range(RECORD + FORMS * LANES, RECORD + (FORMS + 28) * LANES, 4 * LANES)
@@ -89,9 +87,9 @@ def table_rows(width):
 def gather_means(candidates, block, scene, origin, s):
     """Copy the means of the Gaussians ``block`` to the rows V0 .. V2, M0 .. R2; lanes in excess repeat the last one."""
     means, mean_radius = scene.means, scene.mean_radius
-    lanes = block.shape[0]
+    filled = block.shape[0]
     for q in range(LANES):
-        i = candidates[block[min(q, lanes - 1)]]
+        i = candidates[block[min(q, filled - 1)]]
         for k in range(3):
             s[V0 + k * LANES + q] = means[i, k] - origin[k]
             s[M0 + k * LANES + q] = abs(means[i, k])
@@ -100,14 +98,14 @@ def gather_means(candidates, block, scene, origin, s):
 
 @njit(cache=True, error_model="numpy")
 def gather(candidates, block, scene, origin, s):
-    """Copy what the Gaussians ``block`` are made of to the rows V0 .. OPFAINT; lanes in excess repeat the last one."""
+    """Copy what the Gaussians ``block`` are made of to the rows V0 .. OPLIMIT; lanes in excess repeat the last one."""
     gather_means(candidates, block, scene, origin, s)
-    axes, noise, opacity_low, opacity_high, faint = (
-        scene.axes, scene.noise, scene.opacity_low, scene.opacity_high, scene.faint,
+    axes, noise, opacity_low, opacity_high, exponent_limits = (
+        scene.axes, scene.noise, scene.opacity_low, scene.opacity_high, scene.exponent_limits,
     )  # fmt: skip
-    lanes = block.shape[0]
+    filled = block.shape[0]
     for q in range(LANES):
-        i = candidates[block[min(q, lanes - 1)]]
+        i = candidates[block[min(q, filled - 1)]]
         for column in range(3):
             for k in range(3):
                 s[B00 + (3 * column + k) * LANES + q] = axes[i, k, column]
@@ -115,16 +113,16 @@ def gather(candidates, block, scene, origin, s):
             s[N0 + k * LANES + q] = noise[i, k]
         s[OPLOW + q] = opacity_low[i]
         s[OPHIGH + q] = opacity_high[i]
-        s[OPFAINT + q] = faint[i]
+        s[OPLIMIT + q] = exponent_limits[i]
 
 
 @njit(cache=True, error_model="numpy")
 def coordinate_errors(s, n, poses, charges):
     """Float errors of the camera coordinates and what ranges of means add to them (G2, S2): rows EX .. SZ."""
-    rotation_reach, camera_reach = poses.rotation_reach, poses.camera_reach
-    c0, c1, c2 = camera_reach[0], camera_reach[1], camera_reach[2]
+    rotation_magnitude, camera_magnitude = poses.rotation_magnitude, poses.camera_magnitude
+    c0, c1, c2 = camera_magnitude[0], camera_magnitude[1], camera_magnitude[2]
     for row in range(3):
-        r0, r1, r2 = rotation_reach[3 * row], rotation_reach[3 * row + 1], rotation_reach[3 * row + 2]
+        r0, r1, r2 = rotation_magnitude[3 * row], rotation_magnitude[3 * row + 1], rotation_magnitude[3 * row + 2]
         error, spread = EX + row * LANES, SX + row * LANES
         for q in range(n):
             total = (
@@ -132,15 +130,15 @@ def coordinate_errors(s, n, poses, charges):
                 + r1 * (s[M1 + q] + s[R1 + q] + c1)
                 + r2 * (s[M2 + q] + s[R2 + q] + c2)
             )
-            s[error + q] = charges.camera_coordinate * total * _UP
+            s[error + q] = charges.camera_coordinate * total * UP
         for q in range(n):
-            s[spread + q] = (r0 * s[R0 + q] + r1 * s[R1 + q] + r2 * s[R2 + q]) * _UP
+            s[spread + q] = (r0 * s[R0 + q] + r1 * s[R1 + q] + r2 * s[R2 + q]) * UP
 
 
 @njit(cache=True, error_model="numpy", inline="always")
-def _rotation_row(reach, k):
+def _rotation_row(magnitude, k):
     """Upper bounds of the absolute entries of row ``k`` of the rotation."""
-    return reach[3 * k], reach[3 * k + 1], reach[3 * k + 2]
+    return magnitude[3 * k], magnitude[3 * k + 1], magnitude[3 * k + 2]
 
 
 @njit(cache=True, error_model="numpy", inline="always")
@@ -165,14 +163,15 @@ def _dot(a, b):
 
 
 @njit(cache=True, error_model="numpy")
-def float_errors(s, n, rules, camera, charges, rotation_reach):
+def float_errors(s, n, rules, camera, charges, rotation_magnitude):
     """Float errors of mean, covariance and exponent, and the radius' range (design.md, G5-G8): rows ZLOW .. TAME.
 
     Numbers of Gaussians that may come too near are of no use; `regions` does not look at them. One loop, because the
     compiler makes vector code of it as it stands: lanes are Gaussians.
     """
     fx, fy, cx, cy, width, height = camera
-    r0, r1, r2 = _rotation_row(rotation_reach, 0), _rotation_row(rotation_reach, 1), _rotation_row(rotation_reach, 2)
+    r0, r1 = _rotation_row(rotation_magnitude, 0), _rotation_row(rotation_magnitude, 1)
+    r2 = _rotation_row(rotation_magnitude, 2)
     limit_x, limit_y, clamp_x, clamp_y = np.inf, np.inf, 0.0, 0.0
     if rules.view_margin >= 0.0:
         limit_x = max(cx, width - cx) / fx + rules.view_margin * 0.5 * width / fx
@@ -346,10 +345,10 @@ def compensations(s, n, rules, charges):
         s[CHIGHLOG + q] = np.log(s[CHIGH + q] * REGION)
 
 
-def faint_exponents(opacity_high: np.ndarray, alpha_min: float, charges: Charges) -> np.ndarray:
+def exponent_limits(opacity_high: np.ndarray, alpha_min: float, charges: Charges) -> np.ndarray:
     """Exponents [N] from which on opacities [N] leave less than ``alpha_min``, however they are evaluated (B4)."""
     with np.errstate(divide="ignore"):
-        exponent = np.log(opacity_high * (1.0 + charges.opacity) * (1.0 + charges.faint) / alpha_min)
+        exponent = np.log(opacity_high * (1.0 + charges.opacity) * (1.0 + charges.exponent_limit) / alpha_min)
     # room for the rounding of the exponential, which grows more slowly than the exponent's own error
     return exponent * REGION + 2.0**-30
 
@@ -461,15 +460,15 @@ def regions(s, n, rules, camera, charges):
         kappa = kappa * (1.0 + 4.0 * kappa)
         lower = s[OPLOW + q] * (1.0 - charges.opacity)
         upper = s[OPHIGH + q] * (1.0 + charges.opacity)
-        faint = s[OPFAINT + q]
-        reached = faint
+        limit = s[OPLIMIT + q]
+        region_limit = limit
         if antialiased:
             # G11; where the determinant may vanish, nothing is known of the compensation
             known = known & (s[CTOP + q] < np.inf)
-            reached = faint + s[CTOPLOG + q]
-            faint = faint + s[CHIGHLOG + q]
+            region_limit = limit + s[CTOPLOG + q]
+            limit = limit + s[CHIGHLOG + q]
             all_of_it = min(1.0, upper * s[CTOP + q]) if sharp_enough & (s[CTOP + q] < np.inf) else 1.0
-            gone = gone | (all_of_it * (1.0 + charges.faint) < alpha_min)
+            gone = gone | (all_of_it * (1.0 + charges.exponent_limit) < alpha_min)
             lower = lower * s[CLOW + q] if known else lower
             upper = upper * s[CHIGH + q] if known else all_of_it
         # a minimum with a number is a number: an exponent that is none leaves the largest alpha
@@ -479,11 +478,11 @@ def regions(s, n, rules, camera, charges):
         s[R_OPACITY_HIGH + q] = upper
         s[R_KAPPA + q] = kappa if known else 0.0
         # pixels where alpha may reach the threshold
-        gone = gone | (known & (reached < 0.0))
-        s[R_FAINT + q] = faint / (1.0 - kappa) if known else -1.0
-        reached = reached / (1.0 - kappa)
-        extent_x = np.sqrt(2.0 * reached * a) * REGION
-        extent_y = np.sqrt(2.0 * reached * c) * REGION
+        gone = gone | (known & (region_limit < 0.0))
+        s[R_EXPONENT_LIMIT + q] = limit / (1.0 - kappa) if known else -1.0
+        region_limit = region_limit / (1.0 - kappa)
+        extent_x = np.sqrt(2.0 * region_limit * a) * REGION
+        extent_y = np.sqrt(2.0 * region_limit * c) * REGION
         left, right = mean_x_low - extent_x, mean_x_high + extent_x
         top, bottom = mean_y_low - extent_y, mean_y_high + extent_y
         # no pixel centre inside

@@ -171,7 +171,7 @@ class Reference:
             positive = ratio > least * least
             opacities = opacities * torch.where(positive, torch.where(positive, ratio, 1.0).sqrt(), least)
         with torch.no_grad():
-            radii, tiles, visible = self._reach(camera, means2d, xx, yy, det, opacities)
+            radii, tiles, visible = self._tile_ranges(camera, means2d, xx, yy, det, opacities)
             extents = self._extents(xx, yy, opacities)
         kept = torch.nonzero(visible).squeeze(1) if subset is None else torch.arange(len(indices))
         return Projection(
@@ -207,7 +207,7 @@ class Reference:
         flat = covariance[:, 0, 0] * covariance[:, 1, 1] - covariance[:, 0, 1] * covariance[:, 1, 0]
         return means2d, covariance, flat
 
-    def _reach(
+    def _tile_ranges(
         self, camera: Camera, means2d: Tensor, xx: Tensor, yy: Tensor, det: Tensor, opacities: Tensor
     ) -> tuple[Tensor, Tensor, Tensor]:
         """Radii [n, 2], tile ranges [n, 4] and whether the Gaussian is drawn [n].

@@ -13,6 +13,7 @@ import numpy as np
 from numba import get_num_threads, njit, prange
 
 from ns_abstract.arithmetic.elementary import exp_kernel
+from ns_abstract.arithmetic.rounding import REGION
 from ns_abstract.arithmetic.simd.intrinsics import borrowed, pointer, taken
 from ns_abstract.geometry.camera_path import Camera
 from ns_abstract.geometry.tiles import assemble, tile_grid
@@ -33,7 +34,6 @@ from ns_abstract.methods.splat.lists import (
 
 _CHUNK = 1024
 _EXPONENT_LIMIT = 60.0
-_REGION = 1.0 + 2.0**-30
 
 # columns of a projected Gaussian
 _MEAN_X, _MEAN_Y, _P, _Q, _S, _OPACITY, _RED = range(7)
@@ -104,9 +104,9 @@ def _covariance(jx, jy, u, v, r0, r1, r2, axes):
 def _region(mean_x, mean_y, a, b, c, alpha, camera, rules):
     """Pixels x0, x1, y0, y1 where a Gaussian of covariance a, b, c shows, and whether there is one in the image."""
     # pixels where alpha reaches the threshold
-    exponent = 2.0 * math.log(alpha / rules.alpha_min) * _REGION + 2.0**-30
-    extent_x = math.sqrt(exponent * a) * _REGION
-    extent_y = math.sqrt(exponent * c) * _REGION
+    exponent = 2.0 * math.log(alpha / rules.alpha_min) * REGION + 2.0**-30
+    extent_x = math.sqrt(exponent * a) * REGION
+    extent_y = math.sqrt(exponent * c) * REGION
     x0, x1 = mean_x - extent_x, mean_x + extent_x
     y0, y1 = mean_y - extent_y, mean_y + extent_y
     shown = True

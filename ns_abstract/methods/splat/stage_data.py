@@ -46,7 +46,7 @@ class SceneGaussians(NamedTuple):
         extents: [N] largest standard deviations, world units, up to rounding.
         noise: [N, 12] see `gaussians.covariance_noise`.
         opacity_low, opacity_high: [N] ends of the opacities' ranges.
-        faint: [N] see `records.faint_exponents`.
+        exponent_limits: [N] see `records.exponent_limits`.
     """
 
     means: np.ndarray
@@ -56,7 +56,7 @@ class SceneGaussians(NamedTuple):
     noise: np.ndarray
     opacity_low: np.ndarray
     opacity_high: np.ndarray
-    faint: np.ndarray
+    exponent_limits: np.ndarray
 
 
 class CellPoses(NamedTuple):
@@ -66,15 +66,15 @@ class CellPoses(NamedTuple):
         rotation: [rows, 9] forms, world to camera, OpenCV axes, row-major.
         offset: [rows, 3] forms of what is added to rotated means minus ``origin``, world units.
         origin: [3] world.
-        camera_reach: [3] upper bounds of the absolute camera coordinates, world.
-        rotation_reach: [9] upper bounds of the absolute entries of the rotation.
+        camera_magnitude: [3] upper bounds of the absolute camera coordinates, world.
+        rotation_magnitude: [9] upper bounds of the absolute entries of the rotation.
     """
 
     rotation: np.ndarray
     offset: np.ndarray
     origin: np.ndarray
-    camera_reach: np.ndarray
-    rotation_reach: np.ndarray
+    camera_magnitude: np.ndarray
+    rotation_magnitude: np.ndarray
 
 
 class ProjectionInputs(NamedTuple):
@@ -95,7 +95,7 @@ class SceneColors(NamedTuple):
         means, mean_radius: See `SceneGaussians`.
         low, high: [N, 3] ranges of what is added to the colours, or [0, 3].
         sh: [N, K, 3] coefficients of the spherical harmonics.
-        reach: [N, 6] see `colors.color_reach`.
+        magnitudes: [N, 6] see `colors.color_magnitudes`.
         degree: Highest band.
     """
 
@@ -104,7 +104,7 @@ class SceneColors(NamedTuple):
     low: np.ndarray
     high: np.ndarray
     sh: np.ndarray
-    reach: np.ndarray
+    magnitudes: np.ndarray
     degree: int
 
 

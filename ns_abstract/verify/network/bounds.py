@@ -14,7 +14,7 @@ from torch import Tensor
 from ns_abstract.verify.network.graph import Network, NetworkArithmetic
 from ns_abstract.verify.network.layers import Activation, LeakyRelu, Linear, Scale, Sum
 from ns_abstract.verify.network.products import Product
-from ns_abstract.verify.network.rows import Rows, charge, full, grid, join, pass_activation, reach
+from ns_abstract.verify.network.rows import Rows, charge, concretize, full, grid, join, pass_activation
 
 Float64 = NDArray[np.float64]
 Int64 = NDArray[np.int64]
@@ -180,9 +180,9 @@ class _Form:
     @staticmethod
     def ranged(reference: Tensor, c: Tensor, a: Tensor, r: Tensor, active: Tensor | None = None) -> _Form:
         """With the range of the form itself."""
-        reach = (a.abs().sum(1) + r) * (1.0 + 2.0**-40) + c.abs() * 2.0**-50
+        radius = (a.abs().sum(1) + r) * (1.0 + 2.0**-40) + c.abs() * 2.0**-50
         active = torch.ones_like(c, dtype=torch.bool) if active is None else active
-        return _Form(reference, c, a, r, c - reach, c + reach, active)
+        return _Form(reference, c, a, r, c - radius, c + radius, active)
 
 
 class _Cells:
@@ -561,7 +561,7 @@ class _Cells:
                     self._descend(start, at, batch[part], found, need)
                 return
             if need is not None and at != start and at in self.stops and len(batch.waiting) == 1:
-                self._settle(at, batch, self.stops[at], found)
+                self._bound_rows(at, batch, self.stops[at], found)
                 going_on = found.lower[batch.number] < need[batch.number]
                 if going_on.mean() < 0.75:
                     batch = batch[going_on]
@@ -587,9 +587,9 @@ class _Cells:
                 known = batch.waiting.get(source)
                 shape = self.network.shape(source)
                 batch.waiting[source] = full(part, shape) if known is None else join(known, part, shape)
-        self._settle(0, batch, self.image, found)
+        self._bound_rows(0, batch, self.image, found)
 
-    def _settle(self, at: int, batch: _Batch, planes: _Planes, found: _Reached) -> None:
+    def _bound_rows(self, at: int, batch: _Batch, planes: _Planes, found: _Reached) -> None:
         """Bounds of a batch whose rows are all on node ``at``."""
         count = len(batch.cell)
         plane, box = np.zeros((count, 2, self.d + 1)), np.zeros((count, 2))
@@ -597,7 +597,7 @@ class _Cells:
         if rows is None:
             plane[:, :, -1] = box[:] = batch.total
         else:
-            reach(rows.value, rows.y, rows.x, batch.cell, *planes, total=batch.total, plane=plane, box=box)
+            concretize(rows.value, rows.y, rows.x, batch.cell, *planes, total=batch.total, plane=plane, box=box)
         lost = self.flush[batch.cell][:, None] * np.array([-1.0, 1.0])
         plane[:, :, -1] += lost
         box += lost

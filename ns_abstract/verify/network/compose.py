@@ -339,12 +339,12 @@ class Composer(Builder):
     # ------------------------------------------------------------ sizes of maps
 
     def rounded_up(self, x: int, kernel: Any, stride: Any, dilation: Any, pads: Any) -> tuple[int, int]:
-        """Rows and columns behind the pads that windows reach if their number is rounded up."""
+        """Rows and columns behind the pads that windows take in if their number is rounded up."""
         self.check_window(x, kernel, stride, dilation, pads)
         more = []
         for k, size in enumerate(self.shape(x)[1:]):
-            reach = (kernel[k] - 1) * dilation[k] + 1
-            free = size + pads[k] + pads[k + 2] - reach
+            extent = (kernel[k] - 1) * dilation[k] + 1
+            free = size + pads[k] + pads[k + 2] - extent
             count = -(-free // stride[k])
             # the last window begins inside
             count -= count * stride[k] >= size + pads[k]

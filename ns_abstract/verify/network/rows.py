@@ -15,9 +15,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from ns_abstract.arithmetic.elementary import fma
 from ns_abstract.arithmetic.simd.intrinsics import pointer
-from ns_abstract.arithmetic.simd.lanes import load8, store
 
 Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
@@ -202,7 +200,7 @@ def charge(value, y, x, cell, noise, total):
 
 
 @njit(cache=True, error_model="numpy")
-def reach(value, y, x, cell, slopes, offsets, lower, upper, total, plane, box):
+def concretize(value, y, x, cell, slopes, offsets, lower, upper, total, plane, box):
     """Bounds of rows on a node of which planes and intervals are known (N5).
 
     Args:
@@ -257,56 +255,3 @@ def reach(value, y, x, cell, slopes, offsets, lower, upper, total, plane, box):
         room = 2.0**-28 * total_size + 2.0**-48 * (abs(total[r, 0]) + abs(total[r, 1]))
         plane[r, 0, d], box[r, 0] = total[r, 0] + below - room, total[r, 0] + low - room
         plane[r, 1, d], box[r, 1] = total[r, 1] + above + room, total[r, 1] + high + room
-
-
-@njit(cache=True, error_model="numpy")
-def spread(value, weight, stride, target):
-    """Transposed convolution of rows [R, Co, h, w], written to ``target`` [R, Ci, H, W].
-
-    Args:
-        value: Rows; contiguous.
-        weight: [kh, kw, Ci, C] float64 with C >= Co a multiple of 4, zero beyond Co.
-        stride: Rows and columns.
-        target: Contiguous; H = (h - 1) stride + kh and W likewise.
-    """
-    count, channels, h, w = value.shape
-    kh, kw, inputs, padded = weight.shape
-    H, W = target.shape[2:]
-    down, right = stride
-    # eight rows side by side, a pixel's channels together
-    block_ = np.zeros(h * w * padded * 8)
-    eight_ = np.empty(8)
-    rows, block, eight, factor, out = pointer(value), pointer(block_), pointer(eight_), pointer(weight), pointer(target)
-    area, plane = h * w, inputs * H * W
-    for start in range(0, count, 8):
-        number = min(8, count - start)
-        for q in range(8):
-            base = (start + min(q, number - 1)) * channels * area
-            for c in range(channels):
-                for e in range(area):
-                    block[(e * padded + c) * 8 + q] = np.float64(rows[base + c * area + e])
-        for i in range(H):
-            for j in range(W):
-                for c in range(inputs):
-                    s0 = 0.0 * load8(block, 0)
-                    s1, s2, s3 = s0, s0, s0
-                    for u in range(i % down, kh, down):
-                        y = (i - u) // down
-                        if y < 0 or y >= h:
-                            continue
-                        for v in range(j % right, kw, right):
-                            x = (j - v) // right
-                            if x < 0 or x >= w:
-                                continue
-                            at, f = (y * w + x) * padded * 8, ((u * kw + v) * inputs + c) * padded
-                            for k in range(0, padded, 4):
-                                s0 = fma(load8(block, at + 8 * k), factor[f + k], s0)
-                                s1 = fma(load8(block, at + 8 * k + 8), factor[f + k + 1], s1)
-                                s2 = fma(load8(block, at + 8 * k + 16), factor[f + k + 2], s2)
-                                s3 = fma(load8(block, at + 8 * k + 24), factor[f + k + 3], s3)
-                    store(eight, 0, (s0 + s1) + (s2 + s3))
-                    to = start * plane + (c * H + i) * W + j
-                    for q in range(number):
-                        out[to + q * plane] = np.float32(eight[q])
-    # the owners of the pointers live to here
-    return block_.size + eight_.size

@@ -1,0 +1,58 @@
+"""Pictures of 8 bits, as files and cameras have them: rounded, and enclosed after rounding (docs/design.md, V10)."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import numpy as np
+
+from ns_abstract.arithmetic.outward import outward
+
+#: What a network is shown: the renderer's floats, or these rounded to multiples of 1/255.
+Picture = Literal["float", "8-bit"]
+
+_STEPS = 255.0
+#: Roundings of one float32 evaluation of 255 x + 1/2, in steps: two of numbers below 256, and as many to spare.
+_STEP_ERROR = 2.0**-14
+#: Relative error of the quotient n / 255 in float32, or of n times the rounded 1/255.
+_QUOTIENT = 2.0**-22
+
+
+def rounded(image: np.ndarray) -> np.ndarray:
+    """``round(255 x) / 255`` of pictures in [0, 1], float32 of the same shape; values outside are clipped first."""
+    levels = np.rint(np.clip(np.asarray(image, np.float32), 0.0, 1.0) * np.float32(_STEPS))
+    return (levels / np.float32(_STEPS)).astype(np.float32)
+
+
+def rounded_sets(
+    linear: tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray], lower: np.ndarray, upper: np.ndarray
+) -> tuple[tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray], np.ndarray, np.ndarray]:
+    """Sets that hold the rounded pictures of those that ``linear``, ``lower`` and ``upper`` hold (design.md, V10).
+
+    Rounding may be to either neighbour at a tie, and in float32: any program that computes 255 x + 1/2 with two
+    roundings and cuts the fraction off, or takes the nearest whole number, is enclosed. Linear sets keep their slopes
+    and are half a step wider on each side; where the constant bound is better at the middle of the cell, it is taken.
+
+    Args:
+        linear: A_lower [..., d], b_lower [...], A_upper, b_upper, float32.
+        lower, upper: [...] float32.
+
+    Returns:
+        The same for the rounded pictures, float32, rounded outward.
+    """
+    low, high = (np.clip(np.asarray(bound, np.float64), 0.0, 1.0) * _STEPS for bound in (lower, upper))
+    least = np.maximum(np.ceil(low - 0.5 - _STEP_ERROR), 0.0) / _STEPS * (1.0 - _QUOTIENT)
+    most = np.minimum(np.floor(high + 0.5 + _STEP_ERROR), _STEPS) / _STEPS * (1.0 + _QUOTIENT)
+    # rounding must not hide what is wrong: bounds that cross are no numbers afterwards
+    least = np.where(lower <= upper, least, np.nan)
+    a_lower, b_lower, a_upper, b_upper = linear
+    half = (0.5 + _STEP_ERROR) / _STEPS + _QUOTIENT
+    below, above = np.asarray(b_lower, np.float64) - half, np.asarray(b_upper, np.float64) + half
+    # comparisons that a NaN fails keep it, so that it is noticed
+    flat_lower, flat_upper = least > below, most < above
+    b_lower, b_upper = outward(np.where(flat_lower, least, below), np.where(flat_upper, most, above))
+    a_lower, a_upper = (
+        np.where(flat[..., None], np.float32(0.0), np.asarray(a, np.float32))
+        for flat, a in ((flat_lower, a_lower), (flat_upper, a_upper))
+    )
+    return (a_lower, b_lower, a_upper, b_upper), *outward(least, most)
