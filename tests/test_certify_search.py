@@ -125,7 +125,7 @@ def test_verdicts_are_the_truth(threshold: float, d: int) -> None:
     """The counterexample's place is known: x <= (threshold - 0.5) / 0.2."""
     scene = Ramp(d)
     search = search_of(scene, Threshold(threshold), (5, 3)[:d])
-    leaves, _ = drive(search, 3000)
+    leaves, _ = drive(search, 3000 if d == 1 else 600)
     for leaf in leaves:
         box = search.grid.box_of(leaf.cell)
         ends = [float(0.5 + scene.gains @ corner) - threshold for corner in box.corners()]
@@ -359,6 +359,10 @@ class Shade:
         return values, Shade(
             self.owner, float(np.clip(self.shift + size * reach * np.sign(float(slope)), -reach, reach))
         )
+
+    @property
+    def nearest(self) -> Shade:
+        return Shade(self.owner, 0.0)
 
     @property
     def arrays(self) -> dict[str, np.ndarray]:

@@ -275,16 +275,16 @@ class CertificateRun:
             place = "_".join(f"{a}-{b}" for a, b in zip(leaf.cell.first, leaf.cell.past, strict=True)) or "pose"
             values = np.array(leaf.counterexample)
             buffer = io.BytesIO()
-            np.savez(
-                buffer,
-                image=leaf.image,
-                outputs=leaf.outputs,
-                values=values,
-                names=np.array(self.grids[block.frame].box.names, str),
-                camera_to_world=self.job.job.pose_sets[block.frame].pose(values),
-                margin=np.array(np.nan if leaf.margin is None else leaf.margin),
-                **{f"scene_{name}": array for name, array in (leaf.scene or {}).items()},
-            )
+            arrays: dict[str, Any] = {
+                "image": leaf.image,
+                "outputs": leaf.outputs,
+                "values": values,
+                "names": np.array(self.grids[block.frame].box.names, str),
+                "camera_to_world": self.job.job.pose_sets[block.frame].pose(values),
+                "margin": np.array(np.nan if leaf.margin is None else leaf.margin),
+            }
+            arrays |= {f"scene_{name}": array for name, array in (leaf.scene or {}).items()}
+            np.savez(buffer, **arrays)
             store.keep_image(f"frame_{block.frame:05d}_{place}", buffer.getvalue())
 
     def _kept_image(self, frame: int, pose: np.ndarray) -> np.ndarray | None:

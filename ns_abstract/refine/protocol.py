@@ -46,6 +46,11 @@ class Member(Protocol):
         ...
 
     @property
+    def nearest(self) -> Member:
+        """The scene of the set that `Frame.render` shows."""
+        ...
+
+    @property
     def arrays(self) -> dict[str, np.ndarray]:
         """The numbers in which the scene differs from others of its set, by name."""
         ...

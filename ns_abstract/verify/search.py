@@ -48,9 +48,8 @@ _EARLY, _LATE, _RANDOM = 2, 4, 2
 #: Steps of the ascent to a counterexample.
 _STEPS = 6
 _FIRST_STEP = 0.25
-#: Scenes of a set tried in a cell without a proof, and signed steps of all Gaussians from the worst of them: first to
-#: the ends, then half-way.
-_MEMBERS, _PUSHES = 4, (2.0, 1.0)
+#: Scenes of a set tried in a cell without a proof.
+_MEMBERS = 4
 #: A scene among so many, in their order, attacks a proof.
 _ATTACKERS = 24
 
@@ -336,25 +335,28 @@ class Search:
         return [outputs[place[_key(samples[0])]] for samples in chosen if samples]
 
     def _vary(self, cells: Sequence[_Seen]) -> None:
-        """Scenes of the set that break the property, at every pose looked at of every cell without a proof.
+        """Scenes of the set that break the property, at every pose looked at of every cell without a proof (V11).
 
-        The worst of a few is moved along the signs of the margin's gradient, and then tried at the other poses, for
-        what breaks the property at one mostly breaks it nearby.
+        The nearest is moved to the ends of its ranges along the signs of the margin's gradient, the worst by then half
+        as far, and the worst of all tried at the other poses, for what breaks the property at one mostly breaks it
+        nearby.
         """
-        best: Member | None = None
+        known: list[Member] = []
         for cell in sorted(cells, key=lambda c: c.margins[c.worst]):
             pose = cell.samples[cell.worst][0]
-            tried = [*itertools.islice(self._members(cell), _MEMBERS), *([] if best is None else [best])]
+            tried = [*itertools.islice(self._members(cell), _MEMBERS), *known]
             margins = self._shown(cell, [(pose, member) for member in tried])
             least = min(range(len(tried)), key=lambda k: margins[k] if math.isfinite(margins[k]) else math.inf)
             best, margin = tried[least], margins[least]
-            for size in _PUSHES:
+            # colours that are clamped at an end of their range have no slope there
+            for start, size in ((best.nearest, 2.0), (None, 1.0)):
                 if margin <= 0.0:
                     break
-                moved = best.pushed(cell.box, pose, self._loss, size)
+                moved = (start or best).pushed(cell.box, pose, self._loss, size)
                 (found,) = self._shown(cell, [moved])
                 if found < margin:
                     (pose, best), margin = moved, found
+            known = [best]
             self._shown(cell, [(other, best) for key, other in cell.poses.items() if key != pose.tobytes()])
 
     def _shown(self, cell: _Seen, samples: list[Sample]) -> list[float]:

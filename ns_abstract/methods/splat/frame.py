@@ -119,6 +119,10 @@ class SplatMember:
         return values, SplatMember(frame, splats, self.reference)
 
     @property
+    def nearest(self) -> SplatMember:
+        return SplatMember(self.frame, self.frame.varied.nearest, self.reference)
+
+    @property
     def arrays(self) -> dict[str, np.ndarray]:
         counts, splats = self.frame.varied.counts, self.splats
         found = {"mean": splats.means, "opacity": splats.opacity, "color": splats.color_shift}
@@ -194,11 +198,7 @@ class SplatFrame:
         """Other scenes of the set, without end; none where nothing varies."""
         if self.varied.varies:
             for splats in self.varied.members(np.random.default_rng(seed)):
-                yield self.member(splats)
-
-    def member(self, splats: Splats | None = None) -> SplatMember:
-        """One scene of the set; None: the one that `render` shows."""
-        return SplatMember(self, self.varied.nearest if splats is None else splats, self._reference)
+                yield SplatMember(self, splats, self._reference)
 
     def allow(self, excess: float) -> float:
         """Save time from now on where that loosens gaps by no more than a small part of ``excess`` on average (B6).
