@@ -24,7 +24,6 @@ import pytest
 import torch
 from certifying import classifier, linear
 from conftest import Inputs, write_json
-from nerfs import tiny_scene
 
 from ns_abstract.api import certifying
 from ns_abstract.api.certification import Certification, CertifySettings, examine_block, open_certification
@@ -34,7 +33,6 @@ from ns_abstract.demo.writing import write_demo
 from ns_abstract.execution.engines import Here, Processes
 from ns_abstract.execution.opening import forget
 from ns_abstract.io.errors import InputError
-from ns_abstract.methods.nerf.write import write_nerf_run
 from ns_abstract.methods.splat.method import SplatMethod
 from ns_abstract.methods.splat.reference import Reference
 from ns_abstract.verify import model
@@ -731,16 +729,6 @@ def test_partition_that_does_not_fit(
     prop = {"type": "classification", "label": 0, "preprocess": PRE, "partitions": [3, 4]}
     code, said = call(Case(tmp_path / "case", blobs, net, prop).options(tmp_path / "out"))
     assert code == 2 and "prop.json: partitions" in said
-
-
-def test_nerf_is_refused(blobs: Inputs, net: Path, call: Callable[..., tuple[int, str]], tmp_path: Path) -> None:
-    config = write_nerf_run(tiny_scene(0), tmp_path / "runs", timestamp="2026-01-01_000000", experiment_name="tiny")
-    prop = {"type": "classification", "label": 0, "preprocess": PRE}
-    case = Case(tmp_path / "case", Inputs(config, blobs.path, tmp_path / "unused"), net, prop)
-    code, said = call(case.options(tmp_path / "out"))
-    assert code == 2 and said.count("\n") == 1
-    for fragment in ("config.yml", "certificates are for splats", "vanilla NeRF", "give a run of splatfacto"):
-        assert fragment in said
 
 
 EVERYTHING = {"select": {"box": [[-9, -9, -9], [9, 9, 9]]}}

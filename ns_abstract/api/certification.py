@@ -6,11 +6,12 @@ import hashlib
 import itertools
 import json
 import math
+import time
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property, partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 import torch
@@ -18,6 +19,7 @@ import torch
 from ns_abstract.api.files import Settings, path_sets, resized
 from ns_abstract.api.job import Job
 from ns_abstract.api.scenes import platform_problems
+from ns_abstract.execution.ending import AbandonedError, abandoning
 from ns_abstract.execution.opening import Recipe, opened
 from ns_abstract.geometry.box import ParameterBox
 from ns_abstract.geometry.camera_path import load_camera_path
@@ -26,12 +28,13 @@ from ns_abstract.geometry.tiles import assemble
 from ns_abstract.io.errors import InputError
 from ns_abstract.io.jsonio import load_json
 from ns_abstract.perturbation.specification import Perturbation
-from ns_abstract.refine.protocol import Frame, Member, Method
+from ns_abstract.refine.protocol import Frame, Member, Method, RayFrame
 from ns_abstract.report.record import file_stamp
 from ns_abstract.verify.cells import Cell, Grid, coarse_parts
 from ns_abstract.verify.eight_bit import Picture, rounded, rounded_sets
 from ns_abstract.verify.model import NetworkModel, parametric
 from ns_abstract.verify.network import NetworkArithmetic, load_network
+from ns_abstract.verify.pixel_costs import pixel_costs
 from ns_abstract.verify.properties import Claim, LinearClaim, Property, parse_property
 from ns_abstract.verify.search import BLOCK, Findings, Search
 
@@ -48,6 +51,10 @@ _BLOCK_NUMBERS = 1 << 18
 _FIRST_BLOCKS = (1, 1, 1, 1, 2, 2, 4, 4)
 #: Frames whose bounds a process keeps at hand.
 _KEPT = 4
+#: Pictures of a frame that are kept where they are made ray by ray.
+_IMAGES = 64
+#: Part of the time in which it must show how long a ray takes.
+_FORESEEN = 0.25
 #: Bytes for the bounds of one process, where nothing is said.
 MEMORY = 1 << 30
 
@@ -101,6 +108,9 @@ class FramePictures:
     def __init__(self, method: Method, poses: PoseSet, picture: Picture = "float") -> None:
         self._rounded = picture == "8-bit"
         self.frame: Frame = method.frame(poses)
+        #: What pixels of a cell cost, where pictures are made ray by ray: see `pixel_costs`.
+        self.weigh: Callable[[ParameterBox], np.ndarray | None] = lambda box: None
+        self._images: dict[bytes, np.ndarray] = {}
         self.box = self.frame.box
         self._method = method
         self._tiles = np.arange(self.frame.tile_count)
@@ -111,15 +121,29 @@ class FramePictures:
         return self.frame.pose_set
 
     def image(self, values: np.ndarray, member: Member | None = None) -> np.ndarray:
-        render = self.frame.render if member is None else member
-        image = assemble(render(np.asarray(values, np.float64), None), self.frame.camera)
+        values = np.asarray(values, np.float64)
+        if member is not None:
+            image = assemble(member(values), self.frame.camera)
+            return rounded(image) if self._rounded else image
+        key = values.tobytes()
+        image = self._images.get(key)
+        if image is None:
+            image = assemble(self.frame.render(values), self.frame.camera)
+            if self.frame.tilewise:
+                # costly, and neighbouring cells share their ends
+                while len(self._images) >= _IMAGES:
+                    self._images.pop(next(iter(self._images)))
+                self._images[key] = image
         return rounded(image) if self._rounded else image
 
     def members(self, seed: int) -> Iterator[Member]:
         return self.frame.members(seed)
 
     def sets(self, box: ParameterBox) -> tuple[tuple[np.ndarray, ...], np.ndarray, np.ndarray, np.ndarray]:
-        found = self.frame.bound(box, self._tiles, keep_linear=True)
+        if self.frame.tilewise:
+            found = cast("RayFrame", self.frame).sets(box, partial(self.weigh, box))
+        else:
+            found = self.frame.bound(box, self._tiles, keep_linear=True)
         assert found.linear is not None
         whole = [assemble(part, self.frame.camera) for part in (*found.linear, found.lower, found.upper)]
         linear, lower, upper = (whole[0], whole[1], whole[2], whole[3]), whole[4], whole[5]
@@ -194,9 +218,9 @@ class Certification:
         self.network, self.property = question.network, question.property
         if job.method.differentiable(job.pose_sets[0]) is None:
             raise InputError(
-                f"certificates are for splats, this run is a {job.method.content}",
+                f"pictures of {job.method.content} have no slopes that the search could follow",
                 file=job.source.file,
-                fix="give a run of splatfacto or a .ply; ns-abstract-render bounds the pictures of a NeRF",
+                fix="give another scene; ns-abstract-render bounds the pictures of this one",
             )
         camera, size = job.pose_sets[0].camera, question.size
         if (camera.height, camera.width) != size:
@@ -327,10 +351,49 @@ class Certification:
                 self._searches.pop(next(iter(self._searches)))
             pictures = self.pictures(index)
             every_unit = self.property.partitions is not None
-            self._searches[key] = Search(
-                pictures, self.model, self.claim(pictures), grid, every_unit=every_unit, block=self.block
-            )
+            claim = self.claim(pictures)
+            pictures.weigh = partial(pixel_costs, pictures, self.model, claim)
+            self._searches[key] = Search(pictures, self.model, claim, grid, every_unit=every_unit, block=self.block)
         return self._searches[key]
+
+    def foresee(self, index: int, seconds: float) -> None:
+        """Refuse a frame of which not even the first part can be bounded, where pictures are made ray by ray.
+
+        Args:
+            index: The frame.
+            seconds: Time that there is for it.
+
+        Raises:
+            InputError: What it would take.
+        """
+        if not self.job.rays:
+            return
+        frame = cast("RayFrame", self.search_frame(index))
+        # compiling says nothing about rays
+        frame.warm_up()
+        begin = time.perf_counter()
+        more = ""
+        try:
+            with abandoning(lambda: time.perf_counter() - begin > _FORESEEN * seconds):
+                by_ray, parts = frame.effort()
+        except AbandonedError:
+            # one ray was not done; the rest is no shorter
+            by_ray, parts, more = _FORESEEN * seconds, 1, "more than "
+        rays, workers = frame.camera.width * frame.camera.height, self.job.workers
+        least = by_ray * rays / workers
+        if more or least > seconds:
+            cut = f"over one of {parts:,} parts of the set " if parts > 1 else ""
+            raise InputError(
+                f"{self.job.method.content}: {rays:,} rays {cut}take {more}{least:,.0f} s with {workers} "
+                f"{'process' if workers == 1 else 'processes'} ({more}{by_ray:.2g} s a ray), {seconds:,.0f} s given",
+                file=self.job.source.file,
+                field="--time-budget",
+                fix="give more, a smaller network or picture, fewer --num-samples, or declare an --occupancy-grid",
+            )
+
+    def search_frame(self, index: int) -> Frame:
+        """The frame whose bounds the search of ``index`` will use."""
+        return self.search(index, self.grid(index)).scene.frame  # pyright: ignore[reportAttributeAccessIssue]
 
     def write_vnnlib(self, index: int, box: ParameterBox, target: Path, form: Form) -> tuple[Path, Path]:
         """Write the abstract image of a cell, the network and the property for other verifiers.
@@ -403,14 +466,17 @@ class CertifySettings:
     """What to certify, as the command line says it.
 
     Attributes:
-        load_config: config.yml of a Splatfacto run, or a standard 3DGS .ply.
+        load_config: config.yml of a run, or a standard 3DGS .ply.
         camera_path_filename: Camera path JSON.
         model: Network, .onnx or .pt2.
         property: PROP.json.
         perturbation_filename: Perturbation JSON; None: the camera path holds it.
         renderer: "gsplat" or "paper"; None: gsplat.
         gsplat_version: Of gsplat's rules; None: 1.4.0.
-        arithmetic: "float32" or "real"; None: float32.
+        sampling, num_samples, near_plane: Of the rays of a NeRF; None: the method's own.
+        occupancy_grid: File of a grid that is declared as part of a NeRF.
+        workers: Processes that bound the rays of a NeRF.
+        arithmetic: "float32" or "real"; None: the strongest that the scene has.
         network_arithmetic: The same of the network.
         picture: Whether the network is shown floats or pictures of 8 bits.
         memory: Bytes for the bounds of one process.
@@ -427,6 +493,11 @@ class CertifySettings:
     network_arithmetic: NetworkArithmetic = "float32"
     picture: Picture = "float"
     memory: int = MEMORY
+    sampling: str | None = None
+    num_samples: int | None = None
+    near_plane: float | None = None
+    occupancy_grid: Path | None = None
+    workers: int = 1
 
 
 def open_certification(settings: CertifySettings) -> Certification:
@@ -443,13 +514,17 @@ def open_certification(settings: CertifySettings) -> Certification:
         renderer=settings.renderer,
         gsplat_version=settings.gsplat_version,
         arithmetic=settings.arithmetic,
+        sampling=settings.sampling,
+        num_samples=settings.num_samples,
+        near_plane=settings.near_plane,
+        occupancy_grid=settings.occupancy_grid,
     )
     path = load_camera_path(files.camera_path_filename)
     scene = files.scene.open()
     sets = [question.drawn(poses) for poses in path_sets(files, scene, path, default=Perturbation())]
     origin = settings.perturbation_filename or settings.camera_path_filename
     try:
-        job = Job(scene, sets, arithmetic=settings.arithmetic)
+        job = Job(scene, sets, arithmetic=settings.arithmetic, workers=settings.workers)
     except InputError as error:
         raise error.within(origin) if error.field and not error.field.startswith("--") else error from None
     return Certification(job, question, settings.memory, origin, settings.network_arithmetic, settings.picture)

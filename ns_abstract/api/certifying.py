@@ -40,6 +40,8 @@ from ns_abstract.verify.substitution import MODES, STEP, Comparison, compare, ga
 
 #: Seconds between notes of progress, and between reports.
 _TRACE, _REPORT = 1.0, 30.0
+#: Seconds that pictures for the last report may take beyond the budget, where they are made ray by ray.
+_LAST = 5.0
 #: Counterexamples in report.json by frame, and images of each kind on the page.
 _EXAMPLES, _IMAGES = 5, 6
 _PIXELS = 256
@@ -100,6 +102,8 @@ class CertificateRun:
         self.shown: list[dict[str, Any]] = []
         self.seen: dict[tuple[int, int], dict[str, Any]] = {}
         self.rows: dict[int, list[dict[str, Any]]] = {}
+        #: When no more pictures are rendered for the report.
+        self.over = float("inf")
         prop = job.property
         self.about = CertifiedRun(
             guarantee=job.job.method.guarantee,
@@ -159,7 +163,8 @@ class CertificateRun:
             report: Whether to bring the report up to date now and then.
         """
         flying: dict[int, Block] = {}
-        finished = 0
+        # rays may take longer than there is time for; other blocks are waited for once
+        finished = 1 if self.job.job.rays else 0
         traced = reported = time.perf_counter()
         recipe = self.job.recipe
 
@@ -168,7 +173,7 @@ class CertificateRun:
 
         def offer(room: int) -> Iterator[Task]:
             # one block is always waited for, so that resuming with any budget gets on
-            if late() and flying:
+            if late() and (flying or finished):
                 return
             for block in store.pending(set(flying), room):
                 flying[block.number] = block
@@ -239,21 +244,25 @@ class CertificateRun:
             Content of report.json.
 
         Raises:
-            InputError: The folder cannot be used.
+            InputError: The folder cannot be used, or there is not enough time to begin.
         """
+        begin, rays = time.perf_counter(), self.job.job.rays
         with ExitStack() as stack:
             with stop.at_once():
+                self.job.foresee(self.frames[0], budget)
                 store = self.open(resume=resume)
                 stack.callback(store.close)
             stack.enter_context(store.told())
             on_open(store)
             substitution = None
+            # where every ray is costly, all that is done is
+            self.over = begin + budget if rays else float("inf")
             try:
                 if report:
                     # renders pictures, for which kernels may have to be compiled
                     with stop.at_once():
                         self.report(store, "running")
-                deadline = time.perf_counter() + (1.0 - _COMPARE_SHARE) * budget
+                deadline = (begin if rays else time.perf_counter()) + (1.0 - _COMPARE_SHARE) * budget
                 with ExitStack() as engines:
                     self.search(store, engine(engines), deadline, stop, on_progress, report)
                 if report and not stop():
@@ -261,6 +270,7 @@ class CertificateRun:
                         substitution = self.compare(store)
             finally:
                 # also after a failure: what is finished is written
+                self.over += _LAST
                 store.finish(self.grids)
                 state = "interrupted" if stop() else "budget" if store.open_blocks else "done"
                 document = self.report(store, state, substitution) if report else self.document(store, state)[0]
@@ -312,12 +322,13 @@ class CertificateRun:
             return substitution_entry([], reason)
         found: list[tuple[int, Comparison]] = []
         begin = time.perf_counter()
-        for number in spread_by_volume([_volume(self.grids[frame].box, box) for frame, box in cells], _COMPARED):
-            frame, box = cells[number]
-            result = compare(self.job.search(frame, self.grids[frame]), box, begin + allowed)
-            if result is None:
-                break
-            found.append((frame, result))
+        with suppress(AbandonedError), abandoning(lambda: time.perf_counter() >= begin + allowed):
+            for number in spread_by_volume([_volume(self.grids[frame].box, box) for frame, box in cells], _COMPARED):
+                frame, box = cells[number]
+                result = compare(self.job.search(frame, self.grids[frame]), box, begin + allowed)
+                if result is None:
+                    break
+                found.append((frame, result))
         reason = None if found else f"the time for it, {allowed:.0f} s, was over before one cell was done"
         return substitution_entry(found, reason, time.perf_counter() - begin)
 
@@ -432,19 +443,27 @@ class CertificateRun:
             margin = row["margin"]
             text = f"frame {frame}, margin {'not a number' if margin is None else f'{margin:.4g}'}"
             wanted.append(("counterexample", text, frame, row["counterexample"]))
-        return [
-            {"title": title, "text": text, "png": self._drawn(frame, values, _PIXELS)}
-            for title, text, frame, values in wanted
-        ]
+        found = []
+        with suppress(AbandonedError):
+            for title, text, frame, values in wanted:
+                found.append({"title": title, "text": text, "png": self._drawn(frame, values, _PIXELS)})
+        return found
 
     def _drawn(self, frame: int, values: Sequence[float], side: int) -> bytes:
-        """PNG of the picture at parameter values in the order of all parameters."""
+        """PNG of the picture at parameter values in the order of all parameters.
+
+        Raises:
+            AbandonedError: There is no time for more pictures.
+        """
         known = dict(zip((name for name, _ in self.job.parameters), values, strict=True))
         pictures = self.job.pictures(frame)
         pose = np.array([known[name] for name in pictures.box.names])
         # of another scene of the set, maybe
         image = self._kept_image(frame, pose) if pictures.pose_set.perturbation.scene else None
-        return preview(to_bytes(pictures.image(pose) if image is None else image), side)
+        if image is None:
+            with abandoning(lambda: time.perf_counter() >= self.over):
+                image = pictures.image(pose)
+        return preview(to_bytes(image), side)
 
     def _cell_pictures(self, rows: Mapping[int, list[dict[str, Any]]]) -> dict[tuple[int, int], dict[str, Any]]:
         """By frame and position, a picture of some cells: the same number of each verdict, evenly spread."""
@@ -455,13 +474,14 @@ class CertificateRun:
         share = _SEEN // max(1, sum(map(bool, kinds.values())))
         wanted = [key for keys in kinds.values() for key in keys[:: max(1, -(-len(keys) // share))]]
         found = {}
-        for frame, k in wanted:
-            row = rows[frame][k]
-            values, text = row["counterexample"], "the counterexample's picture"
-            if values is None:
-                values = [0.5 * (a + b) for a, b in zip(row["lower"], row["upper"], strict=True)]
-                text = "one picture, at the cell's middle"
-            found[frame, k] = {"png": self._drawn(frame, values, _SEEN_PIXELS), "text": text}
+        with suppress(AbandonedError):
+            for frame, k in wanted:
+                row = rows[frame][k]
+                values, text = row["counterexample"], "the counterexample's picture"
+                if values is None:
+                    values = [0.5 * (a + b) for a, b in zip(row["lower"], row["upper"], strict=True)]
+                    text = "one picture, at the cell's middle"
+                found[frame, k] = {"png": self._drawn(frame, values, _SEEN_PIXELS), "text": text}
         return found
 
 
@@ -624,7 +644,8 @@ def certify(
         picture: "float": the renderer's floats; "8-bit": these rounded to multiples of 1/255, as files have them.
         resume: Whether to go on with what ``output_dir`` holds.
         on_progress: Told about once a second.
-        workers: Processes; with more than one, a script needs ``if __name__ == "__main__":``.
+        workers: Processes (for a NeRF: that bound rays, which all cells share); with more than one, a script needs
+            ``if __name__ == "__main__":``.
         engine: "dask" spreads the cells over a Dask cluster.
         scheduler_address: HOST:PORT of its scheduler; None: a cluster on this machine.
         memory_limit: GiB; None: 80 % of what is free.
@@ -647,7 +668,7 @@ def certify(
     question = Question(Path(model), PropertySource.of(given))
     drawn = [question.drawn(entry.of(scene)) for entry in sets]
     memory = network_memory(memory_limit, workers)
-    job = Job(scene, drawn, arithmetic=arithmetic)
+    job = Job(scene, drawn, arithmetic=arithmetic, workers=workers)
     found = Certification(job, question, memory, network_arithmetic=network_arithmetic, picture=picture)
     settings = {
         "time_budget": time_budget,
@@ -663,7 +684,7 @@ def certify(
         stop = stack.enter_context(interruptible())
         run = CertificateRun(found, range(len(drawn)), folder, settings, ("ns_abstract.certify",))
         document = run.run(
-            lambda engines: engines.enter_context(started(engine, scheduler_address, workers)),
+            lambda engines: engines.enter_context(started(engine, scheduler_address, 1 if scene.rays else workers)),
             time_budget,
             stop,
             resume=resume,

@@ -35,7 +35,7 @@ class Job:
         arithmetic: "float32" or "real"; None: the strongest that the scene has.
         seed: Of the random witnesses.
         memory_limit: GiB; None: 80 % of what is free.
-        workers: Processes that one frame may use.
+        workers: Processes that one frame may use, where pictures are made ray by ray.
 
     Raises:
         InputError: The scene does not vary as asked, or the memory does not do.
@@ -51,9 +51,10 @@ class Job:
         memory_limit: float | None = None,
         workers: int = 1,
     ) -> None:
-        self.source, self._arithmetic = scene.source, arithmetic
+        self.source, self._arithmetic, self.rays = scene.source, arithmetic, scene.rays
         self.method: Method = scene.method(arithmetic, workers)
         self.pose_sets, self.seed, self.memory_limit = tuple(pose_sets), seed, memory_limit
+        self.workers = workers if scene.rays else 1
         self._warm: set[int] = set()
         self.method.prepare([poses.perturbation for poses in self.pose_sets])
         self._check_memory()

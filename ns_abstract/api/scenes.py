@@ -74,10 +74,15 @@ class Scene:
         """
         if arithmetic not in (None, "float32", "real"):
             raise InputError(f"found {arithmetic}", field="--arithmetic", fix="use float32 or real")
-        key = arithmetic, workers
+        key = arithmetic, workers if self.rays else 1
         if key not in self._methods:
             self._methods[key] = self._representation.method(self._content, self.source.options, arithmetic, workers)
         return self._methods[key]
+
+    @property
+    def rays(self) -> bool:
+        """Whether pictures are made ray by ray; see `ns_abstract.methods.representation.Representation`."""
+        return self._representation.rays
 
     @property
     def name(self) -> str:

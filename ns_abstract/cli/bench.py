@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import faulthandler
+import sys
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 import tyro
 
-from ns_abstract.cli.common import DONE, run
+from ns_abstract.cli.common import BAD_INPUT, DONE, run
 from ns_abstract.io.errors import InputError
 
 if TYPE_CHECKING:
@@ -201,6 +202,50 @@ class Stiff:
     """Decides every random choice."""
 
 
+@dataclass
+class Vnnlib:
+    """Decide instances of a verification competition: networks and VNN-LIB properties with boxes of inputs."""
+
+    folder: tyro.conf.Positional[Path]
+    """Holds instances.csv (network,property,seconds) and what it names, packed (.gz) or not."""
+    output_dir: Path = Path("bench")
+    """Folder for results.csv, and for each instance the verdict and a counterexample."""
+    only: tuple[str, ...] = ()
+    """Parts of the names of networks or properties. Default: all instances."""
+    seconds: float | None = None
+    """Limit for every instance beside that of the list."""
+    memory_limit: float = 2.0
+    """GiB that bounds may take."""
+    network_arithmetic: Literal["float32", "real"] = "float32"
+    """What "unsat" covers: every float32 evaluation and the exact network, or the exact network alone."""
+
+
+def vnnlib(options: Vnnlib) -> int:
+    """Decide the instances; the exit code is 2 if a file could not be used."""
+    from ns_abstract.bench.vnnlib import run_folder
+    from ns_abstract.io.errors import visible
+
+    for name, value in (("--seconds", options.seconds), ("--memory-limit", options.memory_limit)):
+        if value is not None and not 0.0 < value <= 1e6:
+            raise InputError(f"{value}", field=name, fix="give a positive number")
+    words: dict[str, int] = {}
+    for row in run_folder(
+        options.folder,
+        options.output_dir,
+        only=options.only,
+        seconds=options.seconds,
+        memory=int(options.memory_limit * 2**30),
+        arithmetic=options.network_arithmetic,
+    ):
+        words[row["verdict"]] = words.get(row["verdict"], 0) + 1
+        names = visible(f"{row['network']} {row['property']}")
+        print(f"{row['verdict']:8s} {row['seconds']:8.2f} s {row['boxes']:6d} boxes  {names}", flush=True)
+        if row["why"]:
+            print(f"error: {row['why']}", file=sys.stderr)
+    print(", ".join(f"{count} {word}" for word, count in sorted(words.items())))
+    return BAD_INPUT if "error" in words else DONE
+
+
 def stiff(options: Stiff) -> int:
     """Run the stiff cases; the exit code is 1 if a bound was broken or a number was not finite."""
     from ns_abstract.bench.stiff import all_cases, compare, run_case
@@ -334,8 +379,12 @@ def rows_of(options: Cell | Soundness | Plan | Rules | Rays, job: PathJob, name:
     ]
 
 
-def bench(options: Cell | Tightness | Soundness | Plan | Rules | Rays | Scale | Certificates | Stiff) -> int:
+def bench(
+    options: Cell | Tightness | Soundness | Plan | Rules | Rays | Scale | Certificates | Stiff | Vnnlib,
+) -> int:
     """Run one benchmark; the exit code is 1 if a bound was violated."""
+    if isinstance(options, Vnnlib):
+        return vnnlib(options)
     if isinstance(options, Stiff):
         return stiff(options)
     if isinstance(options, Scale):
@@ -399,6 +448,7 @@ def main() -> None:
             "scale": Scale(),
             "certificates": Certificates(),
             "stiff": Stiff(),
+            "vnnlib": Vnnlib(folder=tyro.MISSING),
         }
     )
     run(bench, lambda: tyro.cli(kinds, prog="ns-abstract-bench"))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 from dataclasses import dataclass, fields
 from pathlib import Path
@@ -28,7 +29,7 @@ class Certify:
     """
 
     load_config: Path
-    """config.yml of a Splatfacto run, or a standard 3DGS .ply."""
+    """config.yml of a Splatfacto or vanilla-nerf run, or a standard 3DGS .ply."""
     camera_path_filename: Path
     """Camera path as Nerfstudio's viewer writes it."""
     model: Path
@@ -44,12 +45,23 @@ class Certify:
     frames: tuple[int, ...] | None = None
     """Entries of the camera path, counted from 0. Default: all."""
     renderer: Literal["gsplat", "paper"] | None = None
-    """gsplat: what Nerfstudio shows (the default). paper: Algorithm 1 of "Abstract Rendering" (no thresholds, RGB)."""
+    """gsplat: what Nerfstudio shows of splats (the default for them). paper: Algorithm 1 (splats: no thresholds,
+    RGB) or 2 (NeRF: black behind the last sample) of "Abstract Rendering"."""
     gsplat_version: Literal["1.4.0", "1.5.3", "1.6.0"] | None = None
     """Splats: whose rules are bounded. Default: 1.4.0, which nerfstudio 1.1.5 asks for."""
     arithmetic: Literal["float32", "real"] | None = None
-    """float32: images of every float32 evaluation (the default). real: the real-number renderer and its float64
-    evaluation."""
+    """float32: images of every float32 evaluation (splats, the default for them). real: the real-number renderer and
+    its float64 evaluation."""
+    sampling: Literal["uniform", "hierarchical"] | None = None
+    """NeRF. uniform (default): the fine field in the middles of equal bins. hierarchical: Nerfstudio's own picture,
+    bounded for every choice of samples in the bins of the coarse pass."""
+    num_samples: int | None = None
+    """NeRF: bins of every ray. Default: 64."""
+    near_plane: float | None = None
+    """NeRF: distance at which rays start. Default: 0, as in Nerfstudio's evaluation."""
+    occupancy_grid: Path | None = None
+    """NeRF: declare the field empty outside of this grid's occupied voxels (.npz, see ns-abstract-export occupancy).
+    That makes it another scene, for which the certificate holds."""
     network_arithmetic: Literal["float32", "real"] = "float32"
     """float32: every float32 evaluation of the network (the default). real: the exact function of its weights alone."""
     picture: Literal["float", "8-bit"] = "float"
@@ -66,7 +78,8 @@ class Certify:
     tls_key: Path | None = None
     """The certificate's key (PEM)."""
     workers: int | None = None
-    """Processes on this machine; 1 works in this process. Default: one by core."""
+    """Processes on this machine; 1 works in this process. They bound cells of splats, rays of a NeRF. Default: one by
+    core."""
     resume: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
     """Go on with the cells that an interrupted run with the same inputs has stored."""
     memory_limit: float | None = None
@@ -96,6 +109,8 @@ def certify(options: Certify) -> int:
 
         names = {entry.name for entry in fields(CertifySettings)}
         given = {name: value for name, value in vars(options).items() if name in names}
+        if options.workers is None:
+            given["workers"] = 1 if options.engine == "dask" else len(os.sched_getaffinity(0))
         tls = Tls.of(options.tls_ca_file, options.tls_cert, options.tls_key, options.scheduler_address)
         order = Order(
             CertifySettings(**given), options.frames, options.output_dir, options.time_budget or _SECONDS,

@@ -97,7 +97,10 @@ def certify_path(order: Order, stop: Stop) -> bool:
     with progress:
         display = _Display(console, progress)
         document = run.run(
-            lambda stack: stack.enter_context(started(order.engine, order.scheduler_address, workers, order.tls)),
+            # the processes of a NeRF bound its rays, which all cells share
+            lambda stack: stack.enter_context(
+                started(order.engine, order.scheduler_address, 1 if job.job.rays else workers, order.tls)
+            ),
             order.budget,
             stop,
             resume=order.resume,

@@ -52,8 +52,11 @@ class Representation:
         load: Reads it.
         method: The scene with the program that is bounded: scene, options, arithmetic ("float32", "real" or None: the
             strongest there is) and number of processes that may be used.
+        rays: Whether pictures are made ray by ray, each at a cost: frames are then of the kind
+            `ns_abstract.refine.protocol.RayFrame` and use several processes themselves.
     """
 
     reads: Callable[[RunConfig | Path], bool]
     load: Callable[[RunConfig | Path], Any]
     method: Callable[[Any, ProgramOptions, str | None, int], Method]
+    rays: bool = False

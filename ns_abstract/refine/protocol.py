@@ -191,6 +191,33 @@ class Frame(Protocol):
         ...
 
 
+class RayFrame(Frame, Protocol):
+    """A frame whose pictures are made ray by ray (`ns_abstract.methods.representation.Representation.rays`)."""
+
+    def sets(self, box: ParameterBox, weigh: Callable[[], np.ndarray | None] | None = None) -> Bounds:
+        """Bounds of all tiles over a cell with linear bounds, for certificates.
+
+        What is found depends on the cell and on ``weigh`` alone, whatever was bounded before.
+
+        Args:
+            box: The cell.
+            weigh: [H, W, 3] what part of a margin a unit of each pixel's width may cost, or None; asked at most once,
+                where rays could be refined.
+
+        Raises:
+            AbandonedError: There is no time for it.
+        """
+        ...
+
+    def effort(self) -> tuple[float, int]:
+        """Seconds that one ray takes over one part of the set, about, and in how many parts the set is bounded.
+
+        Raises:
+            AbandonedError: There is no time to find out.
+        """
+        ...
+
+
 class Method(Protocol):
     """A scene and the program whose pictures are bounded."""
 

@@ -335,7 +335,7 @@ class Search:
         return [outputs[place[_key(samples[0])]] for samples in chosen if samples]
 
     def _vary(self, cells: Sequence[_Seen]) -> None:
-        """Scenes of the set that break the property, at every pose looked at of every cell without a proof (V11).
+        """Scenes of the set that break the property, at every pose looked at of every cell without a proof (V12).
 
         The nearest is moved to the ends of its ranges along the signs of the margin's gradient, the worst by then half
         as far, and the worst of all tried at the other poses, for what breaks the property at one mostly breaks it

@@ -1,8 +1,10 @@
-"""VNN-LIB files (version 1): which outputs of a network are unsafe.
+"""VNN-LIB files (version 1): which outputs of a network are unsafe, and for which inputs.
 
 Only what the format's users write is read: ``declare-const``, and ``assert`` of ``<=``, ``>=``, ``and``,
-``or`` over linear expressions of the outputs. Bounds of the inputs are set aside: the images of the scene
-take their place. Numbers that overflow or vanish on the way are refused, and constraints with huge or tiny
+``or`` over bounds of single inputs and linear expressions of the outputs. In certificates of scenes bounds of the
+inputs are set aside: the images take their place.
+
+Numbers that overflow or vanish on the way are refused, and constraints with huge or tiny
 factors are multiplied by powers of two, which changes no sign: no overflow may become a verdict.
 """
 
@@ -11,7 +13,7 @@ from __future__ import annotations
 import re
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -22,6 +24,7 @@ _LIMIT = 64 << 20
 _TOKEN = re.compile(r'\s+|;[^\n]*|(?P<text>[()]|"[^"]*"|[^\s();"]+)|(?P<bad>.)', re.DOTALL)
 _NUMBER = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?", re.ASCII)
 _VARIABLE = re.compile(r"([XY])_(\d{1,9})", re.ASCII)
+_OTHER = "use the network's file"
 #: Most conjunctions that a file's assertions may multiply out to.
 _CONJUNCTIONS = 10_000
 _DEPTH = 200
@@ -32,7 +35,9 @@ _PLAIN, _SPREAD, _FAR = 30, 90, 120
 #: Least size at which a product of numbers keeps all of its digits.
 _SMALLEST = float(np.finfo(np.float64).tiny)
 
-#: Coefficients of outputs by number, and a constant.
+#: Numbers that the boxes of a file may have together.
+_BOXES = 1 << 25
+#: Coefficients of outputs by number (of input i by -1 - i), and a constant.
 _Linear = tuple[dict[int, float], float]
 #: ``rows @ y + offset <= 0`` for all rows of a list: one way to be unsafe.
 _Conjunction = list[_Linear]
@@ -55,6 +60,32 @@ class UnsafeSet:
     inputs: int
 
 
+@dataclass(frozen=True)
+class Region:
+    """A box of inputs with what is unsafe there.
+
+    Attributes:
+        lower, upper: [n] float64.
+        unsafe: Outputs; without rows and groups, any output is unsafe.
+    """
+
+    lower: np.ndarray
+    upper: np.ndarray
+    unsafe: UnsafeSet
+
+    def holds(self, output: np.ndarray) -> bool:
+        """Whether ``output`` is unsafe."""
+        value = self.unsafe.rows @ output + self.unsafe.offset
+        return any(bool((value[list(group)] <= 0.0).all()) for group in self.unsafe.groups)
+
+
+class _Sizes(NamedTuple):
+    """Numbers of inputs and outputs; inputs may be None where no assertion is to name them."""
+
+    inputs: int | None
+    outputs: int
+
+
 def load_vnnlib(path: Path, output_size: int) -> UnsafeSet:
     """Read a VNN-LIB file.
 
@@ -70,6 +101,97 @@ def load_vnnlib(path: Path, output_size: int) -> UnsafeSet:
         return _parse(_expressions(text), output_size)
     except InputError as error:
         raise error.within(path) from None
+
+
+def load_regions(path: Path, input_size: int, output_size: int, text: str | None = None) -> tuple[Region, ...]:
+    """Read a VNN-LIB file with its inputs: the property is violated if some region has an input with an unsafe output.
+
+    Args:
+        path: The file; only named in errors if ``text`` is given.
+        input_size, output_size: Numbers of the network's inputs and outputs.
+        text: Its contents.
+
+    Raises:
+        InputError: As `load_vnnlib`, or an input has no bounds.
+    """
+    text = read_text(path, "VNN-LIB file", _LIMIT) if text is None else text
+    try:
+        return _regions(_expressions(text), _Sizes(input_size, output_size))
+    except InputError as error:
+        raise error.within(path) from None
+
+
+def _regions(expressions: list[Any], sizes: _Sizes) -> tuple[Region, ...]:
+    declared: set[str] = set()
+    assert sizes.inputs is not None
+    ends = np.full((2, sizes.inputs), np.inf) * np.array([[-1.0], [1.0]])
+    cases: list[_Conjunction] = [[]]
+    for expression in expressions:
+        if _declares(expression, declared):
+            continue
+        ways = _ways(expression[1], declared, sizes)
+        if len(ways) == 1:
+            rest = [v for v in ways[0] if not _bound(v, ends)]
+            cases = [[*case, *rest] for case in cases] if rest else cases
+            continue
+        if len(cases) * len(ways) > _CONJUNCTIONS or len(cases) * sum(map(len, ways)) > _BOXES:
+            raise InputError(f"more than {_CONJUNCTIONS} combinations of cases", fix="use fewer assertions of (or")
+        cases = [[*old, *new] for old in cases for new in ways]
+    boxes: dict[bytes, tuple[np.ndarray, list[_Conjunction]]] = {}
+    for case in cases:
+        own = ends.copy()
+        outputs = [v for v in case if not _bound(v, own)]
+        if (len(boxes) + 1) * ends.size > _BOXES:
+            raise InputError(f"boxes of inputs with more than {_BOXES} numbers", fix="use fewer boxes")
+        boxes.setdefault(own.tobytes(), (own, []))[1].append(outputs)
+    found = []
+    for own, conjunctions in boxes.values():
+        if not np.isfinite(own).all():
+            index = int(np.flatnonzero(~np.isfinite(own).all(0))[0])
+            raise InputError(f"X_{index} has no bounds", fix="assert a lower and an upper bound of every input")
+        found.append(Region(own[0], own[1], _unsafe(conjunctions, sizes.outputs, 0)))
+    return tuple(found)
+
+
+def _bound(constraint: _Linear, ends: np.ndarray) -> bool:
+    """Whether ``constraint`` is one on an input; if it is, ``ends`` [2, n] obey it afterwards.
+
+    Raises:
+        InputError: It is on several inputs, or on inputs and outputs.
+    """
+    coefficients, constant = constraint
+    used = [(key, value) for key, value in coefficients.items() if value]
+    if all(key >= 0 for key, _ in used):
+        return False
+    if len(used) > 1:
+        raise InputError(
+            "a constraint joins several inputs, or inputs and outputs", fix="assert bounds of single inputs"
+        )
+    value, index = used[0][1], -1 - used[0][0]
+    limit = -constant / value
+    side = 1 if value > 0.0 else 0
+    if abs(value) != 1.0:
+        limit = float(np.nextafter(limit, np.inf if side else -np.inf))
+    ends[side, index] = min(ends[1, index], limit) if side else max(ends[0, index], limit)
+    return True
+
+
+def _declares(expression: Any, declared: set[str]) -> bool:
+    """Whether an expression declares a variable; if not, it is an assertion.
+
+    Raises:
+        InputError: It is neither.
+    """
+    head = expression[0] if isinstance(expression, list) and expression else None
+    if head == "declare-const" and len(expression) == 3:
+        _, name, kind = expression
+        if not (isinstance(name, str) and _VARIABLE.fullmatch(name)) or kind != "Real":
+            raise _fail(expression, "declare X_0, X_1, ..., Y_0, Y_1, ... as Real")
+        declared.add(name)
+        return True
+    if head == "assert" and len(expression) == 2:
+        return False
+    raise _fail(expression, "use declare-const and assert of VNN-LIB version 1")
 
 
 def _expressions(text: str) -> list[Any]:
@@ -111,30 +233,27 @@ def _parse(expressions: list[Any], output_size: int) -> UnsafeSet:
     unsafe: list[_Conjunction] = [[]]
     inputs = 0
     for expression in expressions:
-        head = expression[0] if isinstance(expression, list) and expression else None
-        if head == "declare-const" and len(expression) == 3:
-            _, name, kind = expression
-            if not (isinstance(name, str) and _VARIABLE.fullmatch(name)) or kind != "Real":
-                raise _fail(expression, "declare X_0, X_1, ..., Y_0, Y_1, ... as Real")
-            declared.add(name)
-        elif head == "assert" and len(expression) == 2:
-            names = {name[0] for name in _names(expression[1])}
-            if names == {"X"}:
-                inputs += 1
-                continue
-            ways = _ways(expression[1], declared, output_size)
-            if len(unsafe) * len(ways) > _CONJUNCTIONS:
-                raise InputError(f"more than {_CONJUNCTIONS} combinations of cases", fix="use fewer assertions of (or")
-            unsafe = [[*old, *new] for old in unsafe for new in ways]
-        else:
-            raise _fail(expression, "use declare-const and assert of VNN-LIB version 1")
+        if _declares(expression, declared):
+            continue
+        names = {name[0] for name in _names(expression[1])}
+        if names == {"X"}:
+            inputs += 1
+            continue
+        ways = _ways(expression[1], declared, _Sizes(None, output_size))
+        if len(unsafe) * len(ways) > _CONJUNCTIONS:
+            raise InputError(f"more than {_CONJUNCTIONS} combinations of cases", fix="use fewer assertions of (or")
+        unsafe = [[*old, *new] for old in unsafe for new in ways]
     if not any(unsafe):
         raise InputError("no assertion on an output", fix="assert which outputs are unsafe")
+    return _unsafe(unsafe, output_size, inputs)
+
+
+def _unsafe(conjunctions: list[_Conjunction], output_size: int, inputs: int) -> UnsafeSet:
     rows: list[np.ndarray] = []
     offsets: list[float] = []
     known: dict[tuple[Any, float], int] = {}
     groups = []
-    for conjunction in unsafe:
+    for conjunction in conjunctions:
         group = []
         for coefficients, constant in conjunction:
             key = (tuple(sorted(coefficients.items())), constant)
@@ -145,7 +264,7 @@ def _parse(expressions: list[Any], output_size: int) -> UnsafeSet:
                 offsets.append(offset)
             group.append(known[key])
         groups.append(tuple(group))
-    return UnsafeSet(np.array(rows), np.array(offsets), tuple(groups), inputs)
+    return UnsafeSet(np.array(rows).reshape(-1, output_size), np.array(offsets), tuple(groups), inputs)
 
 
 def _scaled(coefficients: dict[int, float], constant: float, size: int) -> tuple[np.ndarray, float]:
@@ -181,7 +300,7 @@ def _names(expression: Any) -> set[str]:
     return {expression} if _VARIABLE.fullmatch(expression) else set()
 
 
-def _ways(expression: Any, declared: set[str], size: int) -> list[_Conjunction]:
+def _ways(expression: Any, declared: set[str], size: _Sizes) -> list[_Conjunction]:
     """The expression as a disjunction of conjunctions."""
     head = expression[0] if isinstance(expression, list) and expression else None
     if head == "or" and len(expression) > 1:
@@ -221,7 +340,7 @@ def _added(total: float, factor: float, value: float) -> float:
     return found
 
 
-def _linear(expression: Any, declared: set[str], size: int) -> _Linear:
+def _linear(expression: Any, declared: set[str], size: _Sizes) -> _Linear:
     if isinstance(expression, str):
         return _atom(expression, declared, size)
     head, parts = (expression[0], expression[1:]) if expression else (None, [])
@@ -244,7 +363,7 @@ def _linear(expression: Any, declared: set[str], size: int) -> _Linear:
     raise _fail(expression, "write a linear expression of outputs")
 
 
-def _atom(text: str, declared: set[str], size: int) -> _Linear:
+def _atom(text: str, declared: set[str], size: _Sizes) -> _Linear:
     match = _VARIABLE.fullmatch(text)
     if match is None:
         number = _NUMBER.fullmatch(text)
@@ -256,9 +375,13 @@ def _atom(text: str, declared: set[str], size: int) -> _Linear:
         return {}, value
     if text not in declared:
         raise InputError(f"{text} is not declared", fix=f"add (declare-const {text} Real)")
-    if match[1] == "X":
-        raise InputError(f"an assertion joins {text} with outputs", fix="assert inputs and outputs apart")
     index = int(match[2])
-    if index >= size:
-        raise InputError(f"{text}: the network has the outputs Y_0 to Y_{size - 1}", fix="use the network's file")
+    if match[1] == "X":
+        if size.inputs is None:
+            raise InputError(f"an assertion joins {text} with outputs", fix="assert inputs and outputs apart")
+        if index >= size.inputs:
+            raise InputError(f"{text}: the network has the inputs X_0 to X_{size.inputs - 1}", fix=_OTHER)
+        return {-1 - index: 1.0}, 0.0
+    if index >= size.outputs:
+        raise InputError(f"{text}: the network has the outputs Y_0 to Y_{size.outputs - 1}", fix=_OTHER)
     return {index: 1.0}, 0.0

@@ -8,7 +8,7 @@ part by part, where it is exact for independent samples.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -17,6 +17,7 @@ import torch
 from torch import Tensor
 
 from ns_abstract.arithmetic.chebyshev import ChebyshevBasis
+from ns_abstract.arithmetic.outward import outward
 from ns_abstract.arithmetic.rounding import CHEBYSHEV_ROUNDING, COMPOSITE_ROUNDING, UNIT64
 from ns_abstract.arithmetic.taylor import TaylorArray
 from ns_abstract.execution.ending import checkpoint
@@ -135,6 +136,8 @@ class RayBounds:
         alpha: [n, samples] float32 upper bounds of the opacity of every sample over the box.
         cells: Cells of the network that were bounded.
         displacement: Half the way of a sample over a cell that the network's bounds bear, as far as these rays tell.
+        parts: [2, n, shifts, *parts, 3] float32 lower and upper bounds, rounded outward, by part of the box, if a
+            division was given; one row of ``shifts`` where none were.
     """
 
     lower: np.ndarray
@@ -142,6 +145,7 @@ class RayBounds:
     alpha: np.ndarray
     cells: int
     displacement: float
+    parts: np.ndarray | None = None
 
 
 @dataclass
@@ -269,6 +273,7 @@ class NerfBounds:
         known: np.ndarray | None = None,
         aim: tuple[np.ndarray, np.ndarray] | None = None,
         shifts: list[Shifts] | None = None,
+        division: Division | None = None,
     ) -> RayBounds:
         """Bounds of the colours of ``pixels`` [n, 2] over every pose of ``box``.
 
@@ -279,27 +284,41 @@ class NerfBounds:
             known: [n, samples] upper bounds of opacities over a larger box.
             aim: [n, 3] lower and upper colours; bounds between them are good enough (before the shifts).
             shifts: Intervals of hue and saturation that are added to all colours; bounds hold over all of them.
+            division: The cells, in place of those that suit the rays; bounds are then kept by part.
         """
-        n, samples = len(pixels), self.distances.size
+        n, samples, given_division = len(pixels), self.distances.size, division
         pencil = Pencil(pose_set, box, pixels, self.taylor, self.swept)
         moves = pencil.displacement(self.distances, self.lengths)
-        division = self._division(moves)
+        if division is None:
+            division = self.division(moves)
         if division is None or not (np.isfinite(pencil.direction).all() and np.isfinite(pencil.direction_radius).all()):
-            return RayBounds(np.zeros((n, 3)), np.ones((n, 3)), np.ones((n, samples), np.float32), 0, self.displacement)
+            nothing = np.zeros((n, 3)), np.ones((n, 3)), np.ones((n, samples), np.float32)
+            if given_division is None:
+                return RayBounds(*nothing, 0, self.displacement)
+            parts = given_division.parts[: box.dimensions]
+            low = np.zeros((n, max(1, len(shifts or [])), *parts, 3), np.float32)
+            return RayBounds(*nothing, 0, self.displacement, np.stack([low, np.ones_like(low)]))
         if n > 1 and n * samples * math.prod(division.parts) > _NUMBERS:
             halves = []
             for which in (slice(0, n // 2), slice(n // 2, n)):
                 part = None if aim is None else (aim[0][which], aim[1][which])
                 given = None if known is None else known[which]
-                halves.append(self.rays(pose_set, box, pixels[which], tolerance, given, part, shifts))
+                halves.append(self.rays(pose_set, box, pixels[which], tolerance, given, part, shifts, given_division))
             lower, upper, alpha = (
                 np.concatenate([getattr(half, name) for half in halves]) for name in ("lower", "upper", "alpha")
             )
-            return RayBounds(lower, upper, alpha, halves[0].cells + halves[1].cells, typical_displacement(halves))
-        return _Work(self, pencil, division, moves, tolerance, known, aim).run(shifts or [])
+            parts = [half.parts for half in halves if half.parts is not None]
+            return RayBounds(
+                lower, upper, alpha, halves[0].cells + halves[1].cells, typical_displacement(halves),
+                np.concatenate(parts, axis=1) if parts else None,
+            )  # fmt: skip
+        return _Work(self, pencil, division, moves, tolerance, known, aim).run(shifts or [], given_division is not None)
 
-    def _division(self, moves: np.ndarray) -> Division | None:
-        """Levels for samples that move by ``moves`` [n, samples, d]; None where the box is far too wide."""
+    def division(self, moves: np.ndarray, most: int = _PARTS) -> Division | None:
+        """Levels for samples that move by ``moves`` [n, samples, d].
+
+        None where that would be more than ``most`` parts: the box is far too wide.
+        """
         d = moves.shape[2]
         if d == 0:
             return Division((), 0)
@@ -313,7 +332,7 @@ class NerfBounds:
             widest[axis] *= 0.5
         deeper = _DEEPER.get(d, _DEEPER_MORE)
         finer = _FINER.get(d, 0)
-        if 1 << (len(axes) + deeper + d * finer) > _PARTS:
+        if 1 << (len(axes) + deeper + d * finer) > most:
             return None
         for _ in range(deeper):
             axis = int(np.argmax(widest))
@@ -365,8 +384,11 @@ class _Work:
                 self.alpha_high[k, i] = known[i, k]
         self._levels: dict[int, tuple[Tensor, Tensor, np.ndarray]] = {}
 
-    def run(self, shifts: list[Shifts]) -> RayBounds:
-        """Bound block after block of samples, nearest first, then halve cells where colours are too wide."""
+    def run(self, shifts: list[Shifts], by_part: bool = False) -> RayBounds:
+        """Bound block after block of samples, nearest first, then halve cells where colours are too wide.
+
+        ``by_part``: keep the bounds of every part.
+        """
         samples = self.owner.distances.size
         for first in range(0, samples, _BLOCK):
             block = np.arange(first, min(samples, first + _BLOCK))
@@ -376,17 +398,23 @@ class _Work:
             self._bound_block(block)
             self.light *= np.prod(1.0 - self._anywhere(self.alpha_low[block], np.minimum), axis=0)
         self._improve()
-        lower, upper = self._composite()
-        if shifts:
-            color = self.color_low, self.color_high
-            found = []
-            for shift in shifts:
-                checkpoint()
-                self.color_low, self.color_high = self._shifted(color, shift)
-                found.append(self._composite())
-            lower, upper = np.min([low for low, _ in found], axis=0), np.max([high for _, high in found], axis=0)
+        color, found = (self.color_low, self.color_high), []
+        for shift in shifts:
+            checkpoint()
+            self.color_low, self.color_high = self._shifted(color, shift)
+            found.append(self._composite())
+        low, high = (np.stack(ends, axis=1) for ends in zip(*(found or [self._composite()]), strict=True))
         alpha = self.alpha_high.max(axis=2).T.astype(np.float32)
-        return RayBounds(lower, upper, np.nextafter(alpha, np.float32(2.0)), self.cells, self.displacement)
+        return RayBounds(
+            low.min(axis=(1, 2)), high.max(axis=(1, 2)), np.nextafter(alpha, np.float32(2.0)), self.cells,
+            self.displacement,
+            np.stack(outward(self._poses(low, np.min), self._poses(high, np.max))) if by_part else None,
+        )  # fmt: skip
+
+    def _poses(self, values: np.ndarray, end: Callable[..., np.ndarray]) -> np.ndarray:
+        """[n, shifts, *parts, 3] of [n, shifts, parts, 3]: by part of the poses alone."""
+        apart = values.reshape(*values.shape[:2], *self.division.parts, 3)
+        return end(apart, axis=-2) if self.owner.swept else apart
 
     @property
     def _dark(self) -> float:
@@ -659,12 +687,12 @@ class _Work:
         return low, high
 
     def _composite(self) -> tuple[np.ndarray, np.ndarray]:
-        """[n, 3] bounds over all parts (design.md, F8)."""
+        """[n, parts, 3] bounds by part (design.md, F8)."""
         low, high = self._composited(False)
         if self.owner.swept:
             other_low, other_high = self._composited(True)
             low, high = np.maximum(low, other_low), np.minimum(high, other_high)
-        return low.min(axis=1), high.max(axis=1)
+        return low, high
 
     def _composited(self, apart: bool) -> tuple[np.ndarray, np.ndarray]:
         """[n, parts, 3] bounds by parts; ``apart``: see `_mixtures`."""

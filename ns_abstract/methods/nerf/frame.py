@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import secrets
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from typing import Any
@@ -22,6 +22,7 @@ from ns_abstract.methods.nerf.bounds import NerfBounds, RayBounds, Shifts, typic
 from ns_abstract.methods.nerf.hsv import color_shift
 from ns_abstract.methods.nerf.render import NerfRenderer, Sampling
 from ns_abstract.methods.nerf.scene import NerfScene
+from ns_abstract.methods.nerf.strips import Strips
 from ns_abstract.refine.protocol import LinearSets, Member
 
 #: What an open sample may move a pixel by on boxes a quarter as wide as the set, as a part of the pixels' mean
@@ -84,7 +85,7 @@ def _processes(count: int) -> Processes:
 _here: dict[bytes, NerfBounds] = {}
 
 
-def _bound_share(frame: bytes, bounds: tuple[Any, ...], displacement: float, arguments: tuple[Any, ...]) -> RayBounds:
+def _bound_share(frame: bytes, bounds: tuple[Any, ...], displacement: float, arguments: Sequence[Any]) -> RayBounds:
     """`NerfBounds.rays` in another process; ``bounds`` are the constructor's arguments."""
     if frame not in _here:
         _here.clear()
@@ -237,33 +238,83 @@ class NerfFrame:
                     None if known is None else known[part], (low[part], high[part]), shifts,
                 )
             )  # fmt: skip
-        if len(shares) == 1:
-            found = [self.bounds.rays(*shares[0])]
-        else:
-            engine = _processes(self.workers)
-            for number, share in enumerate(shares):
-                engine.submit(number, _bound_share, self._token, self._recipe, self.bounds.displacement, share)
-            done: dict[int, RayBounds] = {}
-            patience = None
-            try:
-                while len(done) < len(shares):
-                    for number, answer in engine.collect(_PATIENCE):
-                        if not isinstance(answer, AbandonedError):
-                            done[number] = answer
-                    if patience is None and is_over():
-                        patience = time.monotonic() + _GRACE
-                        engine.abandon()
-                    if patience is not None and (not engine.unfinished or time.monotonic() > patience):
-                        raise AbandonedError
-            except BaseException:
-                # what is still at work would answer those who ask next
-                if engine.unfinished:
-                    _processes.cache_clear()
-                    engine.close()
-                raise
-            found = [done[number] for number in range(len(shares))]
+        found = self._run(shares)
         self.bounds.displacement = typical_displacement(found)
         return found
+
+    def _run(self, calls: Sequence[Sequence[Any]]) -> list[RayBounds]:
+        """`NerfBounds.rays` with the arguments of each call, side by side where there are several.
+
+        Raises:
+            AbandonedError: There is no time for it.
+        """
+        if len(calls) == 1 or self.workers == 1:
+            return [self.bounds.rays(*call) for call in calls]
+        engine = _processes(self.workers)
+        for number, call in enumerate(calls):
+            engine.submit(number, _bound_share, self._token, self._recipe, self.bounds.displacement, call)
+        done: dict[int, RayBounds] = {}
+        patience = None
+        try:
+            while len(done) < len(calls):
+                for number, answer in engine.collect(_PATIENCE):
+                    if not isinstance(answer, AbandonedError):
+                        done[number] = answer
+                if patience is None and is_over():
+                    patience = time.monotonic() + _GRACE
+                    engine.abandon()
+                if patience is not None and (not engine.unfinished or time.monotonic() > patience):
+                    raise AbandonedError
+        except BaseException:
+            # what is still at work would answer those who ask next
+            if engine.unfinished:
+                _processes.cache_clear()
+                engine.close()
+            raise
+        return [done[number] for number in range(len(calls))]
+
+    @cached_property
+    def _strips(self) -> Strips:
+        return Strips(self.bounds, self.pose_set, self._pixels(np.arange(self.tile_count)), self._run)
+
+    def sets(self, box: ParameterBox, weigh: Callable[[], np.ndarray | None] | None = None) -> RayBox:
+        """All rays over a cell ``box`` with linear bounds, from strips of the set that are kept.
+
+        Args:
+            box: Part of the frame's set.
+            weigh: Gives [H, W, 3] what part of the margin a unit of each pixel's width may cost, or None; asked only
+                where rays could be refined.
+
+        Raises:
+            AbandonedError: There is no time for it.
+        """
+
+        def weights() -> np.ndarray | None:
+            found = None if weigh is None else weigh()
+            return None if found is None else np.asarray(found, np.float64).reshape(self.tile_count, 3)
+
+        linear, lower, upper = self._strips.sets(box, weights)
+        shape = (self.tile_count, 1, 1, 3)
+        a_lower, b_lower, a_upper, b_upper = linear
+        d = box.dimensions
+        slopes = 0.5 * (np.abs(a_lower) + np.abs(a_upper)).astype(np.float64).sum(axis=(0, 1))
+        sets = a_lower.reshape(*shape, d), b_lower.reshape(shape), a_upper.reshape(*shape, d), b_upper.reshape(shape)
+        return RayBox(lower.reshape(shape), upper.reshape(shape), slopes, None, sets)
+
+    def effort(self) -> tuple[float, int]:
+        """Seconds that one ray takes over one strip of the set, about, and how many strips there are.
+
+        Raises:
+            AbandonedError: There is no time to find out.
+        """
+        strips = self._strips
+        try:
+            strips.layout()
+        except AbandonedError:
+            if strips.effort is None:
+                raise
+        assert strips.effort is not None
+        return strips.effort
 
     def watch(self, tiles: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> None:
         """Take notice of the inner bounds [t, 1, 1, 3] of ``tiles`` [t] in a refinement, which change meanwhile."""

@@ -200,9 +200,15 @@ class NerfMethod:
             "notes": list(scene.notes),
         }
 
-    def differentiable(self, poses: PoseSet) -> Callable[[torch.Tensor], torch.Tensor] | None:
-        """None: linear bounds of rays are flat, so certificates are not made of NeRFs."""
-        return None
+    def differentiable(self, poses: PoseSet) -> Callable[[torch.Tensor], torch.Tensor]:
+        """Parameter values [d] to the picture [H, W, 3], by the concrete renderer."""
+        from ns_abstract.geometry.differentiable_pose import differentiable_pose
+        from ns_abstract.methods.nerf.hsv import color_shift
+        from ns_abstract.methods.nerf.render import NerfRenderer
+
+        renderer, pose = NerfRenderer(self.scene, self.sampling), differentiable_pose(poses.geometry)
+        count, camera = poses.geometry.box.dimensions, poses.camera
+        return lambda values: renderer.picture(camera, pose(values[:count]), color_shift(poses, values.unbind()))
 
 
 def _load(source: RunConfig | Path) -> NerfScene:
@@ -218,4 +224,4 @@ def _method(scene: NerfScene, options: ProgramOptions, arithmetic: str | None, w
     )
 
 
-NERF = Representation(lambda source: isinstance(source, RunConfig) and holds_nerf(source), _load, _method)
+NERF = Representation(lambda source: isinstance(source, RunConfig) and holds_nerf(source), _load, _method, rays=True)

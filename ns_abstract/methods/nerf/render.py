@@ -13,6 +13,7 @@ from typing import Any, Literal
 import numpy as np
 import torch
 from torch import Tensor
+from torch.utils.checkpoint import checkpoint as recompute
 
 from ns_abstract.execution.ending import checkpoint
 from ns_abstract.geometry.camera_path import Camera
@@ -127,6 +128,22 @@ class NerfRenderer:
         """The image [H, W, 3] float64."""
         grid = np.indices((camera.height, camera.width)).reshape(2, -1).T
         return self.pixels(camera, pose, grid, shift).reshape(camera.height, camera.width, 3)
+
+    def picture(self, camera: Camera, pose: Tensor, shift: Shift | None = None) -> Tensor:
+        """The image [H, W, 3] from camera-to-world ``pose`` [3, 4]; differentiable.
+
+        Rays are worked on some at a time, and once more where slopes are asked for, so that memory stays small.
+        """
+        grid = np.indices((camera.height, camera.width)).reshape(2, -1).T
+        directions = torch.from_numpy(camera_rays(camera, grid)).to(self.device, self.dtype)
+        count = self.sampling.samples + (self.sampling.importance if self.sampling.kind == "hierarchical" else 0)
+
+        def part(pose: Tensor, directions: Tensor) -> Tensor:
+            checkpoint()
+            return self.rays(pose, directions, shift)
+
+        parts = [recompute(part, pose, some, use_reentrant=False) for some in directions.split(max(1, _CHUNK // count))]
+        return torch.cat(parts).reshape(camera.height, camera.width, 3)
 
     def _distances(self, bins: Tensor) -> Tensor:
         s = self.sampling

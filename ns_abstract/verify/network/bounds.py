@@ -1,4 +1,4 @@
-"""Bounds of a network's outputs over sets of images (docs/design.md, N, N1, N2, N6, N0)."""
+"""Bounds of a network's outputs over sets of images (docs/design.md, N, N0, N1, N2, N6, N12)."""
 
 from __future__ import annotations
 
@@ -11,10 +11,12 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from ns_abstract.execution.ending import checkpoint
 from ns_abstract.verify.network.graph import Network, NetworkArithmetic
 from ns_abstract.verify.network.layers import Activation, LeakyRelu, Linear, Scale, Sum
+from ns_abstract.verify.network.maxima import Candidates, MaxPool, upper_planes
 from ns_abstract.verify.network.products import Product
-from ns_abstract.verify.network.rows import Rows, charge, concretize, full, grid, join, pass_activation
+from ns_abstract.verify.network.rows import Rows, charge, concretize, full, grid, join, pass_activation, pass_maximum
 
 Float64 = NDArray[np.float64]
 Int64 = NDArray[np.int64]
@@ -34,6 +36,12 @@ _OVERFLOW = 2.0**126
 #: So many open numbers of a node are tightened only if some of them gain by it: if not so large a part of these
 #: keeps so large a part of its width.
 _MANY, _SOME, _GAIN = 1024, 64, 0.95
+#: Signs of many units are given up if so few of some are found out, and so many of the layer before were not.
+_UNSURE = 0.25
+#: Differences in windows are bounded by rows if so large a part of those tried first is decided by it.
+_CLOSES = 0.1
+#: Room for rounding of lines relative to references and sizes.
+_REFERENCES = 2.0**-46
 #: Bytes of rows that are worked on at a time: they should stay in a processor's cache.
 _ROWS_AT_ONCE = 24 << 20
 
@@ -207,6 +215,8 @@ class _Cells:
         self.lines: dict[int, np.ndarray] = {}
         #: what rows on a product become on its first and its second factor
         self.products: dict[int, tuple[np.ndarray, ...]] = {}
+        #: what rows on a maximum become on the numbers of its windows
+        self.maxima: dict[int, _Maxima] = {}
         #: rounding of the network and of rows
         self.noise: dict[int, Tensor] = {}
         #: roundings of sums
@@ -215,6 +225,8 @@ class _Cells:
         self.folded: set[int] = set()
         #: what rows may stop at
         self.stops: dict[int, _Planes] = {}
+        #: part of the latest ReLU's inputs whose signs have not been found out
+        self.unsure = 0.0
         self.last = self._forward()
         if substitution == "end":
             self._planes(fields, "everywhere")
@@ -296,6 +308,8 @@ class _Cells:
                 open_ = node.layer.open(*inputs[0].interval)
                 decides = isinstance(node.layer, LeakyRelu)
                 forms[source] = inputs[0] = self._tighten(source, inputs[0], open_, decides)
+                if decides:
+                    self.unsure = float(node.layer.open(*inputs[0].interval).double().mean())
                 forms.append(self._activate(k, source, node.layer, inputs[0]))
                 if self.network.depth[source] > 1:
                     self.stops[source] = self._stop(source, inputs[0])
@@ -304,6 +318,8 @@ class _Cells:
                 for position, source in enumerate(node.inputs):
                     forms[source] = inputs[position] = self._tighten(source, inputs[position], open_)
                 forms.append(self._multiply(k, node.inputs, node.layer, inputs[0], inputs[1]))
+            elif isinstance(node.layer, MaxPool):
+                forms.append(self._maximum(k, node.inputs[0], node.layer, inputs[0]))
             else:
                 forms.append(self._combine(k, node.inputs, node.layer, inputs))
             for index in node.inputs:
@@ -458,6 +474,149 @@ class _Cells:
         room = room + 2.0**-50 * (size + reference.abs())
         return self._within(form, ends.amin(0) - room, ends.amax(0) + room)
 
+    def _maximum(self, k: int, source: int, layer: MaxPool, x: _Form) -> _Form:
+        """Maxima over windows (N12); the reference is that of the number which the lower plane follows."""
+        m, shape = self.count, layer.shape
+        interval = x.interval
+        lower, upper = (layer.taps(v, -torch.inf) for v in interval)
+        winner = layer.taps(x.reference + x.c, -torch.inf).argmax(2, keepdim=True)
+
+        def chosen(v: Tensor) -> Tensor:
+            return layer.taps(v, 0.0).gather(2, winner)[:, :, 0]
+
+        reference, c, r, width = (chosen(v) for v in (x.reference, x.c, x.r, x.width))
+        a = torch.stack([chosen(x.a[:, i]) for i in range(self.d)], 1)
+        # sums of rows where windows overlap
+        unit = (_SPARE + layer.overlaps + self.network.readers[source]) * UNIT
+        give = unit * width
+        offsets = torch.stack([-give, give, give, -give], 0)
+        rivals = upper.scatter(2, winner, -torch.inf).amax(2)
+        most, own_upper = upper.amax(2), chosen(interval.upper)
+        where = (rivals > chosen(interval.lower)).nonzero()
+        which = torch.full(reference.shape, -1, dtype=torch.int64)
+        slopes = []
+        step = max(1, _ROWS_AT_ONCE // (8 * len(layer.steps) ** 2 * 4))
+        for part in where.split(step):
+            cell, channel, window = part.T
+            at = cell, channel, window
+            places = layer.places[:, window].T
+            inside, number = places >= 0, channel[:, None] * x.c[0, 0].numel() + places.clamp(min=0)
+
+            def gathered(v: Tensor, cell: Tensor = cell, number: Tensor = number) -> Tensor:
+                return v.flatten(1)[cell[:, None], number]
+
+            known = Candidates(
+                inside,
+                reference=gathered(x.reference),
+                middle=gathered(x.c),
+                radius=gathered(x.r),
+                slopes=torch.stack([gathered(x.a[:, i]) for i in range(self.d)], 2),
+                lower=gathered(interval.lower),
+                upper=gathered(interval.upper),
+                winner=winner[:, :, 0][at],
+            )
+            apart = self._apart(source, layer, part, known)
+            row = torch.arange(len(part))
+            top = apart[row, :, known.winner].amax(1)
+            left = top > 0.0
+            if not bool(left.any()):
+                continue
+            known, apart = Candidates(*(v[left] for v in known)), apart[left]
+            at, top = tuple(v[left] for v in at), top[left]
+            planes = upper_planes(known, apart)
+            which[at] = torch.arange(len(top)) + sum(map(len, slopes))
+            stored = planes.slopes.float()
+            base = (planes.slopes * known.reference).sum(1) - reference[at]
+            near = gathered(x.width)[left]
+            lost = ((stored.double() - planes.slopes).abs() * near + unit * planes.slopes * near).sum(1)
+            lost = lost + _REFERENCES * ((planes.slopes * known.reference.abs()).sum(1) + reference[at].abs())
+            offsets[1][at] = give[at] + top
+            offsets[2][at] = planes.high + base + lost
+            offsets[3][at] = planes.low + base - lost
+            slopes.append(stored)
+            # the form between the planes, or the winner and what may be above it
+            low, high = planes.low + base - lost, planes.high + base + lost
+            middle = (planes.slopes * known.middle).sum(1) + 0.5 * (low + high)
+            radius = (planes.slopes * known.radius).sum(1) + 0.5 * (high - low)
+            radius = (radius + _REFERENCES * (planes.slopes * known.size).sum(1)) * (1.0 + 2.0**-40)
+            own = r[at] + 0.5 * top
+            better = radius < own
+            tilted = (planes.slopes[:, :, None] * known.slopes).sum(1)
+            c[at] = torch.where(better, middle, c[at] + 0.5 * top)
+            r[at] = torch.where(better, radius, own * (1.0 + 2.0**-40) + _REFERENCES * c[at].abs())
+            cells, channels, windows = at
+            a[cells, :, channels, windows] = torch.where(better[:, None], tilted, a[cells, :, channels, windows])
+            most[at] = torch.minimum(most[at], own_upper[at] + top)
+        grown = (m, *shape)
+        outward = [_outward(v, side) for v, side in zip(offsets, (-1.0, 1.0, 1.0, -1.0), strict=True)]
+        self.maxima[k] = _Maxima(
+            winner[:, :, 0].reshape(grown).numpy().astype(np.int16),
+            which.reshape(grown).numpy().astype(np.int32),
+            (torch.cat(slopes) if slopes else torch.zeros((0, len(layer.steps)))).numpy(),
+            torch.stack(outward).reshape(4, *grown).numpy(),
+        )
+        active = (layer.taps(x.active.double(), 0.0).amax(2) > 0.0).reshape(grown)
+        reference, c, r = (v.reshape(grown) for v in (reference, c, r))
+        form = _Form.ranged(reference, c, a.reshape(m, self.d, *shape), r, active)
+        lost = int(np.prod(shape)) * 2 * len(layer.steps) * _FLUSH
+        self.flush += lost * x.width.reshape(m, -1).amax(1).numpy()
+        room = 2.0**-50 * (reference.abs() + form.width)
+        least = lower.amax(2).reshape(grown)
+        return self._within(form, least - reference - room, most.reshape(grown) - reference + room)
+
+    def _apart(self, source: int, layer: MaxPool, where: Tensor, known: Candidates) -> Tensor:
+        """How far numbers of windows may be above one another, by forms and by rows where these help."""
+        apart = known.apart()
+        at, winner = np.arange(len(apart)), known.winner.numpy()
+
+        def rivals() -> np.ndarray:
+            return apart.numpy()[at, :, winner] > 0.0
+
+        # (window, number, number)
+        window, number = rivals().nonzero()
+        pairs = np.stack([window, winner[window], number], 1)
+        if len(pairs) > _SOME:
+            first = np.arange(0, len(pairs), len(pairs) // _SOME)
+            if self._differences(source, layer, where.numpy(), known, pairs[first], apart) < _CLOSES * len(first):
+                return apart
+            pairs = np.delete(pairs, first, 0)
+        self._differences(source, layer, where.numpy(), known, pairs, apart)
+        # what may be above the winner, among itself
+        left = rivals()
+        both = np.triu(left[:, :, None] & left[:, None, :], 1)
+        self._differences(source, layer, where.numpy(), known, np.argwhere(both), apart)
+        return apart
+
+    def _differences(
+        self, source: int, layer: MaxPool, where: Int64, known: Candidates, pairs: Int64, apart: Tensor
+    ) -> int:
+        """Bound differences of (window, number, number) by rows, in ``apart``; how many second ones are never above."""
+        channels = self.network.shape(source)[0]
+        extent = layer.steps.max(0) + 1
+        step = max(1, _ROWS_AT_ONCE // (16 * channels * int(np.prod(extent))))
+        closed = 0
+        for part in np.array_split(pairs, max(1, -(-len(pairs) // step))):
+            if not len(part):
+                continue
+            window, one, other = part.T
+            cell, channel, place = where[window].T
+            y, x = np.divmod(place, layer.shape[2])
+            value = np.zeros((len(part), channels, *extent), np.float32)
+            row = np.arange(len(part))
+            for chosen, sign in ((one, 1.0), (other, -1.0)):
+                i, j = layer.steps[chosen].T
+                value[row, channel, i, j] = sign
+            near = known.reference[window, one], known.reference[window, other]
+            ahead = (near[0] - near[1]).numpy()
+            room = 2.0**-50 * (near[0].abs() + near[1].abs()).numpy()
+            rows = Rows(value, y * layer.stride[0] - layer.pads[0], x * layer.stride[1] - layer.pads[1])
+            found = self._backward(source, rows, np.ascontiguousarray(cell), room - ahead)
+            above, below = torch.from_numpy(room - ahead - found.lower), torch.from_numpy(room + ahead + found.upper)
+            apart[window, other, one] = torch.minimum(apart[window, other, one], above)
+            apart[window, one, other] = torch.minimum(apart[window, one, other], below)
+            closed += int((above <= 0.0).sum())
+        return closed
+
     def _stop(self, index: int, form: _Form) -> _Planes:
         """What is known of node ``index``, for rows that arrive there."""
         m, d, shape = self.count, self.d, grid(self.network.shape(index))
@@ -486,6 +645,10 @@ class _Cells:
             before, found = form, self._tighten(index, form, first, decides)
             widths = [(f.upper - f.lower).reshape(open_.shape)[some] for f in (before, found)]
             if bool((widths[1] > _GAIN * widths[0]).double().mean() > _GAIN):
+                return found
+            lower, upper = (v.reshape(open_.shape)[some] for v in found.interval)
+            if decides and self.unsure > _UNSURE and float(((lower < 0.0) & (upper > 0.0)).double().mean()) > _GAIN:
+                # hardly any sign is found out, nor was it in the layer before: what follows is not worth it
                 return found
             form, open_ = found, open_ & ~first
             where = open_.nonzero().numpy()
@@ -551,6 +714,7 @@ class _Cells:
 
     def _descend(self, start: int, at: int, batch: _Batch, found: _Reached, need: Float64 | None) -> None:
         """Pass a batch from node ``at`` on to the image."""
+        checkpoint()
         while at > 0:
             if at not in batch.waiting:
                 at -= 1
@@ -572,6 +736,8 @@ class _Cells:
             if isinstance(node.layer, Activation):
                 pass_activation(here.value, here.y, here.x, batch.cell, self.lines[at], batch.total)
                 parts = [here]
+            elif isinstance(node.layer, MaxPool):
+                parts = [self.maxima[at].backward(here, node.layer, batch)]
             elif isinstance(node.layer, Product):
                 # every reader changes its rows in place
                 parts = [here, Rows(here.value.copy(), here.y, here.x)]
@@ -659,6 +825,32 @@ class _Planes(NamedTuple):
     offsets: Float64
     lower: Float64
     upper: Float64
+
+
+class _Maxima(NamedTuple):
+    """Planes of a maximum's windows, as rows want them (N12).
+
+    Attributes:
+        winner: [m, C, H, W] int16, the number that the lower plane follows.
+        which: [m, C, H, W] int32, rows of ``slopes``; -1 where the winner is the maximum.
+        slopes: [U, K] float32 of upper planes.
+        offsets: [4, m, C, H, W] float32: lower and upper for coefficients that are not negative, upper and lower
+            for negative ones.
+    """
+
+    winner: np.ndarray
+    which: np.ndarray
+    slopes: np.ndarray
+    offsets: np.ndarray
+
+    def backward(self, rows: Rows, layer: MaxPool, batch: _Batch) -> Rows:
+        """Rows on the input; what they gather on the way goes to the batch."""
+        height, width = rows.value.shape[2:]
+        (down, right), extent = layer.stride, layer.steps.max(0) + 1
+        size = (height - 1) * down + int(extent[0]), (width - 1) * right + int(extent[1])
+        target = np.zeros((*rows.value.shape[:2], *size), np.float32)
+        pass_maximum(rows.value, rows.y, rows.x, batch.cell, *self, layer.steps, layer.stride, batch.total, target)
+        return Rows(target, rows.y * down - layer.pads[0], rows.x * right - layer.pads[1])
 
 
 @dataclass

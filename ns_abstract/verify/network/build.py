@@ -26,12 +26,15 @@ from ns_abstract.verify.network.layers import (
     Sum,
     Tanh,
 )
+from ns_abstract.verify.network.maxima import MaxPool
 
 #: Numbers that one item of a layer may have.
 _LARGEST = 1 << 26
 #: Numbers that all items and all constants made while reading may have together.
 _LARGEST_TOTAL = 1 << 29
 _ONE = (1, 1)
+#: Numbers of a window whose pairs are compared.
+_TAPS = 32
 
 
 class Builder:
@@ -173,40 +176,20 @@ class Builder:
         return self.scale(index, 1.0 / inside.numpy(), None)
 
     def max_pool(self, x: int, kernel: Any, stride: Any, dilation: Any, pads: Any) -> int:
-        """Maxima of windows, by max(a, b) = b + relu(a - b) over the windows' places (N7)."""
-        channels, *sizes = self.shape(x)
-        found = self.check_window(x, kernel, stride, dilation, pads)
-        taps: list[int] = []
-        if not any(pads):
-            for i, j in np.ndindex(*kernel):
-                one = np.zeros((channels, 1, *kernel))
-                one[:, :, i, j] = 1.0
-                taps.append(self.convolution(x, one, None, stride, dilation, pads, channels, exact=True))
-        else:
-            # a place in the padding is replaced by another of the same window, which changes no maximum
-            places = [
-                self._window_places(n, o, k, s, d, p)
-                for n, o, k, s, d, p in zip(sizes, found, kernel, stride, dilation, pads[:2], strict=True)
-            ]
-            base = np.arange(int(np.prod(self.shape(x)))).reshape(self.shape(x))
-            for i, j in np.ndindex(*kernel):
-                index = base[:, places[0][:, i][:, None], places[1][:, j][None, :]]
-                taps.append(self._gather(x, index, 0.0))
-        while len(taps) > 1:
-            pairs = [self._maximum(a, b) for a, b in zip(taps[::2], taps[1::2], strict=False)]
-            taps = pairs + taps[len(pairs) * 2 :]
-        return taps[0]
-
-    @staticmethod
-    def _window_places(size: int, count: int, kernel: int, stride: int, dilation: int, pad: int) -> np.ndarray:
-        """[count, kernel] positions of a window's places, those outside replaced by the nearest inside."""
-        place = np.arange(count)[:, None] * stride - pad + np.arange(kernel)[None, :] * dilation
-        inside = (place >= 0) & (place < size)
-        if not inside.any(axis=1).all():
+        """Maxima of windows (N12)."""
+        channels, *_ = self.shape(x)
+        size = self.check_window(x, kernel, stride, dilation, pads)
+        if kernel[0] * kernel[1] > _TAPS and min(kernel) > 1:
+            # rows of windows, then their columns: fewer pairs of numbers
+            x = self.max_pool(x, (kernel[0], 1), (stride[0], 1), (dilation[0], 1), (pads[0], 0, pads[2], 0))
+            return self.max_pool(x, (1, kernel[1]), (1, stride[1]), (1, dilation[1]), (0, pads[1], 0, pads[3]))
+        layer = MaxPool((self.shape(x),), (channels, *size), tuple(kernel), tuple(stride), tuple(dilation), tuple(pads))
+        self._check_size(layer.shape)
+        # the largest taps of a window at a time, and their places
+        self.reserve(float(np.prod(kernel)) * size[0] * size[1])
+        if not bool((layer.places >= 0).any(0).all()):
             raise InputError("a window lies in the padding altogether", fix="use smaller pads")
-        first, last = inside.argmax(axis=1), kernel - 1 - inside[:, ::-1].argmax(axis=1)
-        number = np.clip(np.arange(kernel)[None, :], first[:, None], last[:, None])
-        return np.take_along_axis(place, number, axis=1)
+        return self._add(layer, x)
 
     def _maximum(self, a: int, b: int) -> int:
         less = self.sum((a, b), (1, -1), exact=True)

@@ -26,6 +26,7 @@ from ns_abstract.verify.network.layers import (
     Tanh,
 )
 from ns_abstract.verify.network.maps import Sparse, TransposedConvolution, Variance
+from ns_abstract.verify.network.maxima import MaxPool
 from ns_abstract.verify.network.products import Product
 
 #: Sums of exponentials one of which is exp(0) are no less than this, rounding included.
@@ -80,7 +81,7 @@ class Composer(Builder):
         if isinstance(layer, Scale) and bool((layer.factor >= 0.0).all()):
             low = layer.factor * least[0] + (0.0 if layer.offset is None else layer.offset)
             return self._rounded(float(low.min()), layer.offset is None or bool((layer.offset >= 0.0).all()))
-        if type(layer) is Linear:
+        if type(layer) is Linear or isinstance(layer, MaxPool):
             return least[0]
         positive = (
             (isinstance(layer, Sum) and min(layer.signs) > 0)

@@ -14,9 +14,10 @@ from torch import Tensor
 
 from ns_abstract.verify.network.curves import Assumed
 from ns_abstract.verify.network.layers import Activation, Linear, Shape, Sigmoid, Tanh
+from ns_abstract.verify.network.maxima import MaxPool
 from ns_abstract.verify.network.products import Product
 
-Layer = Linear | Activation | Product
+Layer = Linear | Activation | Product | MaxPool
 
 #: Whether bounds hold for every float32 evaluation and the exact network, or for that alone.
 NetworkArithmetic = Literal["float32", "real"]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -29,7 +30,7 @@ def load_network(path: Path) -> Network:
     file_size(path, "network")
     if path.suffix == ".onnx":
         network = read_onnx(path)
-        run = _onnxruntime(path)
+        run = onnx_runner(path)
     elif path.suffix == ".pt2":
         network, run = read_exported(path)
     else:
@@ -58,8 +59,12 @@ def load_network(path: Path) -> Network:
     return network
 
 
-def _onnxruntime(path: Path):
-    """Runs the model in onnxruntime on one image [1, ...]."""
+def onnx_runner(path: Path) -> Callable[[np.ndarray], np.ndarray]:
+    """Runs the model in onnxruntime on one image [1, ...]; all outputs one after another.
+
+    Raises:
+        InputError: onnxruntime refuses the file.
+    """
     options = onnxruntime.SessionOptions()
     options.log_severity_level = 4
     options.intra_op_num_threads = options.inter_op_num_threads = 1

@@ -172,6 +172,50 @@ def pass_activation(value, y, x, cell, lines, total):
 
 
 @njit(cache=True, error_model="numpy")
+def pass_maximum(value, y, x, cell, winner, which, slopes, offsets, steps, stride, total, target):
+    """Rows [R, C, h, w] on maxima of windows become rows ``target`` on the numbers of the windows (N12).
+
+    Args:
+        value, y, x, cell: Rows and which cell each belongs to [R].
+        winner, which, slopes, offsets: See `ns_abstract.verify.network.bounds._Maxima`.
+        steps: [K, 2] rows and columns of a window's numbers, from its first.
+        stride: Rows and columns from one window to the next.
+        total: [R, 2] gathers what the rows are at least and at most.
+        target: [R, C, h', w'], zero.
+    """
+    count, channels, h, w = value.shape
+    H, W = winner.shape[2:]
+    for r in range(count):
+        k = cell[r]
+        least, most = 0.0, 0.0
+        for c in range(channels):
+            for i in range(max(0, -y[r]), min(h, H - y[r])):
+                for j in range(max(0, -x[r]), min(w, W - x[r])):
+                    a = value[r, c, i, j]
+                    if a == 0.0:
+                        continue
+                    Y, X = y[r] + i, x[r] + j
+                    b = np.float64(a)
+                    number = which[k, c, Y, X]
+                    if a > 0.0:
+                        least += b * np.float64(offsets[0, k, c, Y, X])
+                        most += b * np.float64(offsets[1, k, c, Y, X])
+                    else:
+                        least += b * np.float64(offsets[2, k, c, Y, X])
+                        most += b * np.float64(offsets[3, k, c, Y, X])
+                    if a > 0.0 or number < 0:
+                        t = winner[k, c, Y, X]
+                        target[r, c, i * stride[0] + steps[t, 0], j * stride[1] + steps[t, 1]] += a
+                    else:
+                        for t in range(steps.shape[0]):
+                            s = slopes[number, t]
+                            if s != 0.0:
+                                target[r, c, i * stride[0] + steps[t, 0], j * stride[1] + steps[t, 1]] += a * s
+        total[r, 0] += least
+        total[r, 1] += most
+
+
+@njit(cache=True, error_model="numpy")
 def charge(value, y, x, cell, noise, total):
     """Charge rows on a linear layer's output with its rounding and their own, ``noise`` [m, C, H, W] (N2)."""
     count, channels, h, w = value.shape

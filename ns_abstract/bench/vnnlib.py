@@ -1,0 +1,223 @@
+"""Runs folders of instances as the verification competitions publish them: networks, properties, time limits."""
+
+from __future__ import annotations
+
+import contextlib
+import csv
+import gzip
+import io
+import tempfile
+import time
+import zlib
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ns_abstract.io.errors import InputError
+from ns_abstract.io.jsonio import file_beside, file_size, read_text
+from ns_abstract.verify.boxes import Answer, decide
+from ns_abstract.verify.network import Network, NetworkArithmetic, load_network
+from ns_abstract.verify.network.load import onnx_runner
+from ns_abstract.verify.vnnlib import load_regions
+
+_LIST_LIMIT = 16 << 20
+_INSTANCES = 100_000
+#: Bytes that a packed network and a packed property may grow to.
+_NETWORK_LIMIT, _PROPERTY_LIMIT = 1 << 30, 64 << 20
+_CHUNK = 1 << 20
+_LONGEST = 1e6
+
+
+@dataclass(frozen=True)
+class Instance:
+    """One line of instances.csv.
+
+    Attributes:
+        network, property: As the line names them.
+        seconds: Time limit.
+    """
+
+    network: str
+    property: str
+    seconds: float
+
+
+def instances(folder: Path) -> list[Instance]:
+    """The lines of ``folder/instances.csv``: network, property, seconds.
+
+    Raises:
+        InputError: The list is absent, or a line is not understood.
+    """
+    path = folder / "instances.csv"
+    found = []
+    text = read_text(path, "list of instances", _LIST_LIMIT)
+    try:
+        for number, row in enumerate(csv.reader(io.StringIO(text)), 1):
+            row = [part.strip() for part in row]
+            if not any(row):
+                continue
+            if len(row) != 3 or number > _INSTANCES:
+                raise InputError(
+                    f"line {number} has {len(row)} fields", file=path, fix="write network,property,seconds on a line"
+                )
+            try:
+                seconds = float(row[2])
+            except ValueError:
+                seconds = np.nan
+            if not 0.0 < seconds <= _LONGEST:
+                raise InputError(f"line {number}: {row[2]!r} seconds", file=path, fix=f"between 0 and {_LONGEST:g}")
+            found.append(Instance(row[0], row[1], seconds))
+    except csv.Error as error:
+        raise InputError(f"cannot be read: {error}", file=path, fix="write network,property,seconds") from None
+    return found
+
+
+def _stored(folder: Path, name: str) -> Path:
+    """The file that a line names, or the same packed."""
+    path = file_beside(folder, name)
+    if path.suffix != ".gz" and not path.exists():
+        packed = file_beside(folder, f"{name}.gz")
+        return packed if packed.exists() else path
+    return path
+
+
+def unpacked(path: Path, limit: int) -> Iterator[bytes]:
+    """Contents of a .gz file in parts.
+
+    Raises:
+        InputError: It is damaged, or grows past ``limit`` bytes.
+    """
+    total = 0
+    file_size(path, "file")
+    try:
+        with gzip.open(path) as stream:
+            while part := stream.read(_CHUNK):
+                total += len(part)
+                if total > limit:
+                    problem = f"unpacks to more than {limit:,} bytes"
+                    raise InputError(problem, file=path, fix="check that this is the file meant")
+                yield part
+    except (OSError, EOFError, zlib.error) as error:
+        raise InputError(f"cannot be unpacked: {error}", file=path, fix="copy it again") from None
+
+
+class _Networks:
+    """Loads networks; the latest is kept, since neighbouring lines name the same."""
+
+    def __init__(self, scratch: Path) -> None:
+        self.scratch = scratch
+        self.latest: tuple[Path, Network, Any] | None = None
+
+    def load(self, path: Path) -> tuple[Network, Any]:
+        if self.latest is None or self.latest[0] != path:
+            self.latest = None
+            file = path
+            if path.suffix == ".gz":
+                file = self.scratch / "network.onnx"
+                with open(file, "wb") as stream:
+                    for part in unpacked(path, _NETWORK_LIMIT):
+                        stream.write(part)
+            if file.suffix != ".onnx":
+                raise InputError("is no .onnx file", file=path, fix="name an .onnx or .onnx.gz file")
+            self.latest = path, load_network(file), onnx_runner(file)
+        return self.latest[1:]
+
+
+def run_folder(
+    folder: Path,
+    output_dir: Path,
+    *,
+    only: Sequence[str] = (),
+    seconds: float | None = None,
+    memory: int = 2 << 30,
+    arithmetic: NetworkArithmetic = "float32",
+) -> Iterator[dict[str, Any]]:
+    """Decide the instances of ``folder``; a row for each, as soon as it is known.
+
+    ``output_dir/results.csv`` gets the competitions' lines (category, network, property, seconds to prepare, verdict,
+    seconds), and ``output_dir/NETWORK_PROPERTY.txt`` the verdict and, with "sat", the counterexample.
+
+    Args:
+        folder: Holds instances.csv and what it names, also packed (.gz).
+        output_dir: Folder of the results.
+        only: Parts of names of networks or properties; all if there are none.
+        seconds: Limit beside those of the list.
+        memory: Bytes that bounds may take.
+        arithmetic: What "unsat" covers.
+
+    Raises:
+        InputError: The list cannot be read. A network or a property that cannot is a row with "error" and a reason.
+    """
+    chosen = [
+        one
+        for one in instances(folder)
+        if not only or any(part in name for part in only for name in (one.network, one.property))
+    ]
+    if not chosen:
+        raise InputError("no instance is chosen", file=folder / "instances.csv", fix="check --only")
+    output_dir.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory() as scratch, open(output_dir / "results.csv", "w", newline="") as stream:
+        networks = _Networks(Path(scratch))
+        writer = csv.writer(stream)
+        for one in chosen:
+            limit = one.seconds if seconds is None else min(one.seconds, seconds)
+            start = time.perf_counter()
+            ready, answer, why = start, None, ""
+            try:
+                network, run = networks.load(_stored(folder, one.network))
+                regions = load_regions(*_property(folder, one.property, network))
+                ready = time.perf_counter()
+                end = ready + limit
+
+                def over(end: float = end) -> bool:
+                    return time.perf_counter() > end
+
+                answer = decide(network, run, regions, over, memory=memory, arithmetic=arithmetic)
+            except InputError as error:
+                why = str(error)
+            word = "error" if answer is None else answer.word
+            prepared, spent = ready - start, time.perf_counter() - ready
+            writer.writerow([folder.name, one.network, one.property, f"{prepared:.3f}", word, f"{spent:.3f}"])
+            stream.flush()
+            name = f"{_stem(one.network)}_{_stem(one.property)}.txt"
+            (output_dir / name).write_text(word + "\n" + ("" if answer is None else assignment(answer)))
+            yield {
+                "network": one.network,
+                "property": one.property,
+                "verdict": word,
+                "seconds": round(spent, 3),
+                "boxes": 0 if answer is None else answer.boxes,
+                "why": why,
+            }
+
+
+def _property(folder: Path, name: str, network: Network) -> tuple[Path, int, int, str | None]:
+    """Arguments of `load_regions`."""
+    path, text = _stored(folder, name), None
+    if path.suffix == ".gz":
+        data = b"".join(unpacked(path, _PROPERTY_LIMIT))
+        with contextlib.suppress(UnicodeDecodeError):
+            text = data.decode("utf-8")
+        if text is None:
+            raise InputError("VNN-LIB file is not UTF-8 text", file=path, fix="save it as UTF-8")
+    return path, network.input_size, network.output_size, text
+
+
+def _stem(name: str) -> str:
+    """A file's name without its endings."""
+    last = Path(name).name
+    for ending in (".gz", ".onnx", ".vnnlib"):
+        last = last.removesuffix(ending)
+    return last
+
+
+def assignment(answer: Answer) -> str:
+    """A counterexample as the competitions want it; nothing without one."""
+    if answer.x is None or answer.y is None:
+        return ""
+    lines = [f"(X_{k} {value!r})" for k, value in enumerate(answer.x.tolist())]
+    lines += [f"(Y_{k} {value!r})" for k, value in enumerate(answer.y.tolist())]
+    return "(" + "\n".join(lines) + ")\n"

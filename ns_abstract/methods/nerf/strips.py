@@ -1,0 +1,339 @@
+"""Linear bounds of all rays of a frame, cell after cell, from bounds by part that are made once (design.md, F12, F13).
+
+The set of poses is cut into strips, ever narrower from level to level. Rays are bounded over whole strips, a group of
+neighbours at a time, and kept by part of the strip; a cell of a certificate takes what lies in it from there. What a
+strip holds depends on the strip and its group alone, whatever was asked before.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+import time
+from collections import OrderedDict
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from ns_abstract.arithmetic.rounding import UNIT64
+from ns_abstract.geometry.box import ParameterBox
+from ns_abstract.geometry.poses import COLOR_SHIFTS, PoseSet
+from ns_abstract.methods.nerf.bounds import Division, NerfBounds, Pencil, RayBounds, Shifts
+from ns_abstract.methods.nerf.planes import fit_planes
+
+#: Rays that are bounded together.
+GROUP = 8
+#: What an open sample may move a pixel by, by level.
+TOLERANCES = (0.02, 0.005, 0.0012, 3e-4)
+#: Times that, where samples may lie anywhere in their bins: bounds are loose there anyhow.
+_SWEPT = 8.0
+#: Strips by axis from each level to the next: with one parameter, and with more.
+_FINER_LINE, _FINER = 4, 2
+#: Most parts of a strip: with one parameter, and with more.
+_PARTS_LINE, _PARTS = 512, 2048
+#: Most strips along an axis.
+_MOST = 1 << 20
+#: Parts of the range of hues or saturations, of the first level and from level to level.
+_SHIFT_PARTS, _SHIFT_FINER = 12, 2
+#: Part of the margin that the width of all pixels may cost; rays are refined down to the first where they cost more
+#: than the second.
+_AIM, _ENOUGH = 0.2, 0.4
+#: Bytes of bounds that are kept.
+_KEPT = 1 << 29
+#: Rays that are bounded to learn how long it takes and how wide cells may be.
+_TRIED, _ROUNDS = 8, 3
+
+#: Bounds of one group: arguments of `NerfBounds.rays` behind the poses, by group, to what it found.
+Run = Callable[[Sequence[tuple]], list[RayBounds]]
+Weigh = Callable[[], "np.ndarray | None"]
+
+
+@dataclass(frozen=True)
+class _Kept:
+    """Bounds of one group of rays over a strip: [2, n, *parts, 3] by part, and [n, samples] opacities."""
+
+    parts: np.ndarray
+    alpha: np.ndarray
+
+    @property
+    def nbytes(self) -> int:
+        return self.parts.nbytes + self.alpha.nbytes
+
+
+@dataclass(frozen=True)
+class Layout:
+    """How a set is cut into strips.
+
+    Attributes:
+        counts: Strips of the first level along each parameter of the poses.
+        division: Cells and parts of every strip.
+        displacement: Where the bounds of every strip begin (`NerfBounds.displacement`).
+    """
+
+    counts: tuple[int, ...]
+    division: Division
+    displacement: float
+
+
+class Strips:
+    """Bounds of all rays of a frame over strips of its set (design.md, F13).
+
+    Args:
+        bounds: Of the scene.
+        pose_set: The frame's set; parameters that shift colours come last in its box.
+        pixels: [t, 2] rows and columns of the rays.
+        run: Bounds groups of rays, here or in other processes.
+    """
+
+    def __init__(self, bounds: NerfBounds, pose_set: PoseSet, pixels: np.ndarray, run: Run) -> None:
+        self.bounds, self.pose_set, self.geometry = bounds, pose_set, pose_set.geometry
+        self.pixels, self.run = pixels, run
+        self.poses = self.geometry.box
+        self.shifting = tuple(name for name in pose_set.box.names if name in COLOR_SHIFTS)
+        self.groups = [slice(k, min(k + GROUP, len(pixels))) for k in range(0, len(pixels), GROUP)]
+        self._known: OrderedDict[tuple, _Kept] = OrderedDict()
+        self._bytes = 0
+        self._layout: Layout | None = None
+        self._displacement = bounds.displacement
+        #: Seconds that a ray takes over a strip of the first level, and how many there are, once some have been tried.
+        self.effort: tuple[float, int] | None = None
+
+    # ---------------------------------------------------------------- layout
+
+    def layout(self) -> Layout:
+        """Strips that the network's bounds bear, tried on a few rays in the middle of the set."""
+        if self._layout is None:
+            tried = self.pixels[np.unique(np.linspace(0, len(self.pixels) - 1, _TRIED).astype(int))]
+            displacement = self._displacement
+            for _ in range(_ROUNDS):
+                found = self._cut(displacement, tried)
+                strip = self._strip(found.counts, tuple(n // 2 for n in found.counts))
+                learned = displacement
+                # one ray first: where not even a few can be done, that tells how long they take
+                for rays in (tried[len(tried) // 2 :][:1], tried):
+                    begin = time.perf_counter()
+                    learned = self.run([self._call(strip, rays, found, 0, None)])[0].displacement
+                    self.effort = (time.perf_counter() - begin) / len(rays), math.prod(found.counts)
+                if 0.6 < learned / displacement < 1.7:
+                    break
+                displacement = learned
+            self._layout = found
+        return self._layout
+
+    def _cut(self, displacement: float, pixels: np.ndarray) -> Layout:
+        d = self.poses.dimensions
+        counts = [1] * d
+        self.bounds.displacement = displacement
+        while True:
+            box = self._strip(counts, [n // 2 for n in counts])
+            pencil = Pencil(self.geometry, box, pixels, self.bounds.taylor, self.bounds.swept)
+            moves = pencil.displacement(self.bounds.distances, self.bounds.lengths)
+            division = self.bounds.division(moves, _PARTS_LINE if moves.shape[2] < 2 else _PARTS)
+            if division is not None or max(counts, default=_MOST) >= _MOST:
+                break
+            widest = np.nan_to_num(moves[..., :d].reshape(-1, d).max(axis=0), nan=np.inf)
+            counts[int(np.argmax(widest))] *= 2
+        if division is None:
+            # nothing is known then
+            counts, division = [1] * d, Division((), d + self.bounds.swept)
+        return Layout(tuple(counts), division, displacement)
+
+    def _strip(self, counts: Sequence[int], place: Sequence[int]) -> ParameterBox:
+        """The strip ``place`` of ``counts`` along each parameter; neighbours share their ends exactly."""
+        box = self.poses
+        for axis, (count, k) in enumerate(zip(counts, place, strict=True)):
+            ends = self._ends(axis, count, k, k + 1)
+            box = box.replace(axis, float(ends[0]), float(ends[1]))
+        return box
+
+    def _ends(self, axis: int, count: int, first: int, past: int) -> np.ndarray:
+        """Ends of the strips from ``first`` to ``past`` (exclusive) of ``count`` along an axis of the poses."""
+        low, high = self.poses.lower[axis], self.poses.upper[axis]
+        ends = low + (high - low) * (np.arange(first, past + 1) / count)
+        return np.where(np.arange(first, past + 1) == count, high, ends)
+
+    def _counts(self, level: int) -> tuple[int, ...]:
+        finer = _FINER_LINE if self.poses.dimensions == 1 else _FINER
+        return tuple(n * finer**level for n in self.layout().counts)
+
+    def _shift_ends(self, level: int) -> list[np.ndarray]:
+        """Edges of the parts of hue and saturation of a level; two where it is fixed."""
+        found = []
+        for name in COLOR_SHIFTS:
+            if name in self.shifting:
+                axis = self.pose_set.box.names.index(name)
+                low, high = self.pose_set.box.lower[axis], self.pose_set.box.upper[axis]
+                ends = np.linspace(low, high, _SHIFT_PARTS * _SHIFT_FINER**level + 1)
+                ends[0], ends[-1] = low, high
+            else:
+                ends = np.full(2, self.pose_set.fixed.get(name, 0.0))
+            found.append(ends)
+        return found
+
+    def _shifts(self, level: int) -> list[Shifts]:
+        """Parts of hue and saturation, the latter running faster; empty: nothing is shifted."""
+        ranges = [list(itertools.pairwise(ends.tolist())) for ends in self._shift_ends(level)]
+        if not any(low or high for cuts in ranges for low, high in cuts):
+            return []
+        return [(hue, saturation) for hue, saturation in itertools.product(*ranges)]
+
+    # ---------------------------------------------------------------- strips
+
+    def _call(
+        self, strip: ParameterBox, pixels: np.ndarray, layout: Layout, level: int, known: np.ndarray | None
+    ) -> tuple:
+        shifts = self._shifts(level)
+        tolerance = TOLERANCES[level] * (_SWEPT if self.bounds.swept else 1.0)
+        return self.geometry, strip, pixels, tolerance, known, None, shifts, layout.division
+
+    def _ensure(self, level: int, place: tuple[int, ...], groups: Sequence[int]) -> list[_Kept]:
+        """Bounds of ``groups`` over a strip, those that are missing worked out."""
+        found: dict[int, _Kept] = {}
+        missing = []
+        for group in groups:
+            key = (level, place, group)
+            if key in self._known:
+                self._known.move_to_end(key)
+                found[group] = self._known[key]
+            else:
+                missing.append(group)
+        if missing:
+            finer = _FINER_LINE if self.poses.dimensions == 1 else _FINER
+            above = None
+            if level:
+                above = self._ensure(level - 1, tuple(k // finer for k in place), missing)
+            strip, layout = self._strip(self._counts(level), place), self.layout()
+            calls = []
+            for k, group in enumerate(missing):
+                known = None if above is None else above[k].alpha
+                calls.append(self._call(strip, self.pixels[self.groups[group]], layout, level, known))
+            self.bounds.displacement = layout.displacement
+            for group, result in zip(missing, self.run(calls), strict=True):
+                found[group] = self._keep((level, place, group), result)
+        return [found[group] for group in groups]
+
+    def _keep(self, key: tuple, result: RayBounds) -> _Kept:
+        assert result.parts is not None
+        hues, saturations = (len(ends) - 1 for ends in self._shift_ends(key[0]))
+        parts = result.parts
+        if parts.shape[2] != 1 or self.shifting:
+            # [2, n, shifts, *poses, 3]: shifts behind the poses
+            parts = np.moveaxis(parts, 2, -2)
+            sizes = [n for n, name in zip((hues, saturations), COLOR_SHIFTS, strict=True) if name in self.shifting]
+            parts = parts.reshape(*parts.shape[:-2], *sizes, 3)
+        else:
+            parts = parts[:, :, 0]
+        kept = _Kept(np.ascontiguousarray(parts), result.alpha)
+        self._known[key] = kept
+        self._bytes += kept.nbytes
+        while self._bytes > _KEPT and len(self._known) > len(self.groups):
+            self._bytes -= self._known.popitem(last=False)[1].nbytes
+        return kept
+
+    # ---------------------------------------------------------------- cells
+
+    def levels(self, box: ParameterBox) -> int:
+        """Levels whose strips are not much narrower than the cell ``box``."""
+        for level in range(1, len(TOLERANCES)):
+            for axis, count in enumerate(self._counts(level)):
+                width = (self.poses.upper[axis] - self.poses.lower[axis]) / count
+                if box.upper[axis] - box.lower[axis] > 2.0 * width:
+                    return level
+        return len(TOLERANCES)
+
+    def sets(self, box: ParameterBox, weigh: Weigh | None) -> tuple[list[np.ndarray], np.ndarray, np.ndarray]:
+        """Linear bounds (A_lower, b_lower, A_upper, b_upper) [t, 3, d] and [t, 3], and lower and upper [t, 3].
+
+        Args:
+            box: A cell of the frame's set.
+            weigh: Gives [t, 3] which part of the margin a unit of each pixel's width may cost, about; None there, or
+                in its place: nothing is worth refining.
+        """
+        everything = np.arange(len(self.groups))
+        linear, lower, upper = self._level_sets(box, 0, everything)
+        weights, levels = None, self.levels(box)
+        for level in range(1, levels):
+            if weights is None:
+                weights = None if weigh is None else weigh()
+                if weights is None:
+                    break
+            cost = np.add.reduceat((weights * _widths(linear)).sum(axis=1), np.arange(0, len(self.pixels), GROUP))
+            # what no level can make good is not begun
+            if not _ENOUGH < cost.sum() < TOLERANCES[level - 1] / TOLERANCES[levels - 1]:
+                break
+            order = np.argsort(-cost, kind="stable")
+            left = cost.sum() - np.cumsum(cost[order])
+            chosen = np.sort(order[: 1 + int(np.searchsorted(-left, -_AIM))])
+            finer, finer_lower, finer_upper = self._level_sets(box, level, chosen)
+            rays = np.concatenate([np.arange(len(self.pixels))[self.groups[k]] for k in chosen])
+            for whole, part in zip((*linear, lower, upper), (*finer, finer_lower, finer_upper), strict=True):
+                whole[rays] = part
+        return linear, lower, upper
+
+    def _level_sets(
+        self, box: ParameterBox, level: int, groups: np.ndarray
+    ) -> tuple[list[np.ndarray], np.ndarray, np.ndarray]:
+        """The same of the rays of some groups, from strips of one level."""
+        counts = self._counts(level)
+        ranges = [self._overlapped(axis, count, box) for axis, count in enumerate(counts)]
+        parts = self.layout().division.parts[: self.poses.dimensions]
+        # [2, rays, *parts, 3] of all strips that the cell meets, side by side
+        kept = {
+            place: np.concatenate([k.parts for k in self._ensure(level, place, groups.tolist())], axis=1)
+            for place in itertools.product(*(range(a, b) for a, b in ranges))
+        }
+        values = _joined(kept, ranges, 0, ())
+        edges = [
+            self._part_ends(axis, count, first, past, parts[axis])
+            for axis, (count, (first, past)) in enumerate(zip(counts, ranges, strict=True))
+        ]
+        edges += [
+            ends for ends, name in zip(self._shift_ends(level), COLOR_SHIFTS, strict=True) if name in self.shifting
+        ]
+        ends, slack = [], []
+        for axis, lines in enumerate(edges):
+            low, high = box.lower[axis], box.upper[axis]
+            middle, half = 0.5 * (low + high), 0.5 * (high - low)
+            room = 16.0 * UNIT64 * max(abs(low), abs(high), abs(lines[0]), abs(lines[-1]))
+            first = max(0, int(np.searchsorted(lines, low - room, side="right")) - 1)
+            past = min(len(lines) - 1, int(np.searchsorted(lines, high + room, side="left")))
+            values = values.take(np.arange(first, past), axis=axis + 2)
+            ends.append(np.clip((lines[first : past + 1] - middle) / half, -1.0, 1.0))
+            slack.append(room / half)
+        linear = fit_planes(values[0], values[1], ends, slack)
+        axes = tuple(range(1, values[0].ndim - 1))
+        return list(linear), values[0].min(axis=axes), values[1].max(axis=axes)
+
+    def _overlapped(self, axis: int, count: int, box: ParameterBox) -> tuple[int, int]:
+        """First and past strip along an axis that the cell meets with more than an end."""
+        low, high = self.poses.lower[axis], self.poses.upper[axis]
+        first = math.floor((box.lower[axis] - low) / (high - low) * count)
+        past = math.ceil((box.upper[axis] - low) / (high - low) * count)
+        first, past = max(0, first - 1), min(count, past + 1)
+        ends = self._ends(axis, count, first, past)
+        begin = int(np.searchsorted(ends, box.lower[axis], side="right")) - 1
+        end = int(np.searchsorted(ends, box.upper[axis], side="left"))
+        return first + max(0, begin), first + max(end, begin + 1)
+
+    def _part_ends(self, axis: int, count: int, first: int, past: int, parts: int) -> np.ndarray:
+        """Edges of the parts of the strips from ``first`` to ``past`` (exclusive), in the parameter's unit."""
+        ends = self._ends(axis, count, first, past)
+        inner = np.arange(parts) / parts
+        found = ends[:-1, None] + (ends[1:] - ends[:-1])[:, None] * inner
+        return np.append(found.ravel(), ends[-1])
+
+
+def _joined(
+    kept: dict[tuple[int, ...], np.ndarray], ranges: list[tuple[int, int]], axis: int, place: tuple[int, ...]
+) -> np.ndarray:
+    """The arrays of all places, side by side along the axes behind the first two."""
+    if axis == len(ranges):
+        return kept[place]
+    rows = [_joined(kept, ranges, axis + 1, (*place, k)) for k in range(*ranges[axis])]
+    return np.concatenate(rows, axis=axis + 2)
+
+
+def _widths(linear: Sequence[np.ndarray]) -> np.ndarray:
+    """[t, 3] distances between the planes, on average over the cell."""
+    return linear[3].astype(np.float64) - linear[1]

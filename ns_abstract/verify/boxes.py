@@ -1,0 +1,235 @@
+"""Whether a network has an unsafe output for some input of a box: bounds, attacks, and boxes cut in two.
+
+See docs/design.md, V11.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+import torch
+
+from ns_abstract.execution.ending import AbandonedError, abandoning, checkpoint
+from ns_abstract.verify.network import ImageSets, Network, NetworkArithmetic, OutputBounds, bound_outputs
+from ns_abstract.verify.vnnlib import Region
+
+#: The competitions' words: an unsafe output was found; there is none; not decided; not decided in time.
+Word = Literal["sat", "unsat", "unknown", "timeout"]
+
+#: Inputs up to which every input is a parameter of its own.
+_PARAMETERS = 16
+#: Boxes bounded together, and the most that wait.
+_TOGETHER, _WAITING = 8, 1 << 14
+#: Boxes of many inputs that are cut: their halves are hardly easier.
+_CUTS = 64
+#: Starts and steps of the first attack on a region.
+_STARTS, _STEPS = 12, 25
+
+
+@dataclass(frozen=True)
+class Answer:
+    """What is known of an instance.
+
+    Attributes:
+        word: The verdict.
+        x, y: With "sat": the input [n] float64 inside a region and the outputs [k] for it in float32.
+        boxes: Boxes that were bounded.
+    """
+
+    word: Word
+    x: np.ndarray | None = None
+    y: np.ndarray | None = None
+    boxes: int = 0
+
+
+def decide(
+    network: Network,
+    run: Callable[[np.ndarray], np.ndarray],
+    regions: Sequence[Region],
+    over: Callable[[], bool],
+    *,
+    memory: int = 1 << 30,
+    arithmetic: NetworkArithmetic = "float32",
+) -> Answer:
+    """Look for an input of some region with an unsafe output, and for a proof that there is none (V11).
+
+    Args:
+        network: The network.
+        run: The program that counts: outputs [k] for one image [1, *input_shape] float32. Only what it
+            computes is a counterexample.
+        regions: Boxes of inputs, and what is unsafe there.
+        over: Whether time is up.
+        memory: Bytes that bounds may take.
+        arithmetic: What a proof covers.
+    """
+    search = _Search(network, run, memory, arithmetic)
+    try:
+        with abandoning(over):
+            for region in regions:
+                if search.settle(region):
+                    return Answer("sat", *search.found, search.boxes)
+    except AbandonedError:
+        return Answer("timeout", boxes=search.boxes)
+    return Answer("unknown" if search.undecided else "unsat", boxes=search.boxes)
+
+
+class _Search:
+    def __init__(
+        self, network: Network, run: Callable[[np.ndarray], np.ndarray], memory: int, arithmetic: NetworkArithmetic
+    ) -> None:
+        self.network, self.run, self.memory = network, run, memory
+        self.arithmetic: NetworkArithmetic = arithmetic
+        self.boxes = 0
+        self.undecided = False
+        self.found: tuple[np.ndarray, np.ndarray] = (np.zeros(0), np.zeros(0))
+
+    def settle(self, region: Region) -> bool:
+        """Whether the region has a counterexample, which `found` then is; `undecided` if that is not known."""
+        if bool((region.lower > region.upper).any()):
+            return False
+        if self._attack(region):
+            return True
+        if not all(region.unsafe.groups):
+            # any output is unsafe, and no input could be shown to have one
+            self.undecided = True
+            return False
+        waiting = [(region.lower, region.upper)]
+        n = len(region.lower)
+        most = _WAITING if n <= _PARAMETERS else _CUTS
+        done = 0
+        while waiting:
+            checkpoint()
+            boxes, waiting = waiting[-_TOGETHER:], waiting[:-_TOGETHER]
+            bounds = self._bound(region, boxes)
+            proved = proves(bounds, region.unsafe.groups)
+            self.boxes += len(boxes)
+            done += len(boxes)
+            for k in np.flatnonzero(~proved):
+                lower, upper = boxes[k]
+                if self._probe(region, lower, upper, bounds.a[k]):
+                    return True
+                halves = self._cut(region, lower, upper, bounds.a[k])
+                if halves is None or len(waiting) > most or (n > _PARAMETERS and done > most):
+                    self.undecided = True
+                    return False
+                waiting += halves
+        return False
+
+    # ------------------------------------------------------------ proofs
+
+    def _bound(self, region: Region, boxes: Sequence[tuple[np.ndarray, np.ndarray]]) -> OutputBounds:
+        lower, upper = (np.stack(ends) for ends in zip(*boxes, strict=True))
+        # the program rounds an input to float32, and rounding keeps the order
+        lower = np.minimum(lower, lower.astype(np.float32).astype(np.float64))
+        upper = np.maximum(upper, upper.astype(np.float32).astype(np.float64))
+        m, n = lower.shape
+        if n <= _PARAMETERS:
+            middle = 0.5 * (lower + upper)
+            half = np.nextafter(np.maximum(upper - middle, middle - lower), np.inf)
+            a = half[:, :, None] * np.eye(n)
+            images = ImageSets(a, middle, a, middle, lower, upper)
+        else:
+            none = np.zeros((m, n, 1))
+            images = ImageSets(none, lower, none, upper, lower, upper)
+        return bound_outputs(
+            self.network,
+            images,
+            region.unsafe.rows,
+            region.unsafe.offset,
+            memory=self.memory,
+            arithmetic=self.arithmetic,
+        )
+
+    def _cut(
+        self, region: Region, lower: np.ndarray, upper: np.ndarray, slopes: np.ndarray
+    ) -> list[tuple[np.ndarray, np.ndarray]] | None:
+        """The box in two halves across the input that matters most; None if it is too small to be cut."""
+        width = upper - lower
+        if len(lower) <= _PARAMETERS:
+            # slopes are by half widths
+            score = np.abs(slopes).max(0) + 1e-9 * width
+        else:
+            x = torch.from_numpy(0.5 * (lower + upper)).requires_grad_()
+            value = self._value(region, x[None])[0]
+            score = np.zeros_like(width)
+            if value.requires_grad:
+                score = torch.autograd.grad(value, x)[0].abs().numpy() * width
+            score = score + 1e-9 * width
+        at = int(np.argmax(np.where(width > 0.0, score, -1.0)))
+        middle = 0.5 * (lower[at] + upper[at])
+        if not lower[at] < middle < upper[at]:
+            return None
+        left, right = upper.copy(), lower.copy()
+        left[at] = right[at] = middle
+        return [(lower, left), (right, upper)]
+
+    # ------------------------------------------------------------ counterexamples
+
+    def _value(self, region: Region, x: torch.Tensor) -> torch.Tensor:
+        """[B]; an output is unsafe where it is not positive, differentiable."""
+        y = self.network(x.reshape(-1, *self.network.input_shape))
+        rows = y @ torch.from_numpy(region.unsafe.rows).T + torch.from_numpy(region.unsafe.offset)
+        groups = [rows[:, list(group)].amax(1) for group in region.unsafe.groups if group]
+        return torch.stack(groups).amin(0) if groups else torch.zeros(len(x), dtype=x.dtype)
+
+    def _attack(self, region: Region) -> bool:
+        """Gradient descent by signs from the middle, from corners and from random inputs."""
+        lower, upper = torch.from_numpy(region.lower), torch.from_numpy(region.upper)
+        generator = torch.Generator().manual_seed(0)
+        part = torch.rand((_STARTS, len(lower)), generator=generator, dtype=torch.float64)
+        part[0] = 0.5
+        part[1 : _STARTS // 2] = (part[1 : _STARTS // 2] < 0.5).double()
+        x = lower + part * (upper - lower)
+        step = 0.25
+        for _ in range(_STEPS):
+            checkpoint()
+            x = x.detach().requires_grad_()
+            value = self._value(region, x)
+            if self._any(region, x.detach(), value.detach()):
+                return True
+            if not value.requires_grad:
+                break
+            (slope,) = torch.autograd.grad(value.sum(), x)
+            x = torch.minimum(torch.maximum(x.detach() - step * slope.sign() * (upper - lower), lower), upper)
+            step *= 0.85
+        return False
+
+    def _probe(self, region: Region, lower: np.ndarray, upper: np.ndarray, slopes: np.ndarray) -> bool:
+        """The middle of a box, and the corners where planes below are least."""
+        x = [0.5 * (lower + upper)]
+        if slopes.shape[1] == len(lower):
+            x += [np.where(row > 0.0, lower, upper) for row in slopes]
+        with torch.no_grad():
+            tried = torch.from_numpy(np.stack(x))
+            return self._any(region, tried, self._value(region, tried))
+
+    def _any(self, region: Region, x: torch.Tensor, value: torch.Tensor) -> bool:
+        """Whether one of the inputs that look unsafe is, for the program that counts."""
+        order = torch.argsort(value)[:2].tolist()
+        for k in order:
+            if not float(value[k]) <= 1e-5 * (1.0 + abs(float(value[k]))):
+                continue
+            point = np.clip(x[k].numpy(), region.lower, region.upper)
+            y = run_once(self.network, self.run, point)
+            if bool(np.isfinite(y).all()) and region.holds(y):
+                self.found = point, y
+                return True
+        return False
+
+
+def run_once(network: Network, run: Callable[[np.ndarray], np.ndarray], x: np.ndarray) -> np.ndarray:
+    """Outputs [k] float64 that the program computes for the float32 numbers next to ``x`` [n]."""
+    image = np.asarray(x, np.float32).reshape(1, *network.input_shape)
+    return np.asarray(run(image), np.float64).reshape(-1)
+
+
+def proves(bounds: Any, groups: Sequence[Sequence[int]]) -> np.ndarray:
+    """[m] whether in every group some row is certainly positive; NaN proves nothing."""
+    positive = np.asarray(bounds.lower) > 0.0
+    proved = np.ones(len(positive), bool)
+    for group in groups:
+        proved &= positive[:, list(group)].any(1)
+    return proved

@@ -1,0 +1,31 @@
+"""How much of a property's margin the width of each pixel's bounds may cost, about: where bounds are worth refining."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+
+from ns_abstract.geometry.box import ParameterBox
+from ns_abstract.verify.properties import Claim
+
+if TYPE_CHECKING:
+    from ns_abstract.verify.search import Model, Scene
+
+
+def pixel_costs(scene: Scene, model: Model, claim: Claim, box: ParameterBox) -> np.ndarray | None:
+    """[H, W, 3] slopes of the margin by pixel in the middle of a cell, as parts of the margin there (an estimate).
+
+    None where the margin is not above 0, or a slope is no number: no width would be narrow enough. What is found
+    decides about work alone, never about a bound.
+    """
+    values = box.middle
+    image = torch.from_numpy(scene.image(values).astype(np.float64)).requires_grad_(True)
+    margin = claim.margin(model.differentiable(image[None]), torch.from_numpy(values)[None])[0]
+    size = float(margin.detach())
+    if not margin.requires_grad or not 0.0 < size < float("inf"):
+        return None
+    (slope,) = torch.autograd.grad(margin, image)
+    costs = slope.abs().numpy() / size
+    return costs if np.isfinite(costs).all() else None
