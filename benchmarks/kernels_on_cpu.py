@@ -1,6 +1,7 @@
 """Attack float32 bounds by gsplat's own kernels, compiled for the CPU.
 
     python benchmarks/kernels_on_cpu.py [RUN/config.yml ...] [--stiff] [--sets x yaw six] [--modes classic antialiased]
+        [--layers]
 
 For each run, mode and set: cells about random poses of the set, of width zero and of ``--widths`` times the set's, each
 bounded with float32 arithmetic and compared, with tolerance zero, with renders of poses of the cell: its middle, its
@@ -30,14 +31,18 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
 
 from gsplat_kernels import Kernels, Unavailable
 
+from ns_abstract.arithmetic.outward import outward
+from ns_abstract.arithmetic.rounding import FLOAT32
 from ns_abstract.bench.sets import open_jobs, pose_set, splat_of
 from ns_abstract.bench.stiff import all_cases
 from ns_abstract.bench.tables import markdown, write
 from ns_abstract.geometry.box import ParameterBox
 from ns_abstract.geometry.poses import PoseSet
+from ns_abstract.geometry.tiles import assemble
+from ns_abstract.methods.splat.activate import activate
+from ns_abstract.methods.splat.bounds import SplatBounds
 from ns_abstract.methods.splat.constants import VERSIONS, Rasteriser
 from ns_abstract.methods.splat.scene import SplatScene
-from ns_abstract.verify.attack.soundness import bound_cells
 
 BUILDS: tuple[dict[str, Any], ...] = (
     {"scalar": "float"},
@@ -58,9 +63,10 @@ def cell_about(box: ParameterBox, values: np.ndarray, width: float) -> Parameter
 
 def attack(
     scene: SplatScene, poses: PoseSet, cells: list[ParameterBox], renders: int, version: str, rules: Rasteriser,
-    seed: int,
+    seed: int, layers: bool,
 ) -> dict[str, Any]:  # fmt: skip
     """Bound each cell and compare ``renders`` renders with it; the numbers of a row."""
+    bounds = SplatBounds(activate(scene, rules), rules, FLOAT32)
     rng = np.random.default_rng(seed)
     builds = [{**build, "noise": (0, build.get("kind", 0))} for build in BUILDS]
     for build in builds:
@@ -69,7 +75,8 @@ def attack(
     compared = violations = 0
     worst, gaps = 0.0, []
     for cell in cells:
-        ((lower, upper),), _ = bound_cells(scene, poses, [cell], rasteriser=rules, arithmetic="float32")
+        found = bounds.cell(poses.camera, poses.enclosure(cell, 1), layers=layers)
+        lower, upper = outward(assemble(found.lower, poses.camera), assemble(found.upper, poses.camera))
         gaps.append(float(np.linalg.norm(upper.astype(np.float64) - lower, axis=-1).mean()))
         corners = np.asarray(cell.corners())
         picked = corners[rng.permutation(len(corners))[: max(1, renders // 2)]]
@@ -83,6 +90,14 @@ def attack(
             beyond = np.maximum(lower - image, image - upper)
             worst = max(worst, float(np.nan_to_num(beyond, nan=np.inf).max()))
             compared += image.size
+            if found.layers is not None:
+                # depth where anything is drawn
+                values_there = program.layers(poses.camera, poses.pose(np.asarray(point))).astype(np.float64)
+                of_layers = assemble(found.layers, poses.camera)
+                drawn = np.stack([np.ones(values_there.shape[:2], bool), values_there[..., 0] > 0.0], axis=-1)
+                inside = (of_layers[..., ::2] <= values_there) & (values_there <= of_layers[..., 1::2])
+                violations += int((drawn & ~inside).sum())
+                compared += int(drawn.sum())
     return {
         "cells": len(cells), "renders": renders * len(cells), "comparisons": compared, "violations": violations,
         "worst": worst, "gap": float(np.mean(gaps)),
@@ -102,6 +117,7 @@ def main() -> int:
     parser.add_argument("--renders", type=int, default=10, help="by cell")
     parser.add_argument("--frame", type=int, default=0)
     parser.add_argument("--downscale-factor", type=float, default=1.0)
+    parser.add_argument("--layers", action="store_true", help="compare accumulation and expected depth, too")
     parser.add_argument("--planted", action="store_true")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--output-dir", type=Path, default=Path("bench"))
@@ -114,7 +130,10 @@ def main() -> int:
 
     def add(scene: SplatScene, poses: PoseSet, name: str, width: float, cells: list[ParameterBox]) -> None:
         began = time.perf_counter()
-        found = attack(scene, poses, cells, options.renders, options.gsplat_version, rules, options.seed + len(rows))
+        found = attack(
+            scene, poses, cells, options.renders, options.gsplat_version, rules, options.seed + len(rows),
+            options.layers,
+        )  # fmt: skip
         size = f"{poses.camera.width}x{poses.camera.height}"
         head = {"scene": scene.name, "mode": scene.rasterize_mode, "set": name, "width": width, "size": size}
         rows.append({**head, **found, "s": time.perf_counter() - began})

@@ -292,6 +292,7 @@ def evaluated(f: Format, i: Inputs) -> dict[str, Value]:
     found["blend_fragment"] = _blended(f, i, 24)
     found["blend_pixel"] = _blended(f, i, 0) * f.number(0.7)
     found["left_out"] = f.given(i.color[0]) + f.given(i.color[1])
+    found["expected_depth"] = f.given(i.color[0]) / f.given(i.depth)
     return found
 
 
@@ -374,6 +375,7 @@ def allowed(c: Charges, i: Inputs) -> dict[str, np.ndarray]:
         "blend_fragment": (24.0 * c.blend_fragment + c.blend_pixel) * n if c.blend_fragment else 0.0 * n,
         "blend_pixel": c.blend_pixel * n,
         "left_out": c.left_out * (i.color[0] + i.color[1]),
+        "expected_depth": c.expected_depth * i.color[0] / i.depth,
     }  # fmt: skip
 
 

@@ -123,7 +123,8 @@ def main() -> int:
         if options.list:
             print(f"{len(chosen)} mutants apply")
             return 0
-        healthy: dict[str, bool] = {}
+        # what killed a mutant passed without it
+        healthy = {outcome.mutant.test: True for outcome in known.values()}
         for mutant in chosen:
             if mutant in known:
                 outcomes.append(known[mutant])

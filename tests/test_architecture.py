@@ -122,7 +122,29 @@ def unfinished(text: str) -> list[str]:
     return [match[0] for match in re.finditer(rf"\b({words})\b", text)]
 
 
+def drawing() -> str:
+    """Which folder imports from which: a row's folder from those with a mark, columns as rows, from the left."""
+    used = {folder: set() for folder in LEVELS}
+    for file in sources():
+        folder = file.relative_to(PACKAGE).parts[0]
+        if folder in used:
+            names = [name.split(".") for _, name in imported(ast.parse(file.read_text(encoding="utf-8")))]
+            used[folder] |= {parts[1] for parts in names if parts[0] == "ns_abstract" and len(parts) > 1}
+    width = max(map(len, LEVELS))
+    rows = []
+    for k, folder in enumerate(LEVELS):
+        marks = " ".join("x" if other in used[folder] else "." for other in LEVELS[:k])
+        rows.append(f"{folder:{width}}  {marks}".rstrip())
+    return "\n".join(rows)
+
+
 # ---------------------------------------------------------------- the tree
+
+
+@pytest.mark.skipif(not (ROOT / "docs").exists(), reason="the documentation is not beside the tests")
+def test_drawing_of_imports_is_that_of_the_sources() -> None:
+    page = (ROOT / "docs" / "architecture.md").read_text(encoding="utf-8")
+    assert f"```text\n{drawing()}\n```" in page, drawing()
 
 
 @pytest.mark.parametrize("file", sources(), ids=lambda file: str(file.relative_to(PACKAGE)))

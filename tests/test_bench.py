@@ -21,6 +21,12 @@ from ns_abstract.methods.splat.constants import PAPER
 from ns_abstract.paper import splat as paper
 
 
+def test_version_of_gsplat(blobs) -> None:
+    (job,) = open_jobs((blobs.config,), blobs.path, 1.0, gsplat_version="1.6.0")
+    assert job.method.program["version"] == "1.6.0"
+    assert open_jobs((blobs.config,), blobs.path, 1.0)[0].method.program["version"] == "1.4.0"
+
+
 @pytest.fixture(scope="module")
 def job(blobs) -> PathJob:
     return open_jobs((blobs.config,), blobs.path, 1.0)[0]

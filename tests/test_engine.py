@@ -50,6 +50,7 @@ class Waves:
     Pixels outside the image are NaN everywhere.
     """
 
+    channels = 3
     tilewise = False
     tiles_at_once: int | None = None
     witnesses = 1

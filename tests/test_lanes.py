@@ -122,8 +122,8 @@ def test_exponential_of_lanes() -> None:
 def moved(x_, out_, four_):
     x, out, four = pointer(x_), pointer(out_), pointer(four_)
     store_columns(
-        out, 3, 10, load8(x, 0), load8(x, 8), load8(x, 16), load8(x, 24), load8(x, 32), load8(x, 40), load8(x, 48),
-        load8(x, 56),
+        out, 3, 10, (load8(x, 0), load8(x, 8), load8(x, 16), load8(x, 24), load8(x, 32), load8(x, 40), load8(x, 48),
+        load8(x, 56)),
     )  # fmt: skip
     store(four, 1, load4(advanced(x, 5), 2))
     return bits(load8(x, 0) < load8(x, 8)), bits(load4(x, 0) >= 0.0)
@@ -147,8 +147,8 @@ def test_memory() -> None:
 def scattered(x_, places_, out_):
     x, places, out = pointer(x_), pointer(places_), pointer(out_)
     scatter_columns(
-        out, places, 2, 10, 1, load8(x, 0), load8(x, 8), load8(x, 16), load8(x, 24), load8(x, 32), load8(x, 40),
-        load8(x, 48), load8(x, 56),
+        out, places, 2, 10, 1, (load8(x, 0), load8(x, 8), load8(x, 16), load8(x, 24), load8(x, 32), load8(x, 40),
+        load8(x, 48), load8(x, 56)),
     )  # fmt: skip
 
 

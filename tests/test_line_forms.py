@@ -17,7 +17,7 @@ def lanes(function, *operands: FormArray, numbers: tuple[np.ndarray, ...] = ()) 
     """``function`` lane by lane; ``numbers`` are further arguments, [lanes] each."""
     data = np.zeros_like(operands[0].data)
     for lane in range(data.shape[1]):
-        forms = [tuple(float(x) for x in form.data[:4, lane]) for form in operands]
+        forms = [line_forms.LineForm(*map(float, form.data[:4, lane])) for form in operands]
         data[:4, lane] = function(*forms, *(float(n[lane]) for n in numbers))
     set_norms(data, *layout(BASIS))
     return FormArray(BASIS, data, operands[0].shape)
@@ -99,7 +99,7 @@ def test_ends(size):
     set_norms(a.data, *layout(BASIS))
     low, high = a.bounds()
     for lane in range(LANES):
-        bottom, top = line_forms.ends(tuple(float(x) for x in a.data[:4, lane]))
+        bottom, top = line_forms.ends(line_forms.LineForm(*map(float, a.data[:4, lane])))
         for point in points(1, 6, generator):
             for weight in weights(3, generator):
                 assert between(bottom, top, lambda: value(a, lane, point, weight))  # noqa: B023
@@ -123,12 +123,12 @@ def test_raised(size, floor):
 
 def test_raised_without_bounds():
     """Bounds that are infinite or no numbers leave nothing that can be relied on."""
-    for a in ((1.0, 1.0, 0.0, np.inf), (1.0, np.nan, 0.0, 0.0)):
+    for a in (line_forms.LineForm(1.0, 1.0, 0.0, np.inf), line_forms.LineForm(1.0, np.nan, 0.0, 0.0)):
         low, high = line_forms.ends(a)
         assert not np.isfinite(sum(line_forms.raised(a, 0.5, low, high)))
 
 
 def test_never_raised():
     """A floor of minus infinity stands for none."""
-    a = (1.0, 0.5, -0.25, 0.125)
+    a = line_forms.LineForm(1.0, 0.5, -0.25, 0.125)
     assert line_forms.raised(a, -np.inf, *line_forms.ends(a)) == a

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+import math
 from fractions import Fraction
 
 import mpmath
@@ -59,7 +61,7 @@ def test_the_remainder_of_a_pose_is_needed_and_small() -> None:
     assert max(float(model.radius.max()) for model in yaw.taylor(yaw.box, 6)) < 1e-12
 
 
-@pytest.mark.parametrize("half", [1e-9, 0.01, 0.5, 3.0])
+@pytest.mark.parametrize("half", [1e-9, 0.01, 0.1, 0.5, 3.0])
 def test_functions_of_taylor_models(half: float) -> None:
     basis = TaylorBasis(1, 5)
     angle = TaylorArray.parameter(basis, 0, 0.7, half)
@@ -72,6 +74,31 @@ def test_functions_of_taylor_models(half: float) -> None:
             for model, true in zip(found, (mpmath.cos(x), mpmath.sin(x), 1 / mpmath.sqrt(y), x**3 - x), strict=True):
                 value = sum(mpmath.mpf(float(c)) * mpmath.mpf(p) ** k for k, c in enumerate(model.coefficients))
                 assert abs(value - true) <= mpmath.mpf(float(model.radius))
+
+
+@pytest.mark.parametrize("basis", [TaylorBasis(1, 5), TaylorBasis(2, 4)], ids=str)
+def test_rounding_of_products(basis: TaylorBasis) -> None:
+    """Exact factors whose product's degree is kept: all that a radius pays for is rounding, and it is needed."""
+    rng, worst = np.random.default_rng(5), 0.0
+    for _ in range(40):
+        factors = []
+        for _ in range(2):
+            coefficients = np.array([sum(e) <= basis.degree // 2 for e in basis.exponents]) * rng.uniform(
+                -1.0, 1.0, len(basis.exponents)
+            )
+            factors.append(TaylorArray(basis, coefficients, np.zeros(())))
+        a, b = factors
+        product = a * b
+        for p in itertools.product((Fraction(-1), Fraction(1, 3), Fraction(1)), repeat=basis.dimensions):
+            powers = [math.prod(x**k for x, k in zip(p, e, strict=True)) for e in basis.exponents]
+            values = [
+                sum(Fraction(float(c)) * w for c, w in zip(model.coefficients, powers, strict=True))
+                for model in (a, b, product)
+            ]
+            error = abs(values[0] * values[1] - values[2])
+            assert error <= Fraction(float(product.radius))
+            worst = max(worst, float(error))
+    assert worst > 0.0
 
 
 def test_root_of_what_may_vanish_is_not_bounded() -> None:

@@ -10,7 +10,7 @@ from nerfs import raw_outputs, tiny_weights
 from ns_abstract.methods.nerf import zonotope
 from ns_abstract.methods.nerf.bounds import basis_of, opacity
 from ns_abstract.methods.nerf.scene import FieldWeights
-from ns_abstract.methods.nerf.zonotope import FieldBounds
+from ns_abstract.methods.nerf.zonotope import Affine, FieldBounds
 
 #: A tolerance of zero: what is compared carries its own rounding.
 FIELDS = {
@@ -81,6 +81,84 @@ def test_fields_are_enclosed(name: str, half: float) -> None:
 def test_several_parameters(dimensions: int, half: float) -> None:
     excess, compared, _ = worst(tiny_weights(4), half, dimensions, count=6)
     assert excess <= 0.0 and compared > 0
+
+
+def random_batch(field: FieldBounds, width: int, seed: int) -> Affine:
+    """Every unit of a layer before its activation: dead, active and open ones, with and without columns and box."""
+    rng, pieces, terms = np.random.default_rng(seed), 16, 3
+    monomials = field.basis.evaluation.shape[1]
+    poly = rng.normal(size=(pieces, monomials, width)) * 0.5 ** np.arange(monomials)[:, None]
+    poly[:, 0] *= rng.choice([0.3, 1.0, 3.0], (pieces, width))
+    columns = 0.3 * rng.normal(size=(pieces * terms, width)) * rng.choice([0.0, 0.1, 1.0], (pieces * terms, width))
+    columns[: 4 * terms] = 0.0
+    box = 0.2 * rng.uniform(size=(pieces, width)) * rng.choice([0.0, 0.1, 1.0], (pieces, width))
+    owner = np.repeat(np.arange(pieces), terms)
+    count = torch.full((pieces,), terms, dtype=torch.int64)
+    failed = torch.zeros(pieces, dtype=torch.bool)
+    return Affine(*map(torch.from_numpy, (poly, columns, owner, box)), failed, count)
+
+
+def moved(columns: torch.Tensor, owner: torch.Tensor, signs: torch.Tensor, pieces: int) -> torch.Tensor:
+    """[pieces, n] what error terms [C, n] of values ``signs`` [C] add."""
+    return torch.zeros(pieces, columns.shape[1], dtype=torch.float64).index_add_(0, owner, columns * signs[:, None])
+
+
+#: What the comparison's own arithmetic may be off by, far below what is charged for anything but rounding.
+ROUNDING = 1e-12
+
+
+@pytest.mark.parametrize(("dimensions", "compiled"), [(1, True), (1, False), (2, False)])
+def test_every_unit_is_enclosed(dimensions: int, compiled: bool) -> None:
+    """max(0, z) of one unit after the other, at the ends of its error terms and box."""
+    weights, basis, kinds = tiny_weights(0), basis_of(dimensions), set()
+    field = FieldBounds(weights, basis)
+    field._compiled = field._compiled and compiled
+    assert field._compiled == compiled
+    rng = np.random.default_rng(1)
+    points = np.concatenate([rng.uniform(-1, 1, (300, dimensions)), rng.choice([-1.0, 1.0], (8, dimensions))])
+    values = torch.from_numpy(basis.values(points))
+    for seed in range(3):
+        z = random_batch(field, 16, seed)
+        given = torch.matmul(values, z.poly)
+        rho, box = zonotope.column_sums(z.columns, z.owner, 16), z.box.clone()
+        before = z.columns.clone()
+        found = field._relu(z)
+        slope = zonotope.column_sums(found.columns, found.owner, 16) / rho.clamp(min=1e-300)
+        new = torch.zeros(16, 16, dtype=torch.float64)
+        new[found.new_owner, found.new_neuron] = found.new_size
+        kinds |= {"open" if x > 0.0 else "closed" for x in new.ravel().tolist()}
+        result = torch.matmul(values, found.poly)
+        assert before.shape == found.columns.shape and not found.failed.any()
+        for u in (-1.0, 0.0, 1.0):
+            for v in (-1.0, 1.0):
+                true = (given + (u * rho + v * box)[:, None]).clamp(min=0.0)
+                away = (true - result - (u * slope * rho)[:, None]).abs().amax(dim=1)
+                assert (away <= new + found.box + ROUNDING).all()
+    assert kinds == {"open", "closed"}
+
+
+def test_linear_layers_are_enclosed() -> None:
+    """Error terms keep their values through a layer: those that move one neuron, too."""
+    weights, basis = tiny_weights(0), basis_of(1)
+    field = FieldBounds(weights, basis)
+    weight, absolute, bias = field._base[1]
+    width = weight.shape[0]
+    layer = weight, absolute, bias + torch.linspace(-1.0, 1.0, len(bias), dtype=torch.float64)
+    pieces = field._relu(random_batch(field, width, 5))
+    after = field._linear(pieces, layer)
+    rng = np.random.default_rng(2)
+    values = torch.from_numpy(basis.values(rng.uniform(-1, 1, (50, 1))))
+    units = torch.zeros(len(pieces.new_size), width, dtype=torch.float64)
+    units[torch.arange(len(units)), pieces.new_neuron] = pieces.new_size
+    columns, owner = torch.cat([pieces.columns, units]), torch.cat([pieces.owner, pieces.new_owner])
+    assert len(units) > 10 and torch.equal(owner, after.owner)
+    for _ in range(20):
+        signs = torch.from_numpy(rng.choice([-1.0, 1.0], len(owner)))
+        rest = pieces.box * torch.from_numpy(rng.choice([-1.0, 1.0], pieces.box.shape))
+        inner = torch.matmul(values, pieces.poly) + (moved(columns, owner, signs, 16) + rest)[:, None]
+        outer = torch.matmul(values, after.poly) + moved(after.columns, after.owner, signs, 16)[:, None]
+        away = (inner @ layer[0] + layer[2] - outer).abs().amax(dim=1)
+        assert (away <= after.box + ROUNDING).all()
 
 
 def test_tightness() -> None:

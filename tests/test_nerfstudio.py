@@ -268,6 +268,25 @@ def test_trouble_shows_what_is_known(model: Any, nerfstudio: SimpleNamespace, mo
     assert found["rgb"].shape == (40, 56, 3)
 
 
+def test_depth_outputs_hold(model: Any, nerfstudio: SimpleNamespace, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(model.config.abstract, "depth", True)
+    monkeypatch.setattr(model.config.abstract, "gsplat_version", "1.5.3")
+    monkeypatch.setattr(model, "_shown", None)
+    found = model.get_outputs_for_camera(cameras(nerfstudio))
+    assert list(found)[-2:] == ["abstract_depth_lower", "abstract_depth_upper"]
+    assert model.abstract_source().version == "1.5.3"
+    lower, upper = (found[name].numpy() for name in list(found)[-2:])
+    assert lower.shape == (40, 56, 1) and (upper - lower).mean() < 1.0
+    for shift in (0.0, -0.01, 0.01, *np.random.default_rng(1).uniform(-0.01, 0.01, 6)):
+        moved = cameras(nerfstudio)
+        position = moved.camera_to_worlds[0, :, 3].double() + float(shift) * moved.camera_to_worlds[0, :, 0].double()
+        moved.camera_to_worlds[0, :, 3] = position.float()
+        depth = model.get_outputs(moved)["depth"].numpy()
+        assert ((lower <= depth) & (depth <= upper)).all()
+    nothing = nerfstudio.outputs.pictures(None, 2, 3, depth=True)
+    assert (nothing["abstract_depth_lower"] == 0.0).all() and (nothing["abstract_depth_upper"] == 1e10).all()
+
+
 def test_pixels_of_small_pictures_are_repeated(nerfstudio: SimpleNamespace) -> None:
     from ns_abstract.viewer.views import Snapshot
 

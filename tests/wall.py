@@ -49,6 +49,7 @@ class WallBounds:
 
 
 class WallFrame:
+    channels = 3
     tilewise = False
     tiles_at_once = None
     witnesses = 1
@@ -155,7 +156,7 @@ class WallMethod:
     def memory(self, pixels: int) -> int:
         return 1000 * pixels
 
-    def frame(self, poses: PoseSet, slanted: bool = False) -> WallFrame:
+    def frame(self, poses: PoseSet, slanted: bool = False, layers: bool = False) -> WallFrame:
         return WallFrame(self.wall, poses)
 
     def differentiable(self, poses: PoseSet) -> Callable[[torch.Tensor], torch.Tensor] | None:

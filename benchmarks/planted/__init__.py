@@ -1,6 +1,7 @@
 """Planted faults, by the part of the package that they lie in."""
 
 from planted.certificates import CERTIFICATES
+from planted.depths import DEPTHS
 from planted.fault import Fault, apply
 from planted.fields import FIELDS
 from planted.forms import FORMS
@@ -8,6 +9,6 @@ from planted.polynomials import POLYNOMIALS
 from planted.splats import SPLATS
 from planted.verdicts import VERDICTS
 
-FAULTS = (*FORMS, *POLYNOMIALS, *FIELDS, *VERDICTS, *CERTIFICATES, *SPLATS)
+FAULTS = (*FORMS, *POLYNOMIALS, *FIELDS, *VERDICTS, *CERTIFICATES, *SPLATS, *DEPTHS)
 
 __all__ = ["FAULTS", "Fault", "apply"]

@@ -5,7 +5,8 @@ from planted.fault import Fault
 _ZONOTOPE, _BOUNDS = "methods/nerf/zonotope.py", "methods/nerf/bounds.py"
 _HSV, _OCCUPANCY, _RELU = "methods/nerf/hsv.py", "methods/nerf/occupancy.py", "methods/nerf/relu_kernel.py"
 _FIELDS = "test_nerf_zonotope.py::test_fields_are_enclosed"
-_SEVERAL = "test_nerf_zonotope.py::test_several_parameters"
+_LAYERS = "test_nerf_zonotope.py::test_linear_layers_are_enclosed"
+_UNITS = "test_nerf_zonotope.py::test_every_unit_is_enclosed"
 _OPACITY = "test_nerf_zonotope.py::test_opacities_are_monotone_bounds"
 _SETS = "test_nerf_frame.py::test_sets_of_poses_are_enclosed"
 _STIFF = "test_nerf_frame.py::test_stiff_fields_are_enclosed"
@@ -21,42 +22,43 @@ FIELDS = (
     Fault(
         "fields: a layer forgets the box before it",
         _ZONOTOPE, "FieldBounds._linear", "radius @ right_absolute", "0.0 * radius @ right_absolute",
-        _SEVERAL, True,
+        _LAYERS,
     ),
     Fault(
         "fields: a layer forgets its bias",
-        _ZONOTOPE, "FieldBounds._linear", "poly[:, 0] += bias", "pass", _FIELDS + "[0.003-smooth]", True,
+        _ZONOTOPE, "FieldBounds._linear", "poly[:, 0] += bias", "pass", _LAYERS,
     ),
     Fault(
         "fields: error terms of one neuron lose their size",
         _ZONOTOPE, "FieldBounds._linear", "right[pieces.new_neuron] * pieces.new_size[:, None]",
-        "0.1 * right[pieces.new_neuron] * pieces.new_size[:, None]", _SEVERAL, True,
+        "0.1 * right[pieces.new_neuron] * pieces.new_size[:, None]", _LAYERS,
     ),
     Fault(
         "fields: an open unit counts as active",
-        _ZONOTOPE, "FieldBounds._relu_torch", "low >= e + r", "high >= e + r", _SEVERAL, True,
+        _ZONOTOPE, "FieldBounds._relu_torch", "low >= e + r", "high >= e + r", _UNITS + "[1-False]",
     ),
     Fault(
         "fields: a unit that may be active counts as dead",
-        _ZONOTOPE, "FieldBounds._relu_torch", "high <= -(e + r)", "low <= -(e + r)", _SEVERAL, True,
+        _ZONOTOPE, "FieldBounds._relu_torch", "high <= -(e + r)", "low <= -(e + r)", _UNITS + "[1-False]",
     ),
     Fault(
         "fields: the radius of a unit forgets its columns",
-        _ZONOTOPE, "FieldBounds._relu_torch", "spread + rho + box", "0.2 * spread + 0.0 * rho + box", _SEVERAL, True,
+        _ZONOTOPE, "FieldBounds._relu_torch", "spread + rho + box", "0.2 * spread + 0.0 * rho + box",
+        _UNITS + "[1-False]",
     ),
     Fault(
         "fields: the line's error is a quarter of what it is",
         _ZONOTOPE, "FieldBounds._relu_torch", "(0.5 * line * -bottom + 4.0 * slack) * FIELD_UP",
-        "(0.25 * line * -bottom + 4.0 * slack) * FIELD_UP", _SEVERAL, True,
+        "(0.25 * line * -bottom + 4.0 * slack) * FIELD_UP", _UNITS + "[1-False]",
     ),
     Fault(
         "fields: the fit is not shifted to its middle",
-        _ZONOTOPE, "FieldBounds._fitted", "q[:, 0] += shift", "pass", _SEVERAL, True,
+        _ZONOTOPE, "FieldBounds._fitted", "q[:, 0] += shift", "pass", _UNITS + "[1-False]",
     ),
     Fault(
         "fields: the distance between grid and polynomial is not charged",
         _ZONOTOPE, "FieldBounds._fitted", "(positive - fitted).amax(dim=1) + torch.maximum(above, below)",
-        "0.5 * (positive - fitted).amax(dim=1)", _SEVERAL, True,
+        "0.5 * (positive - fitted).amax(dim=1)", _UNITS + "[1-False]",
     ),
     Fault(
         "fields: what is no number does not fail",
@@ -66,21 +68,22 @@ FIELDS = (
     Fault(
         "compiled units: the line's error is a quarter of what it is",
         _RELU, "relu", "line_error = (0.5 * line * -bottom + 4.0 * slack) * FIELD_UP",
-        "line_error = (0.25 * line * -bottom + 4.0 * slack) * FIELD_UP", _FIELDS, True,
+        "line_error = (0.25 * line * -bottom + 4.0 * slack) * FIELD_UP", _UNITS + "[1-True]",
     ),
     Fault(
         "compiled units: the fit is not shifted to its middle",
-        _RELU, "relu", "q[0] += 0.5 * (most + least)", "q[0] += 0.0", _FIELDS, True,
+        _RELU, "relu", "q[0] += 0.5 * (most + least)", "q[0] += 0.0", _UNITS + "[1-True]",
     ),
     Fault(
         "compiled units: columns are halved without their error",
         _RELU, "relu",
         "(0.5 * (most - least) + CHEBYSHEV_ROUNDING * (sum_q + absolute) + 0.5 * e + 2.0 * slack) * FIELD_UP",
-        "(0.5 * (most - least) + CHEBYSHEV_ROUNDING * (sum_q + absolute) + 2.0 * slack) * FIELD_UP", _FIELDS, True,
+        "(0.5 * (most - least) + CHEBYSHEV_ROUNDING * (sum_q + absolute) + 2.0 * slack) * FIELD_UP",
+        _UNITS + "[1-True]",
     ),
     Fault(
         "compiled units: an open unit counts as dead",
-        _RELU, "relu", "high <= -(e + r)", "low <= -(e + r)", _FIELDS, True,
+        _RELU, "relu", "high <= -(e + r)", "low <= -(e + r)", _UNITS + "[1-True]",
     ),
     Fault(
         "opacity: an upper bound is rounded down",

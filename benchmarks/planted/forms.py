@@ -74,8 +74,8 @@ FORMS = (
         "second derivative's bounds are swapped",
         _FORMS,
         "compose",
-        "low = min(0.0, f2_low[q]) * (e * e)",
-        "low = min(0.0, f2_high[q]) * (e * e)",
+        "high = max(0.0, f2_high[q]) * (e * e)",
+        "high = max(0.0, f2_low[q]) * (e * e)",
         "test_forms.py::test_function_contains[plain-rsqrt-d2o1]",
     ),
     Fault(
@@ -250,8 +250,8 @@ FORMS = (
         "one parameter: product without its slopes' product",
         _LINE_FORMS,
         "multiplied",
-        "a[0] * b[2] + b[0] * a[2] + a[1] * b[1]",
-        "a[0] * b[2] + b[0] * a[2]",
+        "a.center * b.bend + b.center * a.bend + a.slope * b.slope",
+        "a.center * b.bend + b.center * a.bend",
         "test_line_forms.py::test_pairs[multiplied-plain]",
     ),
     Fault(
@@ -266,8 +266,8 @@ FORMS = (
         "one parameter: rounding of products is dropped",
         _LINE_FORMS,
         "multiplied",
-        "pa * b[3] + pb * a[3] + a[3] * b[3] + FORM_ROUNDING * (pa * pb)",
-        "pa * b[3] + pb * a[3] + a[3] * b[3]",
+        "pa * b.radius + pb * a.radius + a.radius * b.radius + FORM_ROUNDING * (pa * pb)",
+        "pa * b.radius + pb * a.radius + a.radius * b.radius",
         "test_line_forms.py::test_pairs[multiplied-constant]",
     ),
     Fault(

@@ -20,7 +20,7 @@ SPLATS = (
     Fault(
         "near plane is not uncertain",
         _RECORDS,
-        "regions",
+        "_tile_ranges",
         "s[ZLOW + q] >= near * (1.0 + charges.near)",
         "s[ZLOW + q] > 0.0",
         "test_bounds.py::test_near_plane_alone[2]",
@@ -44,7 +44,7 @@ SPLATS = (
     Fault(
         "tile cut-off by the smallest radius",
         _RECORDS,
-        "regions",
+        "_tile_ranges",
         "mean_x_low - radius_high - snap_x, mean_x_high + radius_high + snap_x",
         "mean_x_low - radius_low + 1.0, mean_x_high + radius_low - 1.0",
         "test_bounds.py::test_tile_cut[1]",
@@ -53,7 +53,7 @@ SPLATS = (
         "Jacobian without its clamp",
         _FORM_PROJECTION,
         "project_forms",
-        "margin >= 0.0",
+        "rules.view_margin >= 0.0",
         "False",
         "test_bounds.py::test_jacobian_clamp[1]",
     ),
@@ -69,14 +69,14 @@ SPLATS = (
         "clamped on one side only, one parameter",
         _LINE_PROJECTION,
         "_clamped",
-        "raised((-a[0], -a[1], -a[2], a[3]), -limit_high, -high, -low)",
-        "(-a[0], -a[1], -a[2], a[3])",
+        "raised(_negated(a), -limit_high, -high, -low)",
+        "_negated(a)",
         "test_bounds.py::test_jacobian_clamp_all_sides[2]",
     ),
     Fault(
         "no compensation when antialiased",
         _FORM_PROJECTION,
-        "project_forms",
+        "_compensate",
         "scale_add(w, _LOG * one, -0.5, _LOG * one, 0.0, 0.0, k, m)",
         "scale_add(w, _LOG * one, 0.0, _LOG * one, 0.0, 0.0, k, m)",
         "test_bounds.py::test_antialiased[1]",
@@ -124,7 +124,7 @@ SPLATS = (
     Fault(
         "compensated layers dropped too early",
         _RECORDS,
-        "regions",
+        "_opacities",
         "all_of_it * (1.0 + charges.exponent_limit)",
         "0.9 * all_of_it * (1.0 + charges.exponent_limit)",
         "test_antialiased.py::test_computed_factor[tiny-x]",
@@ -132,7 +132,7 @@ SPLATS = (
     Fault(
         "compensated layers are drawn on too few pixels",
         _RECORDS,
-        "regions",
+        "_opacities",
         "s[CTOPLOG + q]",
         "1.5 * s[CTOPLOG + q]",
         "test_antialiased.py::test_pictures[x]",
@@ -140,7 +140,7 @@ SPLATS = (
     Fault(
         "blur left out of the determinant",
         _FORM_PROJECTION,
-        "project_forms",
+        "_covariance",
         "add_product(w, t1, z2, 1.0, det, m)",
         "pass",
         "test_bounds.py::test_depth_swap[1]",
@@ -188,9 +188,9 @@ SPLATS = (
     Fault(
         "region of pixels without the mean's range",
         _RECORDS,
-        "regions",
-        "mean_x_high + extent_x",
-        "mean_x_low + extent_x",
+        "_pixel_boxes",
+        "s[MXHI + q] + extent_x",
+        "s[MXLO + q] + extent_x",
         "test_bounds.py::test_alpha_threshold_of_all[2]",
     ),
     Fault(
@@ -204,7 +204,7 @@ SPLATS = (
     Fault(
         "order swap raises but does not lower",
         _BLEND,
-        "_blend_quadratic",
+        "blend_quadratic",
         "ends.low - falls",
         "ends.low",
         "test_bounds.py::test_depth_swap[2]",
@@ -380,7 +380,7 @@ SPLATS = (
     Fault(
         "blend drops the radius of alpha",
         _BLEND,
-        "_blend_quadratic",
+        "blend_quadratic",
         "fma(values[at + FORM + 3], size, fma(FRAGMENT_ROUNDING, fma(1.0 + a1 + a2, size, abs(p0)), added))",
         "fma(FRAGMENT_ROUNDING, fma(1.0 + a1 + a2, size, abs(p0)), added)",
         "test_bounds.py::test_linear[x-2]",
@@ -428,7 +428,7 @@ SPLATS = (
     Fault(
         "an exponent that is no number leaves the opacity",
         _RECORDS,
-        "regions",
+        "_opacities",
         "max(1.0, upper)",
         "upper",
         "test_gsplat_kernels.py::test_stiff_cases_hold[squares at the overflow-1.4.0]",

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from time import perf_counter
 from typing import Any, NamedTuple
@@ -22,7 +22,7 @@ from ns_abstract.execution.stopping import StopRequest, interruptible
 from ns_abstract.geometry.box import ParameterBox
 from ns_abstract.io.errors import InputError
 from ns_abstract.refine.engine import Goal, groups, shared_goal
-from ns_abstract.refine.result import FrameResult, Leaves, PartResult, TracePoint
+from ns_abstract.refine.result import FrameResult, Layer, Leaves, PartResult, TracePoint
 from ns_abstract.report.figures import metrics
 from ns_abstract.report.files import save_frame
 
@@ -234,6 +234,7 @@ class BoundResult:
         bounded: False while no bound but [0, 1] is known.
         interrupted: Whether the work was ended by Ctrl-C or by ``on_progress``.
         cells: Linear sets of the cells, if they were kept.
+        layers: "depth" and "accumulation", if they were asked for; see `ns_abstract.refine.result.Layer`.
     """
 
     lower: np.ndarray
@@ -252,6 +253,7 @@ class BoundResult:
     cells: Leaves | None = field(default=None, repr=False)
     target_ratio: float = 1.05
     about: dict[str, Any] = field(default_factory=dict, repr=False)
+    layers: Mapping[str, Layer] = field(default_factory=dict, repr=False)
 
     @classmethod
     def of(cls, frame: FrameResult, **more: Any) -> BoundResult:
@@ -340,6 +342,7 @@ def bound(
     seed: int = 0,
     memory_limit: float | None = None,
     workers: int = 1,
+    outputs: Sequence[str] = ("rgb",),
 ) -> BoundResult:
     """Bound every picture that a scene shows over a set of poses; sound whenever it ends.
 
@@ -357,6 +360,7 @@ def bound(
         seed: Of the random pictures that are rendered.
         memory_limit: GiB; None: 80 % of what is free.
         workers: NeRF: processes that bound rays. With more than one, a script needs ``if __name__ == "__main__":``.
+        outputs: "rgb", which is always bounded, "depth" and "accumulation" (splats).
 
     Raises:
         InputError: An argument cannot be used.
@@ -367,7 +371,10 @@ def bound(
             raise InputError(f"found {value}", field=name, fix="give a positive number")
     if target_ratio < 1.0:
         raise InputError(f"found {target_ratio}", field="target_ratio", fix="give a number of at least 1")
-    job = Job(scene, [poses.of(scene)], arithmetic=arithmetic, seed=seed, memory_limit=memory_limit, workers=workers)
+    job = Job(
+        scene, [poses.of(scene)], arithmetic=arithmetic, seed=seed, memory_limit=memory_limit, workers=workers,
+        layers=[name for name in outputs if name != "rgb"],
+    )  # fmt: skip
     guarantee = "sampled" if platform_problems() else job.method.guarantee
     with interruptible() as stop:
         results = bound_frames(

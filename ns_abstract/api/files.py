@@ -29,6 +29,7 @@ class Settings:
         seed: Of the random witnesses.
         memory_limit: GiB.
         workers: Processes that bound the rays of a NeRF.
+        outputs: "rgb", and what is bounded beside it: "depth", "accumulation".
         occupancy_grid: File of a grid that is declared as part of a NeRF.
         sampling, num_samples, near_plane: Of the rays of a NeRF; None: the method's own.
     """
@@ -47,6 +48,7 @@ class Settings:
     near_plane: float | None = None
     occupancy_grid: Path | None = None
     workers: int = 1
+    outputs: tuple[str, ...] = ("rgb",)
 
     @property
     def scene(self) -> SceneSource:
@@ -75,6 +77,7 @@ class PathJob(Job):
                 seed=settings.seed,
                 memory_limit=settings.memory_limit,
                 workers=settings.workers,
+                layers=[name for name in settings.outputs if name != "rgb"],
             )
         except InputError as error:
             # options have no file

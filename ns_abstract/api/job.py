@@ -18,7 +18,7 @@ from ns_abstract.io.errors import InputError
 from ns_abstract.methods.runs import available_memory
 from ns_abstract.refine.engine import Goal, Refinement
 from ns_abstract.refine.protocol import Frame, Method
-from ns_abstract.refine.result import FrameResult, PartResult, TracePoint, joined
+from ns_abstract.refine.result import LAYERS, FrameResult, PartResult, TracePoint, joined
 
 #: GiB beyond which a limit is none.
 MOST_MEMORY = 2.0**20
@@ -36,9 +36,10 @@ class Job:
         seed: Of the random witnesses.
         memory_limit: GiB; None: 80 % of what is free.
         workers: Processes that one frame may use, where pictures are made ray by ray.
+        layers: What is bounded beside the colours, of `ns_abstract.refine.result.LAYERS`.
 
     Raises:
-        InputError: The scene does not vary as asked, or the memory does not do.
+        InputError: The scene has no such layers, does not vary as asked, or the memory does not do.
     """
 
     def __init__(
@@ -50,13 +51,20 @@ class Job:
         seed: int = 0,
         memory_limit: float | None = None,
         workers: int = 1,
+        layers: Sequence[str] = (),
     ) -> None:
+        self.layers = tuple(name for name in LAYERS if name in layers)
+        if unknown := [name for name in layers if name not in LAYERS]:
+            raise InputError(f"found {unknown[0]}", field="--outputs", fix=f"use rgb, {', '.join(LAYERS)}")
         self.source, self._arithmetic, self.rays = scene.source, arithmetic, scene.rays
         self.method: Method = scene.method(arithmetic, workers)
         self.pose_sets, self.seed, self.memory_limit = tuple(pose_sets), seed, memory_limit
         self.workers = workers if scene.rays else 1
         self._warm: set[int] = set()
         self.method.prepare([poses.perturbation for poses in self.pose_sets])
+        if self.layers:
+            # refused before hours of work
+            self.frame(0)
         self._check_memory()
 
     @property
@@ -70,7 +78,7 @@ class Job:
         options = self.source.options
         grid = None if options.occupancy_grid is None else options.occupancy_grid.absolute()
         source = SceneSource(self.source.file.absolute(), replace(options, occupancy_grid=grid))
-        again = partial(_open, source, self.pose_sets, self._arithmetic, self.seed, self.memory_limit)
+        again = partial(_open, source, self.pose_sets, self._arithmetic, self.seed, self.memory_limit, self.layers)
         return Recipe(again, self.fingerprint, Path(self.source.file))
 
     # ---------------------------------------------------------------- memory
@@ -112,7 +120,7 @@ class Job:
 
     def frame(self, index: int, slanted: bool = False) -> Frame:
         """Frame ``index``, ready for refinement; see `Method.frame`."""
-        return self.method.frame(self.pose_sets[index], slanted)
+        return self.method.frame(self.pose_sets[index], slanted, bool(self.layers))
 
     def warm_up(self, index: int) -> None:
         """Compile the kernels that frame ``index`` needs, so that its clock measures bounding alone."""
@@ -174,7 +182,8 @@ class Job:
                 f"bounded in {len(parts)} groups of tiles side by side: cells are the sum of theirs, seconds those of "
                 "the slowest"
             )
-        return replace(result, plan=tuple(plan))
+        layers = {name: result.layers[name] for name in self.layers}
+        return replace(result, plan=tuple(plan), layers=layers)
 
     # ---------------------------------------------------------------- reports
 
@@ -198,7 +207,8 @@ class Job:
             sets.update(repr((poses.perturbation, poses.box, sorted(poses.fixed.items()))).encode())
             if poses.perturbation.scene:
                 sets.update(repr(poses.perturbation.scene).encode())
-        return {**self.method.fingerprint, "poses": sets.hexdigest()}
+        more = {"outputs": list(self.layers)} if self.layers else {}
+        return {**self.method.fingerprint, **more, "poses": sets.hexdigest()}
 
     def describe(self) -> dict[str, Any]:
         """The scene for reports."""
@@ -206,9 +216,14 @@ class Job:
 
 
 def _open(
-    source: SceneSource, pose_sets: tuple[PoseSet, ...], arithmetic: str | None, seed: int, memory_limit: float | None
+    source: SceneSource,
+    pose_sets: tuple[PoseSet, ...],
+    arithmetic: str | None,
+    seed: int,
+    memory_limit: float | None,
+    layers: tuple[str, ...],
 ) -> Job:
-    return Job(source.open(), pose_sets, arithmetic=arithmetic, seed=seed, memory_limit=memory_limit)
+    return Job(source.open(), pose_sets, arithmetic=arithmetic, seed=seed, memory_limit=memory_limit, layers=layers)
 
 
 def check_frames(frames: Sequence[int] | None, count: int) -> tuple[int, ...]:

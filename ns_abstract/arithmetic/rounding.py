@@ -151,6 +151,7 @@ class Charges(NamedTuple):
     blend_fragment: float
     blend_pixel: float
     left_out: float
+    expected_depth: float
 
 
 def charges(a: Arithmetic) -> Charges:
@@ -243,4 +244,6 @@ def charges(a: Arithmetic) -> Charges:
         blend_pixel=16.0 * both,
         # B8: a sum, for each fragment that is left out
         left_out=both,
+        # D4: a division; a constant below it, 1
+        expected_depth=(a.division + 1.0) * u,
     )

@@ -52,13 +52,13 @@ def resampled(scene: SplatScene, count: int, seed: int = 0) -> SplatScene:
 
 def _row(
     config: Path, path: Path | None, frame: int, name: str, count: int, width: int, repeats: int, seconds: float,
-    gibibytes: float,
+    gibibytes: float, version: str | None,
 ) -> dict[str, Any]:  # fmt: skip
     """One row; to be run in a process of its own, whose peak memory is told."""
     (job,) = open_jobs((config,), path, 1.0)
     (job,) = open_jobs((config,), path, job.path.cameras[frame].width / width)
     job.memory_limit = gibibytes
-    job.method = splat = SplatMethod(resampled(splat_of(job).scene, count), None, None)
+    job.method = splat = SplatMethod(resampled(splat_of(job).scene, count), None, None, version)
     poses = pose_set(job, name, frame, _WIDTH / width)
     view = SplatFrame(splat.splats, splat.rasteriser, splat.arithmetic, poses)
     cell, tiles = small_cell(poses, PART), np.arange(view.tile_count)
@@ -89,7 +89,7 @@ def _row(
 
 def curve(
     config: Path, path: Path | None, frame: int, name: str, counts: Sequence[int], widths: Sequence[int],
-    repeats: int, seconds: float, gibibytes: float,
+    repeats: int, seconds: float, gibibytes: float, version: str | None = None,
 ) -> Iterator[dict[str, Any]]:  # fmt: skip
     """Rows for every number of Gaussians and width; the last one, the largest, is refined for ``seconds``.
 
@@ -100,4 +100,5 @@ def curve(
             given = seconds if (count, width) == (counts[-1], widths[-1]) else 0.0
             # a process keeps its peak, so each row has its own
             with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as pool:
-                yield pool.submit(_row, config, path, frame, name, count, width, repeats, given, gibibytes).result()
+                arguments = config, path, frame, name, count, width, repeats, given, gibibytes, version
+                yield pool.submit(_row, *arguments).result()

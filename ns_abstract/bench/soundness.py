@@ -31,6 +31,7 @@ def attack(
     return {
         "scene": job.method.name,
         "size": f"{result.lower.shape[1]}x{result.lower.shape[0]}",
+        "program": "{name} {version}".format_map(job.method.program),
         "set": name,
         "ratio": last.mpg / last.mpg_witness if last.mpg_witness else float("nan"),
         "poses": first.poses,

@@ -28,6 +28,7 @@ def summary(job: PathJob, name: str, result: FrameResult) -> dict[str, object]:
     row: dict[str, object] = {
         "scene": job.method.name,
         "size": f"{result.lower.shape[1]}x{result.lower.shape[0]}",
+        "program": "{name} {version}".format_map(job.method.program),
         "set": name,
         "Rt s": last.seconds,
         "cells": last.cells,

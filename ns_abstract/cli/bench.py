@@ -44,6 +44,8 @@ class Scenes:
     """Entry of the camera path."""
     downscale_factor: float = 1.0
     """Images become this many times smaller."""
+    gsplat_version: Literal["1.4.0", "1.5.3", "1.6.0"] | None = None
+    """Splats: whose rules are bounded. Default: 1.4.0."""
 
 
 @dataclass
@@ -303,7 +305,7 @@ def scale(options: Scale) -> int:
     rows: list[dict[str, Any]] = []
     for row in curve(
         options.load_config[0], options.camera_path_filename, options.frame, options.set, options.gaussians,
-        options.widths, options.repeats, options.seconds, options.memory_limit,
+        options.widths, options.repeats, options.seconds, options.memory_limit, options.gsplat_version,
     ):  # fmt: skip
         rows.append(row)
         print("\n".join(markdown([row]).splitlines()[0 if len(rows) == 1 else 2 :]), flush=True)
@@ -396,7 +398,9 @@ def bench(
     from ns_abstract.bench.tables import markdown, write
 
     grid = options.occupancy_grid if isinstance(options, Rays | Tightness) else None
-    jobs = open_jobs(options.load_config, options.camera_path_filename, options.downscale_factor, None, grid)
+    jobs = open_jobs(
+        options.load_config, options.camera_path_filename, options.downscale_factor, None, grid, options.gsplat_version
+    )
     rows: list[dict[str, Any]] = []
     tables: dict[int, list[dict[str, Any]]] = {}
     results = {}

@@ -55,6 +55,9 @@ class Render:
     occupancy_grid: Path | None = None
     """NeRF: declare the field empty outside of this grid's occupied voxels (.npz, see ns-abstract-export occupancy).
     That makes it another scene, for which the bounds hold."""
+    outputs: tuple[Literal["rgb", "depth", "accumulation"], ...] = ("rgb",)
+    """What is bounded. rgb is always; depth: gsplat's expected depth, normalised units (splats). accumulation: the part
+    of the light that the scene takes."""
     seed: int = 0
     """Seed of the random witnesses."""
     engine: Literal["local", "dask"] = "local"

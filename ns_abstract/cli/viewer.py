@@ -56,6 +56,10 @@ class View:
     """Viewer configuration"""
     vis: Literal["viewer", "viewer_legacy"] = "viewer"
     """Type of viewer"""
+    depth: bool = False
+    """Splats: bound the expected depth, too: output types abstract_depth_lower and abstract_depth_upper."""
+    gsplat_version: Literal["1.4.0", "1.5.3", "1.6.0"] | None = None
+    """Splats: whose rules are drawn and bounded. Default: the installed version's."""
 
 
 def view(options: View) -> int:
@@ -71,7 +75,8 @@ def view(options: View) -> int:
     try:
         from ns_abstract.nerfstudio.viewing import view as serve
 
-        serve(options.load_config, options.vis, vars(options.viewer))
+        abstract = {"depth": options.depth, "gsplat_version": options.gsplat_version}
+        serve(options.load_config, options.vis, vars(options.viewer), abstract)
     except ModuleNotFoundError as error:
         raise InputError(
             f"the package {error.name} is missing", field="nerfstudio", fix="pip install 'ns-abstract[nerfstudio]'"

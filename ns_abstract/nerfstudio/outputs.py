@@ -7,7 +7,7 @@ import weakref
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 import torch
@@ -31,6 +31,10 @@ else:
     _Base = object
 
 OUTPUTS = ("abstract_lower", "abstract_upper", "abstract_gap", "abstract_witness")
+#: Further ones, where the depth is bounded.
+DEPTH_OUTPUTS = ("abstract_depth_lower", "abstract_depth_upper")
+#: gsplat draws nothing that is farther away.
+_FAR = 1e10
 
 
 @dataclass
@@ -53,6 +57,10 @@ class AbstractConfig:
     """Time for every image of ns-render and ns-eval; 0: no abstract images there."""
     viewer_seconds: float = 10.0
     """Time for every view in the viewer."""
+    depth: bool = False
+    """Splats: bound the expected depth, too."""
+    gsplat_version: Literal["1.4.0", "1.5.3", "1.6.0"] | None = None
+    """Splats: whose rules are drawn and bounded. Default: the installed version's."""
 
     @property
     def radii(self) -> dict[str, float]:
@@ -61,11 +69,12 @@ class AbstractConfig:
         return {**poses, **{name: getattr(self, name) for name in VARIATIONS}}
 
 
-def pictures(snapshot: Snapshot | None, height: int, width: int) -> dict[str, torch.Tensor]:
+def pictures(snapshot: Snapshot | None, height: int, width: int, depth: bool = False) -> dict[str, torch.Tensor]:
     """Outputs [height, width, 3] for the bounds, [height, width, 1] for the gaps; repeats pixels of small pictures.
 
     ``abstract_gap`` is the length over RGB of upper - lower, ``abstract_witness`` the same of the least
-    and largest values that were really rendered. Without a snapshot the bounds are 0 and 1.
+    and largest values that were really rendered. Without a snapshot the bounds are 0 and 1. With ``depth`` also
+    ``abstract_depth_lower`` and ``abstract_depth_upper`` [height, width, 1], normalised units, at most the far plane.
     """
     if snapshot is None:
         zero = np.zeros((1, 1, 3), np.float32)
@@ -75,7 +84,13 @@ def pictures(snapshot: Snapshot | None, height: int, width: int) -> dict[str, to
         least, most = snapshot.witness_lower, snapshot.witness_upper
     gaps = [np.linalg.norm(high - low, axis=-1, keepdims=True) for low, high in ((lower, upper), (least, most))]
     found = [resampled(torch.from_numpy(image), height, width) for image in (lower, upper, *gaps)]
-    return dict(zip(OUTPUTS, found, strict=True))
+    named: dict[str, torch.Tensor] = dict(zip(OUTPUTS, found, strict=True))
+    if depth:
+        known = None if snapshot is None else snapshot.depth
+        ends = np.array([[[0.0]], [[_FAR]]], np.float32) if known is None else np.minimum(known, np.float32(_FAR))
+        for name, end in zip(DEPTH_OUTPUTS, ends, strict=True):
+            named[name] = resampled(torch.from_numpy(np.ascontiguousarray(end))[..., None], height, width)
+    return named
 
 
 def resampled(image: torch.Tensor, height: int, width: int) -> torch.Tensor:
@@ -155,7 +170,7 @@ class AbstractOutputs(_Base):
         except Exception as error:
             # the viewer's render thread must not end; nothing is known, and that is what is shown
             CONSOLE.print(f"[yellow]No abstract image: {type(error).__name__}: {error}")
-            found = pictures(None, int(camera.height.reshape(-1)[0]), int(camera.width.reshape(-1)[0]))
+            found = self._pictures(None, int(camera.height.reshape(-1)[0]), int(camera.width.reshape(-1)[0]))
         return {**outputs, **{name: value.to(self.device) for name, value in found.items()}}
 
     def _concrete(self, camera: Any, obb_box: Any) -> dict[str, torch.Tensor]:
@@ -174,14 +189,18 @@ class AbstractOutputs(_Base):
             view = View(shown, self.abstract.perturbation)
         except InputError as error:
             self.abstract.refuse(error)
-            return pictures(None, shown.height, shown.width)
+            return self._pictures(None, shown.height, shown.width)
         if self.abstract.control.present:
             self._show(source)
             snapshot = self._background.best(view.at_most(source.most), self.abstract.seconds)
             self.abstract.show(view, snapshot, self._background.status, source.about)
         else:
             snapshot = self._now(source, view, options.seconds)
-        return pictures(snapshot, view.camera.height, view.camera.width)
+        return self._pictures(snapshot, view.camera.height, view.camera.width)
+
+    def _pictures(self, snapshot: Snapshot | None, height: int, width: int) -> dict[str, torch.Tensor]:
+        options: AbstractConfig = self.config.abstract  # pyright: ignore[reportAttributeAccessIssue]
+        return pictures(snapshot, height, width, options.depth and self.gaussians)
 
     def _now(self, source: Source, view: View, seconds: float) -> Snapshot:
         if self._problems is None:

@@ -13,7 +13,7 @@ from nerfstudio.models.splatfacto import SplatfactoModel, SplatfactoModelConfig
 
 from ns_abstract.io.errors import InputError
 from ns_abstract.methods.splat.activate import Splats, activate
-from ns_abstract.methods.splat.constants import installed_gsplat
+from ns_abstract.methods.splat.constants import VERSIONS, Rasteriser, installed_gsplat
 from ns_abstract.methods.splat.load import scene_from_parameters
 from ns_abstract.methods.splat.render import Renderer
 from ns_abstract.methods.splat.scene import SplatScene
@@ -73,8 +73,14 @@ class AbstractSplatfactoModel(AbstractOutputs, SplatfactoModel):
                 rasterize_mode=cast(Literal["classic", "antialiased"], self.config.rasterize_mode),
                 background=np.zeros(3, np.float32),
             )
-            self._active = (state, self.step), scene, activate(scene, installed_gsplat())
+            self._active = (state, self.step), scene, activate(scene, self._rules)
         return self._active[1:]
+
+    @property
+    def _rules(self) -> Rasteriser:
+        """What is drawn and bounded: the version that was asked for, or the installed one's."""
+        version = self.config.abstract.gsplat_version
+        return installed_gsplat() if version is None else VERSIONS[version]
 
     def _scene(self) -> tuple[SplatSource, Renderer]:
         """What is shown: the Gaussians inside the crop box, before the background."""
@@ -90,8 +96,9 @@ class AbstractSplatfactoModel(AbstractOutputs, SplatfactoModel):
                 splats = dataclasses.replace(splats, **parts)
                 scene = cropped(scene, inside)
             splats = dataclasses.replace(splats, background=background)
-            rules = installed_gsplat()
-            self._shown = state, SplatSource(splats, scene, version=rules.version), Renderer(splats, rules)
+            rules = self._rules
+            source = SplatSource(splats, scene, version=rules.version, layers=self.config.abstract.depth)
+            self._shown = state, source, Renderer(splats, rules)
         return self._shown[1:]
 
     def abstract_source(self) -> SplatSource:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import tempfile
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Literal
 
@@ -34,13 +35,16 @@ _CHUNK = 256
 _FIX_DATA = "start the command in the folder that ns-train was started in, or put the data set back"
 
 
-def view(load_config: Path, vis: Literal["viewer", "viewer_legacy"], options: dict[str, Any]) -> None:
+def view(
+    load_config: Path, vis: Literal["viewer", "viewer_legacy"], options: dict[str, Any], abstract: dict[str, Any]
+) -> None:
     """Open the run and serve the viewer until the process is interrupted.
 
     Args:
         load_config: config.yml, or a .ply.
         vis: Which of nerfstudio's viewers.
         options: Of its ``ViewerConfig``.
+        abstract: Of splats' `AbstractConfig`.
 
     Raises:
         InputError: The run cannot be opened.
@@ -49,7 +53,7 @@ def view(load_config: Path, vis: Literal["viewer", "viewer_legacy"], options: di
         config_file = load_config
         if config_file.suffix.lower() == ".ply":
             config_file = run_of_ply(config_file, Path(scratch))
-        config, pipeline, step = open_run(config_file)
+        config, pipeline, step = open_run(config_file, abstract)
         if options["websocket_host"] not in _LOOPBACK or options["make_share_url"]:
             print(
                 "the viewer is open to others: whoever reaches this machine sees the scene, moves the camera and "
@@ -71,11 +75,12 @@ def run_of_ply(file: Path, folder: Path) -> Path:
     return write_splatfacto_run(scene, folder, timestamp="ply", experiment_name="scene", views=views)
 
 
-def open_run(config_file: Path) -> tuple[TrainerConfig, Pipeline, int]:
+def open_run(config_file: Path, abstract: Mapping[str, Any] | None = None) -> tuple[TrainerConfig, Pipeline, int]:
     """nerfstudio's ``eval_setup`` with models that bound; the run may have been moved.
 
     config.yml is read by nerfstudio's own loader, which can run code, so it is read before by ours, which runs none,
-    and so is the checkpoint: what names other objects than runs of nerfstudio do is refused.
+    and so is the checkpoint: what names other objects than runs of nerfstudio do is refused. ``abstract`` are options
+    of splats' `AbstractConfig`.
 
     Returns:
         Configuration, pipeline and training step.
@@ -89,7 +94,9 @@ def open_run(config_file: Path) -> tuple[TrainerConfig, Pipeline, int]:
     allow_numpy_scalars()
 
     def prepare(config: TrainerConfig) -> TrainerConfig:
-        return _prepared(config, run.file)
+        config = _prepared(config, run.file)
+        _set_options(config.pipeline.model, abstract or {})
+        return config
 
     try:
         config, pipeline, _, step = eval_setup(run.file, test_mode="test", update_config_callback=prepare)
@@ -98,6 +105,13 @@ def open_run(config_file: Path) -> tuple[TrainerConfig, Pipeline, int]:
             f"nerfstudio cannot open it: {error}", file=run.file, fix="give a run of nerfstudio 1.1.5"
         ) from None
     return config, pipeline, step
+
+
+def _set_options(model: Any, abstract: Mapping[str, Any]) -> None:
+    for name, value in abstract.items():
+        if value and not isinstance(model, AbstractSplatfactoModelConfig):
+            raise InputError("this run is no splat", field="--" + name.replace("_", "-"), fix="leave it out")
+        setattr(model.abstract, name, value)
 
 
 def _prepared(config: TrainerConfig, file: Path) -> TrainerConfig:

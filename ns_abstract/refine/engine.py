@@ -21,8 +21,8 @@ import numpy as np
 
 from ns_abstract.execution.ending import AbandonedError, abandoning
 from ns_abstract.geometry.box import ParameterBox
-from ns_abstract.refine.protocol import Bounds, Context, Frame, Render
-from ns_abstract.refine.result import FrameResult, Leaves, PartResult, TracePoint, Views, gap, joined
+from ns_abstract.refine.protocol import ACCUMULATION, COLORS, DEPTH, Bounds, Context, Frame, Render
+from ns_abstract.refine.result import FrameResult, Layer, Leaves, PartResult, TracePoint, Views, gap, joined
 
 #: Part of the whole excess that one round of splitting takes on.
 _ROUND_SHARE = 0.8
@@ -198,12 +198,12 @@ class Refinement:
         self.keep_leaves, self.stopped, self.progress = keep_leaves, stopped, progress
         self.random = np.random.default_rng([seed, index])
         side = frame.side
-        shape = (side, side, 3)
+        shape = (side, side, frame.channels)
         self.tiles = [
             _Tile(np.full(shape, np.inf, np.float32), np.full(shape, -np.inf, np.float32)) for _ in range(self._count)
         ]
         whole = (self._count, *shape)
-        self.outer_lower, self.outer_upper = np.zeros(whole, np.float32), np.ones(whole, np.float32)
+        self.outer_lower, self.outer_upper = _usable(np.full(whole, np.nan, np.float32), np.zeros(whole, np.float32))
         self.witness_lower, self.witness_upper = np.full(whole, np.inf, np.float32), np.full(whole, -np.inf, np.float32)
         self.image = np.zeros(whole, np.float32)
         frame.watch(self._numbers_of(None), self.witness_lower, self.witness_upper)
@@ -268,8 +268,13 @@ class Refinement:
 
     def _widen(self, picture: np.ndarray, tiles: np.ndarray | None) -> None:
         which = slice(None) if tiles is None else tiles
-        self.witness_lower[which] = np.minimum(self.witness_lower[which], picture)
-        self.witness_upper[which] = np.maximum(self.witness_upper[which], picture)
+        low, high = self.witness_lower[which], self.witness_upper[which]
+        least, most = np.minimum(low, picture), np.maximum(high, picture)
+        # no number: nothing is drawn there
+        least[..., DEPTH:], most[..., DEPTH:] = (
+            np.fmin(low[..., DEPTH:], picture[..., DEPTH:]), np.fmax(high[..., DEPTH:], picture[..., DEPTH:])
+        )  # fmt: skip
+        self.witness_lower[which], self.witness_upper[which] = least, most
 
     def _bound(self, cell: _Cell, parent: _Cell | None, tiles: np.ndarray) -> tuple[np.ndarray, np.ndarray, Bounds]:
         """Lower and upper [t, side, side, 3] that can be relied on, and all that the frame returned."""
@@ -320,7 +325,7 @@ class Refinement:
     # --- measures ------------------------------------------------------------------------------
 
     def _mpg(self, lower: np.ndarray, upper: np.ndarray) -> float:
-        return float(gap(lower, upper)[self.inside].mean())
+        return float(gap(lower[..., :COLORS], upper[..., :COLORS])[self.inside].mean())
 
     def point(self) -> TracePoint:
         """Where the work stands."""
@@ -598,7 +603,8 @@ class Refinement:
             step = self.frame.tiles_at_once or len(ordered)
             jobs += [(cell, dict(ordered[i : i + step])) for i in range(0, len(ordered), step)]
         # excess falls at least in proportion to the width: far from the goal, levels are skipped
-        allowed = (self.goal.ratio - 1.0) * float((self.witness_upper - self.witness_lower)[self.inside].sum())
+        moved = (self.witness_upper - self.witness_lower)[..., :COLORS]
+        allowed = (self.goal.ratio - 1.0) * float(moved[self.inside].sum())
         return jobs, 4 if running[-1] > _FAR * allowed else 2
 
     def _excess(self) -> tuple[np.ndarray, list[tuple[int, int]]]:
@@ -613,8 +619,9 @@ class Refinement:
         for t, tile in enumerate(self.tiles):
             if tile.lower is None or tile.upper is None:
                 continue
-            beyond = np.maximum(0.0, self.witness_lower[t] - tile.lower)
-            beyond += np.maximum(0.0, tile.upper - self.witness_upper[t])
+            colors = np.s_[..., :COLORS]
+            beyond = np.maximum(0.0, self.witness_lower[t][colors] - tile.lower[colors])
+            beyond += np.maximum(0.0, tile.upper[colors] - self.witness_upper[t][colors])
             amount = beyond[:, self.inside[t]].sum(axis=(1, 2), dtype=np.float64)
             done = (amount <= 0.0) | np.array([cell.narrow for cell in tile.cells])
             tile.close(done)
@@ -718,15 +725,22 @@ class Refinement:
         return joined([self._part_result(point)], self.frame.camera)
 
     def _part_result(self, point: TracePoint) -> PartResult:
+        pictures = self.outer_lower, self.outer_upper, self.witness_lower, self.witness_upper, self.image
+        lower, upper, witness_lower, witness_upper, image = (picture[..., :COLORS] for picture in pictures)
+        layers = None
+        if self.frame.channels > COLORS:
+            places = {"accumulation": ACCUMULATION, "depth": DEPTH}
+            layers = {name: Layer(*(picture[..., k] for picture in pictures)) for name, k in places.items()}
         return PartResult(
             index=self.index,
             box=self.frame.box,
             tiles=self._numbers_of(None),
-            lower=self.outer_lower,
-            upper=self.outer_upper,
-            witness_lower=self.witness_lower,
-            witness_upper=self.witness_upper,
-            image=self.image,
+            lower=lower,
+            upper=upper,
+            witness_lower=witness_lower,
+            witness_upper=witness_upper,
+            image=image,
+            layers=layers,
             pixels=int(self.inside.sum()),
             seconds=point.seconds,
             cells=self.cells,
@@ -744,6 +758,7 @@ class Refinement:
         values = [values for values, _ in self._views]
         images = [picture for _, picture in self._views]
         whole = np.stack(images) if images else np.zeros((0, *self.image.shape), np.float32)
+        whole = whole[..., :COLORS]
         return Views(np.array(values, np.float64).reshape(len(values), self.frame.box.dimensions), whole)
 
 
@@ -778,7 +793,7 @@ def spread(frame: Frame, index: int, seed: int) -> float:
     corners = _first_corners(frame.box, np.random.default_rng([seed, index]))
     pictures = [frame.render(values) for values in (frame.box.middle, *corners[[0, -1]])]
     least, most = np.minimum.reduce(pictures), np.maximum.reduce(pictures)
-    return float(gap(least, most)[_pixels_inside(frame)].mean())
+    return float(gap(least[..., :COLORS], most[..., :COLORS])[_pixels_inside(frame)].mean())
 
 
 def _across(box: ParameterBox) -> Iterator[np.ndarray]:
@@ -802,10 +817,18 @@ def _first_corners(box: ParameterBox, random: np.random.Generator) -> np.ndarray
 
 
 def _usable(lower: np.ndarray, upper: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Bounds within [0, 1]; where they are not finite, cross or miss [0, 1], nothing is known."""
+    """Bounds within [0, 1]; where they are not finite, cross or miss [0, 1], nothing is known.
+
+    Depths are at least 0, and may be unknown above or nowhere (see `Frame`).
+    """
     good = np.isfinite(lower) & np.isfinite(upper) & (lower <= upper) & (lower <= 1.0) & (upper >= 0.0)
     low, high = np.clip(lower, 0.0, 1.0), np.clip(upper, 0.0, 1.0)
-    return np.where(good, low, np.zeros_like(low)), np.where(good, high, np.ones_like(high))
+    low, high = np.where(good, low, np.zeros_like(low)), np.where(good, high, np.ones_like(high))
+    if lower.shape[-1] > DEPTH:
+        near, far = lower[..., DEPTH], upper[..., DEPTH]
+        known = ((near <= far) & np.isfinite(near) & (near >= 0.0)) | ((near == np.inf) & (far == -np.inf))
+        low[..., DEPTH], high[..., DEPTH] = np.where(known, near, 0.0), np.where(known, far, np.inf)
+    return low, high
 
 
 def _usable_linear(linear: tuple[np.ndarray, ...]) -> tuple[np.ndarray, ...]:

@@ -21,7 +21,9 @@ if TYPE_CHECKING:
 
 #: A_lower [..., d], b_lower [...], A_upper, b_upper: see `ns_abstract.refine.result.Leaves`.
 LinearSets = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
-#: Parameter values [d] and tile numbers (None: all) to tiles [t, side, side, 3] float32.
+#: Channels of a picture, and the places of what may stand behind them.
+COLORS, ACCUMULATION, DEPTH = 3, 3, 4
+#: Parameter values [d] and tile numbers (None: all) to tiles [t, side, side, channels] float32.
 Render = Callable[[np.ndarray, "np.ndarray | None"], np.ndarray]
 #: Picture [H, W, 3] and parameter values [d] to a number, differentiable.
 Score = Callable[["torch.Tensor", "torch.Tensor"], "torch.Tensor"]
@@ -74,7 +76,7 @@ class Bounds(Protocol):
     """Bounds of some tiles over one cell.
 
     Attributes:
-        lower, upper: [t, side, side, 3] float32, rounded outward.
+        lower, upper: [t, side, side, channels] float32, rounded outward; see `Frame`.
         slopes: [d] how much the picture varies by parameter: what a cut along it may gain.
         context: For the cells inside this one; None: nothing is known that would help.
         linear: Linear bounds in the cell's parameters, if they were asked for.
@@ -103,6 +105,9 @@ class Frame(Protocol):
         pose_set: The poses; their parameters are those of ``box``.
         box: The parameters of positive width.
         camera: Size and intrinsics.
+        channels: `COLORS`; or 5: behind the colours the accumulation in [0, 1], and the expected depth in world units
+            where anything is drawn. A render's depth is NaN where nothing is, bounds are infinity before its negative
+            where nothing can be.
         side: Pixels along a tile's side.
         across, down: Tiles across and down; tiles are numbered row by row.
         tilewise: Whether tiles are costly and independent (rays): the whole set is then bounded by [0, 1] at no cost,
@@ -120,6 +125,9 @@ class Frame(Protocol):
 
     @property
     def camera(self) -> Camera: ...
+
+    @property
+    def channels(self) -> int: ...
 
     @property
     def side(self) -> int: ...
@@ -149,7 +157,7 @@ class Frame(Protocol):
         ...
 
     def render(self, values: np.ndarray, tiles: np.ndarray | None = None) -> np.ndarray:
-        """Tiles [t, side, side, 3] float32 of the concrete image at parameter values [d]; all tiles if None."""
+        """Tiles [t, side, side, channels] float32 of the concrete image at parameter values [d]; all tiles if None."""
         ...
 
     def members(self, seed: int) -> Iterator[Member]:
@@ -277,8 +285,17 @@ class Method(Protocol):
         """Bytes that bounding pictures of ``pixels`` needs beside the leaves."""
         ...
 
-    def frame(self, poses: PoseSet, slanted: bool = False) -> Frame:
-        """One frame; ``slanted``: its box may count parameters otherwise than the set does, where that is tighter."""
+    def frame(self, poses: PoseSet, slanted: bool = False, layers: bool = False) -> Frame:
+        """One frame.
+
+        Args:
+            poses: Its set.
+            slanted: Its box may count parameters otherwise than the set does, where that is tighter.
+            layers: Whether accumulation and expected depth stand behind the colours.
+
+        Raises:
+            InputError: This representation has no such layers.
+        """
         ...
 
     def differentiable(self, poses: PoseSet) -> Callable[[torch.Tensor], torch.Tensor] | None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import bisect
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -57,6 +57,36 @@ class Leaves:
 
 
 @dataclass(frozen=True)
+class Layer:
+    """One number by pixel beside the colours: bounds, what was rendered, and one render; [H, W] float32 all.
+
+    The accumulation is the part of the light that the scene takes, in [0, 1]. The expected depth is the mean of the
+    depths along the viewing axis, in units of the normalised frame, weighted as the colours are (gsplat's RGB+ED);
+    where nothing is drawn, it is the largest one of the picture. An upper bound of infinity says that nothing is known.
+    """
+
+    lower: Float32Array
+    upper: Float32Array
+    witness_lower: Float32Array
+    witness_upper: Float32Array
+    image: Float32Array
+
+    def mean_gap(self) -> float:
+        """Mean of ``upper - lower`` over the pixels."""
+        return float((self.upper.astype(np.float64) - self.lower).mean())
+
+    def mean_gap_witness(self) -> float:
+        """The same of what was rendered."""
+        return float((self.witness_upper.astype(np.float64) - self.witness_lower).mean())
+
+
+#: Arrays of a `Layer`.
+LAYER_ARRAYS = tuple(Layer.__dataclass_fields__)
+#: What may be bounded beside the colours.
+LAYERS = ("depth", "accumulation")
+
+
+@dataclass(frozen=True)
 class Views:
     """Concrete renders of some poses of a frame's set.
 
@@ -85,6 +115,7 @@ class FrameResult:
         plan: What was left out for this frame and why, one sentence each.
         bounded: False while no bound but [0, 1] is known (the budget ended first).
         leaves: The leaf cells' linear sets, if they were asked for.
+        layers: What else was bounded, by name, of `LAYERS`.
         views: Concrete renders across the set, where leaves are kept.
     """
 
@@ -101,6 +132,7 @@ class FrameResult:
     plan: tuple[str, ...] = ()
     bounded: bool = True
     leaves: Leaves | None = field(default=None, repr=False)
+    layers: Mapping[str, Layer] = field(default_factory=dict, repr=False)
     views: Views | None = field(default=None, repr=False)
 
 
@@ -115,6 +147,7 @@ class PartResult:
         trace: Measures are those of these pixels.
         shown: Scene elements that some cell shows in these tiles, or None.
         floor: What no more light comes to was left out of the first cover; 0: nothing.
+        layers: Arrays [t, side, side]; depths where anything is drawn, as a `Frame` has them; or None.
     """
 
     index: int
@@ -133,6 +166,7 @@ class PartResult:
     shown: NDArray[np.int64] | None
     floor: float = 0.0
     leaves: Leaves | None = field(default=None, repr=False)
+    layers: Mapping[str, Layer] | None = field(default=None, repr=False)
     views: Views | None = field(default=None, repr=False)
 
 
@@ -161,6 +195,13 @@ def joined(parts: Sequence[PartResult], camera: Any) -> FrameResult:
     def whole(name: str) -> np.ndarray:
         return assemble(np.concatenate([getattr(part, name) for part in parts])[order], camera)
 
+    layers: dict[str, Layer] = {}
+    for name in first.layers or ():
+        found = [part.layers[name] for part in parts if part.layers is not None]
+        arrays = (np.concatenate([getattr(layer, array) for layer in found])[order] for array in LAYER_ARRAYS)
+        layers[name] = Layer(*(assemble(array, camera) for array in arrays))
+    if layers:
+        layers["depth"] = _whole_depth(layers["depth"], layers["accumulation"])
     bounded = all(part.bounded for part in parts)
     return FrameResult(
         index=first.index,
@@ -175,8 +216,31 @@ def joined(parts: Sequence[PartResult], camera: Any) -> FrameResult:
         trace=_joined_trace(parts),
         bounded=bounded,
         leaves=_joined_leaves([part.leaves for part in parts]) if bounded else None,
+        layers=layers,
         views=_joined_views([part.views for part in parts], order, camera) if bounded else None,
     )
+
+
+def _whole_depth(depth: Layer, accumulation: Layer) -> Layer:
+    """The expected depth also where nothing is drawn: there it is the largest one of the picture (design.md, D4).
+
+    Args:
+        depth: [H, W] where anything is drawn; see `ns_abstract.refine.protocol.Frame`.
+        accumulation: [H, W].
+    """
+    never, perhaps = depth.lower > depth.upper, ~(accumulation.lower > 0.0)
+    # of every picture of the set, the largest depth lies between these
+    most = np.where(never, 0.0, depth.upper).max(initial=0.0)
+    least = np.where(perhaps | never, 0.0, depth.lower).max(initial=0.0)
+    lower = np.where(never, least, np.where(perhaps, np.minimum(depth.lower, least), depth.lower))
+    upper = np.where(never, most, np.where(perhaps, np.maximum(depth.upper, most), depth.upper))
+    # of the render at the middle all is known; of others, perhaps some tiles
+    empty = np.isnan(depth.image)
+    farthest = np.where(empty, 0.0, depth.image).max(initial=0.0)
+    image = np.where(empty, farthest, depth.image)
+    low = np.where(empty, np.minimum(depth.witness_lower, farthest), depth.witness_lower)
+    high = np.where(empty, np.maximum(depth.witness_upper, farthest), depth.witness_upper)
+    return Layer(*(array.astype(np.float32) for array in (lower, upper, low, high, image)))
 
 
 def _joined_trace(parts: Sequence[PartResult]) -> tuple[TracePoint, ...]:

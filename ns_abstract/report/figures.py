@@ -31,6 +31,22 @@ def metrics(result: FrameResult) -> dict[str, float | None]:
     }
 
 
+def layer_metrics(result: FrameResult) -> dict[str, dict[str, float | None]]:
+    """The figures of a frame's further outputs, by name.
+
+    Returns:
+        ``mean_gap``: mean over the pixels of upper - lower, in the output's unit; ``mean_gap_witness``: the same of
+        what was rendered; ``ratio``: of the two; None where a number is not finite.
+    """
+    found: dict[str, dict[str, float | None]] = {}
+    for name, layer in result.layers.items():
+        outer, inner = layer.mean_gap(), layer.mean_gap_witness()
+        ratio = outer / inner if inner > 0.0 else math.inf
+        values = {"mean_gap": outer, "mean_gap_witness": inner, "ratio": ratio}
+        found[name] = {key: value if math.isfinite(value) else None for key, value in values.items()}
+    return found
+
+
 def seconds_to(trace: Sequence[TracePoint], marks: Sequence[float] = MARKS) -> dict[float, float | None]:
     """Seconds of work after which MPG was at most each of ``marks`` times the witness MPG; None: never."""
     found: dict[float, float | None] = {}

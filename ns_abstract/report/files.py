@@ -21,12 +21,14 @@ from ns_abstract.io.atomic import write_atomic
 from ns_abstract.io.errors import InputError
 from ns_abstract.io.jsonio import parse_json
 from ns_abstract.methods.runs import check_memory
-from ns_abstract.refine.result import FrameResult, Leaves, TracePoint, Views
+from ns_abstract.refine.result import LAYER_ARRAYS, LAYERS, FrameResult, Layer, Leaves, TracePoint, Views
 
 FORMAT = "ns-abstract frame"
 VERSION = 1
 #: Arrays [H, W, 3] of every frame file.
 IMAGES = ("lower", "upper", "witness_lower", "witness_upper", "image")
+#: Arrays [H, W] of a frame file with further outputs, by name and field of `Layer`: ``depth_lower``.
+LAYER_NAMES = {f"{name}_{array}": (name, array) for name in LAYERS for array in LAYER_ARRAYS}
 #: Arrays of a frame file with leaf cells.
 LEAVES = tuple(field.name for field in fields(Leaves))
 #: Arrays of a frame file with leaf cells: poses of the set, and what was rendered there.
@@ -43,6 +45,11 @@ _RECORD_LIMIT, _TABLE_LIMIT = 64 << 20, 1 << 20
 def frame_name(index: int, suffix: str) -> str:
     """File name of one frame: ``frame_00000.npz``."""
     return f"frame_{index:05d}.{suffix}"
+
+
+def layer_name(index: int, name: str) -> str:
+    """File name of a frame's picture of a further output: ``frame_00000_depth.png``."""
+    return f"frame_{index:05d}_{name}.png"
 
 
 def frame_index(path: Path) -> int | None:
@@ -77,6 +84,8 @@ def check_frame(result: FrameResult) -> None:
         excess = float((getattr(result, low) - getattr(result, high)).max())
         if not excess <= 0.0:
             raise fail(f"{low} exceeds {high} by {excess:.3g}; the bounds are not sound")
+    for name, layer in result.layers.items():
+        _check_layer(name, layer, shape[:2], fail)
     box = result.box
     if not len(box.names) == len(box.units) == len(box.lower) == len(box.upper):
         raise fail("the box has sides of different number")
@@ -105,6 +114,21 @@ def _check_views(result: FrameResult, views: Views, fail: Callable[[str], ValueE
         raise fail("views: a pose is not one of the set")
     if not ((images >= result.lower).all() and (images <= result.upper).all()):
         raise fail("views: a render lies outside the bounds; the bounds are not sound")
+
+
+def _check_layer(name: str, layer: Layer, shape: tuple[int, ...], fail: Callable[[str], ValueError]) -> None:
+    for field in LAYER_ARRAYS:
+        array = getattr(layer, field)
+        if array.dtype != np.float32 or array.shape != shape:
+            raise fail(f"{name}_{field} is {array.dtype} {list(array.shape)}, not float32 {list(shape)}")
+        # an upper bound may be infinite; the polarity refuses NaN too
+        most = np.inf if name == "depth" else 1.0
+        finite = field == "upper" or np.isfinite(array).all()
+        if not (finite and array.min() >= 0.0 and array.max() <= most):
+            raise fail(f"{name}_{field} has values that no such output has")
+    for low, high in itertools.pairwise(("lower", "witness_lower", "image", "witness_upper", "upper")):
+        if not (getattr(layer, low) <= getattr(layer, high)).all():
+            raise fail(f"{name}_{low} exceeds {name}_{high}; the bounds are not sound")
 
 
 def _check_leaves(leaves: Leaves, d: int, fail: Callable[[str], ValueError]) -> None:
@@ -142,7 +166,8 @@ def save_frame(
     """Write ``frame_00000.npz``; every array reads with ``np.load(path, allow_pickle=False)``.
 
     The file holds ``lower``, ``upper``, ``witness_lower``, ``witness_upper`` and ``image`` [H, W, 3]
-    float32, ``parameters`` [d] (fields name, unit, lower, upper), ``record`` (a JSON text) and, where
+    float32, ``parameters`` [d] (fields name, unit, lower, upper), ``record`` (a JSON text), the arrays
+    [H, W] of further outputs as ``depth_lower``, ``accumulation_witness_upper`` and so on, and, where
     the result has leaves, the arrays of `ns_abstract.refine.result.Leaves` under their own names, and
     ``view_values`` [n, d] and ``view_images`` [n, H, W, 3], renders across the set.
 
@@ -174,6 +199,7 @@ def save_frame(
     arrays: dict[str, np.ndarray] = {name: getattr(result, name) for name in IMAGES}
     arrays["parameters"] = _parameters(result.box)
     arrays["record"] = np.array(json.dumps(record, allow_nan=False))
+    arrays |= {full: getattr(result.layers[n], a) for full, (n, a) in LAYER_NAMES.items() if n in result.layers}
     if result.leaves is not None:
         arrays |= {name: getattr(result.leaves, name) for name in LEAVES}
     if result.views is not None:
@@ -258,6 +284,9 @@ def _check_declared(archive: Archive, size: tuple[int, int] | None, leaves: bool
             raise InputError(
                 f"{name} is {archive.declared[name][1]} {list(archive.declared[name][0])[:4]}, unlike lower"
             )
+    for name in LAYER_NAMES:
+        if name in archive.declared and archive.declared[name] != (shape[:2], kind):
+            raise InputError(f"{name} is unlike lower")
     if size is not None and shape[:2] != size:
         raise InputError(f"has {shape[1]} x {shape[0]} pixels, not {size[1]} x {size[0]}")
     for name, most in (("record", _RECORD_LIMIT), ("parameters", _TABLE_LIMIT)):
@@ -265,7 +294,7 @@ def _check_declared(archive: Archive, size: tuple[int, int] | None, leaves: bool
         if math.prod(rows) * kind.itemsize > most:
             raise InputError(f"{name} has {math.prod(rows) * kind.itemsize:,} bytes")
     more = (*LEAVES, *(name for name in VIEWS if name in archive.declared)) if leaves else ()
-    wanted = (*IMAGES, *more)
+    wanted = (*IMAGES, *more, *(name for name in LAYER_NAMES if name in archive.declared))
     needed = sum(math.prod(archive.declared[name][0]) * archive.declared[name][1].itemsize for name in wanted)
     check_memory(2 * needed, path, "the frame")
 
@@ -285,6 +314,13 @@ def _parse(archive: Archive, has_leaves: bool, read_leaves: bool) -> StoredFrame
         tuple(map(float, table["lower"])),
         tuple(map(float, table["upper"])),
     )
+    layers = {}
+    for name in LAYERS:
+        known = [full for full, (layer, _) in LAYER_NAMES.items() if layer == name and full in archive.declared]
+        if known and len(known) < len(LAYER_ARRAYS):
+            raise InputError(f"not all arrays of {name}")
+        if known:
+            layers[name] = Layer(*(archive.read(full) for full in known))
     result = FrameResult(
         index=_integer(record["index"]),
         box=box,
@@ -299,6 +335,7 @@ def _parse(archive: Archive, has_leaves: bool, read_leaves: bool) -> StoredFrame
         plan=tuple(map(str, record["plan"])),
         bounded=record["bounded"] is True,
         leaves=Leaves(**{name: archive.read(name) for name in LEAVES}) if has_leaves and read_leaves else None,
+        layers=layers,
         views=Views(*(archive.read(name) for name in VIEWS))
         if read_leaves and set(VIEWS) <= set(archive.declared)
         else None,

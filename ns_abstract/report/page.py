@@ -271,6 +271,12 @@ def _frame(entry: Mapping[str, Any], pictures: Mapping[str, bytes], *, sampled: 
         ("witness", "witness gap", "what rendering has shown, same scale"),
         ("image", "one render", "at the middle of the set"),
     )  # fmt: skip
+    for name, figures in entry.get("layers", {}).items():
+        mean = f"mean {number(figures['mean_gap'])}, {number(figures['ratio'])} times the renders'"
+        captions += (
+            (f"{name}_lower", f"{name}, lower", ""), (f"{name}_upper", f"{name}, upper", ""),
+            (f"{name}_gap", f"{name}, upper − lower", mean), (f"{name}_image", f"{name}, one render", ""),
+        )  # fmt: skip
     small = ' class="pixels"' if max(entry["height"], entry["width"]) <= 256 else ""
     images = "".join(
         f'<figure><img{small} src="{uri(pictures[key])}" alt="{label} of frame {entry["index"]}">'

@@ -26,6 +26,9 @@ if TYPE_CHECKING:
 #: Colour map of gaps: perceptually uniform, black where the bounds meet.
 GAP_COLORS = "inferno"
 
+#: Colour map of depths and accumulations.
+_LAYER_COLORS = "viridis"
+_LAYER_TITLES = {"depth": "expected depth", "accumulation": "accumulation"}
 _PANEL_INCHES = 2.6
 _LEAST_WIDTH, _LEAST_HEIGHT = 1.6, 0.6
 _PANEL_PIXELS = 400
@@ -148,6 +151,54 @@ def frame_figure(result: FrameResult, *, guarantee: str = "", about: str = "") -
     return figure
 
 
+def layer_figure(result: FrameResult, name: str) -> Figure:
+    """The picture of one further output: lower | upper | gap | one render, of one colour scale but for the gap.
+
+    Args:
+        result: The frame.
+        name: Of `ns_abstract.refine.result.LAYERS`; its colour scale ends where what is known ends.
+    """
+    from matplotlib.figure import Figure
+
+    layer = result.layers[name]
+    height, width = layer.lower.shape
+    panel = _PANEL_INCHES, _PANEL_INCHES * min(1.5, max(0.25, height / width))
+    figure = Figure(figsize=(4.0 * panel[0] + 1.2, panel[1] + 0.8), facecolor="white", layout="constrained")
+    axes: Any = figure.subplots(1, 4)
+    known = layer.upper[np.isfinite(layer.upper)]
+    top = float(max(known.max(initial=0.0), layer.image.max(initial=0.0))) or 1.0
+    length = np.where(np.isfinite(layer.upper), layer.upper.astype(np.float64) - layer.lower, np.nan)
+    panels = (
+        ("lower bound", layer.lower), ("upper bound", np.minimum(layer.upper, np.float32(top))),
+        ("upper − lower", length),
+        ("render at the middle" if result.box.dimensions else "render", layer.image),
+    )  # fmt: skip
+    for place, (label, image) in zip(axes, panels, strict=True):
+        whole = float(np.nan_to_num(length).max(initial=0.0)) or 1.0 if image is length else top
+        shown = place.imshow(
+            image, cmap=GAP_COLORS if image is length else _LAYER_COLORS, vmin=0.0, vmax=whole,
+            interpolation="antialiased",
+        )  # fmt: skip
+        _bare(place)
+        place.set_title(label, fontsize=_LABEL_POINTS, color=_INK)
+        figure.colorbar(shown, ax=place, fraction=0.05, pad=0.02).ax.tick_params(labelsize=_TICK_POINTS)
+    unit = " (units of the normalised frame)" if name == "depth" else ""
+    figure.suptitle(f"Frame {result.index}  ·  {_LAYER_TITLES[name]}{unit}", fontsize=_TITLE_POINTS, color=_INK)
+    return figure
+
+
+def save_layer_picture(path: str | os.PathLike[str], result: FrameResult, name: str) -> None:
+    """Write `layer_figure` as PNG, whole or not at all.
+
+    Raises:
+        OSError: The file cannot be written.
+    """
+    figure = layer_figure(result, name)
+    write_atomic(
+        path, lambda stream: figure.savefig(stream, format="png", dpi=120, metadata={"Software": "ns_abstract"})
+    )
+
+
 def _bare(axes: Axes) -> None:
     axes.set_xticks([])
     axes.set_yticks([])
@@ -181,12 +232,12 @@ def save_picture(path: str | os.PathLike[str], result: FrameResult, *, guarantee
     write_atomic(path, lambda stream: figure.savefig(stream, format="png", metadata={"Software": "ns_abstract"}))
 
 
-def heat(length: NDArray[np.floating], top: float) -> NDArray[np.uint8]:
-    """[H, W] gaps as [H, W, 3] uint8 colours of the scale from 0 to ``top``."""
+def heat(length: NDArray[np.floating], top: float, colors: str = GAP_COLORS) -> NDArray[np.uint8]:
+    """[H, W] gaps as [H, W, 3] uint8 ``colors`` of the scale from 0 to ``top``."""
     from matplotlib import colormaps
 
     scaled = np.asarray(length, np.float64) / (top if top > 0.0 else 1.0)
-    return colormaps[GAP_COLORS](scaled, bytes=True)[..., :3]
+    return colormaps[colors](scaled, bytes=True)[..., :3]
 
 
 def color_stops(count: int = 9) -> list[str]:
@@ -215,7 +266,10 @@ def preview(image: NDArray[np.uint8], side: int) -> bytes:
 
 
 def previews(result: FrameResult, side: int) -> Mapping[str, bytes]:
-    """PNGs of a frame for the page: lower, upper, gap, witness gap (same scale) and render."""
+    """PNGs of a frame for the page: lower, upper, gap, witness gap (same scale) and render; those of further outputs.
+
+    The latter are named ``depth_lower`` and so on, and share the scale of the largest value that is known.
+    """
     top = max_pixel_gap(result.lower, result.upper)
     images = {
         "lower": to_bytes(result.lower),
@@ -224,4 +278,13 @@ def previews(result: FrameResult, side: int) -> Mapping[str, bytes]:
         "witness": heat(gap(result.witness_lower, result.witness_upper), top),
         "image": to_bytes(result.image),
     }
+    for name, layer in result.layers.items():
+        known = np.isfinite(layer.upper)
+        high = np.where(known, layer.upper, 0.0)
+        length = np.where(known, high - layer.lower, 0.0)
+        whole = float(max(high.max(initial=0.0), layer.image.max(initial=0.0)))
+        high = np.where(known, high, whole)
+        for kind, array in (("lower", layer.lower), ("upper", high), ("image", layer.image)):
+            images[f"{name}_{kind}"] = heat(array, whole, _LAYER_COLORS)
+        images[f"{name}_gap"] = heat(length, float(length.max(initial=0.0)))
     return {name: preview(image, side) for name, image in images.items()}

@@ -20,13 +20,14 @@ from ns_abstract.io.atomic import write_atomic
 from ns_abstract.io.errors import InputError
 from ns_abstract.io.folder import remove_parts, unwritable
 from ns_abstract.io.jsonio import file_size, is_number, load_json
-from ns_abstract.refine.result import FrameResult, TracePoint
-from ns_abstract.report.figures import metrics, seconds_to
+from ns_abstract.refine.result import FrameResult, Layer, TracePoint
+from ns_abstract.report.figures import layer_metrics, metrics, seconds_to
 from ns_abstract.report.files import (
     StoredFrame,
     check_frame,
     frame_index,
     frame_name,
+    layer_name,
     load_frame,
     save_frame,
 )
@@ -207,7 +208,8 @@ def merged(older: FrameResult, newer: FrameResult) -> FrameResult:
     Raises:
         ValueError: The two are of different frames, boxes or sizes.
     """
-    if (older.index, older.box, older.lower.shape) != (newer.index, newer.box, newer.lower.shape):
+    same = [(r.index, r.box, r.lower.shape, sorted(r.layers)) for r in (older, newer)]
+    if same[0] != same[1]:
         raise ValueError(f"frame {newer.index}: the stored result is of another set of images")
     outer = min((point.mpg for point in older.trace), default=math.inf)
     inner = max((point.mpg_witness for point in older.trace), default=0.0)
@@ -232,6 +234,17 @@ def merged(older: FrameResult, newer: FrameResult) -> FrameResult:
         cells=older.cells + newer.cells,
         trace=older.trace + later,
         bounded=older.bounded or newer.bounded,
+        layers={name: _merged_layer(older.layers[name], layer) for name, layer in newer.layers.items()},
+    )
+
+
+def _merged_layer(older: Layer, newer: Layer) -> Layer:
+    return Layer(
+        np.maximum(older.lower, newer.lower),
+        np.minimum(older.upper, newer.upper),
+        np.minimum(older.witness_lower, newer.witness_lower),
+        np.maximum(older.witness_upper, newer.witness_upper),
+        newer.image,
     )
 
 
@@ -422,11 +435,13 @@ class Report:
         return self._entries[index]
 
     def _draw(self, result: FrameResult) -> None:
-        from ns_abstract.report.picture import previews, save_picture
+        from ns_abstract.report.picture import previews, save_layer_picture, save_picture
 
         name = str(self.run.scene.get("name", ""))
         path = self.folder / frame_name(result.index, "png")
         save_picture(path, result, guarantee=self.run.guarantee, about=name)
+        for layer in result.layers:
+            save_layer_picture(self.folder / layer_name(result.index, layer), result, layer)
         self._previews[result.index] = previews(result, _PREVIEW_PIXELS)
         self._undrawn.discard(result.index)
 
@@ -478,7 +493,9 @@ class Report:
                 "height": height,
                 "width": width,
                 "plan": result.plan,
-                "files": {kind: frame_name(result.index, kind) for kind in ("npz", "png")},
+                "files": {kind: frame_name(result.index, kind) for kind in ("npz", "png")}
+                | {name: layer_name(result.index, name) for name in result.layers},
+                **({"layers": layer_metrics(result)} if result.layers else {}),
             }
         )
 

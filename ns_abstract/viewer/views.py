@@ -107,6 +107,7 @@ class Snapshot:
         cells: Cells bounded at this size.
         final: Whether the work at this size has ended.
         guarantee: "float32-sound", "real-sound" or "sampled".
+        depth: [2, h, w] float32 bounds of the expected depth, normalised units, if it was bounded.
     """
 
     lower: np.ndarray
@@ -118,6 +119,7 @@ class Snapshot:
     cells: int
     final: bool
     guarantee: str
+    depth: np.ndarray | None = None
 
     @classmethod
     def of(cls, result: FrameResult, *, final: bool, guarantee: str) -> Snapshot:
@@ -127,6 +129,7 @@ class Snapshot:
             ValueError: The result is one that no sound refinement can have.
         """
         check_frame(result)
+        depth = result.layers.get("depth")
         return cls(
             result.lower,
             result.upper,
@@ -137,6 +140,7 @@ class Snapshot:
             result.cells,
             final,
             guarantee,
+            None if depth is None else np.stack([depth.lower, depth.upper]),
         )
 
     @property
@@ -217,6 +221,7 @@ class SplatSource:
         renderer: "gsplat" or "paper".
         version: gsplat's; None: 1.4.0.
         arithmetic: "float32" or "real".
+        layers: Whether the expected depth is bounded, too.
     """
 
     splats: Splats
@@ -224,6 +229,7 @@ class SplatSource:
     renderer: str = "gsplat"
     version: str | None = None
     arithmetic: str = "float32"
+    layers: bool = False
     _kept: dict[tuple[SceneVariation, ...], VariedSplats] = field(default_factory=dict, init=False, repr=False)
 
     ladder: ClassVar[Mapping[int, float]] = SPLAT_LADDER
@@ -253,6 +259,7 @@ class SplatSource:
             PoseSet.around(camera, perturbation),
             varied=self._varied(perturbation),
             slanted=True,
+            layers=self.layers,
         )
 
     def _varied(self, perturbation: Perturbation) -> VariedSplats:

@@ -438,17 +438,37 @@ class Kernels:
         """Colours [k, 3] in [0, 1] of pixels [k, 2] (row, column)."""
         if found is None:
             found = self.stages(camera, camera_to_world)
+        colors, alphas = self._rasterized(camera, found, pixels, found.colors)
+        # splatfacto.py:640-643
+        render = torch.from_numpy(colors) + (1 - torch.from_numpy(alphas)[:, None]) * self.background
+        return torch.clamp(render, 0.0, 1.0).numpy()
+
+    def layers(self, camera: Camera, camera_to_world: np.ndarray) -> np.ndarray:
+        """Accumulation and expected depth [H, W, 2], as of gsplat's render mode RGB+ED, before Splatfacto fills in the
+        pixels where nothing is drawn, whose depth is NaN here."""
+        found = self.stages(camera, camera_to_world)
+        pixels = np.stack(np.mgrid[: camera.height, : camera.width], axis=-1).reshape(-1, 2)
+        depths = np.ascontiguousarray(np.repeat(found.depths[:, None], 3, axis=1))
+        sums, alphas = (torch.from_numpy(array) for array in self._rasterized(camera, found, pixels, depths))
+        # gsplat's rendering.py; splatfacto.py:636
+        depth = sums[:, :1] / alphas[:, None].clamp(min=1e-10)
+        drawn = alphas[:, None] > 0
+        both = torch.cat([alphas[:, None], torch.where(drawn, depth, torch.nan)], dim=1)
+        return both.numpy().reshape(camera.height, camera.width, 2)
+
+    def _rasterized(
+        self, camera: Camera, found: Stages, pixels: np.ndarray, values: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Weighted sums [k, 3] of ``values`` [N, 3] and accumulations [k] of pixels [k, 2]."""
         pixels = np.ascontiguousarray(pixels, np.int64)
         colors, alphas = np.zeros((len(pixels), 3), found.depths.dtype), np.zeros(len(pixels), found.depths.dtype)
         across, down = -(-camera.width // _TILE), -(-camera.height // _TILE)
         ids = found.ids if len(found.ids) else np.zeros(1, np.int32)
         self._call(
-            "rasterize", self.scene.count, found.means2d, found.conics, found.colors, found.opacities, camera.width,
+            "rasterize", self.scene.count, found.means2d, found.conics, values, found.opacities, camera.width,
             camera.height, across, down, found.offsets, ids, len(pixels), pixels, colors, alphas,
         )  # fmt: skip
-        # splatfacto.py:640-643
-        render = torch.from_numpy(colors) + (1 - torch.from_numpy(alphas)[:, None]) * self.background
-        return torch.clamp(render, 0.0, 1.0).numpy()
+        return colors, alphas
 
     def image(self, camera: Camera, camera_to_world: np.ndarray) -> np.ndarray:
         """The picture [H, W, 3] in [0, 1]."""

@@ -277,22 +277,22 @@ def _transposed(builder, rows):
 
 
 @intrinsic
-def store_columns(typingctx, elements, at, stride, a, b, c, d, e, f, g, h):  # pyright: ignore[reportRedeclaration]
-    """Write lane k of the eight values side by side to ``elements[at + stride k : ...]`` of a `compiled.pointer`."""
+def store_columns(typingctx, elements, at, stride, rows):  # pyright: ignore[reportRedeclaration]
+    """Write lane k of the eight ``rows`` side by side to ``elements[at + stride k : ...]`` of a `compiled.pointer`."""
     _check(elements)
 
     def codegen(context, builder, sig, args):
-        for k, row in enumerate(_transposed(builder, args[3:])):
+        for k, row in enumerate(_transposed(builder, cgutils.unpack_tuple(builder, args[3]))):
             at = builder.add(args[1], builder.mul(args[2], args[2].type(k)))
             builder.store(row, _address(builder, args[0], at, 8), align=8)
         return context.get_dummy_value()
 
-    return types.void(elements, types.intp, types.intp, a, b, c, d, e, f, g, h), codegen
+    return types.void(elements, types.intp, types.intp, rows), codegen
 
 
 @intrinsic
-def scatter_columns(typingctx, elements, places, first, stride, shift, a, b, c, d, e, f, g, h):  # pyright: ignore[reportRedeclaration]
-    """Write lane k of the eight values side by side to ``elements[stride * places[first + k] + shift : ...]``.
+def scatter_columns(typingctx, elements, places, first, stride, shift, rows):  # pyright: ignore[reportRedeclaration]
+    """Write lane k of the eight ``rows`` side by side to ``elements[stride * places[first + k] + shift : ...]``.
 
     ``elements`` and ``places`` (int64) are `compiled.pointer`.
     """
@@ -302,13 +302,13 @@ def scatter_columns(typingctx, elements, places, first, stride, shift, a, b, c, 
 
     def codegen(context, builder, sig, args):
         int64 = ir.IntType(64)
-        for k, row in enumerate(_transposed(builder, args[5:])):
+        for k, row in enumerate(_transposed(builder, cgutils.unpack_tuple(builder, args[5]))):
             address = builder.gep(args[1], [builder.add(args[2], int64(k))], source_etype=int64)
             at = builder.add(builder.mul(builder.load(address, typ=int64), args[3]), args[4])
             builder.store(row, _address(builder, args[0], at, 8), align=8)
         return context.get_dummy_value()
 
-    return types.void(elements, places, types.intp, types.intp, types.intp, a, b, c, d, e, f, g, h), codegen
+    return types.void(elements, places, types.intp, types.intp, types.intp, rows), codegen
 
 
 if config.DISABLE_JIT:  # pyright: ignore[reportAttributeAccessIssue]
@@ -350,13 +350,13 @@ if config.DISABLE_JIT:  # pyright: ignore[reportAttributeAccessIssue]
         """Write the lanes to ``elements[at : ...]``."""
         elements[at : at + len(lanes)] = lanes
 
-    def store_columns(elements, at, stride, *values):
+    def store_columns(elements, at, stride, rows):
         """Write lane k of the eight values side by side to ``elements[at + stride k : ...]``."""
-        for k, row in enumerate(np.stack(values, axis=1)):
+        for k, row in enumerate(np.stack(rows, axis=1)):
             elements[at + stride * k : at + stride * k + 8] = row
 
-    def scatter_columns(elements, places, first, stride, shift, *values):
-        """Write lane k of the eight values side by side to ``elements[stride * places[first + k] + shift : ...]``."""
-        for k, row in enumerate(np.stack(values, axis=1)):
+    def scatter_columns(elements, places, first, stride, shift, rows):
+        """Write lane k of the eight ``rows`` side by side to ``elements[stride * places[first + k] + shift : ...]``."""
+        for k, row in enumerate(np.stack(rows, axis=1)):
             at = stride * int(places[first + k]) + shift
             elements[at : at + 8] = row

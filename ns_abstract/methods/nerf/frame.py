@@ -110,6 +110,7 @@ class NerfFrame:
 
     #: Every ray is work of its own.
     tilewise = True
+    channels = 3
     #: Poses rendered in every part of a cell that is split.
     witnesses = 8
 

@@ -132,8 +132,14 @@ class NerfMethod:
         """The scene in a few words."""
         return f"vanilla NeRF, {self.scene.fine.text}"
 
-    def frame(self, poses: PoseSet, slanted: bool = False) -> NerfFrame:
-        """One frame, ready for refinement; its cells are never ``slanted``."""
+    def frame(self, poses: PoseSet, slanted: bool = False, layers: bool = False) -> NerfFrame:
+        """One frame, ready for refinement; its cells are never ``slanted``.
+
+        Raises:
+            InputError: Layers are asked for: a NeRF's depth is a median.
+        """
+        if layers:
+            raise InputError("depth and accumulation of a NeRF are not bounded", field="--outputs", fix="leave it out")
         return NerfFrame(self.scene, self.sampling, poses, workers=self.workers)
 
     def prepare(self, perturbations: Sequence[Perturbation]) -> None:

@@ -5,10 +5,29 @@ The grid is symmetric and ``T_k(-p) = (-1)^k T_k(p)``, so even and odd degrees a
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 from numba import njit
 
 from ns_abstract.arithmetic.rounding import CHEBYSHEV_ROUNDING, FIELD_UP, UNIT64
+
+
+class Grid(NamedTuple):
+    """The first half of a symmetric grid of g points, its middle included, and how a polynomial is fitted there.
+
+    Attributes:
+        half: [m, (g + 1) / 2] values of the basis.
+        fit_even, fit_odd: [(g + 1) / 2, .] the fit of even and odd degrees.
+        chord: [m].
+        norming: See `ChebyshevBasis.norming`.
+    """
+
+    half: np.ndarray
+    fit_even: np.ndarray
+    fit_odd: np.ndarray
+    chord: np.ndarray
+    norming: float
 
 
 @njit(cache=True, error_model="numpy")
@@ -68,7 +87,7 @@ def _smallest(values, scratch):
 
 
 @njit(cache=True, error_model="numpy")
-def relu(poly, rho, box, failed, half, fit_even, fit_odd, chord, norming, slope, size, which, neuron, error):
+def relu(poly, rho, box, failed, grid, slope, size, which, neuron, error):
     """max(0, z) in place (design.md, F5); returns the number of new error terms.
 
     Args:
@@ -76,13 +95,11 @@ def relu(poly, rho, box, failed, half, fit_even, fit_odd, chord, norming, slope,
         rho: [B, n] sums of absolute columns.
         box: [B, n]; replaced.
         failed: [B].
-        half: [m, (g + 1) / 2] values on the first half of the grid of g points, middle included.
-        fit_even, fit_odd: [(g + 1) / 2, .] the fit of even and odd degrees there.
-        chord: [m].
-        norming: See `ChebyshevBasis.norming`.
+        grid: `Grid`.
         slope, size: [B, n], filled: what columns are multiplied by; sum of absolute coefficients and columns.
         which, neuron, error: [B n], filled with piece, neuron and size of the new error terms.
     """
+    half, fit_even, fit_odd, chord, norming = grid
     pieces, m, n = poly.shape
     points = 2 * half.shape[1] - 1
     p, q = np.empty(m), np.empty(m)

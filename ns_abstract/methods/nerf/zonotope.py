@@ -21,7 +21,7 @@ from torch import Tensor
 
 from ns_abstract.arithmetic.chebyshev import ChebyshevBasis
 from ns_abstract.arithmetic.rounding import CHEBYSHEV_ROUNDING, FIELD_UP, UNIT64, gamma
-from ns_abstract.methods.nerf.relu_kernel import relu
+from ns_abstract.methods.nerf.relu_kernel import Grid, relu
 from ns_abstract.methods.nerf.scene import Encoding, FieldWeights, Layer
 
 #: Radii of Bernstein ellipses that are tried for the remainder of an encoding.
@@ -271,10 +271,10 @@ class FieldBounds:
         slope, size = torch.empty(2, pieces, n, dtype=torch.float64)
         places = torch.empty(2, pieces * n, dtype=torch.int64)
         error = torch.empty(pieces * n, dtype=torch.float64)
-        poly, (half, even, odd) = z.poly.contiguous(), self._halves
+        poly, grid = z.poly.contiguous(), Grid(*self._halves, self._chord.numpy(), self.basis.norming)
         found = relu(
-            poly.numpy(), rho.numpy(), z.box.numpy(), z.failed.numpy(), half, even, odd, self._chord.numpy(),
-            self.basis.norming, slope.numpy(), size.numpy(), places[0].numpy(), places[1].numpy(), error.numpy(),
+            poly.numpy(), rho.numpy(), z.box.numpy(), z.failed.numpy(), grid, slope.numpy(), size.numpy(),
+            places[0].numpy(), places[1].numpy(), error.numpy(),
         )  # fmt: skip
         return poly, z.box, size, slope, places[0, :found], places[1, :found], error[:found]
 

@@ -172,8 +172,10 @@ def _quadratic_alphas(record, begin, n, given, block, limits, charges, antialias
         bent = fma(alpha.weight, quadratic, alpha.curve * (linear * linear))
         # the columns between alpha's bounds and its form are set later
         store_columns(
-            values, given + 8 * q, 8, alpha.low, alpha.high, alpha.low, alpha.high, alpha.center,
-            alpha.weight * linear, bent, alpha.radius,
+            values, given + 8 * q, 8,
+            (
+                alpha.low, alpha.high, alpha.low, alpha.high, alpha.center, alpha.weight * linear, bent, alpha.radius,
+            ),
         )  # fmt: skip
         found |= (_ALL - bits(alpha.high < limits.alpha_min)) << q
     return found
@@ -271,9 +273,11 @@ def _affine_alphas(record, begin, n, given, block, limits, charges, antialiased,
         for k in range(0, width, 8):
             at = 8 * k
             store_columns(
-                values, given + q * width + k, width, load8(rows, at), load8(rows, at + 8), load8(rows, at + 16),
-                load8(rows, at + 24), load8(rows, at + 32), load8(rows, at + 40), load8(rows, at + 48),
-                load8(rows, at + 56),
+                values, given + q * width + k, width,
+                (
+                    load8(rows, at), load8(rows, at + 8), load8(rows, at + 16), load8(rows, at + 24),
+                    load8(rows, at + 32), load8(rows, at + 40), load8(rows, at + 48), load8(rows, at + 56),
+                ),
             )  # fmt: skip
     return found
 

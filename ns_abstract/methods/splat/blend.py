@@ -217,7 +217,7 @@ def _sharpened(begin, end, ends, form_low, form_high, block, scratch):
 
 
 @njit(cache=True, error_model="numpy", forceinline=True)
-def _blend_quadratic(begin, end, fragments, palette, moves, t):
+def blend_quadratic(begin, end, fragments, palette, moves, t):
     """Blend the list entries [begin, end) of a pixel back to front, as forms and as intervals (design.md, B7).
 
     For one parameter and order 2. ``t`` [m, 4] receives the polynomials; returns their radii, not yet rounded up, and
@@ -299,8 +299,8 @@ def _step_affine(r, at, key, fragments, palette, t, m):
 
 
 @njit(cache=True, error_model="numpy", forceinline=True)
-def _blend_affine(begin, end, fragments, palette, moves, t, m):
-    """`_blend_quadratic` for order 1 and any number of parameters."""
+def blend_affine(begin, end, fragments, palette, moves, t, m):
+    """`blend_quadratic` for order 1 and any number of parameters."""
     values, colors, forms = fragments.values, palette.values, palette.forms
     p0 = load4(palette.background, 0)
     r = 0.0 * p0
@@ -321,7 +321,7 @@ def _blend_affine(begin, end, fragments, palette, moves, t, m):
 
 
 @njit(cache=True, error_model="numpy", forceinline=True)
-def _form_range(t, r, order, m):
+def form_range(t, r, order, m):
     """Range over the box of the polynomials ``t`` [m, 4] of radii ``r``, rounded outward (design.md, A4)."""
     middle = load4(t, 0)
     bottom, top = middle, middle
@@ -387,12 +387,12 @@ def shade(left, above, reordered, block, inputs, bounds):
         begin = q * fragments.capacity
         end = begin + int(fragments.lengths[q])
         if order == 2:
-            r, ends = _blend_quadratic(begin, end, fragments, palette, moves, t)
+            r, ends = blend_quadratic(begin, end, fragments, palette, moves, t)
         else:
-            r, ends = _blend_affine(begin, end, fragments, palette, moves, t, m)
+            r, ends = blend_affine(begin, end, fragments, palette, moves, t, m)
         # the radius' own rounding: three for every fragment
         r = r * (UP + 4.0 * UNIT64 * fragments.lengths[q])
-        form_low, form_high = _form_range(t, r, order, m)
+        form_low, form_high = form_range(t, r, order, m)
         low, high = ends.low, ends.high
         if reordered:
             low, high = _sharpened(begin, end, ends, form_low, form_high, block, scratch)

@@ -74,7 +74,7 @@ class Fragments(NamedTuple):
 
 
 class Palette(NamedTuple):
-    """Colours of a block's list; each is rows of three channels and one of none.
+    """Colours of a block's list; each is rows of three channels and one of the depth, if that is asked for.
 
     Attributes:
         values: [entries, forms + 3, 4] coefficients, radius, lower and upper bound over the cell.
@@ -155,12 +155,14 @@ class Block(NamedTuple):
     """A block as kernels take it: pointers to `Buffers`.
 
     Attributes:
+        shifted: Depths of one pixel's list against its own reference (see `depths`).
         sums: [2 m + 4, 4] scratch by channel: polynomials, then what `blend` needs beside them.
         ray: [3] the block's central ray at the cell's middle, world axes, of unit depth.
     """
 
     fragments: Fragments
     palette: Palette
+    shifted: Palette
     entries: Entries
     reordering: Reordering
     batch: Batch
@@ -178,12 +180,14 @@ class Buffers(NamedTuple):
     rows: np.ndarray
     lengths: np.ndarray
     background: np.ndarray
+    nothing: np.ndarray
     unseen: np.ndarray
     sums: np.ndarray
     ray: np.ndarray
     positions: np.ndarray
     depths: np.ndarray
     palette: np.ndarray
+    shifted: np.ndarray
     values: np.ndarray
     lists: np.ndarray
     drawn: np.ndarray
@@ -222,12 +226,14 @@ def new_buffers(m, forms, pair_limit, background):
         rows=np.zeros((width, 8)),
         lengths=np.empty(PIXELS, np.uint32),
         background=behind,
+        nothing=np.zeros(4),
         unseen=np.zeros(8),
         sums=np.zeros(4 * (2 * m + 4)),
         ray=np.empty(3),
         positions=np.empty((7, _POSITIONS), np.int64),
         depths=np.empty((2, _POSITIONS)),
         palette=np.zeros(_POSITIONS * color_size(forms)),
+        shifted=np.zeros(_POSITIONS * color_size(forms)),
         values=_aligned(_CAPACITY * PIXELS * width),
         lists=np.empty((PIXELS, _CAPACITY, LISTED), np.uint32),
         drawn=np.empty(2 * _CAPACITY, np.int64),
@@ -240,10 +246,11 @@ def new_buffers(m, forms, pair_limit, background):
 @njit(cache=True, error_model="numpy")
 def resized(old, positions, capacity, m, forms):
     """``old`` buffers with room for lists of ``positions`` and ``capacity`` fragments by pixel, where that is more."""
-    places, depths, palette = old.positions, old.depths, old.palette
+    places, depths, palette, shifted = old.positions, old.depths, old.palette, old.shifted
     if positions > places.shape[1]:
         places, depths = np.empty((7, positions), np.int64), np.empty((2, positions))
         palette = np.zeros(positions * color_size(forms))
+        shifted = np.zeros(positions * color_size(forms))
     values, lists, drawn, of_slots, moves = old.values, old.lists, old.drawn, old.places, old.moves
     if capacity > lists.shape[1]:
         values = _aligned(capacity * PIXELS * fragment_width(m))
@@ -259,12 +266,14 @@ def resized(old, positions, capacity, m, forms):
         rows=old.rows,
         lengths=old.lengths,
         background=old.background,
+        nothing=old.nothing,
         unseen=old.unseen,
         sums=old.sums,
         ray=old.ray,
         positions=places,
         depths=depths,
         palette=palette,
+        shifted=shifted,
         values=values,
         lists=lists,
         drawn=drawn,
@@ -287,6 +296,8 @@ def block_of(buffers, m, forms):
         pointer(buffers.per_pixel),
     )
     palette = Palette(pointer(buffers.palette), forms, pointer(buffers.background), pointer(buffers.unseen))
+    # sums that begin at 0 and do not know what else is behind
+    shifted = Palette(pointer(buffers.shifted), forms, pointer(buffers.nothing), pointer(buffers.unseen))
     entries = Entries(
         pointer(positions[0]),
         pointer(positions[1]),
@@ -313,7 +324,7 @@ def block_of(buffers, m, forms):
         pointer(buffers.batch[1]),
         pointer(buffers.rows),
     )
-    return Block(fragments, palette, entries, reordering, batch, pointer(buffers.sums), pointer(buffers.ray))
+    return Block(fragments, palette, shifted, entries, reordering, batch, pointer(buffers.sums), pointer(buffers.ray))
 
 
 @njit(cache=True, error_model="numpy", forceinline=True)

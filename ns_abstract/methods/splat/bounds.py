@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numba import get_num_threads
 
-from ns_abstract.arithmetic.rounding import UNIT64, Arithmetic, Charges, charges
+from ns_abstract.arithmetic.rounding import FRAGMENT_ROUNDING, REGION, UNIT64, Arithmetic, Charges, charges
 from ns_abstract.geometry.camera_path import Camera
 from ns_abstract.geometry.poses import PoseForms
 from ns_abstract.geometry.tiles import tile_grid
@@ -46,6 +46,7 @@ class CellBounds:
         visible: [n] scene indices of the Gaussians that some pose of the cell may show in these tiles.
         tile_ranges: [n, 4] their ranges of tiles: columns first and past, rows first and past.
         linear: [t, side, side, 3, m + 1] polynomial coefficients and radius, or None.
+        layers: [t, side, side, 4] accumulation and expected depth as in `PixelBounds.layers`, or None.
         slopes: [d] mean absolute linear coefficients.
         statistics: Blocks, layers, uncertain pairs, blocks that gave up on order, pixels with results that were not
             numbers.
@@ -57,6 +58,7 @@ class CellBounds:
     visible: np.ndarray
     tile_ranges: np.ndarray
     linear: np.ndarray | None
+    layers: np.ndarray | None
     slopes: np.ndarray
     statistics: np.ndarray
 
@@ -120,6 +122,7 @@ class SplatBounds:
         candidates: np.ndarray | None = None,
         keep_linear: bool = False,
         floor: float = -1.0,
+        layers: bool = False,
     ) -> CellBounds:
         """Bounds of the tiles ``wanted`` over the poses enclosed by ``forms`` (design.md, G10).
 
@@ -131,6 +134,7 @@ class SplatBounds:
             keep_linear: Whether to return the linear sets.
             floor: What no more light comes to may have any colour that is there (B6); negative, and for rasterisers
                 without a stop: every layer counts.
+            layers: Whether to bound accumulation and expected depth, too.
         """
         splats = self.splats
         shape = form_shape(forms.rotation.basis)
@@ -181,16 +185,21 @@ class SplatBounds:
             lower=np.zeros(pixels),
             upper=np.zeros(pixels),
             linear=np.zeros((wanted.size if keep_linear else 0, *pixels[1:], m + 1)),
+            layers=np.zeros((wanted.size if layers else 0, self.side, self.side, 4)),
             slopes=np.zeros((wanted.size, d)),
             statistics=np.zeros((get_num_threads(), 5), np.int64),
             marks=np.zeros(n, np.uint8),
         )
+        common = np.zeros(m + 1)
+        if layers:
+            colors = _four_channels(colors, self._depths(poses, candidates, alive, gaussians.delta, m), alive, m)
+            common = np.ascontiguousarray(offset[: m + 1, 2])
         pixel_stage(
             TileLists(wanted, offsets, entries),
             gaussians,
             ViewingAxes(slope, np.ascontiguousarray(rotation[0]), self._tied(forms.origin)),
             view,
-            Colors(colors, splats.background, self._color_radius),
+            Colors(colors, splats.background, self._color_radius, 4 if layers else 3, common),
             self.rules,
             self.charges,
             self._cutoffs(floor),
@@ -200,9 +209,29 @@ class SplatBounds:
         )
         return CellBounds(
             wanted, found.lower, found.upper, *marked(found.marks, candidates, gaussians.tiles),
-            found.linear if keep_linear else None, found.slopes.sum(axis=0) / (max(wanted.size, 1) * self.side**2 * 3),
+            found.linear if keep_linear else None, found.layers if layers else None,
+            found.slopes.sum(axis=0) / (max(wanted.size, 1) * self.side**2 * 3),
             found.statistics.sum(axis=0),
         )  # fmt: skip
+
+    def _depths(
+        self, poses: CellPoses, candidates: np.ndarray, alive: np.ndarray, delta: np.ndarray, m: int
+    ) -> np.ndarray:
+        """[k, m + 1] forms of the depths of candidates ``alive`` [k] against the offset's (design.md, D1)."""
+        axis, most = poses.rotation[: m + 1, 6:9], poses.rotation_magnitude[6:9]
+        away = delta[alive]
+        forms = away @ axis.T
+        # float error of the coordinate, and what ranges of means add to it (G2, S2)
+        sizes = np.abs(self.varied.mean_middle[candidates[alive]])
+        spread = np.zeros_like(sizes)
+        if self.varied.mean_radius.shape[0]:
+            spread = self.varied.mean_radius[candidates[alive]]
+        error = self.charges.camera_coordinate * ((sizes + spread + poses.camera_magnitude) @ most) + spread @ most
+        # the rows' own radii, and the rounding of delta and of three products and sums
+        sizes = np.abs(away)
+        error += sizes @ axis[m] + FRAGMENT_ROUNDING * (sizes @ np.abs(axis[:m]).sum(axis=0))
+        forms[:, m] = error * REGION
+        return forms
 
     def _cutoffs(self, floor: float) -> Cutoffs:
         """What need not be followed where no more light than ``floor`` comes (design.md, B6, B8)."""
@@ -253,6 +282,22 @@ class SplatBounds:
         colors = self._buffer("colors", (n, 3 * (shape.monomials + 1)))
         moving_colors(indices, scene, position.data, forms.origin, position_error, self.charges, shape, colors)
         return colors
+
+
+def _four_channels(colors: np.ndarray, depths: np.ndarray, alive: np.ndarray, m: int) -> np.ndarray:
+    """[n, 4 (m + 1)] colours of any shape of `Colors.values`, and the ``depths`` [k, m + 1] of the rows ``alive``."""
+    n = colors.shape[0]
+    wide = np.zeros((n, 4, m + 1))
+    columns = colors.shape[1] // 3
+    parts = colors.reshape(n, 3, columns)
+    if columns == m + 1:
+        wide[:, :3] = parts
+    else:
+        wide[:, :3, 0] = parts[:, :, 0]
+        if columns == 2:
+            wide[:, :3, m] = parts[:, :, 1]
+    wide[alive, 3] = depths
+    return wide.reshape(n, 4 * (m + 1))
 
 
 def _gram_deviation(forms: PoseForms) -> float:

@@ -103,6 +103,155 @@ def _keep(w, a, s, f, q, m):
         store(s, row.FP + (f * (m + 1) + k) * LANES + q, load8(w, a + 8 * k))
 
 
+@njit(cache=True, error_model="numpy", forceinline=True)
+def _project_means(w, s, rotation, offset, camera, q, shape):
+    """Camera coordinates, ratios u = x / z, v = y / z, and pixel offsets times depth: _X .. _DY; bounds of u and v."""
+    m = shape.monomials
+    one = size(m)
+    x, y, z, inverse, u, v = _X * one, _Y * one, _Z * one, _RZ * one, _U * one, _V * one
+    mean = load8(s, row.V0 + q), load8(s, row.V1 + q), load8(s, row.V2 + q)
+    rotate(w, rotation, 0, mean, offset, True, load8(s, row.SX + q), x, shape)
+    rotate(w, rotation, 1, mean, offset, True, load8(s, row.SY + q), y, shape)
+    rotate(w, rotation, 2, mean, offset, True, load8(s, row.SZ + q), z, shape)
+    _keep_bounds(w, z, s, row.ZLO, row.ZHI, q, m)
+    store(s, row.Z0 + q, load8(w, z))
+    reciprocal(w, z, inverse, m)
+    multiply(w, x, inverse, u, m)
+    multiply(w, y, inverse, v, m)
+    u_range = _keep_bounds(w, u, s, row.ULO, row.UHI, q, m)
+    v_range = _keep_bounds(w, v, s, row.VLO, row.VHI, q, m)
+    store(s, row.X0 + q, _pixels(w, x, z, u, camera.fx, _DX * one, m))
+    store(s, row.Y0 + q, _pixels(w, y, z, v, camera.fy, _DY * one, m))
+    return u_range, v_range
+
+
+@njit(cache=True, error_model="numpy", forceinline=True)
+def _clamp_ratios(w, u_range, v_range, camera, margin, m):
+    """The Jacobian's clamped ratios."""
+    fx, fy, cx, cy, width, height = camera
+    one = size(m)
+    extra = margin * 0.5 * width / fx
+    clamp(w, _U * one, -(cx / fx + extra), (width - cx) / fx + extra, u_range[0], u_range[1], m)
+    extra = margin * 0.5 * height / fy
+    clamp(w, _V * one, -(cy / fy + extra), (height - cy) / fy + extra, v_range[0], v_range[1], m)
+
+
+@njit(cache=True, error_model="numpy", forceinline=True)
+def _project_axes(w, s, rotation, offset, q, shape):
+    """w = R B, then n0 = w0 - u w2, n1 = w1 - v w2: _N0 .. _N5."""
+    m = shape.monomials
+    one = size(m)
+    deep = _W2 * one
+    none = 0.0 * load8(s, row.V0 + q)
+    for column in range(3):
+        at = row.B00 + 3 * column * LANES + q
+        axis = load8(s, at), load8(s, at + LANES), load8(s, at + 2 * LANES)
+        n0, n1 = (_N0 + column) * one, (_N3 + column) * one
+        rotate(w, rotation, 0, axis, offset, False, none, n0, shape)
+        rotate(w, rotation, 1, axis, offset, False, none, n1, shape)
+        rotate(w, rotation, 2, axis, offset, False, none, deep, shape)
+        store(s, row.DEEP0 + column * LANES + q, magnitude(w, deep, m) + load8(w, deep + 8 * m))
+        _lower(w, _U * one, deep, n0, m)
+        _lower(w, _V * one, deep, n1, m)
+
+
+@njit(cache=True, error_model="numpy", forceinline=True)
+def _covariance(w, s, camera, eps2d, q, m):
+    """The covariance times z^2 and its determinant times z^4, blurred, and the latter without: _A, _B, _C, _DET, _K.
+
+    a' = fx^2 |n0|^2 + eps z^2, c' = fy^2 |n1|^2 + eps z^2, b' = fx fy n0.n1, and, of sums of squares only,
+    det' = fx^2 fy^2 |n0 x n1|^2 + eps z^2 (fx^2 |n0|^2 + fy^2 |n1|^2) + eps^2 z^4.
+    """
+    one = size(m)
+    a, b, c, det, k, z2 = _A * one, _B * one, _C * one, _DET * one, _K * one, _T2 * one
+    t0, t1 = _T0 * one, _T1 * one
+    fx, fy = camera.fx, camera.fy
+    square(w, _Z * one, z2, m)
+    clear(w, a, m)
+    clear(w, b, m)
+    clear(w, c, m)
+    for column in range(3):
+        n0, n1 = (_N0 + column) * one, (_N3 + column) * one
+        add_square(w, n0, a, m)
+        add_square(w, n1, c, m)
+        add_product(w, n0, n1, 1.0, b, m)
+    set_norms(w, a, m)
+    set_norms(w, b, m)
+    set_norms(w, c, m)
+    scale_add(w, b, fx * fy, b, 0.0, 0.0, b, m)
+    clear(w, k, m)
+    for column in range(3):
+        i, j = (column + 1) % 3, (column + 2) % 3
+        clear(w, t0, m)
+        add_product(w, (_N0 + i) * one, (_N3 + j) * one, 1.0, t0, m)
+        add_product(w, (_N0 + j) * one, (_N3 + i) * one, -1.0, t0, m)
+        set_norms(w, t0, m)
+        add_square(w, t0, k, m)
+    set_norms(w, k, m)
+    scale_add(w, k, (fx * fy) * (fx * fy), k, 0.0, 0.0, k, m)
+    scale_add(w, a, fx * fx, c, fy * fy, 0.0, t0, m)
+    scale_add(w, t0, eps2d, z2, eps2d * eps2d, 0.0, t1, m)
+    scale_add(w, k, 1.0, k, 0.0, 0.0, det, m)
+    add_product(w, t1, z2, 1.0, det, m)
+    set_norms(w, det, m)
+    scale_add(w, a, fx * fx, z2, eps2d, 0.0, a, m)
+    scale_add(w, c, fy * fy, z2, eps2d, 0.0, c, m)
+    _keep_bounds(w, a, s, row.ALO, row.AHI, q, m)
+    _keep_bounds(w, c, s, row.CLO, row.CHI, q, m)
+    _keep_bounds(w, b, s, row.BLO, row.BHI, q, m)
+    _keep_bounds(w, det, s, row.DLO, row.DHI, q, m)
+    # (a' - c')/2, for the radius
+    scale_add(w, a, 0.5, c, -0.5, 0.0, t1, m)
+    _keep_bounds(w, t1, s, row.LO, row.HI, q, m)
+
+
+@njit(cache=True, error_model="numpy", forceinline=True)
+def _compensate(w, s, q, m):
+    """K = -log(compensation), compensation^2 = |n0 x n1|^2 / det', and bounds of the latter."""
+    one = size(m)
+    k, t0, t1 = _K * one, _T0 * one, _T1 * one
+    reciprocal(w, _DET * one, t0, m)
+    multiply(w, k, t0, t1, m)
+    _keep_bounds(w, t1, s, row.SQLO, row.SQHI, q, m)
+    logarithm(w, t1, _LOG * one, m)
+    scale_add(w, _LOG * one, -0.5, _LOG * one, 0.0, 0.0, k, m)
+    _keep(w, k, s, 5, q, m)
+
+
+@njit(cache=True, error_model="numpy", forceinline=True)
+def _whiten(w, s, q, m):
+    """The forms of a record: P = P' z, Q = Q' z, S = S' z, W1 = P' X^ - Q' Y^, W2 = S' Y^."""
+    one = size(m)
+    z, p, across, root = _Z * one, _P * one, _Q * one, _S * one
+    t0 = _T0 * one
+    multiply(w, p, z, t0, m)
+    _keep(w, t0, s, 0, q, m)
+    multiply(w, across, z, t0, m)
+    _keep(w, t0, s, 1, q, m)
+    multiply(w, root, z, t0, m)
+    _keep(w, t0, s, 2, q, m)
+    clear(w, t0, m)
+    add_product(w, p, _DX * one, 1.0, t0, m)
+    add_product(w, across, _DY * one, -1.0, t0, m)
+    _keep(w, t0, s, 3, q, m)
+    multiply(w, root, _DY * one, t0, m)
+    _keep(w, t0, s, 4, q, m)
+
+
+@njit(cache=True, error_model="numpy", forceinline=True)
+def _factor(w, m):
+    """The inverse covariance's factors S' = 1/sqrt(c'), P' = sqrt(c'/det'), Q' = P' b'/c': _S, _P, _Q."""
+    one = size(m)
+    b, c, p, root, t0, t1 = _B * one, _C * one, _P * one, _S * one, _T0 * one, _T1 * one
+    reciprocal_square_root(w, c, root, m)
+    reciprocal_square_root(w, _DET * one, t0, m)
+    multiply(w, c, root, t1, m)
+    multiply(w, t1, t0, p, m)
+    multiply(w, b, root, t0, m)
+    multiply(w, t0, root, t1, m)
+    multiply(w, p, t1, _Q * one, m)
+
+
 @njit(cache=True, error_model="numpy")
 def project_forms(w, s, rotation, offset, camera, rules, shape):
     """`line_projection.project_line` with forms of order 1 in any number of parameters, and its `compensate_line`.
@@ -112,111 +261,13 @@ def project_forms(w, s, rotation, offset, camera, rules, shape):
     ``w`` is scratch for `WORKSPACE` forms; the forms of a record go to the rows from FP, m + 1 each.
     """
     m = shape.monomials
-    one = size(m)
-    x, y, z, inverse, u, v = _X * one, _Y * one, _Z * one, _RZ * one, _U * one, _V * one
-    dx, dy, deep = _DX * one, _DY * one, _W2 * one
-    a, b, c, det, k, z2 = _A * one, _B * one, _C * one, _DET * one, _K * one, _T2 * one
-    t0, t1, p, across, root = _T0 * one, _T1 * one, _P * one, _Q * one, _S * one
-    eps2d, margin = rules.eps2d, rules.view_margin
-    fx, fy, cx, cy, width, height = camera
     for q in range(0, LANES, 8):
-        mean = load8(s, row.V0 + q), load8(s, row.V1 + q), load8(s, row.V2 + q)
-        rotate(w, rotation, 0, mean, offset, True, load8(s, row.SX + q), x, shape)
-        rotate(w, rotation, 1, mean, offset, True, load8(s, row.SY + q), y, shape)
-        rotate(w, rotation, 2, mean, offset, True, load8(s, row.SZ + q), z, shape)
-        _keep_bounds(w, z, s, row.ZLO, row.ZHI, q, m)
-        store(s, row.Z0 + q, load8(w, z))
-        # u = x / z, v = y / z
-        reciprocal(w, z, inverse, m)
-        multiply(w, x, inverse, u, m)
-        multiply(w, y, inverse, v, m)
-        u_low, u_high = _keep_bounds(w, u, s, row.ULO, row.UHI, q, m)
-        v_low, v_high = _keep_bounds(w, v, s, row.VLO, row.VHI, q, m)
-        store(s, row.X0 + q, _pixels(w, x, z, u, fx, dx, m))
-        store(s, row.Y0 + q, _pixels(w, y, z, v, fy, dy, m))
-        # the Jacobian's clamped ratios
-        if margin >= 0.0:
-            extra = margin * 0.5 * width / fx
-            clamp(w, u, -(cx / fx + extra), (width - cx) / fx + extra, u_low, u_high, m)
-            extra = margin * 0.5 * height / fy
-            clamp(w, v, -(cy / fy + extra), (height - cy) / fy + extra, v_low, v_high, m)
-        # w = R B, then n0 = w0 - u w2, n1 = w1 - v w2
-        none = 0.0 * mean[0]
-        for column in range(3):
-            at = row.B00 + 3 * column * LANES + q
-            axis = load8(s, at), load8(s, at + LANES), load8(s, at + 2 * LANES)
-            n0, n1 = (_N0 + column) * one, (_N3 + column) * one
-            rotate(w, rotation, 0, axis, offset, False, none, n0, shape)
-            rotate(w, rotation, 1, axis, offset, False, none, n1, shape)
-            rotate(w, rotation, 2, axis, offset, False, none, deep, shape)
-            store(s, row.DEEP0 + column * LANES + q, magnitude(w, deep, m) + load8(w, deep + 8 * m))
-            _lower(w, u, deep, n0, m)
-            _lower(w, v, deep, n1, m)
-        # a' = fx^2 |n0|^2 + eps z^2, c' = fy^2 |n1|^2 + eps z^2, b' = fx fy n0.n1 (covariance times z^2)
-        square(w, z, z2, m)
-        clear(w, a, m)
-        clear(w, b, m)
-        clear(w, c, m)
-        for column in range(3):
-            n0, n1 = (_N0 + column) * one, (_N3 + column) * one
-            add_square(w, n0, a, m)
-            add_square(w, n1, c, m)
-            add_product(w, n0, n1, 1.0, b, m)
-        set_norms(w, a, m)
-        set_norms(w, b, m)
-        set_norms(w, c, m)
-        scale_add(w, b, fx * fy, b, 0.0, 0.0, b, m)
-        # det' = fx^2 fy^2 |n0 x n1|^2 + eps z^2 (fx^2 |n0|^2 + fy^2 |n1|^2) + eps^2 z^4, sums of squares only
-        clear(w, k, m)
-        for column in range(3):
-            i, j = (column + 1) % 3, (column + 2) % 3
-            clear(w, t0, m)
-            add_product(w, (_N0 + i) * one, (_N3 + j) * one, 1.0, t0, m)
-            add_product(w, (_N0 + j) * one, (_N3 + i) * one, -1.0, t0, m)
-            set_norms(w, t0, m)
-            add_square(w, t0, k, m)
-        set_norms(w, k, m)
-        scale_add(w, k, (fx * fy) * (fx * fy), k, 0.0, 0.0, k, m)
-        scale_add(w, a, fx * fx, c, fy * fy, 0.0, t0, m)
-        scale_add(w, t0, eps2d, z2, eps2d * eps2d, 0.0, t1, m)
-        scale_add(w, k, 1.0, k, 0.0, 0.0, det, m)
-        add_product(w, t1, z2, 1.0, det, m)
-        set_norms(w, det, m)
-        scale_add(w, a, fx * fx, z2, eps2d, 0.0, a, m)
-        scale_add(w, c, fy * fy, z2, eps2d, 0.0, c, m)
-        _keep_bounds(w, a, s, row.ALO, row.AHI, q, m)
-        _keep_bounds(w, c, s, row.CLO, row.CHI, q, m)
-        _keep_bounds(w, b, s, row.BLO, row.BHI, q, m)
-        _keep_bounds(w, det, s, row.DLO, row.DHI, q, m)
-        # (a' - c')/2, for the radius
-        scale_add(w, a, 0.5, c, -0.5, 0.0, t1, m)
-        _keep_bounds(w, t1, s, row.LO, row.HI, q, m)
-        # S' = 1/sqrt(c'), P' = sqrt(c'/det'), Q' = P' b'/c'
-        reciprocal_square_root(w, c, root, m)
-        reciprocal_square_root(w, det, t0, m)
-        multiply(w, c, root, t1, m)
-        multiply(w, t1, t0, p, m)
-        multiply(w, b, root, t0, m)
-        multiply(w, t0, root, t1, m)
-        multiply(w, p, t1, across, m)
+        u_range, v_range = _project_means(w, s, rotation, offset, camera, q, shape)
+        if rules.view_margin >= 0.0:
+            _clamp_ratios(w, u_range, v_range, camera, rules.view_margin, m)
+        _project_axes(w, s, rotation, offset, q, shape)
+        _covariance(w, s, camera, rules.eps2d, q, m)
+        _factor(w, m)
         if rules.antialiased:
-            # K = -log(compensation), compensation^2 = |n0 x n1|^2 / det'
-            reciprocal(w, det, t0, m)
-            multiply(w, k, t0, t1, m)
-            _keep_bounds(w, t1, s, row.SQLO, row.SQHI, q, m)
-            logarithm(w, t1, _LOG * one, m)
-            scale_add(w, _LOG * one, -0.5, _LOG * one, 0.0, 0.0, k, m)
-            _keep(w, k, s, 5, q, m)
-        # P = P' z, Q = Q' z, S = S' z, W1 = P' X^ - Q' Y^, W2 = S' Y^
-        multiply(w, p, z, t0, m)
-        _keep(w, t0, s, 0, q, m)
-        multiply(w, across, z, t0, m)
-        _keep(w, t0, s, 1, q, m)
-        multiply(w, root, z, t0, m)
-        _keep(w, t0, s, 2, q, m)
-        clear(w, t0, m)
-        add_product(w, p, dx, 1.0, t0, m)
-        add_product(w, across, dy, -1.0, t0, m)
-        _keep(w, t0, s, 3, q, m)
-        multiply(w, root, dy, t0, m)
-        _keep(w, t0, s, 4, q, m)
+            _compensate(w, s, q, m)
+        _whiten(w, s, q, m)

@@ -441,11 +441,11 @@ def _keep_moving(found, pixels, number, k, slot, block, stop, dim, moved):
 
 
 @njit(cache=True, error_model="numpy", forceinline=True)
-def _set_colors(palette, k, color, color_rows):
-    """Write the colour of list position k: see `Palette`; ``color`` [3, color_rows] is the Gaussian's."""
+def _set_colors(palette, k, color, color_rows, channels):
+    """Write the colour of list position k: see `Palette`; ``color`` [channels, color_rows] is the Gaussian's."""
     forms, values = palette.forms, palette.values
     at = k * color_size(forms)
-    for channel in range(3):
+    for channel in range(channels):
         start = channel * color_rows
         spread = 0.0
         for r in range(1, color_rows):
@@ -459,14 +459,17 @@ def _set_colors(palette, k, color, color_rows):
 
 
 @njit(cache=True, error_model="numpy")
-def _colors_behind(first, listed, colors, palette, marks):
+def _colors_behind(first, listed, colors, channels, palette, marks):
     """Ends of the colours of the list's entries from ``first`` on and of the background; marks them (design.md, B6)."""
     color_columns = colors.shape[1]
-    color_rows = color_columns // 3
+    color_rows = color_columns // channels
     values, unseen = pointer(colors), palette.unseen
     for channel in range(4):
         unseen[channel] = palette.background[channel]
         unseen[4 + channel] = palette.background[channel]
+    if channels == 4:
+        # the background has no depth
+        unseen[3], unseen[7] = np.inf, -np.inf
     for k in range(first, listed.length):
         ahead = listed.numbers[min(k + BATCH, listed.length - 1)]
         for byte in range(0, 8 * color_columns, 64):
@@ -475,7 +478,7 @@ def _colors_behind(first, listed, colors, palette, marks):
         if marks[i] == 0:
             marks[i] = 1
         color = advanced(values, i * color_columns)
-        for channel in range(3):
+        for channel in range(channels):
             at = channel * color_rows
             spread = 0.0
             for r in range(1, color_rows):
@@ -573,7 +576,7 @@ def collect_fragments(numbers, place, inputs, block, marks_):
     """
     fragments, entries, reordering, batch = block.fragments, block.entries, block.reordering, block.batch
     gaussians, charges, m = inputs.gaussians, inputs.charges, inputs.shape.monomials
-    colors, marks = inputs.colors.values, pointer(marks_)
+    colors, channels, marks = inputs.colors.values, inputs.colors.channels, pointer(marks_)
     listed = _Listed(
         pointer(numbers), numbers.size, pointer(gaussians.record), gaussians.record.shape[1], pointer(gaussians.box),
         pointer(gaussians.tiles), pointer(gaussians.delta), pointer(gaussians.depth_error),
@@ -613,7 +616,8 @@ def collect_fragments(numbers, place, inputs, block, marks_):
             # threads share these bytes: written no more than once each
             if marks[i] == 0:
                 marks[i] = 1
-            _set_colors(block.palette, k, advanced(pointer(colors), i * color_columns), color_columns // 3)
+            color = advanced(pointer(colors), i * color_columns)
+            _set_colors(block.palette, k, color, color_columns // channels, channels)
             if entries.first[k] == k and entries.last[k] == k:
                 found = _keep_drawn(found, pixels, used + begin, k, fragments, stop)
                 live, dim = _keep_alone(found, pixels, used + begin, k, fragments, stop, live, dim, m)
@@ -627,7 +631,7 @@ def collect_fragments(numbers, place, inputs, block, marks_):
             break
         used += end
     if missing < length:
-        _colors_behind(missing, listed, colors, block.palette, marks)
+        _colors_behind(missing, listed, colors, channels, block.palette, marks)
     return pairs, slots
 
 

@@ -18,11 +18,12 @@ from ns_abstract.geometry.tiles import tile_grid
 from ns_abstract.methods.splat.activate import Splats
 from ns_abstract.methods.splat.bounds import SplatBounds
 from ns_abstract.methods.splat.constants import Rasteriser
+from ns_abstract.methods.splat.depths import ACCUMULATION_HIGH, ACCUMULATION_LOW, DEPTH_HIGH, DEPTH_LOW
 from ns_abstract.methods.splat.lists import tile_mask, touching
 from ns_abstract.methods.splat.render import Renderer
 from ns_abstract.methods.splat.variations import VariedSplats
 from ns_abstract.perturbation.specification import ROTATIONS
-from ns_abstract.refine.protocol import LinearSets, Score
+from ns_abstract.refine.protocol import COLORS, LinearSets, Score
 
 if TYPE_CHECKING:
     from ns_abstract.methods.splat.reference import Reference
@@ -69,7 +70,7 @@ class TileBounds:
     """Bounds of some tiles over one cell.
 
     Attributes:
-        lower, upper: [t, side, side, 3] float32, rounded outward.
+        lower, upper: [t, side, side, channels] float32, rounded outward.
         slopes: [d] mean absolute linear coefficient by parameter: what a split along it may gain.
         context: For the cells inside this one.
         linear: (A_lower, b_lower, A_upper, b_upper) as in `ns_abstract.refine.result.Leaves`, or None.
@@ -99,10 +100,7 @@ class SplatMember:
     reference: Callable[[], Reference] | None = field(repr=False)
 
     def __call__(self, values: np.ndarray, tiles: np.ndarray | None = None) -> np.ndarray:
-        checkpoint()
-        frame = self.frame
-        view = frame.pose_set.world_to_camera(values)
-        return frame.renderer.tiles(frame.camera, *view, tiles, self.splats).astype(np.float32)
+        return self.frame.drawn(values, tiles, self.splats)
 
     def pushed(
         self, box: ParameterBox, values: np.ndarray, score: Score, size: float
@@ -140,6 +138,7 @@ class SplatFrame:
         varied: The scenes of the set; None: ``splats`` alone.
         slanted: Whether cells may be slanted, so that rotations make up for what other parameters move (P2). Their
             parameters are then not those of ``pose_set``.
+        layers: Whether accumulation and expected depth stand behind the colours, in renders and bounds.
         reference: Makes the renderer with gradients, for steps of `members`.
     """
 
@@ -158,8 +157,10 @@ class SplatFrame:
         order: int | None = None,
         varied: VariedSplats | None = None,
         slanted: bool = False,
+        layers: bool = False,
         reference: Callable[[], Reference] | None = None,
     ) -> None:
+        self.channels = 5 if layers else COLORS
         self.pose_set = pose_set
         self.camera = pose_set.camera
         self.box = pose_set.box
@@ -190,9 +191,13 @@ class SplatFrame:
         self.render(box.middle)
 
     def render(self, values: np.ndarray, tiles: np.ndarray | None = None) -> np.ndarray:
-        """Tiles [t, side, side, 3] float32 of the concrete image at parameter values [d]."""
+        """Tiles [t, side, side, channels] float32 of the concrete image at parameter values [d]."""
         checkpoint()
-        return self.renderer.tiles(self.camera, *self.pose_set.world_to_camera(values), tiles).astype(np.float32)
+        return self.drawn(values, tiles, None)
+
+    def drawn(self, values: np.ndarray, tiles: np.ndarray | None, member: Splats | None) -> np.ndarray:
+        draw = self.renderer.tiles if self.channels == COLORS else self.renderer.layer_tiles
+        return draw(self.camera, *self.pose_set.world_to_camera(values), tiles, member).astype(np.float32)
 
     def members(self, seed: int) -> Iterator[SplatMember]:
         """Other scenes of the set, without end; none where nothing varies."""
@@ -242,8 +247,15 @@ class SplatFrame:
         checkpoint()
         forms = self.pose_set.enclosure(box, self.order)
         candidates = self._candidates(tiles, within)
-        cell = self.bounds.cell(self.camera, forms, tiles, candidates, keep_linear, self._floor)
-        lower, upper = outward(cell.lower, cell.upper)
+        layers = self.channels > COLORS
+        cell = self.bounds.cell(self.camera, forms, tiles, candidates, keep_linear, self._floor, layers)
+        lower, upper = cell.lower, cell.upper
+        if cell.layers is not None:
+            low, high = (
+                cell.layers[..., [a, b]] for a, b in ((ACCUMULATION_LOW, DEPTH_LOW), (ACCUMULATION_HIGH, DEPTH_HIGH))
+            )
+            lower, upper = np.concatenate([lower, low], axis=-1), np.concatenate([upper, high], axis=-1)
+        lower, upper = outward(lower, upper)
         # hardly smaller: not worth its memory
         kept = within is not None and cell.visible.size > _WORTH_KEEPING * within.visible.size
         context = within if within is not None and kept else Context(cell.visible, cell.tile_ranges)

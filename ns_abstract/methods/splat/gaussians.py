@@ -151,7 +151,6 @@ def _cull_block(candidates, block, inputs, scratch, state, alive, count):
     s = pointer(s_)
     d, order, m = inputs.shape
     fx, fy, cx, cy, width, height = inputs.camera
-    margin = rules.view_margin
     gather_means(candidates, block, scene, poses.origin, s_)
     filled = block.shape[0]
     extents, opacity_high = scene.extents, scene.opacity_high
@@ -160,9 +159,8 @@ def _cull_block(candidates, block, inputs, scratch, state, alive, count):
         s[row.EXTENT + q] = extents[i]
         s[row.OPHIGH + q] = opacity_high[i]
     coordinate_errors(s_, LANES, poses, charges)
-    limit_x = max(cx, width - cx) / fx + margin * 0.5 * width / fx
-    limit_y = max(cy, height - cy) / fy + margin * 0.5 * height / fy
-    if margin >= 0.0:
+    limit_x, limit_y = row.view_limits(rules, inputs.camera)
+    if rules.view_margin >= 0.0:
         stretch = math.sqrt(fx * fx * (1.0 + limit_x * limit_x) + fy * fy * (1.0 + limit_y * limit_y)) * REGION
     else:
         stretch = np.inf
@@ -256,9 +254,12 @@ def _scatter_records(block, s, places, record):
             at = row.RECORD + column * LANES + q
             # lanes in excess repeat the last one
             scatter_columns(
-                out, to, q, width, column, load8(rows, at), load8(rows, at + LANES),
-                load8(rows, at + 2 * LANES), load8(rows, at + 3 * LANES), load8(rows, at + 4 * LANES),
-                load8(rows, at + 5 * LANES), load8(rows, at + 6 * LANES), load8(rows, at + 7 * LANES),
+                out, to, q, width, column,
+                (
+                    load8(rows, at), load8(rows, at + LANES), load8(rows, at + 2 * LANES), load8(rows, at + 3 * LANES),
+                    load8(rows, at + 4 * LANES), load8(rows, at + 5 * LANES), load8(rows, at + 6 * LANES),
+                    load8(rows, at + 7 * LANES),
+                ),
             )  # fmt: skip
 
 

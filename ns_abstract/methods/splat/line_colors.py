@@ -4,7 +4,17 @@ from __future__ import annotations
 
 from numba import njit
 
-from ns_abstract.arithmetic.line_forms import combined, ends, inverse_root, load, magnitude, multiplied, scaled, store
+from ns_abstract.arithmetic.line_forms import (
+    LineForm,
+    combined,
+    ends,
+    inverse_root,
+    load,
+    magnitude,
+    multiplied,
+    scaled,
+    store,
+)
 from ns_abstract.arithmetic.rounding import SUM_ROUNDING, UP
 from ns_abstract.methods.splat.records import LANES
 
@@ -59,7 +69,7 @@ def _product(s, n, left, right, factor):
 def _shifted_square(s, n, left, factor, shift):
     """``left (factor z^2 + shift)``."""
     for q in range(n):
-        inner = combined(load(s, _Z2, LANES, q), factor, (shift, 0.0, 0.0, 0.0), 1.0)
+        inner = combined(load(s, _Z2, LANES, q), factor, LineForm(shift, 0.0, 0.0, 0.0), 1.0)
         store(multiplied(load(s, left, LANES, q), inner), s, _BASIS, LANES, q)
 
 
@@ -78,7 +88,7 @@ def basis_line(s, n, k):
         _product(s, n, _Z, _Y, -1.092548430592079)
     elif k == 6:
         for q in range(n):
-            shift = (-0.3153915652525201, 0.0, 0.0, 0.0)
+            shift = LineForm(-0.3153915652525201, 0.0, 0.0, 0.0)
             store(combined(load(s, _Z2, LANES, q), 0.9461746957575601, shift, 1.0), s, _BASIS, LANES, q)
     elif k == 7:
         _product(s, n, _Z, _X, -1.092548430592079)
@@ -118,9 +128,8 @@ def _accumulated(s, n, weights, target):
         w = abs(weights[q])
         basis = load(s, _BASIS, LANES, q)
         found = load(s, target, LANES, q)
-        c, g, b = (
-            found[0] + weights[q] * basis[0], found[1] + weights[q] * basis[1], found[2] + weights[q] * basis[2],
-        )  # fmt: skip
+        c = found.center + weights[q] * basis.center
+        g, b = found.slope + weights[q] * basis.slope, found.bend + weights[q] * basis.bend
         added = w * magnitude(basis)
-        radius = (found[3] + w * basis[3] + SUM_ROUNDING * (added + abs(c) + added)) * UP
-        store((c, g, b, radius), s, target, LANES, q)
+        radius = (found.radius + w * basis.radius + SUM_ROUNDING * (added + abs(c) + added)) * UP
+        store(LineForm(c, g, b, radius), s, target, LANES, q)

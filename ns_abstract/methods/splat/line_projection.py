@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 from numba import njit
 
 from ns_abstract.arithmetic.forms import logarithm
 from ns_abstract.arithmetic.line_forms import (
+    LineForm,
     combined,
     ends,
     inverse,
@@ -23,15 +26,29 @@ from ns_abstract.methods.splat import records as row
 from ns_abstract.methods.splat.records import LANES
 
 
+class _RotationRow(NamedTuple):
+    """The forms of one row of the rotation, by column, and the magnitudes of their polynomials."""
+
+    x: LineForm
+    y: LineForm
+    z: LineForm
+    magnitude_x: float
+    magnitude_y: float
+    magnitude_z: float
+
+
+@njit(cache=True, error_model="numpy", inline="always")
+def _column(forms, k):
+    """Column ``k`` of forms [6, n]."""
+    return LineForm(forms[0, k], forms[1, k], forms[2, k], forms[3, k])
+
+
 @njit(cache=True, error_model="numpy", inline="always")
 def _rotation_row(rotation, k):
-    """The forms of one row of the rotation [6, 9] and the sizes of their polynomials."""
+    """Row ``k`` of the rotation [6, 9]."""
     a, b, c = 3 * k, 3 * k + 1, 3 * k + 2
-    return (
-        rotation[0, a], rotation[0, b], rotation[0, c],
-        rotation[1, a], rotation[1, b], rotation[1, c],
-        rotation[2, a], rotation[2, b], rotation[2, c],
-        rotation[3, a], rotation[3, b], rotation[3, c],
+    return _RotationRow(
+        _column(rotation, a), _column(rotation, b), _column(rotation, c),
         abs(rotation[0, a]) + rotation[4, a] + rotation[5, a],
         abs(rotation[0, b]) + rotation[4, b] + rotation[5, b],
         abs(rotation[0, c]) + rotation[4, c] + rotation[5, c],
@@ -42,14 +59,19 @@ def _rotation_row(rotation, k):
 def _rotated(r, x, y, z, shift, shift_size, spread):
     """``r . (x, y, z) + shift`` for exact x, y, z and a form ``shift``, widened (`form_projection.rotate`)."""
     a, b, c = abs(x), abs(y), abs(z)
-    radius = r[9] * a + r[10] * b + r[11] * c + shift[3]
-    radius += SUM_ROUNDING * (r[12] * a + r[13] * b + r[14] * c + shift_size)
-    return (
-        r[0] * x + r[1] * y + r[2] * z + shift[0],
-        r[3] * x + r[4] * y + r[5] * z + shift[1],
-        r[6] * x + r[7] * y + r[8] * z + shift[2],
+    radius = r.x.radius * a + r.y.radius * b + r.z.radius * c + shift.radius
+    radius += SUM_ROUNDING * (r.magnitude_x * a + r.magnitude_y * b + r.magnitude_z * c + shift_size)
+    return LineForm(
+        r.x.center * x + r.y.center * y + r.z.center * z + shift.center,
+        r.x.slope * x + r.y.slope * y + r.z.slope * z + shift.slope,
+        r.x.bend * x + r.y.bend * y + r.z.bend * z + shift.bend,
         radius * UP + spread,
     )
+
+
+@njit(cache=True, error_model="numpy", inline="always")
+def _negated(a):
+    return LineForm(-a.center, -a.slope, -a.bend, a.radius)
 
 
 @njit(cache=True, error_model="numpy", inline="always")
@@ -57,8 +79,7 @@ def _clamped(a, low, high, limit_low, limit_high):
     """``min(limit_high, max(-limit_low, a))`` given bounds of ``a`` (`wide_forms.clamp`)."""
     a = raised(a, -limit_low, low, high)
     low, high = max(low, -limit_low), max(high, -limit_low)
-    a = raised((-a[0], -a[1], -a[2], a[3]), -limit_high, -high, -low)
-    return -a[0], -a[1], -a[2], a[3]
+    return _negated(raised(_negated(a), -limit_high, -high, -low))
 
 
 @njit(cache=True, error_model="numpy", inline="always")
@@ -66,8 +87,12 @@ def _pixels(a, z, ratio, focal):
     """``focal a - (focal ratio) z``, which vanishes at the middle of the cell: a pixel offset times depth."""
     # the pixel offset used later is exactly focal * ratio in float64
     shift = focal * ratio
-    radius = focal * a[3] + abs(shift) * z[3] + SUM_ROUNDING * (focal * magnitude(a) + abs(shift) * magnitude(z))
-    return focal * a[0] - shift * z[0], focal * a[1] - shift * z[1], focal * a[2] - shift * z[2], radius * UP
+    radius = focal * a.radius + abs(shift) * z.radius
+    radius = radius + SUM_ROUNDING * (focal * magnitude(a) + abs(shift) * magnitude(z))
+    return LineForm(
+        focal * a.center - shift * z.center, focal * a.slope - shift * z.slope, focal * a.bend - shift * z.bend,
+        radius * UP,
+    )  # fmt: skip
 
 
 @njit(cache=True, error_model="numpy", inline="always")
@@ -100,11 +125,9 @@ def project_line(s, n, rotation, offset, camera, rules):
     eps2d, margin = rules.eps2d, rules.view_margin
     fx, fy, cx, cy, width, height = camera
     r0, r1, r2 = _rotation_row(rotation, 0), _rotation_row(rotation, 1), _rotation_row(rotation, 2)
-    offset_x = (offset[0, 0], offset[1, 0], offset[2, 0], offset[3, 0])
-    offset_y = (offset[0, 1], offset[1, 1], offset[2, 1], offset[3, 1])
-    offset_z = (offset[0, 2], offset[1, 2], offset[2, 2], offset[3, 2])
+    offset_x, offset_y, offset_z = _column(offset, 0), _column(offset, 1), _column(offset, 2)
     size_x, size_y, size_z = magnitude(offset_x), magnitude(offset_y), magnitude(offset_z)
-    still = (0.0, 0.0, 0.0, 0.0)
+    still = LineForm(0.0, 0.0, 0.0, 0.0)
     left, right, top, bottom = np.inf, np.inf, np.inf, np.inf
     if margin >= 0.0:
         left, right = cx / fx + margin * 0.5 * width / fx, (width - cx) / fx + margin * 0.5 * width / fx
@@ -115,32 +138,32 @@ def project_line(s, n, rotation, offset, camera, rules):
         y = _rotated(r1, v0, v1, v2, offset_y, size_y, s[row.SY + q])
         z = _rotated(r2, v0, v1, v2, offset_z, size_z, s[row.SZ + q])
         s[row.ZLO + q], s[row.ZHI + q] = ends(z)
-        s[row.Z0 + q] = z[0]
+        s[row.Z0 + q] = z.center
         inverse_z = inverse(z)
         u, v = multiplied(x, inverse_z), multiplied(y, inverse_z)
         u_low, u_high = ends(u)
         v_low, v_high = ends(v)
         s[row.ULO + q], s[row.UHI + q] = u_low, u_high
         s[row.VLO + q], s[row.VHI + q] = v_low, v_high
-        s[row.X0 + q], s[row.Y0 + q] = fx * u[0], fy * v[0]
-        dx, dy = _pixels(x, z, u[0], fx), _pixels(y, z, v[0], fy)
+        s[row.X0 + q], s[row.Y0 + q] = fx * u.center, fy * v.center
+        dx, dy = _pixels(x, z, u.center, fx), _pixels(y, z, v.center, fy)
         # the Jacobian's clamped ratios
         u = _clamped(u, u_low, u_high, left, right)
         v = _clamped(v, v_low, v_high, top, bottom)
         # w = R B, then n0 = w0 - u w2, n1 = w1 - v w2
         b0, b1, b2 = s[row.B00 + q], s[row.B10 + q], s[row.B20 + q]
         deep = _rotated(r2, b0, b1, b2, still, 0.0, 0.0)
-        s[row.DEEP0 + q] = magnitude(deep) + deep[3]
+        s[row.DEEP0 + q] = magnitude(deep) + deep.radius
         n00 = _lowered(_rotated(r0, b0, b1, b2, still, 0.0, 0.0), u, deep)
         n10 = _lowered(_rotated(r1, b0, b1, b2, still, 0.0, 0.0), v, deep)
         b0, b1, b2 = s[row.B01 + q], s[row.B11 + q], s[row.B21 + q]
         deep = _rotated(r2, b0, b1, b2, still, 0.0, 0.0)
-        s[row.DEEP1 + q] = magnitude(deep) + deep[3]
+        s[row.DEEP1 + q] = magnitude(deep) + deep.radius
         n01 = _lowered(_rotated(r0, b0, b1, b2, still, 0.0, 0.0), u, deep)
         n11 = _lowered(_rotated(r1, b0, b1, b2, still, 0.0, 0.0), v, deep)
         b0, b1, b2 = s[row.B02 + q], s[row.B12 + q], s[row.B22 + q]
         deep = _rotated(r2, b0, b1, b2, still, 0.0, 0.0)
-        s[row.DEEP2 + q] = magnitude(deep) + deep[3]
+        s[row.DEEP2 + q] = magnitude(deep) + deep.radius
         n02 = _lowered(_rotated(r0, b0, b1, b2, still, 0.0, 0.0), u, deep)
         n12 = _lowered(_rotated(r1, b0, b1, b2, still, 0.0, 0.0), v, deep)
         # a' = fx^2 |n0|^2 + eps z^2, c' = fy^2 |n1|^2 + eps z^2, b' = fx fy n0.n1 (covariance times z^2)
@@ -184,10 +207,8 @@ def compensate_line(s, n, ratios, scratch, out):
     for q in range(n):
         ratio = multiplied(load(s, row.FK, LANES, q), inverse(load(s, row.FD, LANES, q)))
         s[row.SQLO + q], s[row.SQHI + q] = ends(ratio)
-        for r in range(4):
-            ratios[r, q] = ratio[r]
-        ratios[4, q] = abs(ratio[1])
-        ratios[5, q] = abs(ratio[2])
+        ratios[0, q], ratios[1, q], ratios[2, q], ratios[3, q] = ratio.center, ratio.slope, ratio.bend, ratio.radius
+        ratios[4, q], ratios[5, q] = abs(ratio.slope), abs(ratio.bend)
     logarithm(ratios, scratch, out, 1, 2, 3)
     for q in range(n):
-        store(scaled((out[0, q], out[1, q], out[2, q], out[3, q]), -0.5), s, row.FK, LANES, q)
+        store(scaled(_column(out, q), -0.5), s, row.FK, LANES, q)

@@ -85,11 +85,18 @@ class SplatMethod:
         """The scene in a few words."""
         return f"{self.scene.count:,} Gaussians"
 
-    def frame(self, poses: PoseSet, slanted: bool = False) -> SplatFrame:
-        """One frame, ready for refinement; ``slanted``: see `SplatFrame`."""
+    def frame(self, poses: PoseSet, slanted: bool = False, layers: bool = False) -> SplatFrame:
+        """One frame, ready for refinement; ``slanted``, ``layers``: see `SplatFrame`.
+
+        Raises:
+            InputError: Layers of the paper's renderer, which has none.
+        """
+        if layers and self.rasteriser.name != "gsplat":
+            raise InputError("the paper's renderer has no depth", field="--outputs", fix="leave it out")
+        varied = self.varied(poses.perturbation.scene)
         return SplatFrame(
-            self.splats, self.rasteriser, self.arithmetic, poses, varied=self.varied(poses.perturbation.scene),
-            slanted=slanted, reference=self._slow,
+            self.splats, self.rasteriser, self.arithmetic, poses, varied=varied, slanted=slanted, layers=layers,
+            reference=self._slow,
         )  # fmt: skip
 
     def prepare(self, perturbations: Sequence[Perturbation]) -> None:

@@ -14,6 +14,7 @@ from numba import njit, prange
 from ns_abstract.arithmetic.simd.intrinsics import borrowed, pointer, taken
 from ns_abstract.methods.splat.blend import shade, swap_bounds
 from ns_abstract.methods.splat.block import Place, block_of, longest_list, new_buffers, resized
+from ns_abstract.methods.splat.depths import ACCUMULATION_HIGH, ACCUMULATION_LOW, DEPTH_HIGH, DEPTH_LOW, shade_layers
 from ns_abstract.methods.splat.fragments import GIVE_UP, GROW, apply_stops, collect_fragments, number_groups
 from ns_abstract.methods.splat.lists import BLOCK, PIXELS, block_lists, longest_first
 from ns_abstract.methods.splat.stage_data import Colors, PixelBounds, PixelInputs, ProjectedGaussians, ViewingAxes
@@ -33,6 +34,10 @@ def _set_trivial(numbers, left, above, bounds, m):
             if linear.shape[0] > 0:
                 linear[0, row, column, channel, 0] = 0.5
                 linear[0, row, column, channel, m] = 0.5
+        if bounds.layers.shape[0] > 0:
+            of_pixel = bounds.layers[0, row, column]
+            of_pixel[ACCUMULATION_LOW], of_pixel[ACCUMULATION_HIGH] = 0.0, 1.0
+            of_pixel[DEPTH_LOW], of_pixel[DEPTH_HIGH] = 0.0, np.inf
 
 
 @njit(cache=True, error_model="numpy")
@@ -64,6 +69,8 @@ def _bound_block(numbers, place, inputs, block, bounds):
     bounds.statistics[1] += longest_list(block.fragments.lengths)
     bounds.statistics[2] += pairs
     shade(left, above, slots > 0, block, inputs, bounds)
+    if bounds.layers.shape[0] > 0:
+        shade_layers(left, above, block, inputs, bounds)
     return True
 
 
@@ -75,17 +82,20 @@ def _borrowed_inputs(gaussians, axes, intrinsics, colors, rules, charges, cutoff
         borrowed(gaussians.delta), borrowed(gaussians.depth_error),
     )  # fmt: skip
     axes = ViewingAxes(borrowed(axes.depth), borrowed(axes.middle), axes.tied)
-    colors = Colors(borrowed(colors.values), borrowed(colors.background), colors.error)
+    colors = Colors(
+        borrowed(colors.values), borrowed(colors.background), colors.error, colors.channels, borrowed(colors.common)
+    )
     return PixelInputs(gaussians, axes, intrinsics, colors, rules, charges, cutoffs, shape)
 
 
 @njit(cache=True, error_model="numpy")
 def _tile_bounds(bounds, number, thread):
     """The parts of ``bounds`` that tile ``number`` of those wanted and ``thread`` write."""
-    linear = borrowed(bounds.linear)
+    linear, layers = borrowed(bounds.linear), borrowed(bounds.layers)
     return PixelBounds(
         borrowed(bounds.lower)[number], borrowed(bounds.upper)[number], linear[min(number, linear.shape[0]) :],
-        borrowed(bounds.slopes)[number], borrowed(bounds.statistics)[thread], borrowed(bounds.marks),
+        layers[min(number, layers.shape[0]) :], borrowed(bounds.slopes)[number],
+        borrowed(bounds.statistics)[thread], borrowed(bounds.marks),
     )  # fmt: skip
 
 
@@ -97,7 +107,7 @@ def _pixel_worker(thread, sequence_, counter_, lists, inputs, bounds):
     side = bounds.lower.shape[1]
     tiles_x = int(math.ceil(camera.width / side))
     blocks = side // BLOCK
-    forms = max(inputs.colors.values.shape[1] // 3 - 1, 1)
+    forms = max(inputs.colors.values.shape[1] // inputs.colors.channels - 1, 1)
     buffers = new_buffers(m, forms, inputs.cutoffs.pairs, inputs.colors.background)
     block = block_of(buffers, m, forms)
     block_offsets = np.empty(blocks * blocks + 1, np.int64)

@@ -27,6 +27,8 @@ from ns_abstract.arithmetic.rounding import REGION, UNIT64, UP, Charges
 LANES = 32
 #: The squared compensation from which on its logarithm is used.
 _LEAST_SQUARE = 1e-60
+#: Relative error of a covariance, as its entries' errors tell, beyond which that of its factors is looked at.
+_FACTORS_MATTER = 2.0**-10
 
 # columns of a record before its forms
 MEAN_X, MEAN_Y, OPACITY_LOW, OPACITY_HIGH, KAPPA, UNBOUNDED, EXPONENT_LIMIT, SPREAD = range(8)
@@ -58,15 +60,19 @@ def columns(count, m):
     Z0, X0, Y0,
     # float errors of the coordinates, what a range of means adds to them
     EX, EY, EZ, SX, SY, SZ,
-    # what `float_errors` leaves; of G = J R M by row: squared sizes, errors of the factors; errors in G G^T
-    ZLOW, ZHIGH, MXLO, MXHI, MYLO, MYHI, A, C, DET, EDET, RHIGH, RLOW, ETA, EW, TAME,
+    # what `float_errors` leaves: depth, means and their errors; clamped ratios' sizes, what their errors move in
+    # pixels by unit of depth, relative error of an entry of J
+    ZLOW, ZHIGH, MXLO, MXHI, MYLO, MYHI, EMX, EMY, RATIOX, RATIOY, JUMPX, JUMPY, RELJ,
+    # the covariance and its errors
+    A, B, C, DET, EA, EB, EC, EDET, RHIGH, RLOW, ETA, EW, TAME,
+    # of G = J R M by row: squared sizes, errors of the factors; errors in G G^T
     ROWX, ROWY, MOVEX, MOVEY, GRAMA, GRAMB, GRAMC,
     # what `compensations` leaves: bound of the compensation, bounds of the factor beside its form, whether there is no
     # form, logarithms of the upper bounds
     CTOP, CLOW, CHIGH, FORMLESS, CTOPLOG, CHIGHLOG,
     # what `regions` leaves beside columns of the record: state, box and tiles
-    GONE, KNOWN, BOX0, BOX1, BOX2, BOX3, T0, T1, T2, T3, T4, T5, T6, T7,
-) = range(0, 106 * LANES, LANES)  # fmt: skip
+    GONE, FINITE, FRONT, PLACED, KNOWN, REGIONLIMIT, BOX0, BOX1, BOX2, BOX3, T0, T1, T2, T3, T4, T5, T6, T7,
+) = range(0, 121 * LANES, LANES)  # fmt: skip
 # a record, column by column
 RECORD = T7 + LANES
 R_MEAN_X, R_MEAN_Y, R_OPACITY_LOW, R_OPACITY_HIGH, R_KAPPA, R_UNBOUNDED, R_EXPONENT_LIMIT, R_SPREAD = (
@@ -162,27 +168,57 @@ def _dot(a, b):
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
+@njit(cache=True, error_model="numpy", inline="always")
+def view_limits(rules, camera):
+    """Largest absolute ratios x/z and y/z that the Jacobian is evaluated at; infinite without a margin."""
+    fx, fy, cx, cy, width, height = camera
+    margin = rules.view_margin
+    if margin < 0.0:
+        return np.inf, np.inf
+    limit_x = max(cx, width - cx) / fx + margin * 0.5 * width / fx
+    limit_y = max(cy, height - cy) / fy + margin * 0.5 * height / fy
+    return limit_x, limit_y
+
+
+@njit(cache=True, error_model="numpy", inline="always")
+def _axis_sizes(s, k, q):
+    """Absolute entries of principal axis ``k``."""
+    at = B00 + 3 * k * LANES + q
+    return abs(s[at]), abs(s[at + LANES]), abs(s[at + 2 * LANES])
+
+
 @njit(cache=True, error_model="numpy")
 def float_errors(s, n, rules, camera, charges, rotation_magnitude):
-    """Float errors of mean, covariance and exponent, and the radius' range (design.md, G5-G8): rows ZLOW .. TAME.
+    """Float errors of mean, covariance and exponent, and the radius' range (design.md, G5-G8): rows ZLOW .. GRAMC.
 
-    Numbers of Gaussians that may come too near are of no use; `regions` does not look at them. One loop, because the
-    compiler makes vector code of it as it stands: lanes are Gaussians.
+    Numbers of Gaussians that may come too near are of no use; `regions` does not look at them. The compiler makes
+    vector code of the loops as they stand: lanes are Gaussians.
     """
-    fx, fy, cx, cy, width, height = camera
-    r0, r1 = _rotation_row(rotation_magnitude, 0), _rotation_row(rotation_magnitude, 1)
-    r2 = _rotation_row(rotation_magnitude, 2)
-    limit_x, limit_y, clamp_x, clamp_y = np.inf, np.inf, 0.0, 0.0
+    _mean_errors(s, n, rules, camera, charges)
+    _covariance_errors(s, n, camera, charges, rotation_magnitude)
+    _radius_ranges(s, n, rules, charges)
+    if rules.antialiased or _any_sharp(s, n):
+        _factor_errors(s, n, rules, camera, charges, rotation_magnitude)
+    for q in range(n):
+        a, c, det = s[A + q], s[C + q], s[DET + q]
+        s[ETA + q] = (s[ETA + q] + charges.conic * (a * c) / det) * 1.01
+        # float error of the mean, in units of y
+        s[EW + q] = (np.sqrt(c / det) * s[EMX + q] + np.sqrt(a / det) * s[EMY + q]) * 1.01
+
+
+@njit(cache=True, error_model="numpy")
+def _mean_errors(s, n, rules, camera, charges):
+    """Depth and mean with their errors, and errors of the Jacobian (design.md, G5, G6): rows ZLOW .. RELJ."""
+    fx, fy, cx, cy, _, _ = camera
+    limit_x, limit_y = view_limits(rules, camera)
+    clamp_x, clamp_y = 0.0, 0.0
     if rules.view_margin >= 0.0:
-        limit_x = max(cx, width - cx) / fx + rules.view_margin * 0.5 * width / fx
-        limit_y = max(cy, height - cy) / fy + rules.view_margin * 0.5 * height / fy
         clamp_x, clamp_y = charges.clamp * limit_x, charges.clamp * limit_y
     for q in range(n):
         error_z = s[EZ + q]
         z_low = s[ZLO + q] - error_z
-        z_high = s[ZHI + q] + error_z
         s[ZLOW + q] = z_low
-        s[ZHIGH + q] = z_high
+        s[ZHIGH + q] = s[ZHI + q] + error_z
         ratio_x = max(abs(s[ULO + q]), abs(s[UHI + q]))
         ratio_y = max(abs(s[VLO + q]), abs(s[VHI + q]))
         # G5: reciprocal of depth, means
@@ -192,20 +228,30 @@ def float_errors(s, n, rules, camera, charges, rotation_magnitude):
         error_v = s[EY + q] / z_low + ratio_y * (relative_rz + charges.ratio)
         error_mean_x = fx * error_u + charges.mean * (fx * ratio_x + abs(cx))
         error_mean_y = fy * error_v + charges.mean * (fy * ratio_y + abs(cy))
+        s[EMX + q], s[EMY + q] = error_mean_x, error_mean_y
         s[MXLO + q] = fx * s[ULO + q] + cx - error_mean_x * REGION
         s[MXHI + q] = fx * s[UHI + q] + cx + error_mean_x * REGION
         s[MYLO + q] = fy * s[VLO + q] + cy - error_mean_y * REGION
         s[MYHI + q] = fy * s[VHI + q] + cy + error_mean_y * REGION
         # clamped ratios
-        ratio_x = min(ratio_x, limit_x)
-        ratio_y = min(ratio_y, limit_y)
-        error_u = min(error_u, 2.0 * limit_x) + clamp_x
-        error_v = min(error_v, 2.0 * limit_y) + clamp_y
-        # G6: covariance. F bounds the error of the world covariance and all later roundings
-        relative_j = relative_z + 2.0 * relative_rz + charges.jacobian
-        jx = fx / z_low
-        jy = fy / z_low
-        g_x, g_y = _scaled_row(jx, ratio_x, r0, r2), _scaled_row(jy, ratio_y, r1, r2)
+        s[RATIOX + q] = min(ratio_x, limit_x)
+        s[RATIOY + q] = min(ratio_y, limit_y)
+        s[JUMPX + q] = fx / z_low * (min(error_u, 2.0 * limit_x) + clamp_x)
+        s[JUMPY + q] = fy / z_low * (min(error_v, 2.0 * limit_y) + clamp_y)
+        s[RELJ + q] = relative_z + 2.0 * relative_rz + charges.jacobian
+
+
+@njit(cache=True, error_model="numpy")
+def _covariance_errors(s, n, camera, charges, rotation_magnitude):
+    """The covariance and its errors, from the rows of `_mean_errors` (design.md, G6): rows A .. EC, TAME."""
+    r0, r1 = _rotation_row(rotation_magnitude, 0), _rotation_row(rotation_magnitude, 1)
+    r2 = _rotation_row(rotation_magnitude, 2)
+    for q in range(n):
+        z_low, z_high = s[ZLOW + q], s[ZHIGH + q]
+        jump_x, jump_y, relative_j = s[JUMPX + q], s[JUMPY + q], s[RELJ + q]
+        g_x = _scaled_row(camera.fx / z_low, s[RATIOX + q], r0, r2)
+        g_y = _scaled_row(camera.fy / z_low, s[RATIOY + q], r1, r2)
+        # F bounds the error of the world covariance and all later roundings
         grow = relative_j * (2.0 + relative_j)
         f00 = s[N0 + q] + grow * s[N6 + q]
         f11 = s[N1 + q] + grow * s[N7 + q]
@@ -224,20 +270,84 @@ def float_errors(s, n, rules, camera, charges, rotation_magnitude):
         a = s[AHI + q] / z2_low
         c = s[CHI + q] / z2_low
         b = max(abs(s[BLO + q]), abs(s[BHI + q])) / z2_low
-        det = s[DLO + q] / (z2_high * z2_high)
-        jump_x = jx * error_u
-        jump_y = jy * error_v
-        # G7: errors of the factors of G = J R M, row by row, and of the products in G G^T
-        relative = 1.01 * (relative_j + charges.rotation)
+        deep, root_a, root_c = np.sqrt(variance), np.sqrt(a), np.sqrt(c)
+        # of what an entry is made of, of the ratios in J, of its last sum
+        error_a = _dot(g_x, h_x) + 2.0 * jump_x * deep * root_a + jump_x * jump_x * variance + charges.blur * a
+        error_c = _dot(g_y, h_y) + 2.0 * jump_y * deep * root_c + jump_y * jump_y * variance + charges.blur * c
+        error_b = _dot(g_x, h_y) + deep * (jump_x * root_c + jump_y * root_a) + jump_x * jump_y * variance
+        error_a, error_c, error_b = error_a * 1.01, error_c * 1.01, (error_b + charges.blur * b) * 1.01
+        s[A + q], s[B + q], s[C + q] = a, b, c
+        s[DET + q] = s[DLO + q] / (z2_high * z2_high)
+        s[EA + q], s[EB + q], s[EC + q] = error_a, error_b, error_c
+        # what is not finite, or not a number, in any of them is not so in the sum
+        s[TAME + q] = a + c + error_a + error_b + error_c
+
+
+@njit(cache=True, error_model="numpy")
+def _radius_ranges(s, n, rules, charges):
+    """The determinant's error, the radius' range (design.md, G8) and G7's first bound: EDET, RHIGH, RLOW, ETA."""
+    for q in range(n):
+        z_low, z_high = s[ZLOW + q], s[ZHIGH + q]
+        z2_low = z_low * z_low
+        z2_high = z_high * z_high
+        a, b, c, det = s[A + q], s[B + q], s[C + q], s[DET + q]
+        error_a, error_b, error_c = s[EA + q], s[EB + q], s[EC + q]
+        # lambda_max = (a + c)/2 + sqrt(max(floor, ((a - c)/2)^2 + b^2))
+        difference = max(abs(s[LO + q]), abs(s[HI + q])) / z2_low
+        nearest = max(0.0, s[LO + q], -s[HI + q]) / z2_high
+        b_nearest = max(0.0, s[BLO + q], -s[BHI + q]) / z2_high
+        half_high = 0.5 * (a + c)
+        half_low = 0.5 * (max(s[ALO + q], 0.0) + max(s[CLO + q], 0.0)) / z2_high
+        error_half = 0.5 * (error_a + error_c) + charges.half_trace * half_high
+        error_det = (
+            c * error_a + a * error_c + 2.0 * b * error_b + error_a * error_c + error_b * error_b
+            + charges.determinant * (a * c + b * b)
+        ) * 1.01  # fmt: skip
+        error_disc = 2.0 * half_high * error_half + error_half * error_half + error_det
+        error_disc += charges.discriminant * half_high * half_high
+        disc_high = max(rules.discriminant_min, difference * difference + b * b + error_disc)
+        disc_low = max(rules.discriminant_min, nearest * nearest + b_nearest * b_nearest - error_disc)
+        top_high = (half_high + error_half + np.sqrt(disc_high)) * (1.0 + charges.radius)
+        top_low = max(0.0, half_low - error_half + np.sqrt(disc_low)) * (1.0 - charges.radius)
+        # np.ceil: math.ceil is an int64, which a huge Gaussian overflows
+        s[RHIGH + q] = np.ceil(rules.radius_sigmas * np.sqrt(top_high) * (1.0 + charges.radius) * REGION)
+        s[RLOW + q] = np.ceil(rules.radius_sigmas * np.sqrt(top_low) * (1.0 - charges.radius) / REGION)
+        s[EDET + q] = error_det
+        s[ETA + q] = (c * error_a + 2.0 * (np.sqrt(a) * np.sqrt(c)) * error_b + a * error_c) / det
+
+
+@njit(cache=True, error_model="numpy")
+def _any_sharp(s, n):
+    """Whether any of the row ETA is above `_FACTORS_MATTER`."""
+    found = False
+    for q in range(n):
+        found = found | (s[ETA + q] > _FACTORS_MATTER)
+    return found
+
+
+@njit(cache=True, error_model="numpy")
+def _factor_errors(s, n, rules, camera, charges, rotation_magnitude):
+    """G7's second bound, from the errors of the factors of G = J R M (design.md, G7, G11): ETA, EDET, ROWX .. GRAMC.
+
+    The errors are those of the factors, row by row, and of the products in G G^T. Not antialiased, only what is above
+    `_FACTORS_MATTER` is replaced, so that a Gaussian's bounds do not depend on those beside it.
+    """
+    r0, r1 = _rotation_row(rotation_magnitude, 0), _rotation_row(rotation_magnitude, 1)
+    r2 = _rotation_row(rotation_magnitude, 2)
+    enough = -1.0 if rules.antialiased else _FACTORS_MATTER
+    for q in range(n):
+        z_low, jump_x, jump_y = s[ZLOW + q], s[JUMPX + q], s[JUMPY + q]
+        a, b, c, det = s[A + q], s[B + q], s[C + q], s[DET + q]
+        g_x = _scaled_row(camera.fx / z_low, s[RATIOX + q], r0, r2)
+        g_y = _scaled_row(camera.fy / z_low, s[RATIOY + q], r1, r2)
+        relative = 1.01 * (s[RELJ + q] + charges.rotation)
         more = 1.0 + relative
         sum_x = (g_x[0] + g_x[1] + g_x[2] + jump_x * (r2[0] + r2[1] + r2[2])) * more
         sum_y = (g_y[0] + g_y[1] + g_y[2] + jump_y * (r2[0] + r2[1] + r2[2])) * more
         move_x, move_y, gram_a, gram_b, gram_c, row_x, row_y = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
         for k in range(3):
-            at = B00 + 3 * k * LANES + q
-            b0, b1, b2 = abs(s[at]), abs(s[at + LANES]), abs(s[at + 2 * LANES])
-            axis = b0, b1, b2
-            entry = charges.rotation_entry * np.sqrt(b0 * b0 + b1 * b1 + b2 * b2)
+            axis = _axis_sizes(s, k, q)
+            entry = charges.rotation_entry * np.sqrt(_dot(axis, axis))
             size_x, size_y = _dot(g_x, axis), _dot(g_y, axis)
             near = s[DEEP0 + k * LANES + q] * more
             whole = _dot(r2, axis) * more
@@ -254,50 +364,16 @@ def float_errors(s, n, rules, camera, charges, rotation_magnitude):
         gram_c = charges.gram * gram_c + charges.flush * (sum_y * sum_y + 1.0)
         s[ROWX + q], s[ROWY + q], s[MOVEX + q], s[MOVEY + q] = row_x, row_y, move_x, move_y
         s[GRAMA + q], s[GRAMB + q], s[GRAMC + q] = gram_a, gram_b, gram_c
-        deep = np.sqrt(variance)
-        root_a = np.sqrt(a)
-        root_c = np.sqrt(c)
-        # of what an entry is made of, of the ratios in J, of its last sum
-        error_a = _dot(g_x, h_x) + 2.0 * jump_x * deep * root_a + jump_x * jump_x * variance + charges.blur * a
-        error_c = _dot(g_y, h_y) + 2.0 * jump_y * deep * root_c + jump_y * jump_y * variance + charges.blur * c
-        error_b = _dot(g_x, h_y) + deep * (jump_x * root_c + jump_y * root_a) + jump_x * jump_y * variance
-        error_a, error_c, error_b = error_a * 1.01, error_c * 1.01, (error_b + charges.blur * b) * 1.01
-        # G8: lambda_max = (a + c)/2 + sqrt(max(floor, ((a - c)/2)^2 + b^2))
-        difference = max(abs(s[LO + q]), abs(s[HI + q])) / z2_low
-        nearest = max(0.0, s[LO + q], -s[HI + q]) / z2_high
-        b_nearest = max(0.0, s[BLO + q], -s[BHI + q]) / z2_high
-        half_high = 0.5 * (a + c)
-        half_low = 0.5 * (max(s[ALO + q], 0.0) + max(s[CLO + q], 0.0)) / z2_high
-        error_half = 0.5 * (error_a + error_c) + charges.half_trace * half_high
-        products = charges.determinant * (a * c + b * b)
-        error_det = (
-            c * error_a + a * error_c + 2.0 * b * error_b + error_a * error_c + error_b * error_b + products
-        ) * 1.01
-        error_disc = 2.0 * half_high * error_half + error_half * error_half + error_det
-        error_disc += charges.discriminant * half_high * half_high
-        disc_high = max(rules.discriminant_min, difference * difference + b * b + error_disc)
-        disc_low = max(rules.discriminant_min, nearest * nearest + b_nearest * b_nearest - error_disc)
-        top_high = (half_high + error_half + np.sqrt(disc_high)) * (1.0 + charges.radius)
-        top_low = max(0.0, half_low - error_half + np.sqrt(disc_low)) * (1.0 - charges.radius)
-        # np.ceil: math.ceil is an int64, which a huge Gaussian overflows
-        s[RHIGH + q] = np.ceil(rules.radius_sigmas * np.sqrt(top_high) * (1.0 + charges.radius) * REGION)
-        s[RLOW + q] = np.ceil(rules.radius_sigmas * np.sqrt(top_low) * (1.0 - charges.radius) / REGION)
-        # what is not finite, or not a number, in any of them is not so in the sum
-        s[TAME + q] = a + c + error_a + error_b + error_c
-        s[A + q] = a
-        s[C + q] = c
-        s[DET + q] = det
-        # G7: relative errors of the covariance, of its determinant and of the exponent
+        # relative errors of the covariance and of its determinant
         moved = np.sqrt(c / det) * move_x + np.sqrt(a / det) * move_y
-        gram = c * (gram_a + charges.blur * a) + 2.0 * (root_a * root_c) * gram_b + a * (gram_c + charges.blur * c)
-        eta = min(
-            (c * error_a + 2.0 * (root_a * root_c) * error_b + a * error_c) / det,
-            (moved * (2.0 + moved) + gram / det) * 1.01,
-        )
-        s[EDET + q] = min(error_det, (eta * (2.0 + eta) * det + products) * 1.01)
-        s[ETA + q] = (eta + charges.conic * (a * c) / det) * 1.01
-        # float error of the mean, in units of y
-        s[EW + q] = (np.sqrt(c / det) * error_mean_x + np.sqrt(a / det) * error_mean_y) * 1.01
+        gram = c * (gram_a + charges.blur * a) + 2.0 * (np.sqrt(a) * np.sqrt(c)) * gram_b
+        gram = gram + a * (gram_c + charges.blur * c)
+        eta = min(s[ETA + q], (moved * (2.0 + moved) + gram / det) * 1.01)
+        products = charges.determinant * (a * c + b * b)
+        error_det = min(s[EDET + q], (eta * (2.0 + eta) * det + products) * 1.01)
+        replaced = s[ETA + q] > enough
+        s[EDET + q] = error_det if replaced else s[EDET + q]
+        s[ETA + q] = eta if replaced else s[ETA + q]
 
 
 @njit(cache=True, error_model="numpy")
@@ -383,12 +459,10 @@ def largest_extent(s, q):
 @njit(cache=True, error_model="numpy", inline="always")
 def projected_stretch(rules, camera):
     """Upper bound of the norm of z J, up to rounding; 0 where no float32 program is modelled (the paper's rules)."""
-    fx, fy, cx, cy, width, height = camera
-    margin = rules.view_margin
-    if margin < 0.0:
+    if rules.view_margin < 0.0:
         return 0.0
-    limit_x = max(cx, width - cx) / fx + margin * 0.5 * width / fx
-    limit_y = max(cy, height - cy) / fy + margin * 0.5 * height / fy
+    fx, fy, _, _, _, _ = camera
+    limit_x, limit_y = view_limits(rules, camera)
     return np.sqrt(fx * fx * (1.0 + limit_x * limit_x) + fy * fy * (1.0 + limit_y * limit_y)) * REGION
 
 
@@ -399,17 +473,30 @@ def regions(s, n, rules, camera, charges):
     GONE is 1 where no pose shows it, KNOWN where its forms may be relied on. The others may cover every pixel. Of a
     record: the opacities, kappa and the exponent from which on alpha is below the threshold.
     """
-    near, far, alpha_min, antialiased = rules.near, rules.far, rules.alpha_min, rules.antialiased
+    _tile_ranges(s, n, rules, camera, charges)
+    _opacities(s, n, rules, charges)
+    _pixel_boxes(s, n, rules, camera)
+
+
+@njit(cache=True, error_model="numpy", inline="always")
+def _tile_side(rules):
+    """Side of a tile, pixels: the program's, or that of the work's division where it has none."""
+    return rules.tile_size if rules.tile_size > 0.0 else float(rules.work_tile)
+
+
+@njit(cache=True, error_model="numpy")
+def _tile_ranges(s, n, rules, camera, charges):
+    """Tiles of the program (design.md, G8, G9, G12): rows T0 .. T7, GONE, FINITE, FRONT, PLACED."""
+    near, far, room, ellipse = rules.near, rules.far, rules.tile_room, rules.ellipse_tiles
     width, height = camera.width, camera.height
-    room, ellipse = rules.tile_room, rules.ellipse_tiles
     cut = rules.tile_size > 0.0
-    side = rules.tile_size if cut else float(rules.work_tile)
+    side = _tile_side(rules)
     across, down = np.ceil(width / side), np.ceil(height / side)
     # below it no product of entries of a covariance overflows (G9)
     safe = near * np.sqrt(np.sqrt(charges.overflow)) * 0.5
     stretch = projected_stretch(rules, camera)
     for q in range(n):
-        a, c, det, error_det = s[A + q], s[C + q], s[DET + q], s[EDET + q]
+        a, c = s[A + q], s[C + q]
         mean_x_low, mean_x_high, mean_y_low, mean_y_high = s[MXLO + q], s[MXHI + q], s[MYLO + q], s[MYHI + q]
         z_high = s[ZHIGH + q]
         # in front of the camera; products of covariances that may overflow leave nothing known
@@ -447,21 +534,34 @@ def regions(s, n, rules, camera, charges):
             whole = whole & (s[ETA + q] * (1.0 + 4.0 * s[ETA + q]) < 0.05) & (8.0 * charges.tile * span < 1.0)
             if ellipse:
                 thinnest = max(min(s[ALO + q], s[CLO + q]), 0.0) / (z_high * z_high)
-                whole = whole & ellipse_is_met(det / (a * c), max(a, c), thinnest, s[ETA + q], span, charges)
+                sharpness = s[DET + q] / (a * c)
+                whole = whole & ellipse_is_met(sharpness, max(a, c), thinnest, s[ETA + q], span, charges)
         s[T4 + q] = np.floor(_within(left / side, across)) if sure else 0.0
         last = np.ceil(_within(right / side, across)) if sure else (across if whole else 0.0)
         s[T5 + q] = s[T4 + q] if z_high > far else last
         s[T6 + q] = np.floor(_within(top / side, down)) if sure else 0.0
         s[T7 + q] = np.ceil(_within(bottom / side, down)) if sure else (down if whole else 0.0)
+        s[GONE + q], s[FINITE + q] = 1.0 if gone else 0.0, 1.0 if finite else 0.0
+        s[FRONT + q], s[PLACED + q] = 1.0 if front else 0.0, 1.0 if placed else 0.0
+
+
+@njit(cache=True, error_model="numpy")
+def _opacities(s, n, rules, charges):
+    """Opacities, kappa and exponents (design.md, G7, G9, G11): KNOWN, GONE, columns of the record, REGIONLIMIT."""
+    alpha_min, antialiased = rules.alpha_min, rules.antialiased
+    for q in range(n):
+        det = s[DET + q]
+        finite = s[FINITE + q] != 0.0
         # G7: relative error of the exponent
-        sharp_enough = front & (det > 0.0) & (error_det < 0.5 * det)
+        sharp_enough = (s[FRONT + q] != 0.0) & (det > 0.0) & (s[EDET + q] < 0.5 * det)
         kappa = s[ETA + q]
-        known = placed & sharp_enough & (kappa < 0.25)
+        known = (s[PLACED + q] != 0.0) & sharp_enough & (kappa < 0.25)
         kappa = kappa * (1.0 + 4.0 * kappa)
         lower = s[OPLOW + q] * (1.0 - charges.opacity)
         upper = s[OPHIGH + q] * (1.0 + charges.opacity)
         limit = s[OPLIMIT + q]
         region_limit = limit
+        gone = s[GONE + q] != 0.0
         if antialiased:
             # G11; where the determinant may vanish, nothing is known of the compensation
             known = known & (s[CTOP + q] < np.inf)
@@ -473,20 +573,29 @@ def regions(s, n, rules, camera, charges):
             upper = upper * s[CHIGH + q] if known else all_of_it
         # a minimum with a number is a number: an exponent that is none leaves the largest alpha
         upper = upper if finite else max(1.0, upper)
-        gone = gone & finite
+        gone = (gone & finite) | (known & (region_limit < 0.0))
         s[R_OPACITY_LOW + q] = lower
         s[R_OPACITY_HIGH + q] = upper
         s[R_KAPPA + q] = kappa if known else 0.0
-        # pixels where alpha may reach the threshold
-        gone = gone | (known & (region_limit < 0.0))
         s[R_EXPONENT_LIMIT + q] = limit / (1.0 - kappa) if known else -1.0
-        region_limit = region_limit / (1.0 - kappa)
-        extent_x = np.sqrt(2.0 * region_limit * a) * REGION
-        extent_y = np.sqrt(2.0 * region_limit * c) * REGION
-        left, right = mean_x_low - extent_x, mean_x_high + extent_x
-        top, bottom = mean_y_low - extent_y, mean_y_high + extent_y
+        s[REGIONLIMIT + q] = region_limit / (1.0 - kappa)
+        s[GONE + q], s[KNOWN + q] = 1.0 if gone else 0.0, 1.0 if known else 0.0
+
+
+@njit(cache=True, error_model="numpy")
+def _pixel_boxes(s, n, rules, camera):
+    """Pixels where alpha may reach the threshold (design.md, G9): rows BOX0 .. BOX3, GONE, and fewer tiles."""
+    width, height = camera.width, camera.height
+    side = _tile_side(rules)
+    for q in range(n):
+        known = s[KNOWN + q] != 0.0
+        extent_x = np.sqrt(2.0 * s[REGIONLIMIT + q] * s[A + q]) * REGION
+        extent_y = np.sqrt(2.0 * s[REGIONLIMIT + q] * s[C + q]) * REGION
+        left, right = s[MXLO + q] - extent_x, s[MXHI + q] + extent_x
+        top, bottom = s[MYLO + q] - extent_y, s[MYHI + q] + extent_y
         # no pixel centre inside
-        gone = gone | (known & ((right < 0.5) | (left > width - 0.5) | (bottom < 0.5) | (top > height - 0.5)))
+        outside = known & ((right < 0.5) | (left > width - 0.5) | (bottom < 0.5) | (top > height - 0.5))
+        s[GONE + q] = 1.0 if outside else s[GONE + q]
         s[BOX0 + q] = left if known else -np.inf
         s[BOX1 + q] = right if known else np.inf
         s[BOX2 + q] = top if known else -np.inf
@@ -496,5 +605,3 @@ def regions(s, n, rules, camera, charges):
         s[T1 + q] = min(s[T1 + q], np.floor(min(right - 0.5, width) / side) + 1.0) if known else s[T1 + q]
         s[T2 + q] = max(s[T2 + q], np.floor(max(top - 0.5, 0.0) / side)) if known else s[T2 + q]
         s[T3 + q] = min(s[T3 + q], np.floor(min(bottom - 0.5, height) / side) + 1.0) if known else s[T3 + q]
-        s[GONE + q] = 1.0 if gone else 0.0
-        s[KNOWN + q] = 1.0 if known else 0.0

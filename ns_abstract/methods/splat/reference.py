@@ -12,6 +12,7 @@ rasterize_to_pixels_fwd.cu).
 from __future__ import annotations
 
 import copy
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
@@ -267,11 +268,26 @@ class Reference:
         return order[(first <= tile) & (tile < past) & (mean + extent >= low) & (mean - extent <= high)]
 
     def _blend(self, p: Projection, layers: Tensor, centers: Tensor) -> Tensor:
-        """Composite rows ``layers`` of ``p`` at pixel ``centers`` [k, 2] (rasterize_to_pixels_fwd.cu:60-184)."""
+        """Composite rows ``layers`` of ``p`` at pixel ``centers`` [k, 2] over the background; [k, 3]."""
+        color, light = self._sums(p, layers, centers, p.colors)
+        return (color + light[:, None] * self._background).clamp(0.0, 1.0)
+
+    def _blend_layers(self, p: Projection, layers: Tensor, centers: Tensor) -> Tensor:
+        """Accumulation and expected depth [k, 2], NaN where nothing is drawn (rendering.py of gsplat, RGB+ED)."""
+        depth, light = self._sums(p, layers, centers, p.depths[:, None])
+        accumulation = 1.0 - light[:, None]
+        mean = depth / accumulation.clamp(min=1e-10)
+        return torch.cat([accumulation, torch.where(accumulation > 0.0, mean, torch.nan)], dim=1)
+
+    def _sums(self, p: Projection, layers: Tensor, centers: Tensor, colors: Tensor) -> tuple[Tensor, Tensor]:
+        """Weighted sums [k, c] of ``colors`` [n, c] at ``centers`` [k, 2], and the light [k] that is left.
+
+        See rasterize_to_pixels_fwd.cu:60-184.
+        """
         r = self.rules
         light = torch.ones(len(centers), dtype=self.dtype)
         live = torch.ones(len(centers), dtype=torch.bool)
-        color = torch.zeros(len(centers), 3, dtype=self.dtype)
+        color = torch.zeros(len(centers), colors.shape[1], dtype=self.dtype)
         for start in range(0, len(layers), _LAYERS):
             chunk = layers[start : start + _LAYERS]
             dx = p.means2d[chunk, 0:1] - centers[:, 0]
@@ -287,12 +303,12 @@ class Reference:
                 # falls monotonically, so this is a run of layers from the first
                 drawn = drawn & (rest[1:] > r.transmittance_min)
             weight = torch.where(drawn, alpha * rest[:-1], 0.0)
-            color = color + weight.T @ p.colors[chunk]
+            color = color + weight.T @ colors[chunk]
             light = rest.gather(0, drawn.sum(dim=0, keepdim=True)).squeeze(0)
             live = live & drawn[-1]
             if not live.any():
                 break
-        return (color + light[:, None] * self._background).clamp(0.0, 1.0)
+        return color, light
 
     def image(self, camera: Camera, camera_to_world: Tensor) -> Tensor:
         """The picture [H, W, 3] in [0, 1].
@@ -301,6 +317,15 @@ class Reference:
             camera: Intrinsics and size; its own pose is not used.
             camera_to_world: [3, 4], OpenGL axes.
         """
+        return self._picture(camera, camera_to_world, self._blend)
+
+    def layers(self, camera: Camera, camera_to_world: Tensor) -> Tensor:
+        """Accumulation and expected depth [H, W, 2], NaN where nothing is drawn; arguments as for `image`."""
+        return self._picture(camera, camera_to_world, self._blend_layers)
+
+    def _picture(
+        self, camera: Camera, camera_to_world: Tensor, blend: Callable[[Projection, Tensor, Tensor], Tensor]
+    ) -> Tensor:
         p = self.project(camera, camera_to_world)
         order = torch.argsort(p.depths.detach(), stable=True)
         rows = []
@@ -312,7 +337,7 @@ class Reference:
                 x = torch.arange(left, min(left + _REGION, camera.width), dtype=self.dtype) + 0.5
                 layers = self._layers(p, strip, 0, float(x[0]), float(x[-1]))
                 centers = torch.stack([x.repeat(len(y)), y.repeat_interleave(len(x))], dim=1)
-                row.append(self._blend(p, layers, centers).reshape(len(y), len(x), 3))
+                row.append(blend(p, layers, centers).reshape(len(y), len(x), -1))
             rows.append(torch.cat(row, dim=1))
         return torch.cat(rows)
 

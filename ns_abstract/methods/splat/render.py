@@ -437,11 +437,29 @@ class Renderer:
             Image [H, W, 3] and accumulation [H, W, 1] in [0, 1]; expected depth [H, W, 1], the largest
             one of the image where nothing is hit.
         """
+        found = assemble(self.layer_tiles(camera, rotation, position), camera)
+        image, accumulation, depth = found[..., :3], found[..., 3:4], found[..., 4:]
+        drawn = accumulation > 0.0
+        return image, accumulation, np.where(drawn, depth, depth[drawn].max(initial=0.0))
+
+    def layer_tiles(
+        self,
+        camera: Camera,
+        rotation: np.ndarray,
+        position: np.ndarray,
+        wanted: np.ndarray | None = None,
+        member: Splats | None = None,
+    ) -> np.ndarray:
+        """`tiles` with two more channels: [t, side, side, 5].
+
+        The fourth is the accumulation, the fifth the expected depth in world units, NaN where nothing is drawn.
+        """
         across, down = tile_grid(camera, self.side)
-        wanted = np.arange(across * down)
-        lists = self.lists(self.splats, camera, rotation, position, wanted)
+        wanted = np.arange(across * down) if wanted is None else np.asarray(wanted, np.int64)
+        splats = self.splats if member is None else member
+        lists = self.lists(splats, camera, rotation, position, wanted)
         found = self._projected
-        image = self._blend(camera, lists, found.record, self.splats.background)
+        image = self._blend(camera, lists, found.record, splats.background)
         # the same weights, with depths as colours; the blending clamps to [0, 1]
         seen = found.visible.astype(bool)
         farthest = max(float(found.depth[seen].max(initial=0.0)), 1e-300)
@@ -449,7 +467,7 @@ class Renderer:
         record[seen, _RED] = 1.0
         record[seen, _RED + 1] = found.depth[seen] / farthest
         record[seen, _RED + 2] = 0.0
-        sums = assemble(self._blend(camera, lists, record, np.zeros(3)), camera)
+        sums = self._blend(camera, lists, record, np.zeros(3))
         accumulation = sums[..., :1]
         depth = farthest * sums[..., 1:2] / np.maximum(accumulation, 1e-10)
-        return assemble(image, camera), accumulation, np.where(accumulation > 0.0, depth, depth.max())
+        return np.concatenate([image, accumulation, np.where(accumulation > 0.0, depth, np.nan)], axis=-1)

@@ -146,14 +146,19 @@ class Colors(NamedTuple):
     """What the Gaussians and the background look like.
 
     Attributes:
-        values: [n, 3] colours, or [n, 3 (k + 1)] forms by channel: k coefficients and a radius; k is 1 or m.
+        values: [n, channels] colours, or [n, channels (k + 1)] forms by channel: k coefficients and a radius; k is 1 or
+            m.
         background: [3].
         error: Bound of the colours' float error, added to every result.
+        channels: 3; or 4, the last of which is a form of the depth against ``common``, world units.
+        common: [m + 1] form that all depths are counted from.
     """
 
     values: np.ndarray
     background: np.ndarray
     error: float
+    channels: int
+    common: np.ndarray
 
 
 class Cutoffs(NamedTuple):
@@ -181,6 +186,8 @@ class PixelBounds(NamedTuple):
         slopes: [t, d] sums of absolute linear coefficients, added to.
         statistics: [threads, 5] blocks, fragments of the longest lists, uncertain pairs, blocks where too many pairs
             were uncertain, pixels with results that were not numbers.
+        layers: [t, side, side, 4] bounds of the accumulation, and of the expected depth where anything is drawn (see
+            `depths`; infinity before its negative: nothing can be), or empty.
         marks: [n] uint8; set to 1 for every Gaussian that some pixel of these tiles may draw or stop at. Those that
             stay 0 are hidden or too faint for every pose: leaving them out changes nothing.
     """
@@ -188,6 +195,7 @@ class PixelBounds(NamedTuple):
     lower: np.ndarray
     upper: np.ndarray
     linear: np.ndarray
+    layers: np.ndarray
     slopes: np.ndarray
     statistics: np.ndarray
     marks: np.ndarray

@@ -1,0 +1,231 @@
+"""Expected depth and accumulation of a block's pixels (design.md, D1-D4).
+
+The fragments are those that `blend` shades; their colours are depths, in the fourth lane of the palette, and 1 in the
+first lane for the accumulation.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+
+from ns_abstract.arithmetic.rounding import FRAGMENT_ROUNDING, UNIT64, UP
+from ns_abstract.arithmetic.simd.intrinsics import advanced
+from ns_abstract.arithmetic.simd.lanes import maximum, minimum, store
+from ns_abstract.methods.splat.blend import blend_affine, blend_quadratic, form_range
+from ns_abstract.methods.splat.block import (
+    ALPHA_HIGH,
+    FORM,
+    OPEN,
+    RHO,
+    color_ends,
+    color_size,
+    listed_fragment,
+)
+from ns_abstract.methods.splat.lists import BLOCK, PIXELS
+
+#: Lanes of accumulation and depth.
+_SUM, DEPTH = 0, 3
+#: Columns of `PixelBounds.layers`.
+ACCUMULATION_LOW, ACCUMULATION_HIGH, DEPTH_LOW, DEPTH_HIGH = range(4)
+
+
+class _Span(NamedTuple):
+    """Depths of a pixel's fragments against the reference, and without it.
+
+    Attributes:
+        nearest, farthest: Least and greatest difference.
+        largest: Greatest size of a depth, against what all have in common.
+    """
+
+    nearest: float
+    farthest: float
+    largest: float
+
+
+@njit(cache=True, error_model="numpy", forceinline=True)
+def _set_reference(begin, end, fragments, palette, reference, m):
+    """Write the mean of the depths' polynomials of a pixel, weighted as in the middle of the cell (design.md, D2)."""
+    values, colors, forms = fragments.values, palette.values, palette.forms
+    for k in range(m):
+        reference[k] = 0.0
+    light, total = 1.0, 0.0
+    for entry in range(begin, end):
+        at, key, _ = listed_fragment(fragments, entry, forms)
+        weight = light * min(max(values[at + FORM], 0.0), values[at + ALPHA_HIGH])
+        light -= weight
+        total += weight
+        for k in range(m):
+            reference[k] += weight * colors[key + 4 * k + DEPTH]
+    if total > 0.0:
+        for k in range(m):
+            reference[k] /= total
+
+
+@njit(cache=True, error_model="numpy", forceinline=True)
+def _shift_depths(begin, end, block, reference, m):
+    """Fill the palette ``block.shifted`` for a pixel's fragments: depths against the reference, and 1; its `_Span`.
+
+    What reordering changes in colours is taken out of their rows of moves.
+    """
+    fragments, palette, moves = block.fragments, block.palette, block.reordering.moves
+    forms, colors, shifted = palette.forms, palette.values, block.shifted.values
+    nearest, farthest, largest = np.inf, -np.inf, 0.0
+    for entry in range(begin, end):
+        _, key, move = listed_fragment(fragments, entry, forms)
+        for r in range(color_size(forms)):
+            shifted[key + r] = 0.0
+        radius, spread = colors[key + 4 * forms + DEPTH], 0.0
+        for k in range(m):
+            coefficient = colors[key + 4 * k + DEPTH]
+            change = coefficient - reference[k]
+            shifted[key + 4 * k + DEPTH] = change
+            # the difference's rounding
+            radius += FRAGMENT_ROUNDING * (abs(coefficient) + abs(reference[k]))
+            spread += abs(change) if k > 0 else 0.0
+        shifted[key + 4 * forms + DEPTH] = radius
+        spread = (spread + radius) * UP
+        ends = key + color_ends(forms)
+        low, high = shifted[key + DEPTH] - spread, shifted[key + DEPTH] + spread
+        shifted[ends + DEPTH], shifted[ends + 4 + DEPTH] = low, high
+        shifted[key + _SUM] = shifted[ends + _SUM] = shifted[ends + 4 + _SUM] = 1.0
+        nearest, farthest = min(nearest, low), max(farthest, high)
+        largest = max(largest, abs(colors[ends + DEPTH]), abs(colors[ends + 4 + DEPTH]))
+        if move != 0:
+            for lane in range(DEPTH):
+                moves[move + lane] = 0.0
+                moves[move + 4 + lane] = 0.0
+    return _Span(nearest, farthest, largest)
+
+
+@njit(cache=True, error_model="numpy", forceinline=True)
+def _range(polynomial, order, m):
+    """Range over the box of a polynomial of ``m`` coefficients, rounded outward (design.md, A4)."""
+    middle, size = polynomial[0], 0.0
+    for k in range(1, m):
+        size += abs(polynomial[k])
+    low, high = middle - size, middle + size
+    if order == 2:
+        slope, bend = abs(polynomial[1]), polynomial[2]
+        low, high = middle + min(bend - slope, 0.0), middle + max(bend + slope, 0.0)
+        if slope < 2.0 * abs(bend):
+            vertex = middle - 0.25 * slope * slope / bend
+            low, high = min(low, vertex), max(high, vertex)
+    room = 8.0 * FRAGMENT_ROUNDING * (abs(middle) + size)
+    return low - room, high + room
+
+
+@njit(cache=True, error_model="numpy", forceinline=True)
+def _weighted_mean(t, radius, low, high, total_low, total_high, order, m):
+    """Bounds of a sum over the accumulation, added to a polynomial (design.md, D3).
+
+    ``t`` [m] holds the polynomial and behind it [m] that of the sum, of ``radius`` beside its own; the sum lies between
+    ``low`` and ``high``, the accumulation, which is not 0, between ``total_low`` and ``total_high``. Overwrites ``t``.
+    """
+    base_low, base_high = _range(t, order, m)
+    first_low = base_low + low / (total_low if low < 0.0 else total_high)
+    first_high = base_high + high / (total_low if high > 0.0 else total_high)
+    # to first order the sum is divided by one number
+    factor = 2.0 / (total_low + total_high)
+    for k in range(m):
+        t[k] += factor * t[m + k]
+    other_low, other_high = _range(t, order, m)
+    off = max(abs(low), abs(high)) * max(abs(1.0 / total_low - factor), abs(factor - 1.0 / total_high))
+    room = 0.0
+    for k in range(m):
+        room += abs(t[k]) + 2.0 * factor * abs(t[m + k])
+    off = (off + factor * radius) * UP + FRAGMENT_ROUNDING * (room + factor * max(abs(low), abs(high)))
+    return max(first_low, other_low - off), min(first_high, other_high + off)
+
+
+@njit(cache=True, error_model="numpy")
+def shade_layers(left, above, block, inputs, bounds):
+    """Write `PixelBounds.layers` of every pixel of a block that `shade` has shaded (design.md, D1-D4).
+
+    Reads the depths in lane `DEPTH` of the palette, and changes rows of moves, which are of no use afterwards.
+    """
+    fragments, moves, t = block.fragments, block.reordering.moves, block.sums
+    per_pixel, charges, cutoffs = fragments.per_pixel, inputs.charges, inputs.cutoffs
+    order, m = inputs.shape.order, inputs.shape.monomials
+    common, unseen = inputs.colors.common, block.palette.unseen
+    # behind the polynomials: ends and radii by lane, the reference, two polynomials of the result
+    by_lane = advanced(t, 4 * m)
+    reference = advanced(t, 4 * m + 16)
+    result = advanced(t, 5 * m + 16)
+    # a fragment that is drawn has this alpha at least
+    least = inputs.rules.alpha_min * (1.0 - 2.0 * charges.threshold)
+    for q in range(PIXELS):
+        begin, n = q * fragments.capacity, int(fragments.lengths[q])
+        end = begin + n
+        _set_reference(begin, end, fragments, block.palette, reference, m)
+        span = _shift_depths(begin, end, block, reference, m)
+        if order == 2:
+            r, ends = blend_quadratic(begin, end, fragments, block.shifted, moves, t)
+        else:
+            r, ends = blend_affine(begin, end, fragments, block.shifted, moves, t, m)
+        r = r * (UP + 4.0 * UNIT64 * n)
+        bottom, top = form_range(t, r, order, m)
+        store(by_lane, 0, maximum(ends.low, bottom))
+        store(by_lane, 4, minimum(ends.high, top))
+        store(by_lane, 8, r)
+        rounding = 1.01 * (charges.blend_fragment * n + charges.blend_pixel)
+        # light that is lost to a stop that was ignored, and that comes to what is missing (B6)
+        lost = per_pixel[RHO + q] * (1.0 + charges.lost_light)
+        passed = per_pixel[OPEN + q] * (1.0 + charges.lost_light)
+        nearest, farthest, largest = span.nearest, span.farthest, span.largest
+        shift_low, shift_high = _range(reference, order, m)
+        if passed > 0.0:
+            nearest = min(nearest, unseen[DEPTH] - shift_high)
+            farthest = max(farthest, unseen[4 + DEPTH] - shift_low)
+            largest = max(largest, abs(unseen[DEPTH]), abs(unseen[4 + DEPTH]))
+            rounding += 1.01 * cutoffs.fade
+        # the sum: of weights times depths against the reference
+        fall = max(lost * max(farthest, 0.0), passed * max(-nearest, 0.0))
+        rise = max(lost * max(-nearest, 0.0), passed * max(farthest, 0.0))
+        sum_low, sum_high = by_lane[DEPTH] - fall, by_lane[4 + DEPTH] + rise
+        total_low = max(by_lane[_SUM] - lost - rounding, 0.0)
+        total_high = min(by_lane[4 + _SUM] + passed + rounding, 1.0)
+        layers = bounds.layers[0, above + q // BLOCK, left + q % BLOCK]
+        if not total_low <= total_high or not math.isfinite(farthest - nearest + sum_high - sum_low):
+            # nothing can be drawn, or nothing is known
+            nothing = n == 0 and passed == 0.0
+            layers[ACCUMULATION_LOW], layers[ACCUMULATION_HIGH] = 0.0, 0.0 if nothing else 1.0
+            layers[DEPTH_LOW], layers[DEPTH_HIGH] = (np.inf, -np.inf) if nothing else (0.0, np.inf)
+            continue
+        some = least - rounding
+        if not some > 0.0:
+            # so many that rounding may hide one
+            layers[ACCUMULATION_LOW], layers[ACCUMULATION_HIGH] = total_low, total_high
+            layers[DEPTH_LOW], layers[DEPTH_HIGH] = 0.0, np.inf
+            continue
+        if total_high < some:
+            layers[ACCUMULATION_LOW], layers[ACCUMULATION_HIGH] = 0.0, 0.0
+            layers[DEPTH_LOW], layers[DEPTH_HIGH] = np.inf, -np.inf
+            continue
+        if total_low > 0.0:
+            total_low = max(total_low, some)
+        layers[ACCUMULATION_LOW], layers[ACCUMULATION_HIGH] = total_low, total_high
+        # the depth where something is drawn
+        total_low = max(total_low, some)
+        all_of_it = 0.0
+        for k in range(m):
+            result[k] = reference[k] + common[k]
+            result[m + k] = t[4 * k + DEPTH]
+            all_of_it += abs(common[k])
+        all_of_it = (all_of_it + common[m]) * UP + largest
+        # of the sums of weights times depths, and of the accumulation
+        error = (rounding * total_high + rounding) * all_of_it
+        radius = by_lane[8 + DEPTH] + max(fall, rise) + error
+        shift_low, shift_high = _range(result, order, m)
+        low, high = _weighted_mean(result, radius, sum_low - error, sum_high + error, total_low, total_high, order, m)
+        # a mean lies among what it is made of
+        off = error / total_low * UP
+        low, high = max(low, shift_low + nearest - off), min(high, shift_high + farthest + off)
+        size = max(abs(low), abs(high))
+        off = common[m] + charges.expected_depth * size + 16.0 * FRAGMENT_ROUNDING * (all_of_it + size)
+        low, high = low - off, high + off
+        known = low <= high and math.isfinite(high - low)
+        layers[DEPTH_LOW], layers[DEPTH_HIGH] = max(low if known else 0.0, 0.0), high if known else np.inf
