@@ -196,6 +196,7 @@ class SplatFrame:
         return self.drawn(values, tiles, None)
 
     def drawn(self, values: np.ndarray, tiles: np.ndarray | None, member: Splats | None) -> np.ndarray:
+        """What `render` returns, of another scene of the set if one is given."""
         draw = self.renderer.tiles if self.channels == COLORS else self.renderer.layer_tiles
         return draw(self.camera, *self.pose_set.world_to_camera(values), tiles, member).astype(np.float32)
 
