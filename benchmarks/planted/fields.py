@@ -4,6 +4,8 @@ from planted.fault import Fault
 
 _ZONOTOPE, _BOUNDS = "methods/nerf/zonotope.py", "methods/nerf/bounds.py"
 _HSV, _OCCUPANCY, _RELU = "methods/nerf/hsv.py", "methods/nerf/occupancy.py", "methods/nerf/relu_kernel.py"
+_PLANES, _STRIPS = "methods/nerf/planes.py", "methods/nerf/strips.py"
+_PARTS = "test_nerf_certify.py::test_planes_lie_beyond_every_part_exactly"
 _FIELDS = "test_nerf_zonotope.py::test_fields_are_enclosed"
 _LAYERS = "test_nerf_zonotope.py::test_linear_layers_are_enclosed"
 _UNITS = "test_nerf_zonotope.py::test_every_unit_is_enclosed"
@@ -111,11 +113,11 @@ FIELDS = (
     Fault(
         "compositing: brighter colours take the lower opacity",
         _BOUNDS, "_Work._composited", "np.where(rise > 0.0, most, least)", "np.where(rise > 0.0, least, least)",
-        _SETS + "[plain]", True,
+        _STIFF + "[rough]", True,
     ),
     Fault(
         "compositing: darker colours take the lower opacity",
-        _BOUNDS, "_Work._composited", "np.where(fall < 0.0, most, least)", "least", _SETS + "[plain]", True,
+        _BOUNDS, "_Work._composited", "np.where(fall < 0.0, most, least)", "least", _STIFF + "[rough]", True,
     ),
     Fault(
         "colours: a batch that was given up keeps its numbers",
@@ -166,5 +168,21 @@ FIELDS = (
         "hue: rounding is not charged",
         _HSV, "shifted_bounds", "least + (value_low - least) * share_low - HUE_ROUNDING",
         "least + (value_low - least) * share_low + 0.0", _COLORS,
+    ),
+    Fault(
+        "planes: parts have no width",
+        _PLANES, "_offset", "rows - slope @ centre.T + np.abs(slope) @ half.T", "rows - slope @ centre.T",
+        _PARTS + "[counts0]",
+    ),
+    Fault(
+        "planes: of neighbours that are united one is forgotten",
+        _PLANES, "united", "np.minimum.reduceat(low, starts, axis=axis + 1)",
+        "np.maximum.reduceat(low, starts, axis=axis + 1)", _PARTS + "[counts3]",
+    ),
+    Fault(
+        "strips: parts lie elsewhere in their strip",
+        _STRIPS, "Strips._part_ends", "ends[:-1, None] + (ends[1:] - ends[:-1])[:, None] * inner",
+        "ends[:-1, None] + 0.5 * (ends[1:] - ends[:-1])[:, None] * inner",
+        "test_nerf_certify.py::test_planted_faults_are_found", True,
     ),
 )  # fmt: skip

@@ -19,7 +19,7 @@ import torch
 from ns_abstract.api.files import Settings, path_sets, resized
 from ns_abstract.api.job import Job
 from ns_abstract.api.scenes import platform_problems
-from ns_abstract.execution.ending import AbandonedError, abandoning
+from ns_abstract.execution.ending import abandoning
 from ns_abstract.execution.opening import Recipe, opened
 from ns_abstract.geometry.box import ParameterBox
 from ns_abstract.geometry.camera_path import load_camera_path
@@ -372,13 +372,12 @@ class Certification:
         # compiling says nothing about rays
         frame.warm_up()
         begin = time.perf_counter()
+        with abandoning(lambda: time.perf_counter() - begin > _FORESEEN * seconds):
+            by_ray, parts = frame.effort()
         more = ""
-        try:
-            with abandoning(lambda: time.perf_counter() - begin > _FORESEEN * seconds):
-                by_ray, parts = frame.effort()
-        except AbandonedError:
-            # one ray was not done; the rest is no shorter
-            by_ray, parts, more = _FORESEEN * seconds, 1, "more than "
+        if by_ray is None:
+            # not even one was done
+            by_ray, more = _FORESEEN * seconds, "more than "
         rays, workers = frame.camera.width * frame.camera.height, self.job.workers
         least = by_ray * rays / workers
         if more or least > seconds:

@@ -217,11 +217,10 @@ class RayFrame(Frame, Protocol):
         """
         ...
 
-    def effort(self) -> tuple[float, int]:
+    def effort(self) -> tuple[float | None, int]:
         """Seconds that one ray takes over one part of the set, about, and in how many parts the set is bounded.
 
-        Raises:
-            AbandonedError: There is no time to find out.
+        None: there was no time to find out.
         """
         ...
 

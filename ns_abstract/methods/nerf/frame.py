@@ -6,6 +6,7 @@ import itertools
 import secrets
 import time
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from typing import Any
@@ -302,20 +303,15 @@ class NerfFrame:
         sets = a_lower.reshape(*shape, d), b_lower.reshape(shape), a_upper.reshape(*shape, d), b_upper.reshape(shape)
         return RayBox(lower.reshape(shape), upper.reshape(shape), slopes, None, sets)
 
-    def effort(self) -> tuple[float, int]:
+    def effort(self) -> tuple[float | None, int]:
         """Seconds that one ray takes over one strip of the set, about, and how many strips there are.
 
-        Raises:
-            AbandonedError: There is no time to find out.
+        None: there was no time to find out (`ns_abstract.execution.ending`).
         """
         strips = self._strips
-        try:
+        with suppress(AbandonedError):
             strips.layout()
-        except AbandonedError:
-            if strips.effort is None:
-                raise
-        assert strips.effort is not None
-        return strips.effort
+        return strips.effort, strips.count
 
     def watch(self, tiles: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> None:
         """Take notice of the inner bounds [t, 1, 1, 3] of ``tiles`` [t] in a refinement, which change meanwhile."""

@@ -96,8 +96,10 @@ class Strips:
         self._bytes = 0
         self._layout: Layout | None = None
         self._displacement = bounds.displacement
-        #: Seconds that a ray takes over a strip of the first level, and how many there are, once some have been tried.
-        self.effort: tuple[float, int] | None = None
+        #: Strips of the first level, as far as the layout has got.
+        self.count = 1
+        #: Seconds that a ray takes over a strip of the first level, once some have been tried.
+        self.effort: float | None = None
 
     # ---------------------------------------------------------------- layout
 
@@ -108,13 +110,14 @@ class Strips:
             displacement = self._displacement
             for _ in range(_ROUNDS):
                 found = self._cut(displacement, tried)
+                self.count = math.prod(found.counts)
                 strip = self._strip(found.counts, tuple(n // 2 for n in found.counts))
                 learned = displacement
                 # one ray first: where not even a few can be done, that tells how long they take
                 for rays in (tried[len(tried) // 2 :][:1], tried):
                     begin = time.perf_counter()
                     learned = self.run([self._call(strip, rays, found, 0, None)])[0].displacement
-                    self.effort = (time.perf_counter() - begin) / len(rays), math.prod(found.counts)
+                    self.effort = (time.perf_counter() - begin) / len(rays)
                 if 0.6 < learned / displacement < 1.7:
                     break
                 displacement = learned

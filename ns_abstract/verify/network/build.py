@@ -14,6 +14,7 @@ from torch import Tensor
 from ns_abstract.io.errors import InputError
 from ns_abstract.verify.network.graph import Layer, Network, Node, as_double, item
 from ns_abstract.verify.network.layers import (
+    Channels,
     Convolution,
     Gather,
     LeakyRelu,
@@ -325,11 +326,7 @@ class Builder:
         total, parts, done = sum(s[axis] for s in shapes), [], 0
         for source, shape in zip(sources, shapes, strict=True):
             if axis == 0 and len(shape) == 3:
-                self._check_size((total, *shape[1:]))
-                self.reserve(2.0 * total * shape[0])
-                place = np.zeros((total, shape[0], 1, 1))
-                place[done + np.arange(shape[0]), np.arange(shape[0])] = 1.0
-                parts.append(self.convolution(source, place, None, _ONE, _ONE, (0, 0, 0, 0), 1, exact=True))
+                parts.append(self._add(Channels((shape,), (total, *shape[1:]), 0, 1, done), source))
             else:
                 before, after = [0] * len(shape), [0] * len(shape)
                 before[axis], after[axis] = done, total - done - shape[axis]

@@ -273,6 +273,21 @@ class Pad(Linear):
 
 
 @dataclass(frozen=True, eq=False)
+class Channels(Linear):
+    """A map among channels of zeros: its first channel becomes number ``first``."""
+
+    first: int = 0
+
+    def apply(self, inputs: Sequence[Tensor]) -> Tensor:
+        after = self.shape[0] - self.input_shapes[0][0] - self.first
+        return functional.pad(inputs[0], (0, 0, 0, 0, self.first, after))
+
+    def backward(self, rows: Rows) -> list[Rows]:
+        part = rows.value[:, self.first : self.first + self.input_shapes[0][0]]
+        return [Rows(np.ascontiguousarray(part), rows.y, rows.x)]
+
+
+@dataclass(frozen=True, eq=False)
 class Gather(Linear):
     """Numbers of the input in another order.
 
