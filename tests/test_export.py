@@ -82,6 +82,29 @@ def test_pictures_round_outward(call: Call, bounded: Path, tmp_path: Path) -> No
         assert ((result.upper * 255.0).astype(np.uint8) / 255.0 < result.upper).any()
 
 
+def test_video_of_panels_labels_pictures(call: Call, bounded: Path, tmp_path: Path) -> None:  # noqa: F811
+    av = pytest.importorskip("av", reason="needs the extra video")
+    file = tmp_path / "panels.mp4"
+    code, said = run(call, "mp4", "--input-dir", bounded, "--output-filename", file, "--panels")
+    assert code == 0, said
+    with av.open(str(file)) as container:
+        shown = [frame.to_ndarray(format="rgb24").astype(int) for frame in container.decode(video=0)]
+    results = Results(bounded)
+    height, width = results.size
+    times = -(-200 // width)
+    assert len(shown) == len(results.files)
+    for picture, result in zip(shown, results, strict=True):  # type: ignore[call-overload]
+        assert abs(picture.shape[0] - (times * height + 40)) <= 1
+        for k, name in enumerate(("lower", "upper", "gap", "image")):
+            left = k * (times * width + 6)
+            panel = picture[20 : 20 + times * height, left : left + times * width]
+            wanted = results.picture(result, name).repeat(times, axis=0).repeat(times, axis=1).astype(int)
+            # a lossy video
+            assert np.abs(panel - wanted).mean() < 12.0, name
+            label = picture[:20, left : left + times * width]
+            assert label.max() > 230 and label.min() < 110, "no label"
+
+
 def test_video_shows_every_frame(call: Call, bounded: Path, tmp_path: Path) -> None:  # noqa: F811
     av = pytest.importorskip("av", reason="needs the extra video")
     file = tmp_path / "path.mp4"

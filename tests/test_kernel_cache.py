@@ -71,6 +71,29 @@ def test_other_module_changed(tmp_path: Path, folder: Path) -> None:
     assert not list(package.rglob("*.nb?"))
 
 
+def test_kernels_of_another_process_are_taken_while_this_one_runs(folder: Path) -> None:
+    """What others publish meanwhile is used, and what this process has compiled itself stays."""
+    other = (
+        "from ns_abstract.arithmetic.forms import set_norms; import numpy as np; set_norms(np.zeros((4, 3)), 0, 1, 1)"
+    )
+    program = f"""
+import subprocess, sys
+import numpy as np
+from ns_abstract.arithmetic.forms import set_norms
+from ns_abstract.arithmetic.kernel_cache import store
+assert store().empty
+subprocess.run([sys.executable, "-c", {other!r}], check=True)
+store().refresh()
+set_norms(np.zeros((4, 3)), 0, 1, 1)
+print(sum(set_norms.stats.cache_hits.values()), store().compiled)
+set_norms(np.zeros((4, 3), np.float32), 0, 1, 1)
+own = store().compiled
+store().refresh()
+print(sum(set_norms.stats.cache_hits.values()), own > 0)
+"""
+    assert run(program, NS_ABSTRACT_CACHE_DIR=str(folder))[0] == "1 0\n1 True"
+
+
 @pytest.mark.parametrize("content", [b"", b"garbage", None], ids=["empty", "garbage", "truncated"])
 @pytest.mark.parametrize("what", ["blobs", "manifest"])
 def test_damaged_files(folder: Path, what: str, content: bytes | None) -> None:

@@ -149,6 +149,20 @@ def test_defaults():
     assert parse_perturbation({"orbit": None}).orbit is None
 
 
+def test_degrees():
+    """Angles alone are converted, the orbit's too; the same set reads the same in radians."""
+    value = {"angle_units": "degrees", "translation": {"x": 2.0}, "rotation": {"yaw": 180, "roll": [-90, 45]},
+             "orbit": {"target": [1, 2, 3], "axis": [0, 0, 1], "azimuth": [0, 360]}}  # fmt: skip
+    found = parse_perturbation(value)
+    assert found.rotation == {"yaw": (-math.pi, math.pi), "roll": (-math.pi / 2, math.pi / 4)}
+    assert found.orbit is not None and found.orbit.azimuth == (0.0, 2 * math.pi)
+    assert found.translation == {"x": (-2.0, 2.0)} and found.orbit.target == (1.0, 2.0, 3.0)
+    assert parse_perturbation(value | {"angle_units": "radians"}).rotation["yaw"] == (-180.0, 180.0)
+    for wrong in ("deg", 1, None):
+        with pytest.raises(InputError, match="angle_units"):
+            parse_perturbation(value | {"angle_units": wrong})
+
+
 def test_dataset_units():
     """Lengths in the units of transforms.json are scaled; angles are not."""
     value = {"units": "dataset", "translation": {"x": 2.0, "z": [1, 3]}, "rotation": {"yaw": 0.5}}

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 from ns_abstract.api.job import Job
 from ns_abstract.api.scenes import Scene, SceneSource
@@ -22,6 +24,7 @@ class Settings:
         load_config: config.yml of a run, or a standard 3DGS .ply.
         camera_path_filename: Camera path JSON.
         perturbation_filename: Perturbation JSON; None: the camera path holds it.
+        given_set: The content of a perturbation file, in place of one; errors name its keys as options.
         downscale_factor: Pictures become this many times smaller.
         renderer: "gsplat" or "paper"; None: what the method's own renderer is.
         gsplat_version: Of the splats' rules; None: 1.4.0.
@@ -48,6 +51,7 @@ class Settings:
     near_plane: float | None = None
     occupancy_grid: Path | None = None
     workers: int = 1
+    given_set: Mapping[str, Any] | None = None
     outputs: tuple[str, ...] = ("rgb",)
 
     @property
@@ -142,6 +146,9 @@ def _perturbations(
     settings: Settings, scale: float, path: CameraPath, default: Perturbation | None
 ) -> tuple[Perturbation, ...]:
     file = settings.perturbation_filename
+    if settings.given_set is not None:
+        given = parse_perturbation(settings.given_set, dataset_scale=scale, field_prefix="--")
+        return (given,) * len(path.cameras)
     if file is not None:
         return (load_perturbation(file, dataset_scale=scale),) * len(path.cameras)
     found, folder = [], Path(path.source).parent

@@ -106,11 +106,22 @@ class KernelStore:
     def fetch(self, place: str) -> str:
         """The session's folder of one module, with what is kept of its functions; damaged files are left out."""
         folder = self.session / place
-        if folder.exists():
-            return str(folder)
-        folder.mkdir(parents=True)
+        if not folder.exists():
+            folder.mkdir(parents=True)
+            self._link(place)
+        return str(folder)
+
+    def refresh(self) -> None:
+        """Take what other processes have published since this one began; what it has itself stays."""
+        self._entries = _read_manifest(self._folder) | self._entries
+        for folder in [path for path in self.session.rglob("*") if path.is_dir()]:
+            self._link(folder.relative_to(self.session).as_posix())
+
+    def _link(self, place: str) -> None:
+        """Bring what is kept of a module's functions into the session's folder."""
+        folder = self.session / place
         for name, wanted in self._entries.items():
-            if name.rpartition("/")[0] != place:
+            if name.rpartition("/")[0] != place or (folder / f"{name.rpartition('/')[2]}.nbi").exists():
                 continue
             blobs = {file: blob for file, digest in wanted.items() if (blob := self._blob(digest)) is not None}
             if len(blobs) < len(wanted):
@@ -122,7 +133,6 @@ class KernelStore:
                 except OSError:
                     shutil.copyfile(blob, path)
                 self._published[path] = _stamp(path)
-        return str(folder)
 
     def _blob(self, digest: str) -> Path | None:
         for source in self._sources:

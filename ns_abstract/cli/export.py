@@ -52,6 +52,8 @@ class Mp4:
     """lower, upper, gap (heat map), witness (gap of real renders, same scale), image (one render)."""
     fps: float = 24.0
     """Frames per second."""
+    panels: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    """Labels above the pictures, the frame's figures below; small pictures enlarged."""
 
 
 @dataclass
@@ -240,7 +242,7 @@ def _path(options: Npz | Png | Mp4) -> list[str]:
     elif isinstance(options, Png):
         write_pictures(results, options.output_dir, options.pictures)
     else:
-        write_video(results, options.output_filename, options.pictures, options.fps)
+        write_video(results, options.output_filename, options.pictures, options.fps, options.panels)
     notes = [] if results.checked else ["no report.json beside the frames: nothing says whether they were changed"]
     if results.unbounded:
         notes.append(f"no bounds but [0, 1] in frames {', '.join(map(str, results.unbounded))}")

@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 import os
+import sys
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import tyro
 
 from ns_abstract.cli.common import DONE, INTERRUPTED, Stop, run
 from ns_abstract.io.errors import InputError
+
+#: Keys of a perturbation file, in the order of the options' numbers; their own module needs numpy, --help must not.
+_AXES = {"translation": ("x", "y", "z"), "rotation": ("yaw", "pitch", "roll")}
 
 
 @dataclass
@@ -29,6 +33,14 @@ class Render:
     """Folder for the results; made if missing."""
     perturbation_filename: Path | None = None
     """Set of poses (JSON). Default: the key "perturbation" of the camera path."""
+    translation: tuple[float, ...] | None = None
+    """A set without a file: radius of the shift along x, y and z of the camera, or three radii."""
+    rotation: tuple[float, ...] | None = None
+    """A set without a file: radius of yaw, pitch and roll, or three radii."""
+    units: Literal["normalised", "dataset"] = "normalised"
+    """Of --translation: the run's normalised frame, or transforms.json."""
+    angle_units: Literal["radians", "degrees"] = "radians"
+    """Of --rotation."""
     time_budget: float | None = None
     """Seconds for all frames together. Default: 60 per frame."""
     target_ratio: float = 1.05
@@ -78,6 +90,62 @@ class Render:
     """Store every leaf cell's box and linear sets in the npz files."""
     memory_limit: float | None = None
     """GiB that may be used. Default: 80 % of what is free."""
+    describe: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    """Only tell what cameras, units and set mean, in pixels and distances, and do nothing else; needs no
+    --output-dir."""
+
+
+@dataclass
+class Describe(Render):
+    """Tell what cameras, units and set mean, in pixels and distances, and do nothing else."""
+
+    output_dir: Path = Path()
+    """Not used."""
+
+
+def given_set(options: Render) -> dict[str, Any] | None:
+    """The set of --translation and --rotation as the content of a perturbation file, or None.
+
+    Raises:
+        InputError: They do not go together, or with other options.
+    """
+    if options.translation is None and options.rotation is None:
+        return None
+    if options.perturbation_filename is not None:
+        field = "--translation" if options.translation is not None else "--rotation"
+        raise InputError("given beside --perturbation-filename", field=field, fix="give one of them")
+    found: dict[str, Any] = {"version": 1, "units": options.units, "angle_units": options.angle_units}
+    for name, axes in _AXES.items():
+        radii = getattr(options, name)
+        if radii is None:
+            continue
+        if len(radii) not in (1, 3):
+            fix = f"give one radius, or three for {', '.join(axes)}"
+            raise InputError(f"found {len(radii)} numbers", field=f"--{name}", fix=fix)
+        found[name] = dict(zip(axes, radii if len(radii) == 3 else radii * 3, strict=True))
+    return found
+
+
+def describe(options: Describe) -> int:
+    """Print what is about to be bounded; returns the exit code.
+
+    Raises:
+        InputError: A file, a field or an option cannot be used.
+    """
+    from ns_abstract.api.describe import describe as described
+    from ns_abstract.api.files import Settings, open_job
+    from ns_abstract.api.job import check_frames
+    from ns_abstract.io.errors import visible
+    from ns_abstract.perturbation.specification import Perturbation
+
+    names = {entry.name for entry in fields(Settings)}
+    given = {name: value for name, value in vars(options).items() if name in names}
+    settings = Settings(**given | {"workers": 1, "given_set": given_set(options)})
+    # a path that says nothing of a set is looked at all the same
+    job = open_job(settings, default=Perturbation())
+    for line in described(job, check_frames(options.frames, job.frame_count)):
+        print(visible(line))
+    return DONE
 
 
 def render(options: Render) -> int:
@@ -108,6 +176,7 @@ def render(options: Render) -> int:
         given = {name: value for name, value in vars(options).items() if name in names}
         if options.workers is None:
             given["workers"] = 1 if options.engine == "dask" else len(os.sched_getaffinity(0))
+        given["given_set"] = given_set(options)
         tls = Tls.of(options.tls_ca_file, options.tls_cert, options.tls_key, options.scheduler_address)
         order = Order(
             Settings(**given), options.frames, options.output_dir, options.time_budget, options.target_ratio,
@@ -119,6 +188,8 @@ def render(options: Render) -> int:
 
 def main() -> None:
     """Entry point of the console script."""
+    if "--describe" in sys.argv[1:]:
+        run(describe, lambda: tyro.cli(Describe, prog="ns-abstract-render"))
     run(render, lambda: tyro.cli(Render, prog="ns-abstract-render"))
 
 

@@ -13,6 +13,7 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
 from ns_abstract.api import bounding
+from ns_abstract.api.compiling import compile_beside
 from ns_abstract.api.files import PathJob, Settings, open_job
 from ns_abstract.api.job import Job, check_frames
 from ns_abstract.api.scenes import platform_problems
@@ -95,6 +96,9 @@ def render_path(order: Order, stop: Stop) -> bool:
         for reason in report.ignored:
             console.print(f"not used: {reason}", markup=False)
         _introduce(console, job, report)
+        if report.pending and order.engine == "local":
+            with stop.at_once():
+                compile_beside(job, report.pending[0])
         _fill(report, job, order, engine, stop, console)
     if report.missing:
         console.print(f"no bounds yet for frames {', '.join(map(str, report.missing))}: raise --time-budget, --resume")
@@ -120,7 +124,9 @@ def _fill(report: Report, job: Job, order: Order, engine: Engine, stop: Stop, co
                 keep_leaves=order.save_cells, stop=stop, on_progress=meter.told,
             )  # fmt: skip
             for done, result in enumerate(results, 1):
-                _tell(console, report.add(result))
+                # first what was asked for: drawing loads matplotlib
+                _tell(console, report.add(result, picture=False))
+                report.draw(result.index)
                 meter.finished(done)
     finally:
         # also after a failure: what is finished is written

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -21,6 +22,7 @@ _KEYS = {
     "version": "1",
     "frame": '"camera" or "world"',
     "units": '"normalised" or "dataset"',
+    "angle_units": '"radians" or "degrees"',
     "translation": "an object with x, y, z",
     "rotation": "an object with yaw, pitch, roll",
     "sweep": '"keyframes" or "segments"',
@@ -115,6 +117,7 @@ def parse_perturbation(
         raise fail("version", f"found {show(value['version'])}", "this program reads version 1")
     frame = _choice(value, "frame", ("camera", "world"), fail)
     units = _choice(value, "units", ("normalised", "dataset"), fail)
+    turn = math.pi / 180.0 if _choice(value, "angle_units", ("radians", "degrees"), fail) == "degrees" else 1.0
     sweep = _choice(value, "sweep", ("keyframes", "segments"), fail)
     shifts = {name: interval(value[name], name, fail) for name in ("hue", "saturation") if name in value}
     for name, (low, high) in shifts.items():
@@ -122,13 +125,13 @@ def parse_perturbation(
             raise fail(name, f"found {show(value[name])}", "stay within -1 and 1")
     translation = _ranges(value, "translation", TRANSLATIONS, fail)
     if units == "dataset":
-        translation = {name: (dataset_scale * low, dataset_scale * high) for name, (low, high) in translation.items()}
+        translation = _scaled(translation, dataset_scale)
     return Perturbation(
         frame=frame,  # pyright: ignore[reportArgumentType]
         translation=translation,
-        rotation=_ranges(value, "rotation", ROTATIONS, fail),
+        rotation=_scaled(_ranges(value, "rotation", ROTATIONS, fail), turn),
         sweep=sweep,  # pyright: ignore[reportArgumentType]
-        orbit=_orbit(value, fail),
+        orbit=_orbit(value, fail, turn),
         scene=_scene(value, fail, field_prefix, folder),
         hue=shifts.get("hue"),
         saturation=shifts.get("saturation"),
@@ -174,6 +177,10 @@ def _ranges(value: Mapping[str, Any], name: str, keys: tuple[str, ...], fail: Fa
     return {key: interval(inner[key], f"{name}.{key}", fail) for key in keys if key in inner}
 
 
+def _scaled(limits: Mapping[str, Range], factor: float) -> dict[str, Range]:
+    return {name: (factor * low, factor * high) for name, (low, high) in limits.items()}
+
+
 def _scene(value: Mapping[str, Any], fail, prefix: str, folder: Path | None) -> tuple[SceneVariation, ...]:
     if "scene" not in value:
         return ()
@@ -196,7 +203,7 @@ def _scene(value: Mapping[str, Any], fail, prefix: str, folder: Path | None) -> 
     return tuple(found)
 
 
-def _orbit(value: Mapping[str, Any], fail: Fail) -> Orbit | None:
+def _orbit(value: Mapping[str, Any], fail: Fail, turn: float) -> Orbit | None:
     if value.get("orbit") is None:
         return None
     inner = value["orbit"]
@@ -211,8 +218,5 @@ def _orbit(value: Mapping[str, Any], fail: Fail) -> Orbit | None:
         length = float(np.linalg.norm(axis))
     if not 1e-12 < length < np.inf:
         raise fail("orbit.axis", f"has length {length:g}", "write a direction, such as [0, 0, 1]")
-    return Orbit(
-        target=vector(inner["target"], "orbit.target", fail),
-        axis=axis,
-        azimuth=interval(inner["azimuth"], "orbit.azimuth", fail),
-    )
+    low, high = interval(inner["azimuth"], "orbit.azimuth", fail)
+    return Orbit(target=vector(inner["target"], "orbit.target", fail), axis=axis, azimuth=(turn * low, turn * high))

@@ -152,8 +152,13 @@ class Frame(Protocol):
         """Number of tiles."""
         ...
 
-    def warm_up(self) -> None:
-        """Compile what is compiled at first use."""
+    @property
+    def stages(self) -> tuple[str, ...]:
+        """Parts of the kernels that can be compiled apart, the slowest first; none: they cannot."""
+        ...
+
+    def warm_up(self, stage: str | None = None) -> None:
+        """Compile what is compiled at first use, all of it or one of `stages`."""
         ...
 
     def render(self, values: np.ndarray, tiles: np.ndarray | None = None) -> np.ndarray:
@@ -174,6 +179,13 @@ class Frame(Protocol):
 
     def motion(self, box: ParameterBox) -> np.ndarray:
         """[d] pixels that the picture moves by over each parameter's range (an estimate)."""
+        ...
+
+    def depths(self) -> np.ndarray | None:
+        """[n] distances along the optical axis of some scene elements that the middle pose shows (normalised units).
+
+        None: elements have no place of their own.
+        """
         ...
 
     def watch(self, tiles: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> None:

@@ -15,11 +15,17 @@ from ns_abstract.io.atomic import write_atomic
 from ns_abstract.io.errors import InputError
 from ns_abstract.io.jsonio import load_json
 from ns_abstract.refine.result import FrameResult, gap
+from ns_abstract.report.figures import metrics, number
 from ns_abstract.report.files import IMAGES, frame_index, load_frame
 from ns_abstract.report.picture import heat, to_bytes
 from ns_abstract.report.record import file_stamp, frame_digests
 
 PICTURES = ("lower", "upper", "gap", "witness", "image")
+_LABELS = {
+    "lower": "lower bound", "upper": "upper bound", "gap": "gap", "witness": "gap of renders", "image": "one render",
+}  # fmt: skip
+#: Least width of a panel, room between panels, height of a line of text.
+_PANEL_WIDTH, _PANEL_GAP, _PANEL_TEXT = 200, 6, 20
 _REPORT_LIMIT = 2**30
 _FIX_RESULTS = "give the folder that ns-abstract-render wrote"
 
@@ -142,8 +148,36 @@ def write_pictures(results: Results, folder: Path, names: Sequence[str]) -> list
     return written
 
 
-def write_video(results: Results, file: Path, names: Sequence[str], fps: float) -> None:
+def panels(results: Results, result: FrameResult, names: Sequence[str]) -> np.ndarray:
+    """[h, w, 3] uint8: the pictures ``names`` side by side, each under its label, and the frame's figures below.
+
+    Small pictures are shown with several screen pixels for each of theirs.
+    """
+    from PIL import Image, ImageDraw
+
+    times = max(1, -(-_PANEL_WIDTH // results.size[1]))
+    pictures = [results.picture(result, name).repeat(times, axis=0).repeat(times, axis=1) for name in names]
+    height, width = pictures[0].shape[:2]
+    step = width + _PANEL_GAP
+    whole = Image.new("RGB", (step * len(names) - _PANEL_GAP, height + 2 * _PANEL_TEXT), "white")
+    pen = ImageDraw.Draw(whole)
+    for k, (name, picture) in enumerate(zip(names, pictures, strict=True)):
+        whole.paste(Image.fromarray(picture), (k * step, _PANEL_TEXT))
+        pen.text((k * step + 4, 4), _LABELS[name], fill="black")
+    figures = metrics(result)
+    text = f"frame {result.index}   mean gap {number(figures['mpg'])}   ratio {number(figures['ratio'])}"
+    if not result.bounded:
+        text = f"frame {result.index}   no bound but [0, 1]"
+    elif "gap" in names or "witness" in names:
+        text += f"   brightest gap {number(results.largest)}"
+    pen.text((4, height + _PANEL_TEXT + 4), text, fill="black")
+    return np.asarray(whole)
+
+
+def write_video(results: Results, file: Path, names: Sequence[str], fps: float, labelled: bool = False) -> None:
     """An H.264 video (mp4) of the pictures ``names`` side by side, one frame of the path after the other.
+
+    ``labelled``: as `panels`.
 
     Raises:
         InputError: PyAV is missing.
@@ -154,7 +188,12 @@ def write_video(results: Results, file: Path, names: Sequence[str], fps: float) 
         raise InputError("needs the package av", field="mp4", fix="pip install 'ns-abstract[video]'") from None
     from fractions import Fraction
 
-    height, width = results.size[0], results.size[1] * len(names)
+    def row(result: FrameResult) -> np.ndarray:
+        if labelled:
+            return panels(results, result, names)
+        return np.concatenate([results.picture(result, name) for name in names], axis=1)
+
+    height, width = row(next(iter(results))).shape[:2]  # pyright: ignore[reportCallIssue, reportArgumentType]
     # the colour planes have half the size
     even = height + height % 2, width + width % 2
 
@@ -164,8 +203,7 @@ def write_video(results: Results, file: Path, names: Sequence[str], fps: float) 
             video.height, video.width = even
             video.pix_fmt, video.options = "yuv420p", {"crf": "18"}
             for result in results:  # pyright: ignore[reportGeneralTypeIssues]
-                row = np.concatenate([results.picture(result, name) for name in names], axis=1)
-                padded = np.pad(row, ((0, even[0] - height), (0, even[1] - width), (0, 0)))
+                padded = np.pad(row(result), ((0, even[0] - height), (0, even[1] - width), (0, 0)))
                 container.mux(video.encode(av.VideoFrame.from_ndarray(padded, "rgb24")))
             container.mux(video.encode())
 

@@ -400,7 +400,7 @@ class Report:
             result: The frame.
             status: "done", or "partial" where the work ended before its target; decided by
                 ``target_ratio`` if None. A frame without bounds is always "missing".
-            picture: Whether to draw the PNG now; otherwise `finish` does.
+            picture: Whether to draw the PNG now; otherwise `draw` or `finish` does.
 
         Returns:
             The frame's entry in report.json.
@@ -434,6 +434,18 @@ class Report:
         self._publish(page=time.monotonic() >= self._page_due)
         return self._entries[index]
 
+    def draw(self, index: int) -> None:
+        """Draw the PNG of a frame that was added, unless it is drawn.
+
+        Raises:
+            InputError: A file cannot be written.
+        """
+        try:
+            if index in self._undrawn:
+                self._draw(load_frame(self.folder / frame_name(index, "npz"), leaves=False).result)
+        except OSError as error:
+            raise unwritable(self.folder, error) from None
+
     def _draw(self, result: FrameResult) -> None:
         from ns_abstract.report.picture import previews, save_layer_picture, save_picture
 
@@ -457,11 +469,8 @@ class Report:
         self._state = outcome
         # first what must not be lost
         self._publish(page=False)
-        try:
-            for index in sorted(self._undrawn):
-                self._draw(load_frame(self.folder / frame_name(index, "npz"), leaves=False).result)
-        except OSError as error:
-            raise unwritable(self.folder, error) from None
+        for index in sorted(self._undrawn):
+            self.draw(index)
         self._publish(page=True)
         return self.document()
 

@@ -131,6 +131,9 @@ class NerfFrame:
         self.tiles_at_once = workers * int(np.clip(_WORK // weights, 1, 32))
         self._witness: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None
 
+    #: Few kernels, which are compiled together.
+    stages: tuple[str, ...] = ()
+
     @property
     def tile_count(self) -> int:
         """Number of rays, row by row."""
@@ -143,7 +146,7 @@ class NerfFrame:
     def _pixels(self, tiles: np.ndarray) -> np.ndarray:
         return np.stack([tiles // self.across, tiles % self.across], axis=1)
 
-    def warm_up(self) -> None:
+    def warm_up(self, stage: str | None = None) -> None:
         """Compile the kernels that this frame needs."""
         box = self.box
         for axis in range(box.dimensions):
@@ -161,6 +164,9 @@ class NerfFrame:
     def feasible(self, box: ParameterBox) -> ParameterBox | None:
         """All of ``box``: every parameter in it belongs to a pose of the set."""
         return box
+
+    def depths(self) -> None:
+        """A field is everywhere; nothing in it has a distance of its own."""
 
     def motion(self, box: ParameterBox) -> np.ndarray:
         """[d] pixels that points at a typical distance move by over each parameter's range (an estimate)."""

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 
 import numpy as np
@@ -32,8 +34,27 @@ from ns_abstract.methods.splat.stage_data import (
 )
 from ns_abstract.methods.splat.variations import VariedSplats
 
+#: Kernels of a cell that write into memory that they are given, the slowest to compile first.
+STAGES = ("gaussian_stage", "pixel_stage", "moving_colors")
 #: Most pairs of fragments whose depth order is examined in one block of pixels.
 PAIR_LIMIT = 30_000
+
+
+@contextmanager
+def alone(stage: str) -> Iterator[None]:
+    """Inside, of `STAGES` only one does anything, so that it alone is compiled.
+
+    What `SplatBounds.cell` then returns is no bound of anything.
+    """
+    kept = {name: globals()[name] for name in STAGES}
+    nothing = {name: lambda *arguments: None for name in STAGES}
+    # nothing is seen
+    nothing["gaussian_stage"] = lambda *arguments: arguments[-1].fill(0)
+    globals().update({name: nothing[name] for name in STAGES if name != stage})
+    try:
+        yield
+    finally:
+        globals().update(kept)
 
 
 @dataclass

@@ -16,7 +16,7 @@ from ns_abstract.geometry.box import ParameterBox
 from ns_abstract.geometry.poses import PoseSet, translation_only
 from ns_abstract.geometry.tiles import tile_grid
 from ns_abstract.methods.splat.activate import Splats
-from ns_abstract.methods.splat.bounds import SplatBounds
+from ns_abstract.methods.splat.bounds import STAGES, SplatBounds, alone
 from ns_abstract.methods.splat.constants import Rasteriser
 from ns_abstract.methods.splat.depths import ACCUMULATION_HIGH, ACCUMULATION_LOW, DEPTH_HIGH, DEPTH_LOW
 from ns_abstract.methods.splat.lists import tile_mask, touching
@@ -145,6 +145,7 @@ class SplatFrame:
     #: What tiles share is most of the work: every call bounds as many as it is given.
     tilewise = False
     tiles_at_once: int | None = None
+    stages = STAGES
     #: Poses rendered in every part of a cell that is split.
     witnesses = 1
 
@@ -182,11 +183,15 @@ class SplatFrame:
         """Number of tiles, row by row."""
         return self.across * self.down
 
-    def warm_up(self) -> None:
-        """Compile the kernels that this frame needs."""
+    def warm_up(self, stage: str | None = None) -> None:
+        """Compile the kernels that this frame needs, or those of one of `stages`."""
         box = self.box
         for axis in range(box.dimensions):
             box = box.split(axis, 1024)[0]
+        if stage is not None:
+            with alone(stage):
+                self.bound(box, np.arange(1))
+            return
         self.bound(box, np.arange(1))
         self.render(box.middle)
 
@@ -334,6 +339,12 @@ class SplatFrame:
                 moved = np.linalg.norm(there[seen] - here[seen], axis=1) / _MOTION_STEP
                 total[k] = max(total[k], float(np.quantile(moved, 0.75)))
         return total
+
+    def depths(self) -> np.ndarray:
+        """[n] depths of typical Gaussians that lie in the picture of the middle pose."""
+        means = self._typical_means()
+        _, seen = self._seen(self.box.middle, means)
+        return self._project(self.box.middle, means)[1][seen]
 
     def _project(self, values: np.ndarray, means: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         rotation, position = self.pose_set.world_to_camera(values)

@@ -1,0 +1,133 @@
+"""Kernels compiled by several processes at first use."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from multiprocessing import Pipe
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from conftest import Inputs
+
+from ns_abstract.api import compiling
+from ns_abstract.api.files import Settings, open_job
+from ns_abstract.arithmetic.kernel_cache import store
+from ns_abstract.methods.splat import bounds
+
+
+def test_stages_are_shared_out() -> None:
+    stages = ("slow", "middle", "quick")
+    assert compiling.shares(stages, 1) == [["slow", "middle", "quick"]]
+    assert compiling.shares(stages, 2) == [["slow"], ["middle", "quick"]]
+    assert compiling.shares(stages, 3) == compiling.shares(stages, 64) == [["slow"], ["middle"], ["quick"]]
+
+
+def test_one_stage_alone_is_run_and_the_others_come_back(blobs: Inputs, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each stage is called with what it is called with otherwise, and afterwards bounds are what they were."""
+    frame = open_job(Settings(blobs.config, blobs.path, blobs.spec)).frame(0)
+    tiles = np.arange(frame.tile_count)
+    before = frame.bound(frame.box, tiles)
+    kernels = {name: getattr(bounds, name) for name in bounds.STAGES}
+    seen: dict[str, list[list[Any]]] = {name: [] for name in bounds.STAGES}
+
+    def types(arguments: tuple[Any, ...]) -> list[Any]:
+        import numba
+
+        return [numba.typeof(argument) for argument in arguments]
+
+    def spy(name: str) -> Any:
+        def kernel(*arguments: Any) -> Any:
+            seen[name].append(types(arguments))
+            return kernels[name](*arguments)
+
+        return kernel
+
+    for name in bounds.STAGES:
+        monkeypatch.setattr(bounds, name, spy(name))
+    frame.warm_up()
+    assert all(len(calls) == 1 for calls in seen.values())
+    for name in frame.stages:
+        frame.warm_up(name)
+        assert [len(calls) for calls in seen.values()] == [
+            2 if other in frame.stages[: frame.stages.index(name) + 1] else 1 for other in bounds.STAGES
+        ]
+        # so that what was compiled is what will be used
+        assert seen[name][0] == seen[name][1]
+    monkeypatch.undo()
+    assert {name: getattr(bounds, name) for name in bounds.STAGES} == kernels
+    with pytest.raises(ZeroDivisionError), bounds.alone("pixel_stage"):
+        assert bounds.gaussian_stage is not kernels["gaussian_stage"]
+        raise ZeroDivisionError
+    assert bounds.gaussian_stage is kernels["gaussian_stage"]
+    after = frame.bound(frame.box, tiles)
+    np.testing.assert_array_equal(before.lower, after.lower)
+    np.testing.assert_array_equal(before.upper, after.upper)
+
+
+def test_nothing_is_started_where_kernels_are(blobs: Inputs, monkeypatch: pytest.MonkeyPatch) -> None:
+    job = open_job(Settings(blobs.config, blobs.path, blobs.spec))
+    monkeypatch.setattr(compiling.subprocess, "Popen", lambda *a, **k: pytest.fail("a process was started"))
+    monkeypatch.setattr(compiling, "store", lambda: SimpleNamespace(empty=False, refresh=lambda: None))
+    compiling.compile_beside(job, 0, 3)
+    monkeypatch.setattr(compiling, "store", lambda: SimpleNamespace(empty=True, refresh=lambda: None))
+    compiling.compile_beside(job, 0, 1)
+    with pytest.raises(pytest.fail.Exception):
+        compiling.compile_beside(job, 0, 2)
+
+
+def test_processes_that_fail_leave_the_work_to_this_one(blobs: Inputs, monkeypatch: pytest.MonkeyPatch) -> None:
+    job = open_job(Settings(blobs.config, blobs.path, blobs.spec))
+    refreshed, started = [], []
+    monkeypatch.setattr(compiling, "store", lambda: SimpleNamespace(empty=True, refresh=lambda: refreshed.append(True)))
+    popen = subprocess.Popen
+
+    def failing(command: list[str], **more: Any) -> Any:
+        started.append(command[4:])
+        return popen([sys.executable, "-c", "raise SystemExit(3)"], **more)
+
+    monkeypatch.setattr(compiling.subprocess, "Popen", failing)
+    compiling.compile_beside(job, 0, 2)
+    assert started == [["gaussian_stage"], ["pixel_stage", "moving_colors"]] and refreshed == [True]
+
+    def refuse(*_: Any, **__: Any) -> None:
+        raise OSError("no more processes")
+
+    monkeypatch.setattr(compiling.subprocess, "Popen", refuse)
+    compiling.compile_beside(job, 0, 2)
+    assert len(refreshed) == 2
+
+
+def test_worker_compiles_what_it_is_told(blobs: Inputs, tmp_path: Path) -> None:
+    """A process of its own opens the job anew and runs one stage; kernels are there, so nothing is compiled."""
+    job = open_job(Settings(blobs.config, blobs.path, blobs.spec))
+    job.warm_up(0)
+    store().publish()
+    here, there = Pipe()
+    with there:
+        worker = subprocess.Popen(
+            [sys.executable, "-m", "ns_abstract.api.compiling", str(there.fileno()), "moving_colors"],
+            pass_fds=[there.fileno()], stderr=subprocess.PIPE, cwd=Path(compiling.__file__).parents[2],
+        )  # fmt: skip
+    with here:
+        here.send((job.recipe, 0))
+        _, said = worker.communicate()
+    assert worker.returncode == 0, said.decode()
+
+
+def test_worker_ends_with_the_one_that_started_it() -> None:
+    here, there = Pipe()
+    with there:
+        command = (
+            "from multiprocessing.connection import Connection; from ns_abstract.api import compiling; "
+            f"compiling._watch(Connection({there.fileno()}))"
+        )
+        worker = subprocess.Popen(
+            [sys.executable, "-c", command], pass_fds=[there.fileno()], cwd=Path(compiling.__file__).parents[2]
+        )
+    assert here.recv() >= 0
+    here.close()
+    assert worker.wait() == 1
