@@ -149,6 +149,8 @@ def test_divisions_are_nested_covers(axes: tuple[int, ...], finer: int) -> None:
     for level in range(division.levels + 1):
         members, (low, high) = division.members(level), division.boxes(level)
         assert sorted(members.ravel()) == list(range(total))
+        # the parts of a cell in their own order, which bounds of parts are in
+        assert (np.diff(members, axis=1) > 0).all()
         assert np.prod(high - low, axis=1).sum() == pytest.approx(2.0**d)
         if level == division.levels:
             continue
