@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import hashlib
 import importlib.util
+import itertools
 import json
 import os
 import re
@@ -730,13 +731,79 @@ def test_partition_that_does_not_fit(
     assert code == 2 and "prop.json: partitions" in said
 
 
-def test_scene_variations_are_refused(
+EVERYTHING = {"select": {"box": [[-9, -9, -9], [9, 9, 9]]}}
+
+
+@pytest.mark.parametrize(
+    "entry", [{"color": 0.02}, {"opacity": [-0.1, 0.02]}, {"mean": 0.002}], ids=lambda e: next(iter(e))
+)
+@pytest.mark.parametrize("moves", [True, False])
+def test_scene_variations(
+    blobs: Inputs, bright: tuple[Path, float, float], entry: dict[str, Any], moves: bool, tmp_path: Path
+) -> None:
+    """Members of the set break no certificate; counterexamples name a scene that breaks the property."""
+    spec = {"version": 1, "scene": [EVERYTHING | entry]} | ({"translation": {"x": [-0.15, -0.1]}} if moves else {})
+    case = Case(tmp_path / "case", blobs, bright[0], {"type": "classification", "label": 0, "preprocess": PRE}, spec)
+    job = case.job
+    # compiles what the time would go to
+    examine_block(job.recipe, 0, job.grid(0), tuple(job.grid(0).roots()[:1]))
+    found = case.run(tmp_path / "out", time_budget=3.0)
+    assert any("scenes of the set" in line for line in found["plan"])
+    pictures = job.pictures(0)
+    claim = job.claim(pictures)
+
+    def margin(image: np.ndarray, values: np.ndarray) -> float:
+        outputs = torch.from_numpy(np.asarray(job.model.outputs(image[None]), np.float64))
+        return float(claim.margin(outputs, torch.from_numpy(values)[None])[0])
+
+    def loss(picture: torch.Tensor, values: torch.Tensor) -> torch.Tensor:
+        return -claim.margin(job.model.differentiable(picture[None]), values[None])[0]
+
+    rng = np.random.default_rng(3)
+    for _, lower, upper, verdict, proved, _ in cells(tmp_path / "out"):
+        if verdict != "certified":
+            continue
+        box = pictures.box
+        for axis, ends in enumerate(zip(json.loads(lower), json.loads(upper), strict=True)):
+            box = box.replace(axis, *ends)
+        for member in itertools.islice(pictures.members(5), 0, 26, 5):
+            values = box.sample(1, rng)[0] if box.dimensions else box.middle
+            assert margin(pictures.image(values, member), values) >= proved
+        values, member = member.pushed(box, values, loss, 2.0)
+        assert box.contains(values) and margin(pictures.image(values, member), values) >= proved
+    for file in (tmp_path / "out" / "counterexamples").glob("*.npz"):
+        with np.load(file) as stored:
+            assert margin(stored["image"], stored["values"]) <= 0.0
+            # what varies is stored where another scene than the nearest is shown
+            for name in set(stored.files) & {"scene_mean", "scene_opacity", "scene_color"}:
+                assert name == f"scene_{next(iter(entry))}"
+
+
+def test_a_variation_of_the_scene_breaks_what_poses_do_not(
+    blobs: Inputs, bright: tuple[Path, float, float], tmp_path: Path
+) -> None:
+    """One pose at which the property holds: colours that may be anything break it, and the page shows how."""
+    pose = {"version": 1, "translation": {"x": [0.1, 0.1]}}
+    prop = {"type": "classification", "label": 0, "preprocess": PRE}
+    job = Case(tmp_path / "one", blobs, bright[0], prop, pose).job
+    assert np.subtract(*job.model.outputs(job.pictures(0).image(np.zeros(0))[None])[0]) > 0.0
+    case = Case(tmp_path / "case", blobs, bright[0], prop, pose | {"scene": [EVERYTHING | {"color": 1.0}]})
+    found = case.run(tmp_path / "out")
+    assert found["verdict"] == "falsified" and found["coverage"]["falsified"] == 1.0
+    (file,) = (tmp_path / "out" / "counterexamples").glob("*.npz")
+    with np.load(file) as stored:
+        assert np.abs(stored["scene_color"]).max() <= 1.0
+        assert not np.subtract(*case.job.model.outputs(stored["image"][None])[0]) > 0.0
+        assert not np.array_equal(stored["image"], case.job.pictures(0).image(np.zeros(0)))
+
+
+def test_a_variation_that_picks_nothing(
     blobs: Inputs, net: Path, call: Callable[..., tuple[int, str]], tmp_path: Path
 ) -> None:
-    spec = SWEEP | {"scene": [{"select": {"box": [[-1, -1, -1], [1, 1, 1]]}, "color": 0.1}]}
+    spec = SWEEP | {"scene": [{"select": {"box": [[90, 90, 90], [91, 91, 91]]}, "color": 0.1}]}
     case = Case(tmp_path / "case", blobs, net, {"type": "classification", "label": 0, "preprocess": PRE}, spec)
     code, said = call(case.options(tmp_path / "out"))
-    assert code == 2 and "spec.json: scene" in said and "sets of poses" in said
+    assert code == 2 and said.count("\n") == 1 and "spec.json: scene[0].select" in said and "picks none" in said
 
 
 def test_help_is_quick_and_light() -> None:

@@ -7,7 +7,7 @@ import itertools
 import json
 import math
 import sqlite3
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -54,6 +54,9 @@ class Ramp:
 
     def differentiable(self, values: torch.Tensor) -> torch.Tensor:
         return (0.5 + (torch.from_numpy(self.gains) * values).sum()).expand(2, 2, 3)
+
+    def members(self, seed: int) -> Iterator[Any]:
+        return iter(())
 
 
 class Threshold:
@@ -122,7 +125,7 @@ def test_verdicts_are_the_truth(threshold: float, d: int) -> None:
     """The counterexample's place is known: x <= (threshold - 0.5) / 0.2."""
     scene = Ramp(d)
     search = search_of(scene, Threshold(threshold), (5, 3)[:d])
-    leaves, _ = drive(search, 3000)
+    leaves, _ = drive(search, 3000 if d == 1 else 600)
     for leaf in leaves:
         box = search.grid.box_of(leaf.cell)
         ends = [float(0.5 + scene.gains @ corner) - threshold for corner in box.corners()]
@@ -339,16 +342,112 @@ def test_partition_that_does_not_fit(partitions: tuple[int, ...]) -> None:
         Grid.fixed(interval(d), partitions, (1,) * d)
 
 
+class Shade:
+    """A scene of a `Shaded` set: brighter by ``shift``."""
+
+    def __init__(self, owner: Shaded, shift: float) -> None:
+        self.owner, self.shift = owner, shift
+
+    def __call__(self, values: np.ndarray, tiles: np.ndarray | None = None) -> np.ndarray:
+        return self.owner.image(values, self)
+
+    def pushed(self, box: ParameterBox, values: np.ndarray, score: Any, size: float) -> tuple[np.ndarray, Shade]:
+        shift = torch.tensor(self.shift, requires_grad=True)
+        place = torch.from_numpy(values)
+        (slope,) = torch.autograd.grad(score(self.owner.differentiable(place) + shift, place), shift)
+        reach = self.owner.reach
+        return values, Shade(
+            self.owner, float(np.clip(self.shift + size * reach * np.sign(float(slope)), -reach, reach))
+        )
+
+    @property
+    def nearest(self) -> Shade:
+        return Shade(self.owner, 0.0)
+
+    @property
+    def arrays(self) -> dict[str, np.ndarray]:
+        return {"color": np.array([self.shift])}
+
+
+class Shaded(Ramp):
+    """A ramp whose scenes may be brighter or darker by up to ``reach``; those that are listed change nothing."""
+
+    def __init__(self, d: int = 1, reach: float = 0.05) -> None:
+        super().__init__(d)
+        self.reach = reach
+
+    def image(self, values: np.ndarray, member: Any = None) -> np.ndarray:
+        return super().image(values) + np.float32(0.0 if member is None else member.shift)
+
+    def members(self, seed: int) -> Iterator[Any]:
+        return itertools.repeat(Shade(self, 0.0))
+
+    def sets(self, box: ParameterBox) -> Any:
+        (a, low, _, high), lower, upper, slopes = super().sets(box)
+        return (a, low - self.reach, a, high + self.reach), lower - self.reach, upper + self.reach, slopes
+
+
+def test_scenes_of_a_set() -> None:
+    """Where some scene is too dark the cell is falsified by it, although the stored scene is bright enough there."""
+    scene = Shaded()
+    leaves, _ = drive(Search(scene, Threshold(0.5), CLAIM, Grid.adaptive(scene.box, (5,))), 3000)
+    # 0.5 + 0.2 x - 0.05 > 0.5 from x = 0.25 on
+    for leaf in leaves:
+        low, high = leaf.cell.first[0], leaf.cell.past[0]
+        ends = [-1.0 + 2.0 * k / (5 << HALVINGS) for k in (low, high)]
+        if leaf.verdict == "certified":
+            assert ends[0] > 0.25 and leaf.scene is None
+        elif leaf.verdict == "falsified":
+            assert ends[0] <= 0.2500001 and leaf.counterexample is not None and leaf.margin is not None
+            shift = 0.0 if leaf.scene is None else float(leaf.scene["color"][0])
+            assert abs(shift) <= scene.reach
+            assert leaf.margin == pytest.approx(0.2 * leaf.counterexample[0] + shift, abs=1e-6)
+    whole = volume(leaves)
+    assert volume(leaves, "falsified") > 0.62 * whole and volume(leaves, "certified") > 0.36 * whole
+    # beyond x = 0 the stored scene holds
+    dark = [leaf for leaf in leaves if leaf.verdict == "falsified" and leaf.counterexample[0] > 0.0]
+    assert dark and all(leaf.scene is not None for leaf in dark)
+    single = Search(Shaded(0), Threshold(0.48), CLAIM, Grid(interval(0), (), ()))
+    (leaf,), _ = drive(single)
+    assert leaf.verdict == "falsified" and leaf.scene is not None and leaf.scene["color"][0] == pytest.approx(-0.05)
+
+
+def test_networks_are_asked_only_where_that_may_prove() -> None:
+    """Wide cells are cut at once into as many parts as the margin's gradient asks for; what is bounded is proved."""
+    scene = Ramp(2, slack=0.0)
+
+    class Wide(Ramp):
+        def sets(self, box: ParameterBox) -> Any:
+            (a, low, _, high), lower, upper, slopes = super().sets(box)
+            # falls with the square of the width
+            more = 0.04 * float(np.square(np.subtract(box.upper, box.lower)).sum())
+            return (a, low - more, a, high + more), lower - more, upper + more, slopes
+
+    scene = Wide(2, slack=0.0)
+    search = Search(scene, Threshold(0.1), CLAIM, Grid.adaptive(scene.box, (1, 1)))
+    first = search.examine(search.grid.roots())
+    assert first.bounded == 0 and sum(map(len, first.blocks)) >= 4
+    assert sum(cell.volume for block in first.blocks for cell in block) == search.grid.volume
+    leaves, _ = drive(search)
+    assert {leaf.verdict for leaf in leaves} == {"certified"} and volume(leaves) == search.grid.volume
+    assert len(leaves) <= 64
+
+
 def test_grid() -> None:
     grid = Grid.adaptive(interval(2), (3, 2))
     assert grid.units == (3 << HALVINGS, 2 << HALVINGS) and len(grid.roots()) == 6
     assert sum(cell.volume for cell in grid.roots()) == grid.volume
     cell = Cell((0, 0), (1, 5))
-    parts = grid.split(cell, np.array([9.0, 1.0]), 4)
+    parts = grid.divide(cell, np.array([9.0, 1.0]), 0.25, 64)
     # the first parameter cannot be cut any more
     assert [(p.first[1], p.past[1]) for p in parts] == [(0, 1), (1, 2), (2, 3), (3, 5)]
-    assert grid.split(Cell((0, 0), (1, 1)), np.ones(2), 2) == []
-    assert grid.split(Cell((0, 0), (4, 4)), np.array([np.nan, 0.0]), 2)[0].past == (2, 4)
+    assert grid.divide(Cell((0, 0), (1, 1)), np.ones(2), 0.5, 64) == []
+    assert grid.divide(Cell((0, 0), (4, 4)), np.array([np.nan, 0.0]), 1.0, 64)[0].past == (2, 4)
+    # both are halved where that shrinks the sum, and no more often than allowed
+    assert len(grid.divide(Cell((0, 0), (8, 8)), np.array([1.0, 1.0]), 0.5, 64)) == 4
+    assert len(grid.divide(Cell((0, 0), (8, 8)), np.array([1.0, 1.0]), 0.01, 20)) == 16
+    found = grid.divide(Cell((0, 0), (7, 5)), np.array([3.0, 1.0]), 0.2, 64)
+    assert sum(part.volume for part in found) == 35 and len(set(found)) == len(found)
     assert coarse_parts(np.array([10.0, 0.0, np.inf]), 2.0) == (5, 1, 1)
     assert math.prod(coarse_parts(np.array([1e4, 1e4]), 0.1)) <= 1 << 16
 

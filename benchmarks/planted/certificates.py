@@ -16,6 +16,8 @@ _OVERLAP = "test_certify_properties.py::test_overlap_against_sampling"
 _VERDICTS = "test_certify_search.py::test_verdicts_are_the_truth"
 _IMAGES = "test_certify_search.py::test_bad_image_bounds_certify_nothing"
 _NETWORKS = "test_certify_search.py::test_bad_network_bounds_certify_nothing"
+_CHEAP = "test_certify_search.py::test_networks_are_asked_only_where_that_may_prove"
+_SCENES = "test_certify_search.py::test_scenes_of_a_set"
 _IMPOSSIBLE = "test_certify_search.py::test_impossible_leaves_are_refused_and_nothing_is_stored"
 _RESUMED = "test_certify_search.py::test_resumed_store_equals_an_uninterrupted_one"
 
@@ -193,12 +195,31 @@ CERTIFICATES = (
     ),
     Fault(
         "search: what is broken is counted from the margins above 0",
-        _SEARCH, "_Seen.broken", "margin <= 0.0", "margin < -1.0",
+        _SEARCH, "_fails", "margin <= 0.0", "margin < -1.0",
         "test_certify_search.py::test_fixed_partition_gives_every_part_that_fails_its_own_verdict",
     ),
     Fault(
+        "search: networks are asked about the widest cells",
+        _SEARCH, "Search._too_wide", "float(width.mean()) > _HOPELESS or costs[number] > _COSTLY", "False", _CHEAP,
+    ),
+    Fault(
+        "search: only the stored scene is shown",
+        "api/certification.py", "FramePictures.image", "member(values)",
+        "self.frame.render(values)", "test_certify_cli.py::test_a_variation_of_the_scene_breaks_what_poses_do_not",
+        compiled=True,
+    ),
+    Fault(
+        "search: scenes are not moved along the gradient",
+        _SEARCH, "Search._loss", "-self.claim.margin(self.model.differentiable(picture[None]), values[None])[0]",
+        "self.claim.margin(self.model.differentiable(picture[None]), values[None])[0]", _SCENES,
+    ),
+    Fault(
+        "search: a scene that breaks the property leaves its pose whole",
+        _SEARCH, "_Seen.hopeless", "len(self._where(_spoilt)) == len(self.poses)", "False", _SCENES,
+    ),
+    Fault(
         "cells: parts of a cut leave a gap",
-        _CELLS, "Grid.split", "first + size * i // parts", "first + (size - 1) * i // parts",
+        _CELLS, "Grid.divide", "first + (past - first) * i // n", "first + (past - first + 1) * i // n",
         "test_certify_search.py::test_grid",
     ),
     Fault(

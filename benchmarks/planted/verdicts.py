@@ -10,7 +10,7 @@ VERDICTS = (
     Fault(
         "a margin that is no number breaks the property",
         _SEARCH,
-        "_Seen.broken",
+        "_fails",
         "math.isfinite(margin) and margin <= 0.0",
         "not margin > 0.0",
         "test_certify_search.py::test_network_without_a_number_decides_nothing[nan]",

@@ -7,7 +7,7 @@ import itertools
 import json
 import math
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property, partial
 from pathlib import Path
@@ -28,7 +28,7 @@ from ns_abstract.geometry.tiles import assemble
 from ns_abstract.io.errors import InputError
 from ns_abstract.io.jsonio import load_json
 from ns_abstract.perturbation.specification import Perturbation
-from ns_abstract.refine.protocol import Frame, Method, RayFrame
+from ns_abstract.refine.protocol import Frame, Member, Method, RayFrame
 from ns_abstract.report.record import file_stamp
 from ns_abstract.verify.cells import Cell, Grid, coarse_parts
 from ns_abstract.verify.eight_bit import Picture, rounded, rounded_sets
@@ -42,7 +42,7 @@ if TYPE_CHECKING:
     from ns_abstract.verify.interop import Form
 
 #: Of the search's rules: results of different ones are not mixed.
-_RULES = 1
+_RULES = 2
 #: Pixels that the picture moves by over a first cell: with one parameter, and with more.
 _MOTION_LINE, _MOTION = 0.08, 0.5
 #: Numbers that a network's layers may have together in a block's cells.
@@ -120,8 +120,11 @@ class FramePictures:
         """The frame's poses."""
         return self.frame.pose_set
 
-    def image(self, values: np.ndarray) -> np.ndarray:
+    def image(self, values: np.ndarray, member: Member | None = None) -> np.ndarray:
         values = np.asarray(values, np.float64)
+        if member is not None:
+            image = assemble(member(values), self.frame.camera)
+            return rounded(image) if self._rounded else image
         key = values.tobytes()
         image = self._images.get(key)
         if image is None:
@@ -132,6 +135,9 @@ class FramePictures:
                     self._images.pop(next(iter(self._images)))
                 self._images[key] = image
         return rounded(image) if self._rounded else image
+
+    def members(self, seed: int) -> Iterator[Member]:
+        return self.frame.members(seed)
 
     def sets(self, box: ParameterBox) -> tuple[tuple[np.ndarray, ...], np.ndarray, np.ndarray, np.ndarray]:
         if self.frame.tilewise:
@@ -216,8 +222,6 @@ class Certification:
                 file=job.source.file,
                 fix="give another scene; ns-abstract-render bounds the pictures of this one",
             )
-        if any(poses.perturbation.scene for poses in job.pose_sets):
-            raise InputError("certificates are for sets of poses", file=origin, field="scene", fix="leave the key out")
         camera, size = job.pose_sets[0].camera, question.size
         if (camera.height, camera.width) != size:
             raise InputError(
@@ -257,6 +261,16 @@ class Certification:
         for poses in sorted(self.job.pose_sets, key=lambda p: -p.box.dimensions):
             found |= {n: u for n, u in zip(poses.box.names, poses.box.units, strict=True) if n not in found}
         return list(found.items())
+
+    @property
+    def scenes(self) -> tuple[str, ...]:
+        """That the set holds scenes besides poses, if it does."""
+        if not any(poses.perturbation.scene for poses in self.job.pose_sets):
+            return ()
+        return (
+            "every pose stands for the images of all scenes of the set: each Gaussian that the key scene picks varies "
+            "by itself; falsified cells name a pose and a scene",
+        )
 
     @property
     def fixed(self) -> dict[int, dict[str, float]]:

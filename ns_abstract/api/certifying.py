@@ -7,6 +7,8 @@ import os
 import tempfile
 import time
 from collections.abc import Callable, Mapping, Sequence
+import zipfile
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -34,7 +36,7 @@ from ns_abstract.verify.cells import Grid
 from ns_abstract.verify.eight_bit import Picture
 from ns_abstract.verify.network import NetworkArithmetic
 from ns_abstract.verify.search import Findings
-from ns_abstract.verify.store import Block, Store, fractions
+from ns_abstract.verify.store import IMAGES, Block, Store, fractions
 from ns_abstract.verify.substitution import MODES, STEP, Comparison, compare, gains, spread_by_volume
 
 #: Seconds between notes of progress, and between reports.
@@ -119,7 +121,7 @@ class CertificateRun:
             settings=settings,
             fingerprint=job.fingerprint,
             command=command,
-            plan=(*job.job.plan, *prop.notes),
+            plan=(*job.job.plan, *job.scenes, *prop.notes),
             picture=job.picture,
         )
 
@@ -261,16 +263,22 @@ class CertificateRun:
             place = "_".join(f"{a}-{b}" for a, b in zip(leaf.cell.first, leaf.cell.past, strict=True)) or "pose"
             values = np.array(leaf.counterexample)
             buffer = io.BytesIO()
-            np.savez(
-                buffer,
-                image=leaf.image,
-                outputs=leaf.outputs,
-                values=values,
-                names=np.array(self.grids[block.frame].box.names, str),
-                camera_to_world=self.job.job.pose_sets[block.frame].pose(values),
-                margin=np.array(np.nan if leaf.margin is None else leaf.margin),
-            )
+            arrays: dict[str, Any] = {
+                "image": leaf.image,
+                "outputs": leaf.outputs,
+                "values": values,
+                "names": np.array(self.grids[block.frame].box.names, str),
+                "camera_to_world": self.job.job.pose_sets[block.frame].pose(values),
+                "margin": np.array(np.nan if leaf.margin is None else leaf.margin),
+            }
+            arrays |= {f"scene_{name}": array for name, array in (leaf.scene or {}).items()}
+            np.savez(buffer, **arrays)
             store.keep_image(f"frame_{block.frame:05d}_{place}", buffer.getvalue())
+
+    def _kept_image(self, frame: int, pose: np.ndarray) -> np.ndarray | None:
+        """The stored image of a counterexample."""
+        files = sorted((self.folder / IMAGES).glob(f"frame_{frame:05d}_*.npz"))
+        return next((image for file in files if (image := _image_at(file, pose)) is not None), None)
 
     # ---------------------------------------------------------------- weaker bounds
 
@@ -427,8 +435,12 @@ class CertificateRun:
         """
         known = dict(zip((name for name, _ in self.job.parameters), values, strict=True))
         pictures = self.job.pictures(frame)
-        with abandoning(lambda: time.perf_counter() >= self.over):
-            image = pictures.image(np.array([known[name] for name in pictures.box.names]))
+        pose = np.array([known[name] for name in pictures.box.names])
+        # of another scene of the set, maybe
+        image = self._kept_image(frame, pose) if pictures.pose_set.perturbation.scene else None
+        if image is None:
+            with abandoning(lambda: time.perf_counter() >= self.over):
+                image = pictures.image(pose)
         return preview(to_bytes(image), side)
 
     def _cell_pictures(self, rows: Mapping[int, list[dict[str, Any]]]) -> dict[tuple[int, int], dict[str, Any]]:
@@ -449,6 +461,16 @@ class CertificateRun:
                     text = "one picture, at the cell's middle"
                 found[frame, k] = {"png": self._drawn(frame, values, _SEEN_PIXELS), "text": text}
         return found
+
+
+def _image_at(file: Path, pose: np.ndarray) -> np.ndarray | None:
+    """The image of a stored counterexample, if it is that of ``pose``; None also where others have changed the file."""
+    try:
+        with np.load(file, allow_pickle=False) as stored:
+            image = stored["image"] if np.array_equal(stored["values"], pose) else None
+            return None if image is None or image.ndim != 3 or image.dtype != np.float32 else image
+    except (OSError, ValueError, LookupError, zipfile.BadZipFile):
+        return None
 
 
 def _volume(whole: ParameterBox, part: ParameterBox) -> float:

@@ -41,6 +41,8 @@ from ns_abstract.io.errors import InputError
 PACKAGE = Path(__file__).resolve().parents[1]
 #: Folders of the package that kernels lie in or use.
 FOLDERS = ("arithmetic", "geometry", "methods", "perturbation")
+#: Folder of kernels that use these, and themselves alone besides: they do not make the others be compiled again.
+OUTER = "verify"
 #: Variable that names the folder of compiled kernels.
 VARIABLE = "NS_ABSTRACT_CACHE_DIR"
 #: Versions of the sources whose kernels are kept.
@@ -318,13 +320,16 @@ class KernelLocator:
 
     def __init__(self, py_func: Any, path: Path) -> None:
         self._line = py_func.__code__.co_firstlineno
+        self._stamp = source_key()
+        if PACKAGE / OUTER in path.parents:
+            self._stamp += hashlib.sha256(path.read_bytes()).hexdigest()
         self._path = store().fetch(path.relative_to(PACKAGE).with_suffix("").as_posix())
 
     @classmethod
     def from_function(cls, py_func: Any, py_file: str) -> KernelLocator | None:
         """The locator of a kernel of this package, else None."""
         path = Path(py_file).resolve()
-        return cls(py_func, path) if any(PACKAGE / folder in path.parents for folder in FOLDERS) else None
+        return cls(py_func, path) if any(PACKAGE / folder in path.parents for folder in (*FOLDERS, OUTER)) else None
 
     def get_cache_path(self) -> str:
         """Folder of the function's files."""
@@ -332,7 +337,7 @@ class KernelLocator:
 
     def get_source_stamp(self) -> str:
         """What the files belong to."""
-        return source_key()
+        return self._stamp
 
     def get_disambiguator(self) -> str:
         """Tells functions of one name apart."""

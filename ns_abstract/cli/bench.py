@@ -26,6 +26,7 @@ _TITLES = {
     "plan": "What is left out, taken back",
     "rules": "Our bounds and the paper's rules",
     "rays": "Rays of a NeRF",
+    "certificates": "Certified fraction against time",
 }
 
 
@@ -162,6 +163,24 @@ class Scale(Scenes):
 
 
 @dataclass
+class Certificates(Scenes):
+    """Certified fraction against time, by set of poses."""
+
+    model: Path | None = None
+    """Network, .onnx or .pt2."""
+    property: Path | None = None
+    """What is to hold (JSON)."""
+    sets: tuple[str, ...] = ("xyz",)
+    """Sets of poses: x, xyz, xyz-small, six, six-wide; path: what the camera path says."""
+    seconds: float = 120.0
+    """Time for every set."""
+    workers: int = 2
+    """Processes."""
+    marks: tuple[float, ...] = (30.0, 60.0, 120.0, 300.0, 600.0)
+    """Seconds at which the certified fraction is told, up to the time that there is."""
+
+
+@dataclass
 class Stiff:
     """Bound and attack tiny scenes at the ends of what can be loaded and asked."""
 
@@ -295,6 +314,36 @@ def scale(options: Scale) -> int:
     return DONE
 
 
+def certificates(options: Certificates) -> int:
+    """Measure how fast sets are certified; the table is written after every row."""
+    from ns_abstract.api.scenes import load_scene
+    from ns_abstract.bench.certificates import SETS, curve
+    from ns_abstract.bench.tables import markdown, write
+    from ns_abstract.geometry.camera_path import load_camera_path
+
+    if len(options.load_config) != 1 or options.model is None or options.property is None:
+        field = "--load-config, --model, --property"
+        raise InputError("missing, or several runs", field=field, fix="give one run, a network and a property")
+    file = options.camera_path_filename or options.load_config[0].resolve().parents[2] / "camera_path.json"
+    path, scene = load_camera_path(file, options.downscale_factor), load_scene(options.load_config[0])
+    known = SETS if path.perturbations[options.frame] is None else {**SETS, "path": path.perturbations[options.frame]}
+    for name in options.sets:
+        if name not in known:
+            raise InputError(f"found {name}", field="--sets", fix=f"the sets are {', '.join(known)}")
+    rows: list[dict[str, Any]] = []
+    for name in options.sets:
+        marks = [mark for mark in options.marks if mark <= options.seconds]
+        rows.append(
+            curve(
+                scene, path.cameras[options.frame], name, known[name], options.model, options.property, options.seconds,
+                options.workers, marks,
+            )
+        )  # fmt: skip
+        print("\n".join(markdown([rows[-1]]).splitlines()[0 if len(rows) == 1 else 2 :]), flush=True)
+        write(rows, options.output_dir, "certificates", _TITLES["certificates"])
+    return DONE
+
+
 def rows_of(options: Cell | Soundness | Plan | Rules | Rays, job: PathJob, name: str) -> list[dict[str, Any]]:
     """What a benchmark without curves finds for one scene and set of poses."""
     if isinstance(options, Cell):
@@ -332,7 +381,9 @@ def rows_of(options: Cell | Soundness | Plan | Rules | Rays, job: PathJob, name:
     ]
 
 
-def bench(options: Cell | Tightness | Soundness | Plan | Rules | Rays | Scale | Stiff | Vnnlib) -> int:
+def bench(
+    options: Cell | Tightness | Soundness | Plan | Rules | Rays | Scale | Certificates | Stiff | Vnnlib,
+) -> int:
     """Run one benchmark; the exit code is 1 if a bound was violated."""
     if isinstance(options, Vnnlib):
         return vnnlib(options)
@@ -340,6 +391,8 @@ def bench(options: Cell | Tightness | Soundness | Plan | Rules | Rays | Scale | 
         return stiff(options)
     if isinstance(options, Scale):
         return scale(options)
+    if isinstance(options, Certificates):
+        return certificates(options)
     from ns_abstract.bench import paper
     from ns_abstract.bench.sets import open_jobs, pose_set
     from ns_abstract.bench.tables import markdown, write
@@ -397,6 +450,7 @@ def main() -> None:
             "rules": Rules(),
             "rays": Rays(),
             "scale": Scale(),
+            "certificates": Certificates(),
             "stiff": Stiff(),
             "vnnlib": Vnnlib(folder=tyro.MISSING),
         }

@@ -756,8 +756,8 @@ class Refinement:
         if not self.keep_leaves:
             return None
         values = [values for values, _ in self._views]
-        images = [picture for _, picture in self._views]
-        whole = np.stack(images) if images else np.zeros((0, *self.image.shape), np.float32)
+        images = [picture[..., :COLORS] for _, picture in self._views]
+        whole = np.stack(images) if images else np.zeros((0, *self.image.shape[:-1], COLORS), np.float32)
         whole = whole[..., :COLORS]
         return Views(np.array(values, np.float64).reshape(len(values), self.frame.box.dimensions), whole)
 

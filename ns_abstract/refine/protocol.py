@@ -25,6 +25,37 @@ LinearSets = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
 COLORS, ACCUMULATION, DEPTH = 3, 3, 4
 #: Parameter values [d] and tile numbers (None: all) to tiles [t, side, side, channels] float32.
 Render = Callable[[np.ndarray, "np.ndarray | None"], np.ndarray]
+#: Picture [H, W, 3] and parameter values [d] to a number, differentiable.
+Score = Callable[["torch.Tensor", "torch.Tensor"], "torch.Tensor"]
+
+
+class Member(Protocol):
+    """One scene of a set of scenes."""
+
+    def __call__(self, values: np.ndarray, tiles: np.ndarray | None = None) -> np.ndarray:
+        """Tiles [t, side, side, 3] float32 of the concrete image at parameter values [d]; all tiles if None."""
+        ...
+
+    def pushed(self, box: ParameterBox, values: np.ndarray, score: Score, size: float) -> tuple[np.ndarray, Member]:
+        """Parameter values in ``box`` and a scene a signed step on, along which the score of the picture should grow.
+
+        Args:
+            box: Where the values have to stay.
+            values: [d] where the step begins.
+            score: What should grow.
+            size: Length in half-widths of every range.
+        """
+        ...
+
+    @property
+    def nearest(self) -> Member:
+        """The scene of the set that `Frame.render` shows."""
+        ...
+
+    @property
+    def arrays(self) -> dict[str, np.ndarray]:
+        """The numbers in which the scene differs from others of its set, by name."""
+        ...
 
 
 class Context(Protocol):
@@ -134,8 +165,8 @@ class Frame(Protocol):
         """Tiles [t, side, side, channels] float32 of the concrete image at parameter values [d]; all tiles if None."""
         ...
 
-    def members(self, seed: int) -> Iterator[Render]:
-        """Other scenes of the set, each as a function like `render`; none where only poses vary."""
+    def members(self, seed: int) -> Iterator[Member]:
+        """Other scenes of the set; none where only poses vary."""
         ...
 
     def bound(self, box: ParameterBox, tiles: np.ndarray, within: Any = None, keep_linear: bool = False) -> Bounds:

@@ -92,32 +92,38 @@ class Grid:
         spans = [list(itertools.pairwise(line)) for line in lines]
         return [Cell(tuple(a for a, _ in part), tuple(b for _, b in part)) for part in itertools.product(*spans)]
 
-    def split(self, cell: Cell, slopes: np.ndarray, parts: int) -> list[Cell]:
-        """The cell cut along the parameter with the largest slope that has more than one unit; empty if none has.
+    def divide(self, cell: Cell, slopes: np.ndarray, shrink: float, most: int) -> list[Cell]:
+        """The cell halved along the parameter with the largest slope, and so on; empty if it is one unit.
 
         Args:
             cell: What to cut.
             slopes: [d] what a cut along each parameter may gain.
-            parts: Into how many, fewer where there are fewer units.
+            shrink: Until the slopes' sum is so many times smaller; there is one halving at least.
+            most: Most parts.
         """
+        gains = np.where(np.isfinite(slopes), slopes, 0.0)
         sizes = np.array(cell.past, np.int64) - np.array(cell.first, np.int64)
-        free = np.flatnonzero(sizes > 1)
-        if not free.size:
+        if not gains.any():
+            # halves all in turn
+            gains = sizes.astype(np.float64)
+        parts = [1] * len(gains)
+        goal = shrink * float(gains.sum())
+        while True:
+            free = np.flatnonzero(sizes > 1)
+            count = math.prod(parts)
+            if not free.size or 2 * count > most or (count > 1 and gains.sum() <= goal * (1.0 + 1e-9)):
+                break
+            axis = int(free[np.lexsort((-sizes[free], -gains[free]))[0]])
+            parts[axis] *= 2
+            gains[axis] *= 0.5
+            sizes[axis] //= 2
+        if math.prod(parts) == 1:
             return []
-        gains = np.where(np.isfinite(slopes), slopes, 0.0)[free]
-        # without slopes the longest in units, which halves all of them in turn
-        order = np.lexsort((-sizes[free], -gains))
-        axis = int(free[order[0]])
-        first, size = cell.first[axis], int(sizes[axis])
-        parts = min(parts, size)
-        lines = [first + size * i // parts for i in range(parts + 1)]
-        return [
-            Cell(
-                (*cell.first[:axis], low, *cell.first[axis + 1 :]),
-                (*cell.past[:axis], high, *cell.past[axis + 1 :]),
-            )
-            for low, high in itertools.pairwise(lines)
+        spans = [
+            [(first + (past - first) * i // n, first + (past - first) * (i + 1) // n) for i in range(n)]
+            for first, past, n in zip(cell.first, cell.past, parts, strict=True)
         ]
+        return [Cell(tuple(a for a, _ in part), tuple(b for _, b in part)) for part in itertools.product(*spans)]
 
 
 def coarse_parts(motion: np.ndarray, pixels: float) -> tuple[int, ...]:

@@ -6,10 +6,11 @@ many machines and after however many interruptions blocks are examined.
 
 from __future__ import annotations
 
+import itertools
 import math
 import time
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, Literal, Protocol
 
 import numpy as np
@@ -18,6 +19,7 @@ import torch
 from ns_abstract.execution.ending import checkpoint
 from ns_abstract.geometry.box import ParameterBox
 from ns_abstract.io.errors import InputError
+from ns_abstract.refine.protocol import Member
 from ns_abstract.verify.cells import Cell, Grid
 from ns_abstract.verify.properties import Claim, Query
 
@@ -31,6 +33,9 @@ BLOCK = 8
 #: Mean width of the linear sets, as a part of the range of a pixel, from which on a cell that can be cut is cut
 #: without asking the network.
 _HOPELESS = 0.1
+#: The same of what the sets' width costs the margin to first order, as a part of the margin at the middle; the part
+#: that the cuts aim at, the power of the width that it is about, and most parts at once.
+_COSTLY, _AIM, _POWER, _MOST_PARTS = 0.35, 0.22, 1.6, 64
 #: Rank of first cells: behind what is known to be near a proof, before what has been found to be far from one.
 RANK_FIRST = 1e3
 #: Rank of cells of which nothing is known, and of those in which the property fails in places: they are cut to the end,
@@ -43,6 +48,10 @@ _EARLY, _LATE, _RANDOM = 2, 4, 2
 #: Steps of the ascent to a counterexample.
 _STEPS = 6
 _FIRST_STEP = 0.25
+#: Scenes of a set tried in a cell without a proof.
+_MEMBERS = 4
+#: A scene among so many, in their order, attacks a proof.
+_ATTACKERS = 24
 
 
 class Scene(Protocol):
@@ -50,8 +59,12 @@ class Scene(Protocol):
 
     box: ParameterBox
 
-    def image(self, values: np.ndarray) -> np.ndarray:
-        """Concrete picture [H, W, 3] float32 at parameter values [d]."""
+    def image(self, values: np.ndarray, member: Member | None = None) -> np.ndarray:
+        """Concrete picture [H, W, 3] float32 at parameter values [d], of another scene of the set if one is named."""
+        ...
+
+    def members(self, seed: int) -> Iterator[Member]:
+        """Other scenes of the set, without end; none where only poses vary."""
         ...
 
     def sets(self, box: ParameterBox) -> tuple[tuple[np.ndarray, ...], np.ndarray, np.ndarray, np.ndarray]:
@@ -96,6 +109,7 @@ class Leaf:
         image: [H, W, 3] float32 picture of the counterexample, or None.
         outputs: [n] what the network says about it, or None.
         reason: Why nothing is known, or "".
+        scene: What tells the counterexample's scene from others of the set, by name; None: only poses vary.
     """
 
     cell: Cell
@@ -106,6 +120,7 @@ class Leaf:
     image: np.ndarray | None = field(default=None, repr=False)
     outputs: np.ndarray | None = field(default=None, repr=False)
     reason: str = ""
+    scene: Mapping[str, np.ndarray] | None = field(default=None, repr=False)
 
 
 @dataclass(frozen=True)
@@ -116,7 +131,7 @@ class Findings:
         leaves: Cells that are done with.
         blocks: Cells to examine next.
         ranks: How far off a proof of each block is, about (see `Search._rank`); the nearest are best examined first.
-        samples: Whether the property holds at the middle of each cell.
+        samples: Whether the property was seen to hold at the middle of each cell.
         bounded: Cells whose network bounds were computed.
         seconds: Time spent.
     """
@@ -129,29 +144,69 @@ class Findings:
     ranks: tuple[float, ...] = ()
 
 
+#: A pose, and the scene of the set that is shown; None: the stored one, or the nearest to it.
+Sample = tuple[np.ndarray, "Member | None"]
+
+
 @dataclass
 class _Seen:
-    """Concrete poses of one cell."""
+    """Concrete pictures of one cell."""
 
     cell: Cell
     box: ParameterBox
-    poses: list[np.ndarray] = field(default_factory=list)
+    samples: list[Sample] = field(default_factory=list)
     margins: list[float] = field(default_factory=list)
 
     @property
     def worst(self) -> int:
-        """The pose with the smallest margin that is a number."""
+        """The sample with the smallest margin that is a number."""
         return int(np.argmin(np.where(np.isfinite(self.margins), self.margins, np.inf)))
 
     @property
+    def poses(self) -> dict[bytes, np.ndarray]:
+        """Those that were looked at, each once."""
+        return {pose.tobytes(): pose for pose, _ in self.samples}
+
+    def _where(self, holds: Callable[[float], bool]) -> set[bytes]:
+        return {pose.tobytes() for (pose, _), margin in zip(self.samples, self.margins, strict=True) if holds(margin)}
+
+    @property
     def broken(self) -> int:
-        """Poses at which the property fails."""
-        return sum(math.isfinite(margin) and margin <= 0.0 for margin in self.margins)
+        """Poses at which the property fails, for some scene."""
+        return len(self._where(_fails))
 
     @property
     def undecided(self) -> int:
-        """Poses of whose margin nothing is known: it is no finite number."""
-        return sum(not math.isfinite(margin) for margin in self.margins)
+        """Poses with a margin of which nothing is known: it is no finite number."""
+        return len(self._where(_unknown))
+
+    @property
+    def hopeless(self) -> bool:
+        """Whether there is no pose at which the property was seen to hold for all scenes."""
+        return len(self._where(_spoilt)) == len(self.poses)
+
+    @property
+    def wavers(self) -> bool:
+        """Whether margins differ so much that there may be poses where the property fails."""
+        known = [margin for margin in self.margins if math.isfinite(margin)]
+        return bool(known) and 2.0 * min(known) <= max(known)
+
+    @property
+    def holds(self) -> bool:
+        """Whether the property was seen to hold at the first pose, the middle, for all scenes."""
+        return self.samples[0][0].tobytes() not in self._where(_spoilt)
+
+
+def _fails(margin: float) -> bool:
+    return math.isfinite(margin) and margin <= 0.0
+
+
+def _unknown(margin: float) -> bool:
+    return not math.isfinite(margin)
+
+
+def _spoilt(margin: float) -> bool:
+    return not 0.0 < margin < math.inf
 
 
 class Search:
@@ -178,18 +233,21 @@ class Search:
     ) -> None:
         self.scene, self.model, self.claim, self.grid = scene, model, claim, grid
         self.every_unit, self.block = every_unit, block
+        self._latest: dict[tuple[bytes, int], np.ndarray] = {}
+        self.varies = next(iter(scene.members(0)), None) is not None
 
-    def margins(self, poses: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-        """[s] concrete margins and [s, n] outputs at parameter values."""
-        images = np.stack([self._image(values) for values in poses])
+    def margins(self, samples: Sequence[Sample]) -> tuple[np.ndarray, np.ndarray]:
+        """[s] concrete margins and [s, n] outputs at poses, each of a scene of the set."""
+        images = np.stack([self._image(*sample) for sample in samples])
+        self._latest = {_key(sample): image for sample, image in zip(samples, images, strict=True)}
         outputs = np.asarray(self.model.outputs(images), np.float64)
         with torch.no_grad():
-            margin = self.claim.margin(torch.from_numpy(outputs), torch.from_numpy(np.stack(poses)))
+            margin = self.claim.margin(torch.from_numpy(outputs), torch.from_numpy(np.stack([p for p, _ in samples])))
         return margin.numpy(), outputs
 
-    def _image(self, values: np.ndarray) -> np.ndarray:
+    def _image(self, values: np.ndarray, member: Member | None) -> np.ndarray:
         checkpoint()
-        return self.scene.image(values)
+        return self.scene.image(values) if member is None else self.scene.image(values, member)
 
     def examine(self, block: Sequence[Cell]) -> Findings:
         """Examine the cells.
@@ -204,15 +262,18 @@ class Search:
         bounded: dict[int, float] = {}
         reasons: dict[int, str] = {}
         slopes = np.zeros((len(seen), self.grid.box.dimensions))
+        costs = np.full(len(seen), np.nan)
         open_cells = [k for k, cell in enumerate(seen) if not (cell.broken or cell.undecided)]
         if open_cells:
-            self._bound([seen[k] for k in open_cells], outputs, open_cells, bounded, reasons, slopes)
+            self._bound([seen[k] for k in open_cells], outputs, open_cells, bounded, reasons, slopes, costs)
         proved = {k for k in open_cells if bounded.get(k, -math.inf) > 0.0}
         self._sample([seen[k] for k in sorted(proved)], self._attack)
         failing = [seen[k] for k in open_cells if k not in proved]
         self._sample(failing, self._late)
         self._ascend(failing)
-        leaves, children = self._verdicts(seen, bounded, reasons, slopes)
+        if self.varies:
+            self._vary(failing)
+        leaves, children = self._verdicts(seen, bounded, reasons, slopes, costs)
         seconds = time.perf_counter() - begin
         # cells of one rank are examined together
         children.sort(key=lambda child: child[0])
@@ -222,47 +283,90 @@ class Search:
             leaves=tuple(_timed(leaf, share) for leaf in leaves),
             blocks=tuple(tuple(cell for _, cell in part) for part in parts),
             ranks=tuple(part[0][0] for part in parts),
-            samples=tuple((cell.cell, 0.0 < cell.margins[0] < math.inf) for cell in seen),
+            samples=tuple((cell.cell, cell.holds) for cell in seen),
             bounded=len(bounded),
             seconds=seconds,
         )
 
     # ---------------------------------------------------------------- concrete poses
 
-    def _early(self, cell: _Seen) -> list[np.ndarray]:
+    def _early(self, cell: _Seen) -> list[Sample]:
         """The middle and two opposite corners."""
         box = cell.box
         if not box.dimensions:
-            return [box.middle]
-        return [box.middle, np.array(box.lower), np.array(box.upper)][: 1 + _EARLY]
+            return [(box.middle, None)]
+        return [(pose, None) for pose in (box.middle, np.array(box.lower), np.array(box.upper))[: 1 + _EARLY]]
 
-    def _attack(self, cell: _Seen) -> list[np.ndarray]:
-        """A random pose: no proof is believed without."""
-        return list(cell.box.sample(1, _generator(cell.cell))) if cell.box.dimensions else []
+    def _attack(self, cell: _Seen) -> list[Sample]:
+        """A random pose and scene: no proof is believed without."""
+        generator = _generator(cell.cell)
+        poses = list(cell.box.sample(1, generator)) if cell.box.dimensions else []
+        if not self.varies:
+            return [(pose, None) for pose in poses]
+        number = int(generator.integers(_ATTACKERS))
+        member = next(itertools.islice(self._members(cell), number, None))
+        return [(pose, member) for pose in poses or [cell.box.middle]]
 
-    def _late(self, cell: _Seen) -> list[np.ndarray]:
+    def _members(self, cell: _Seen) -> Iterator[Member]:
+        return self.scene.members(int(_generator(cell.cell).integers(1 << 31)))
+
+    def _late(self, cell: _Seen) -> list[Sample]:
         """Corners and random poses that no sample has been yet."""
         box = cell.box
         if not box.dimensions:
             return []
         generator = _generator(cell.cell)
         poses = [np.where(generator.random(box.dimensions) < 0.5, box.lower, box.upper) for _ in range(_LATE)]
-        known = {pose.tobytes() for pose in cell.poses}
-        fresh = [*poses, *box.sample(_RANDOM, generator)]
-        return [pose for pose in {p.tobytes(): p for p in fresh}.values() if pose.tobytes() not in known]
+        fresh = {pose.tobytes(): pose for pose in (*poses, *box.sample(_RANDOM, generator))}
+        return [(pose, None) for key, pose in fresh.items() if key not in cell.poses]
 
-    def _sample(self, cells: Sequence[_Seen], choose: Callable[[_Seen], list[np.ndarray]]) -> list[np.ndarray]:
-        """Add poses to the cells; returns the outputs at each cell's first new one."""
+    def _sample(self, cells: Sequence[_Seen], choose: Callable[[_Seen], list[Sample]]) -> list[np.ndarray]:
+        """Add samples to the cells; returns the outputs at each cell's first new one."""
         chosen = [choose(cell) for cell in cells]
-        unique = {pose.tobytes(): pose for poses in chosen for pose in poses}
+        # neighbours share corners
+        unique = {_key(sample): sample for samples in chosen for sample in samples}
         if not unique:
             return []
         margins, outputs = self.margins(list(unique.values()))
         place = {key: k for k, key in enumerate(unique)}
-        for cell, poses in zip(cells, chosen, strict=True):
-            cell.poses += poses
-            cell.margins += [float(margins[place[pose.tobytes()]]) for pose in poses]
-        return [outputs[place[poses[0].tobytes()]] for poses in chosen if poses]
+        for cell, samples in zip(cells, chosen, strict=True):
+            cell.samples += samples
+            cell.margins += [float(margins[place[_key(sample)]]) for sample in samples]
+        return [outputs[place[_key(samples[0])]] for samples in chosen if samples]
+
+    def _vary(self, cells: Sequence[_Seen]) -> None:
+        """Scenes of the set that break the property, at every pose looked at of every cell without a proof (V12).
+
+        The nearest is moved to the ends of its ranges along the signs of the margin's gradient, the worst by then half
+        as far, and the worst of all tried at the other poses, for what breaks the property at one mostly breaks it
+        nearby.
+        """
+        known: list[Member] = []
+        for cell in sorted(cells, key=lambda c: c.margins[c.worst]):
+            pose = cell.samples[cell.worst][0]
+            tried = [*itertools.islice(self._members(cell), _MEMBERS), *known]
+            margins = self._shown(cell, [(pose, member) for member in tried])
+            least = min(range(len(tried)), key=lambda k: margins[k] if math.isfinite(margins[k]) else math.inf)
+            best, margin = tried[least], margins[least]
+            # colours that are clamped at an end of their range have no slope there
+            for start, size in ((best.nearest, 2.0), (None, 1.0)):
+                if margin <= 0.0:
+                    break
+                moved = (start or best).pushed(cell.box, pose, self._loss, size)
+                (found,) = self._shown(cell, [moved])
+                if found < margin:
+                    (pose, best), margin = moved, found
+            known = [best]
+            self._shown(cell, [(other, best) for key, other in cell.poses.items() if key != pose.tobytes()])
+
+    def _shown(self, cell: _Seen, samples: list[Sample]) -> list[float]:
+        """Add samples to a cell; their margins."""
+        self._sample([cell], lambda _: samples)
+        return cell.margins[len(cell.margins) - len(samples) :]
+
+    def _loss(self, picture: torch.Tensor, values: torch.Tensor) -> torch.Tensor:
+        """The margin's negative."""
+        return -self.claim.margin(self.model.differentiable(picture[None]), values[None])[0]
 
     def _ascend(self, cells: Sequence[_Seen]) -> None:
         """Projected gradient descent of the margin in the cell that came closest to a counterexample.
@@ -270,15 +374,13 @@ class Search:
         With one parameter, samples do better than gradients.
         """
         d = self.grid.box.dimensions
-        hopeful = [cell for cell in cells if not cell.broken]
+        hopeful = [cell for cell in cells if not cell.broken and cell.wavers]
         if d < 2 or not hopeful:
             return
         cell = min(hopeful, key=lambda c: c.margins[c.worst])
         found = self._descend(cell)
         if found is not None:
-            margins, _ = self.margins([found])
-            cell.poses.append(found)
-            cell.margins.append(float(margins[0]))
+            self._sample([cell], lambda c: [(found, None)])
 
     def _descend(self, cell: _Seen) -> np.ndarray | None:
         low, high = (torch.tensor(v, dtype=torch.float64) for v in (cell.box.lower, cell.box.upper))
@@ -293,7 +395,7 @@ class Search:
                 (slope,) = torch.autograd.grad(margin, scaled)
             return float(margin.detach()), slope
 
-        start = torch.from_numpy(cell.poses[cell.worst])
+        start = torch.from_numpy(cell.samples[cell.worst][0])
         scaled = (2.0 * (start - low) / (high - low) - 1.0).clamp(-1.0, 1.0)
         best, slope = evaluate(scaled)
         step, moved = _FIRST_STEP, False
@@ -320,6 +422,7 @@ class Search:
         bounded: dict[int, float],
         reasons: dict[int, str],
         slopes: np.ndarray,
+        costs: np.ndarray,
     ) -> None:
         """Lower bounds of the margin by cell; what fails leaves a reason and no bound."""
         kept: list[int] = []
@@ -336,7 +439,7 @@ class Search:
             slopes[number] = slope
             if not _sane(linear, lower, upper):
                 reasons[number] = "the image's bounds are not finite or cross"
-            elif self._splittable(cell.cell) and _slack(linear, lower, upper) > _HOPELESS:
+            elif self._splittable(cell.cell) and self._too_wide(cell, number, linear, lower, upper, costs):
                 reasons[number] = "the image's bounds are too wide"
             else:
                 kept.append(number)
@@ -361,13 +464,58 @@ class Search:
             else:
                 reasons[number] = "the network's bounds are not finite"
 
+    def _too_wide(
+        self,
+        cell: _Seen,
+        number: int,
+        linear: tuple[np.ndarray, ...],
+        lower: np.ndarray,
+        upper: np.ndarray,
+        costs: np.ndarray,
+    ) -> bool:
+        """Whether the network's bounds would be wasted on the sets.
+
+        ``costs[number]`` becomes the part of the margin that they cost. A guess by the margin's gradient at the middle,
+        which decides about work and not about verdicts.
+        """
+        a_lower, _, a_upper, _ = linear
+        width = _widths(linear, lower, upper)
+        costs[number] = self._cost(cell, width, 0.5 * (a_lower.astype(np.float64) + a_upper))
+        return float(width.mean()) > _HOPELESS or costs[number] > _COSTLY
+
+    def _cost(self, cell: _Seen, width: np.ndarray, slopes: np.ndarray) -> float:
+        """What pictures of ``width`` [H, W, 3] and common ``slopes`` [H, W, 3, d] may take from the margin, by it.
+
+        To first order about the middle; NaN where the gradient or the margin is no number.
+        """
+        values = cell.box.middle
+        image = self._latest.get(_key((values, None)))
+        image = self._image(values, None) if image is None else image
+        try:
+            picture = torch.from_numpy(image.astype(np.float64)).requires_grad_(True)
+            margin = self.claim.margin(self.model.differentiable(picture[None]), torch.from_numpy(values)[None])[0]
+            if not margin.requires_grad:
+                return math.nan
+            (gradient,) = torch.autograd.grad(margin, picture)
+        except FAILURES:
+            return math.nan
+        slope = gradient.numpy()
+        lost = 0.5 * np.abs(slope * width).sum() + np.abs(np.tensordot(slope, slopes, 3)).sum()
+        here = float(margin.detach())
+        return float(lost) / here if here > 0.0 else math.nan
+
     def _splittable(self, cell: Cell) -> bool:
         return cell.volume > 1
 
     # ---------------------------------------------------------------- verdicts
 
     def _verdicts(
-        self, seen: Sequence[_Seen], bounded: dict[int, float], reasons: dict[int, str], slopes: np.ndarray
+        self,
+        seen: Sequence[_Seen],
+        bounded: dict[int, float],
+        reasons: dict[int, str],
+        slopes: np.ndarray,
+        costs: np.ndarray,
     ) -> tuple[list[Leaf], list[tuple[float, Cell]]]:
         leaves: list[Leaf] = []
         children: list[tuple[float, Cell]] = []
@@ -378,7 +526,7 @@ class Search:
                     # a proof and a counterexample cannot both be right
                     raise ContradictionError(
                         f"internal error: margin proved to be at least {bound} on {cell.box.lower} to "
-                        f"{cell.box.upper}, found {cell.margins[cell.worst]} at {cell.poses[cell.worst].tolist()}"
+                        f"{cell.box.upper}, found {cell.margins[cell.worst]} at {cell.samples[cell.worst][0].tolist()}"
                     )
                 if not cell.undecided:
                     leaves.append(Leaf(cell.cell, "certified", bound, 0.0))
@@ -386,10 +534,10 @@ class Search:
                 bound = None
             if cell.undecided:
                 reasons.setdefault(number, "the margin of a picture is no finite number")
-            hopeless = cell.broken + cell.undecided == len(cell.margins) and not self.every_unit
+            hopeless = cell.hopeless and not self.every_unit
             if self._splittable(cell.cell) and not hopeless:
-                rank = self._rank(cell, bound)
-                parts = self.grid.split(cell.cell, slopes[number], self._parts(cell, bound))
+                rank = self._rank(cell, bound, costs[number])
+                parts = self.grid.divide(cell.cell, slopes[number], *self._cuts(cell, bound, costs[number]))
                 children += [(rank, part) for part in parts]
             elif cell.broken:
                 leaves.append(self._counterexample(cell))
@@ -397,7 +545,7 @@ class Search:
                 leaves.append(Leaf(cell.cell, "unknown", bound, 0.0, reason=reasons.get(number, "the finest cell")))
         return leaves, children
 
-    def _rank(self, cell: _Seen, bound: float | None) -> float:
+    def _rank(self, cell: _Seen, bound: float | None, cost: float) -> float:
         """How many times the bound of ``cell`` misses the margin that samples show: its parts need about as many cuts.
 
         Largest cells first would prove nothing for long where all cells need several cuts; the nearest to a proof
@@ -407,21 +555,27 @@ class Search:
         if cell.broken:
             return _RANK_BROKEN - math.log2(share)
         margin = cell.margins[cell.worst]
-        if bound is None or not 0.0 < margin < math.inf:
+        if not 0.0 < margin < math.inf:
             return _RANK_UNKNOWN * (1.0 + share)
+        if bound is None:
+            # the cuts are made for the parts to be near a proof
+            return min(cost, RANK_FIRST / 2.0) if math.isfinite(cost) else _RANK_UNKNOWN * (1.0 + share)
         return min((margin - bound) / margin, _RANK_UNKNOWN)
 
-    def _parts(self, cell: _Seen, bound: float | None) -> int:
-        if cell.broken or bound is None:
-            return 4
+    def _cuts(self, cell: _Seen, bound: float | None, cost: float) -> tuple[float, int]:
+        """How many times narrower parts should be for a proof, and how many there may be."""
+        if cell.broken:
+            return 0.25, 4
+        if bound is None:
+            return ((_AIM / cost) ** (1.0 / _POWER), _MOST_PARTS) if cost > _COSTLY else (0.25, 4)
         margin = cell.margins[cell.worst]
-        return 4 if margin - bound > _FAR * margin else 2
+        return (0.25, 4) if margin - bound > _FAR * margin else (0.5, 2)
 
     def _counterexample(self, cell: _Seen) -> Leaf:
         """The worst pose, rendered and classified once more."""
-        values = cell.poses[cell.worst]
-        image = self.scene.image(values)
-        margins, outputs = self.margins([values])
+        values, member = cell.samples[cell.worst]
+        image = self._image(values, member)
+        margins, outputs = self.margins([(values, member)])
         margin = float(margins[0])
         if not -math.inf < margin <= 0.0 or not cell.box.contains(values):
             return Leaf(cell.cell, "unknown", None, 0.0, reason="a counterexample was not confirmed")
@@ -433,6 +587,7 @@ class Search:
             counterexample=tuple(values.tolist()),
             image=image,
             outputs=outputs[0],
+            scene=None if member is None else member.arrays,
         )
 
 
@@ -449,9 +604,13 @@ def _told(error: Exception) -> str:
 
 
 def _timed(leaf: Leaf, seconds: float) -> Leaf:
-    return Leaf(
-        leaf.cell, leaf.verdict, leaf.margin, seconds, leaf.counterexample, leaf.image, leaf.outputs, leaf.reason
-    )
+    return replace(leaf, seconds=seconds)
+
+
+def _key(sample: Sample) -> tuple[bytes, int]:
+    """Equal for one picture; members are told apart by their identity."""
+    pose, member = sample
+    return pose.tobytes(), id(member)
 
 
 def _generator(cell: Cell) -> np.random.Generator:
@@ -463,8 +622,8 @@ def _sane(linear: tuple[np.ndarray, ...], lower: np.ndarray, upper: np.ndarray) 
     return bool(all(np.isfinite(v).all() for v in (*linear, lower, upper)) and (lower <= upper).all())
 
 
-def _slack(linear: tuple[np.ndarray, ...], lower: np.ndarray, upper: np.ndarray) -> float:
-    """Mean width of the sets in p, by pixel and channel."""
+def _widths(linear: tuple[np.ndarray, ...], lower: np.ndarray, upper: np.ndarray) -> np.ndarray:
+    """[H, W, 3] widths of the sets at a p."""
     a_lower, b_lower, a_upper, b_upper = (np.asarray(v, np.float64) for v in linear)
     wide = b_upper - b_lower + np.abs(a_upper - a_lower).sum(axis=-1)
-    return float(np.minimum(wide, np.asarray(upper, np.float64) - lower).mean())
+    return np.minimum(wide, np.asarray(upper, np.float64) - lower)

@@ -57,7 +57,7 @@ class _Ladder:
         self.search, self.cell, self.deadline = search, cell, deadline
         self.known: dict[tuple[int, Substitution], float] = {}
         self.sets: dict[int, tuple[ParameterBox, tuple[np.ndarray, ...], np.ndarray, np.ndarray] | None] = {}
-        self.query = search.claim.query(search.margins([cell.middle])[1])
+        self.query = search.claim.query(search.margins([(cell.middle, None)])[1])
 
     def box(self, step: int) -> ParameterBox:
         """The box of a step, no wider than the set."""

@@ -18,10 +18,10 @@ import torch
 
 from ns_abstract.geometry.box import Float64Array, ParameterBox
 from ns_abstract.geometry.camera_path import load_camera_path
-from ns_abstract.geometry.differentiable_pose import differentiable_pose
 from ns_abstract.geometry.poses import PoseSet
 from ns_abstract.methods.splat.activate import Splats, activate
 from ns_abstract.methods.splat.constants import GSPLAT_1_4_0, Rasteriser
+from ns_abstract.methods.splat.descent import pushed
 from ns_abstract.methods.splat.load import load_scene
 from ns_abstract.methods.splat.reference import Reference
 from ns_abstract.methods.splat.render import Renderer
@@ -130,13 +130,19 @@ def attack_varied(
         values = corners[generator.integers(len(corners))] if at_corner else box.sample(1, generator)[0]
         compare(box.middle if k % 3 == 0 else values, member, "members")
     compare(box.middle, varied.nearest, "nearest")
-    slopes = _Slopes(scene, poses, rasteriser, varied, box)
+    slow = Reference(scene, rasteriser)
     for number in range(targets):
         row, column, channel, sign = _target(record, lower, upper, number, generator)
         values, member = seen[(most_at if sign > 0.0 else least_at)[row, column, channel]]
         for step in range(_STEPS):
             # a full step to the ends first, then steps of half the rest
-            values, member = slopes.push(values, member, (row, column, channel), sign, 2.0 if step == 0 else 0.5)
+            values, member = pushed(
+                slow, poses, varied, box, values, member,
+                lambda show, values, place=(row, column, channel), sign=sign: (
+                    sign * show(torch.tensor([place[:2]]))[0, place[2]]
+                ),
+                2.0 if step == 0 else 0.5,
+            )  # fmt: skip
             compare(values, member, "gradient")
     return record
 
@@ -155,49 +161,6 @@ def _target(
     flat = order[number // 4 % usable] if number % 4 < 2 else order[generator.integers(usable)]
     row, column, channel = (int(v) for v in np.unravel_index(flat, lower.shape))
     return row, column, channel, sign
-
-
-class _Slopes:
-    """Signed steps of poses and scenes along the gradient of one pixel channel."""
-
-    def __init__(
-        self, scene: SplatScene, poses: PoseSet, rasteriser: Rasteriser, varied: VariedSplats, box: ParameterBox
-    ) -> None:
-        self.reference, self.poses = Reference(scene, rasteriser), poses
-        self.varied, self.box, self.pose = varied, box, differentiable_pose(poses)
-
-    def push(
-        self, values: Float64Array, member: Splats, place: tuple[int, int, int], sign: float, size: float
-    ) -> tuple[Float64Array, Splats]:
-        """The pose and member after a step of ``size`` half-widths in every range, clipped into the set."""
-        varied, box = self.varied, self.box
-        leaves = [torch.from_numpy(values.copy()), *(None if t is None else t.clone() for t in _tensors(member))]
-        for leaf in leaves:
-            if leaf is not None:
-                leaf.requires_grad_(True)
-        reference = self.reference.member(leaves[1], leaves[2], leaves[3])  # pyright: ignore[reportArgumentType]
-        color = reference.pixels(self.poses.camera, self.pose(leaves[0]), torch.tensor([place[:2]]))
-        value = sign * color[0, place[2]]
-        if value.requires_grad:
-            value.backward()
-        low, high = np.array(box.lower), np.array(box.upper)
-        steps = [_sign(leaf) * size for leaf in leaves]
-        values = np.clip(values + 0.5 * steps[0] * (high - low), low, high) if values.size else values
-        means = member.means
-        if varied.mean_low.size:
-            means = means + 0.5 * steps[1] * (varied.mean_high - varied.mean_low)
-        opacity = member.opacity + 0.5 * steps[2] * (varied.opacity_high - varied.opacity_low)
-        shift = member.color_shift
-        if varied.color_low.size:
-            shift = shift + 0.5 * steps[3] * (varied.color_high - varied.color_low)
-        return values, varied.at(means, opacity, shift)
-
-
-def _sign(leaf: torch.Tensor | None) -> Float64Array:
-    """The gradient's signs; 0 where there is none."""
-    if leaf is None or leaf.grad is None:
-        return np.zeros(1 if leaf is None else tuple(leaf.shape))
-    return np.sign(np.nan_to_num(leaf.grad.numpy()))
 
 
 def check_varied(

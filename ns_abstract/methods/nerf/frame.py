@@ -24,7 +24,7 @@ from ns_abstract.methods.nerf.hsv import color_shift
 from ns_abstract.methods.nerf.render import NerfRenderer, Sampling
 from ns_abstract.methods.nerf.scene import NerfScene
 from ns_abstract.methods.nerf.strips import Strips
-from ns_abstract.refine.protocol import LinearSets, Render
+from ns_abstract.refine.protocol import LinearSets, Member
 
 #: What an open sample may move a pixel by on boxes a quarter as wide as the set, as a part of the pixels' mean
 #: variation over the set; less on narrower boxes.
@@ -139,7 +139,7 @@ class NerfFrame:
         """Number of rays, row by row."""
         return self.across * self.down
 
-    def members(self, seed: int) -> Iterator[Render]:
+    def members(self, seed: int) -> Iterator[Member]:
         """Other scenes of the set: none, only poses vary."""
         return iter(())
 

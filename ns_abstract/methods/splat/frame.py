@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -22,7 +23,10 @@ from ns_abstract.methods.splat.lists import tile_mask, touching
 from ns_abstract.methods.splat.render import Renderer
 from ns_abstract.methods.splat.variations import VariedSplats
 from ns_abstract.perturbation.specification import ROTATIONS
-from ns_abstract.refine.protocol import COLORS, LinearSets, Render
+from ns_abstract.refine.protocol import COLORS, LinearSets, Score
+
+if TYPE_CHECKING:
+    from ns_abstract.methods.splat.reference import Reference
 
 #: Gaussians and poses looked at to estimate how far the picture moves.
 _MOTION_GAUSSIANS = 2000
@@ -81,6 +85,48 @@ class TileBounds:
     trivial: int
 
 
+@dataclass(frozen=True)
+class SplatMember:
+    """A scene of a frame's set; see `ns_abstract.refine.protocol.Member`.
+
+    Attributes:
+        frame: The frame.
+        splats: The scene.
+        reference: Makes the renderer with gradients.
+    """
+
+    frame: SplatFrame
+    splats: Splats = field(repr=False)
+    reference: Callable[[], Reference] | None = field(repr=False)
+
+    def __call__(self, values: np.ndarray, tiles: np.ndarray | None = None) -> np.ndarray:
+        return self.frame.drawn(values, tiles, self.splats)
+
+    def pushed(
+        self, box: ParameterBox, values: np.ndarray, score: Score, size: float
+    ) -> tuple[np.ndarray, SplatMember]:
+        from ns_abstract.methods.splat.descent import pushed
+
+        frame = self.frame
+        if self.reference is None:
+            return values, self
+        values, splats = pushed(
+            self.reference(), frame.pose_set, frame.varied, box, np.asarray(values, np.float64), self.splats,
+            lambda show, pose: score(show(None), pose), size,
+        )  # fmt: skip
+        return values, SplatMember(frame, splats, self.reference)
+
+    @property
+    def nearest(self) -> SplatMember:
+        return SplatMember(self.frame, self.frame.varied.nearest, self.reference)
+
+    @property
+    def arrays(self) -> dict[str, np.ndarray]:
+        counts, splats = self.frame.varied.counts, self.splats
+        found = {"mean": splats.means, "opacity": splats.opacity, "color": splats.color_shift}
+        return {name: array for name, array in found.items() if counts[name]}
+
+
 class SplatFrame:
     """Bounds and renders one frame's set of poses.
 
@@ -93,6 +139,7 @@ class SplatFrame:
         slanted: Whether cells may be slanted, so that rotations make up for what other parameters move (P2). Their
             parameters are then not those of ``pose_set``.
         layers: Whether accumulation and expected depth stand behind the colours, in renders and bounds.
+        reference: Makes the renderer with gradients, for steps of `members`.
     """
 
     #: What tiles share is most of the work: every call bounds as many as it is given.
@@ -112,12 +159,14 @@ class SplatFrame:
         varied: VariedSplats | None = None,
         slanted: bool = False,
         layers: bool = False,
+        reference: Callable[[], Reference] | None = None,
     ) -> None:
         self.channels = 5 if layers else COLORS
         self.pose_set = pose_set
         self.camera = pose_set.camera
         self.box = pose_set.box
         self.order = order or (2 if self.box.dimensions == 1 else 1)
+        self._reference = reference
         self.bounds = SplatBounds(splats, rasteriser, arithmetic, varied)
         self.varied = self.bounds.varied
         self.renderer = Renderer(self.varied.nearest, rasteriser)
@@ -149,22 +198,18 @@ class SplatFrame:
     def render(self, values: np.ndarray, tiles: np.ndarray | None = None) -> np.ndarray:
         """Tiles [t, side, side, channels] float32 of the concrete image at parameter values [d]."""
         checkpoint()
-        return self._drawn(values, tiles, None)
+        return self.drawn(values, tiles, None)
 
-    def _drawn(self, values: np.ndarray, tiles: np.ndarray | None, member: Splats | None) -> np.ndarray:
+    def drawn(self, values: np.ndarray, tiles: np.ndarray | None, member: Splats | None) -> np.ndarray:
+        """What `render` returns, of another scene of the set if one is given."""
         draw = self.renderer.tiles if self.channels == COLORS else self.renderer.layer_tiles
         return draw(self.camera, *self.pose_set.world_to_camera(values), tiles, member).astype(np.float32)
 
-    def members(self, seed: int) -> Iterator[Render]:
-        """Other scenes of the set, without end, each as a function like `render`; none where nothing varies."""
-        if not self.varied.varies:
-            return
-        for member in self.varied.members(np.random.default_rng(seed)):
-
-            def render(values: np.ndarray, tiles: np.ndarray | None = None, member: Splats = member) -> np.ndarray:
-                return self._drawn(values, tiles, member)
-
-            yield render
+    def members(self, seed: int) -> Iterator[SplatMember]:
+        """Other scenes of the set, without end; none where nothing varies."""
+        if self.varied.varies:
+            for splats in self.varied.members(np.random.default_rng(seed)):
+                yield SplatMember(self, splats, self._reference)
 
     def allow(self, excess: float) -> float:
         """Save time from now on where that loosens gaps by no more than a small part of ``excess`` on average (B6).

@@ -95,8 +95,9 @@ class SplatMethod:
             raise InputError("the paper's renderer has no depth", field="--outputs", fix="leave it out")
         varied = self.varied(poses.perturbation.scene)
         return SplatFrame(
-            self.splats, self.rasteriser, self.arithmetic, poses, varied=varied, slanted=slanted, layers=layers
-        )
+            self.splats, self.rasteriser, self.arithmetic, poses, varied=varied, slanted=slanted, layers=layers,
+            reference=self._slow,
+        )  # fmt: skip
 
     def prepare(self, perturbations: Sequence[Perturbation]) -> None:
         """Find the Gaussians that vary.
@@ -172,12 +173,16 @@ class SplatMethod:
     def differentiable(self, poses: PoseSet) -> Callable[[torch.Tensor], torch.Tensor]:
         """Parameter values [d] to the picture [H, W, 3], by the reference renderer."""
         from ns_abstract.geometry.differentiable_pose import differentiable_pose
+
+        reference, pose = self._slow(), differentiable_pose(poses)
+        return lambda values: reference.image(poses.camera, pose(values))
+
+    def _slow(self) -> Reference:
         from ns_abstract.methods.splat.reference import Reference
 
         if self._reference is None:
             self._reference = Reference(self.scene, self.rasteriser)
-        reference, pose = self._reference, differentiable_pose(poses)
-        return lambda values: reference.image(poses.camera, pose(values))
+        return self._reference
 
 
 def _load(source: RunConfig | Path) -> SplatScene:

@@ -746,7 +746,7 @@ class _Cells:
             else:
                 if at == start or at not in self.folded:
                     shape = grid(node.layer.shape)
-                    noise = self.noise[at].reshape(self.count, *shape).numpy()
+                    noise = self.noise[at].reshape(self.count, *shape).contiguous().numpy()
                     charge(here.value, here.y, here.x, batch.cell, noise, batch.total)
                 parts = node.layer.backward(here)
             for source, part in zip(node.inputs, parts, strict=True):

@@ -15,6 +15,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from ns_abstract.arithmetic.simd.intrinsics import pointer
+
 Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
 Int64 = NDArray[np.int64]
@@ -34,6 +36,10 @@ class Rows:
     value: Float32
     y: Int64
     x: Int64
+
+    def __post_init__(self) -> None:
+        # kernels go through memory as it lies
+        self.value = np.ascontiguousarray(self.value)
 
     def __getitem__(self, chosen: Any) -> Rows:
         return Rows(self.value[chosen], self.y[chosen], self.x[chosen])
@@ -134,36 +140,35 @@ def pass_activation(value, y, x, cell, lines, total):
         total: [R, 2] gathers what the rows are at least and at most.
     """
     count, channels, h, w = value.shape
-    H, W = lines.shape[3:]
-    # by column, so that the loop over columns has no order
-    least, most = np.empty(w), np.empty(w)
+    m, (H, W) = lines.shape[1], lines.shape[3:]
+    plane = m * channels * H * W
+    rows, line = pointer(value), pointer(lines)
     for r in range(count):
-        k, shift = cell[r], x[r]
-        first, past = min(w, max(0, -shift)), max(0, min(w, W - shift))
-        least[:] = 0.0
-        most[:] = 0.0
+        top, left = y[r], x[r]
+        first, past = min(w, max(0, -left)), max(0, min(w, W - left))
+        least, most = 0.0, 0.0
         for c in range(channels):
             for i in range(h):
-                Y = y[r] + i
-                row = value[r, c, i]
+                at, Y = ((r * channels + c) * h + i) * w, top + i
                 if Y < 0 or Y >= H or past <= first:
-                    row[:] = 0.0
+                    for j in range(w):
+                        rows[at + j] = np.float32(0.0)
                     continue
-                row[:first] = 0.0
-                row[past:] = 0.0
-                X = first + shift
-                slope0, low0, high0 = lines[0, k, c, Y, X:], lines[1, k, c, Y, X:], lines[2, k, c, Y, X:]
-                slope1, low1, high1 = lines[3, k, c, Y, X:], lines[4, k, c, Y, X:], lines[5, k, c, Y, X:]
-                part, down, up = row[first:past], least[first:past], most[first:past]
-                for j in range(past - first):
-                    a = part[j]
+                for j in range(first):
+                    rows[at + j] = np.float32(0.0)
+                for j in range(past, w):
+                    rows[at + j] = np.float32(0.0)
+                here = ((cell[r] * channels + c) * H + Y) * W + left
+                for j in range(first, past):
+                    a = rows[at + j]
+                    # signs are as good as random: a branch would be guessed wrong half of the time
+                    k = here + j + 3 * plane * np.int64(a < 0.0)
                     b = np.float64(a)
-                    positive = a >= 0.0
-                    down[j] += b * np.float64(low0[j] if positive else low1[j])
-                    up[j] += b * np.float64(high0[j] if positive else high1[j])
-                    part[j] = a * (slope0[j] if positive else slope1[j])
-        total[r, 0] += least.sum()
-        total[r, 1] += most.sum()
+                    least += b * np.float64(line[k + plane])
+                    most += b * np.float64(line[k + 2 * plane])
+                    rows[at + j] = a * line[k]
+        total[r, 0] += least
+        total[r, 1] += most
 
 
 @njit(cache=True, error_model="numpy")
@@ -215,26 +220,27 @@ def charge(value, y, x, cell, noise, total):
     """Charge rows on a linear layer's output with its rounding and their own, ``noise`` [m, C, H, W] (N2)."""
     count, channels, h, w = value.shape
     H, W = noise.shape[2:]
-    shaken = np.empty(w)
+    rows, shake = pointer(value), pointer(noise)
     for r in range(count):
-        k, shift = cell[r], x[r]
-        first, past = min(w, max(0, -shift)), max(0, min(w, W - shift))
-        shaken[:] = 0.0
+        top, left = y[r], x[r]
+        first, past = min(w, max(0, -left)), max(0, min(w, W - left))
+        shaken = 0.0
         for c in range(channels):
             for i in range(h):
-                Y = y[r] + i
-                row = value[r, c, i]
+                at, Y = ((r * channels + c) * h + i) * w, top + i
                 if Y < 0 or Y >= H or past <= first:
-                    row[:] = 0.0
+                    for j in range(w):
+                        rows[at + j] = np.float32(0.0)
                     continue
-                row[:first] = 0.0
-                row[past:] = 0.0
-                noise_here = noise[k, c, Y, first + shift :]
-                part, shake = row[first:past], shaken[first:past]
-                for j in range(past - first):
-                    shake[j] += abs(np.float64(part[j])) * noise_here[j]
-        total[r, 0] -= shaken.sum()
-        total[r, 1] += shaken.sum()
+                for j in range(first):
+                    rows[at + j] = np.float32(0.0)
+                for j in range(past, w):
+                    rows[at + j] = np.float32(0.0)
+                here = ((cell[r] * channels + c) * H + Y) * W + left
+                for j in range(first, past):
+                    shaken += abs(np.float64(rows[at + j])) * shake[here + j]
+        total[r, 0] -= shaken
+        total[r, 1] += shaken
 
 
 @njit(cache=True, error_model="numpy")
@@ -252,34 +258,44 @@ def concretize(value, y, x, cell, slopes, offsets, lower, upper, total, plane, b
     """
     count, channels, h, w = value.shape
     H, W, d = slopes.shape[3:]
+    size = channels * H * W
+    rows, slope, offset = pointer(value), pointer(slopes), pointer(offsets)
+    least, most = pointer(lower), pointer(upper)
+    sums_ = np.empty((2, d))
+    sums = pointer(sums_)
     for r in range(count):
-        k = cell[r]
-        below, above, low, high, size = 0.0, 0.0, 0.0, 0.0, 0.0
+        top, left, whole = y[r], x[r], 2 * size * cell[r]
+        first, past = max(0, -left), min(w, W - left)
+        below, above, low, high, total_size = 0.0, 0.0, 0.0, 0.0, 0.0
+        sums_[:] = 0.0
         for c in range(channels):
-            for i in range(h):
-                Y = y[r] + i
-                if Y < 0 or Y >= H:
-                    continue
-                for j in range(w):
-                    X = x[r] + j
-                    a = np.float64(value[r, c, i, j])
-                    if X < 0 or X >= W or a == 0.0:
-                        continue
-                    side = 0 if a > 0.0 else 1
-                    b0, b1 = a * offsets[k, side, c, Y, X], a * offsets[k, 1 - side, c, Y, X]
+            for i in range(max(0, -top), min(h, H - top)):
+                at = ((r * channels + c) * h + i) * w
+                here = (c * H + top + i) * W + left
+                for j in range(first, past):
+                    a = np.float64(rows[at + j])
+                    # the plane below for positive coefficients, the one above for others, without a branch
+                    other = size * np.int64(a <= 0.0)
+                    one = whole + other + here + j
+                    two = whole + (size - other) + here + j
+                    b0, b1 = a * offset[one], a * offset[two]
                     below += b0
                     above += b1
-                    size += abs(b0) + abs(b1)
+                    reached = abs(b0) + abs(b1)
                     for l in range(d):
-                        s0, s1 = a * slopes[k, side, c, Y, X, l], a * slopes[k, 1 - side, c, Y, X, l]
-                        plane[r, 0, l] += s0
-                        plane[r, 1, l] += s1
-                        size += abs(s0) + abs(s1)
-                    e0, e1 = a * lower[k, c, Y, X], a * upper[k, c, Y, X]
-                    low += e0 if a > 0.0 else e1
-                    high += e1 if a > 0.0 else e0
-                    size += abs(e0) + abs(e1)
+                        s0, s1 = a * slope[one * d + l], a * slope[two * d + l]
+                        sums[l] += s0
+                        sums[d + l] += s1
+                        reached += abs(s0) + abs(s1)
+                    k = size * cell[r] + here + j
+                    e0, e1 = a * least[k], a * most[k]
+                    low += min(e0, e1)
+                    high += max(e0, e1)
+                    total_size += reached + abs(e0) + abs(e1)
+        for l in range(d):
+            plane[r, 0, l] += sums[l]
+            plane[r, 1, l] += sums[d + l]
         # sums of at most 2^24 products
-        room = 2.0**-28 * size + 2.0**-48 * (abs(total[r, 0]) + abs(total[r, 1]))
+        room = 2.0**-28 * total_size + 2.0**-48 * (abs(total[r, 0]) + abs(total[r, 1]))
         plane[r, 0, d], box[r, 0] = total[r, 0] + below - room, total[r, 0] + low - room
         plane[r, 1, d], box[r, 1] = total[r, 1] + above + room, total[r, 1] + high + room

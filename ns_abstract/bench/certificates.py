@@ -1,0 +1,73 @@
+"""How much of a set of poses is certified, against time."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from ns_abstract.api.certifying import CertifyProgress, certify
+from ns_abstract.api.poses import PoseSet
+from ns_abstract.api.scenes import Scene
+from ns_abstract.geometry.camera_path import Camera
+
+#: Sets by name, as a perturbation file writes them.
+SETS: dict[str, dict[str, Any]] = {
+    "x": {"translation": {"x": 0.05}},
+    "xyz": {"translation": {"x": 0.05, "y": 0.05, "z": 0.05}},
+    "xyz-small": {"translation": {"x": 0.01, "y": 0.01, "z": 0.01}},
+    "six": {
+        "translation": {"x": 0.005, "y": 0.005, "z": 0.005},
+        "rotation": {"yaw": 0.005, "pitch": 0.005, "roll": 0.005},
+    },
+    "six-wide": {
+        "translation": {"x": 0.05, "y": 0.05, "z": 0.05},
+        "rotation": {"yaw": 0.02, "pitch": 0.02, "roll": 0.02},
+    },
+}
+
+
+def curve(
+    scene: Scene,
+    camera: Camera,
+    name: str,
+    specification: dict[str, Any],
+    model: Path,
+    prop: Path,
+    seconds: float,
+    workers: int,
+    marks: Sequence[float],
+) -> dict[str, Any]:
+    """Search one set for ``seconds``.
+
+    Args:
+        scene, camera, model, prop: What is certified.
+        name, specification: The set, and how a table calls it.
+        seconds, workers: Time and processes.
+        marks: Times, in seconds from the call, at which the certified fraction is told; kernels have to be loaded, and
+            compiled at the first time, within them.
+
+    Returns:
+        A row: certified fraction at the marks and at the end, falsified and unknown ones, cells bounded by the network,
+        worker seconds by bounded cell.
+    """
+    points: list[CertifyProgress] = []
+    found = certify(
+        scene, PoseSet.from_json(camera, specification), model, prop,
+        time_budget=seconds, workers=workers, on_progress=points.append,
+    )  # fmt: skip
+    effort = found.report["effort"]
+    bounded = effort["cells_bounded"]
+    row: dict[str, Any] = {"set": name, "parameters": len(found.parameters), "network": model.stem}
+    for mark in marks:
+        reached = [point.certified for point in points if point.seconds <= mark]
+        done = found.seconds <= mark
+        row[f"at {mark:g} s"] = found.certified if done else reached[-1] if reached else 0.0
+    return row | {
+        "seconds": found.seconds,
+        "certified": found.certified,
+        "falsified": found.falsified,
+        "unknown": found.unknown,
+        "bounded": bounded,
+        "worker s / bounded": effort["worker_seconds"] / bounded if bounded else float("nan"),
+    }
