@@ -244,6 +244,19 @@ def test_a_good_controller_is_certified_and_a_bad_one_falsified(tmp_path: Path) 
     assert all(leaf.margin <= 0.0 and leaf.counterexample is not None for leaf in bad)
 
 
+def test_cells_are_cut_where_runs_differ(tmp_path: Path) -> None:
+    """Some initial states are unsafe at once: their part is falsified, the rest certified down to small cells."""
+    value = specification("affine") | {"initial": {"p": [-0.02, 0.02], "q": 0.0, "r": 0.0}}
+    value["unsafe"] = [{"box": {"p": [None, -0.01]}}]
+    leaves = examined(LoopSearch(reacher(tmp_path, value)), 0)
+    assert {leaf.verdict for leaf in leaves} == {"certified", "falsified"}
+    # a quarter of the 1024 units is unsafe, its edge included
+    shares = {
+        kind: sum(leaf.cell.volume for leaf in leaves if leaf.verdict == kind) for kind in ("certified", "falsified")
+    }
+    assert 256 <= shares["falsified"] <= 257 and shares["certified"] <= 768
+
+
 def test_what_is_not_finite_is_never_safe(tmp_path: Path) -> None:
     value = specification("affine")
     value["dynamics"]["A"] = (1e15 * np.ones((3, 3))).tolist()

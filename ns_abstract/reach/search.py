@@ -209,7 +209,7 @@ class LoopSearch:
             hopeless = seen.broken + seen.undecided == len(seen.margins)
             if cell.volume > 1 and not hopeless:
                 rank = self._rank(seen, bound, cell.volume / grid.volume)
-                children += [(rank, part) for part in grid.split(cell, slopes, 2)]
+                children += [(rank, part) for part in grid.divide(cell, slopes, 1.0, 2)]
             elif seen.broken:
                 leaf, run = self._counterexample(question, seen, seconds)
                 leaves.append(leaf)
