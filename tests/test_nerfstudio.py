@@ -477,7 +477,7 @@ def test_options_are_ns_viewers() -> None:
     from ns_abstract.cli.viewer import View as Command
 
     names = [entry.name for entry in dataclasses.fields(RunViewer)]
-    assert [entry.name for entry in dataclasses.fields(Command)] == names
+    assert [entry.name for entry in dataclasses.fields(Command)] == [*names, "depth", "gsplat_version"]
 
 
 # ---------------------------------------------------------------- registered methods

@@ -53,6 +53,7 @@ class WallFrame:
     tilewise = False
     tiles_at_once = None
     witnesses = 1
+    stages = ()
 
     def __init__(self, wall: Wall, pose_set: PoseSet) -> None:
         self.wall, self.pose_set = wall, pose_set
@@ -63,7 +64,7 @@ class WallFrame:
     def tile_count(self) -> int:
         return self.across * self.down
 
-    def warm_up(self) -> None:
+    def warm_up(self, stage: str | None = None) -> None:
         pass
 
     def _pixels(self, tiles: np.ndarray | None) -> np.ndarray:

@@ -251,11 +251,12 @@ class _Cells:
         c = self.middle
         b_lower, lower = (v - c - 2.0**-51 * (np.abs(v) + np.abs(c)) for v in (b_lower, lower))
         b_upper, upper = (v - c + 2.0**-51 * (np.abs(v) + np.abs(c)) for v in (b_upper, upper))
+        # numpy keeps the order of axes in memory that the images came with
         self.image = _Planes(
-            np.stack([a_lower, a_upper], 1).reshape(self.count, 2, *shape, self.d),
-            np.stack([b_lower, b_upper], 1).reshape(self.count, 2, *shape),
-            lower.reshape(self.count, *shape),
-            upper.reshape(self.count, *shape),
+            np.ascontiguousarray(np.stack([a_lower, a_upper], 1)).reshape(self.count, 2, *shape, self.d),
+            np.ascontiguousarray(np.stack([b_lower, b_upper], 1)).reshape(self.count, 2, *shape),
+            np.ascontiguousarray(lower).reshape(self.count, *shape),
+            np.ascontiguousarray(upper).reshape(self.count, *shape),
         )
 
     def _image(self) -> _Form:
