@@ -226,8 +226,8 @@ def _verdict(document: Mapping[str, Any], name: str) -> str:
     if ratios and not sampled:
         worst = max((entry for entry in frames if entry["ratio"] in ratios), key=lambda entry: entry["ratio"])
         lines.append(
-            f"Tightness: the bounds are {number(median(ratios))} times as wide as what was really rendered "
-            + (f"(median; at most {number(worst['ratio'])}, frame {worst['index']})." if len(ratios) > 1 else ".")
+            f"Tightness: the bounds are {number(median(ratios))} times as wide as what was really rendered"
+            + (f" (median; at most {number(worst['ratio'])}, frame {worst['index']})." if len(ratios) > 1 else ".")
         )
     partial = [entry for entry in frames if entry["status"] == "partial"]
     if partial:
