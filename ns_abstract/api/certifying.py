@@ -7,7 +7,7 @@ import os
 import tempfile
 import time
 import zipfile
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -20,9 +20,9 @@ from ns_abstract.api.certification import MEMORY, Certification, PropertySource,
 from ns_abstract.api.job import MOST_MEMORY, Job
 from ns_abstract.api.poses import PoseSet
 from ns_abstract.api.scenes import Scene
+from ns_abstract.api.searching import search_blocks
 from ns_abstract.execution.ending import AbandonedError, abandoning
 from ns_abstract.execution.engines import Engine, EngineName, started
-from ns_abstract.execution.scheduler import Task, work
 from ns_abstract.execution.stopping import StopRequest, interruptible
 from ns_abstract.geometry.box import ParameterBox
 from ns_abstract.io.errors import InputError
@@ -31,7 +31,7 @@ from ns_abstract.report.certificate import CertifiedRun, certificate_document, c
 from ns_abstract.report.certificate_page import certificate_page
 from ns_abstract.report.picture import preview, to_bytes
 from ns_abstract.report.record import file_stamp
-from ns_abstract.verify.cells import Cell, Grid
+from ns_abstract.verify.cells import Grid
 from ns_abstract.verify.eight_bit import Picture
 from ns_abstract.verify.network import NetworkArithmetic
 from ns_abstract.verify.search import Findings
@@ -162,54 +162,31 @@ class CertificateRun:
             on_progress: Told about once a second.
             report: Whether to bring the report up to date now and then.
         """
-        flying: dict[int, Block] = {}
-        # rays may take longer than there is time for; other blocks are waited for once
-        finished = 1 if self.job.job.rays else 0
         traced = reported = time.perf_counter()
-        recipe = self.job.recipe
 
-        def late() -> bool:
-            return time.perf_counter() >= deadline
-
-        def offer(room: int) -> Iterator[Task]:
-            # one block is always waited for, so that resuming with any budget gets on
-            if late() and (flying or finished):
-                return
-            for block in store.pending(set(flying), room):
-                flying[block.number] = block
-                found = block.frame, self.grids[block.frame], block.cells
-                if engine.shares:
-                    yield Task(block.number, examined, found)
-                else:
-                    yield Task(block.number, examine_block, (recipe, *found))
-
-        def over() -> bool:
-            return stop() or (late() and finished > 0)
-
-        def examined(index: int, grid: Grid, cells: tuple[Cell, ...]) -> Findings | None:
-            # in this process a block is given up at the deadline or a signal
-            try:
-                with stop.at_once(), abandoning(lambda: late() and finished > 0):
-                    return examine_here(self.job, index, grid, cells)
-            except (KeyboardInterrupt, AbandonedError):
-                return None
-
-        for results in work(engine, offer, over):
-            for number, findings in results:
-                block = flying.pop(number)
-                if findings is None:
-                    continue
-                self._keep_images(store, block, findings)
-                store.close_block(block, findings, self.grids[block.frame])
-                finished += 1
-            now = time.perf_counter()
-            if now - traced >= _TRACE:
-                traced = now
+        def between(instant: float) -> None:
+            nonlocal traced, reported
+            if instant - traced >= _TRACE:
+                traced = instant
                 store.trace()
                 on_progress(self.progress(store))
-            if report and now - reported >= _REPORT:
-                reported = now
+            if report and instant - reported >= _REPORT:
+                reported = instant
                 self.report(store, "running")
+
+        search_blocks(
+            store,
+            engine,
+            self.grids,
+            lambda *found: examine_here(self.job, *found),
+            (examine_block, self.job.recipe),
+            deadline=deadline,
+            stop=stop,
+            keep=lambda block, findings: self._keep_images(store, block, findings),
+            between=between,
+            # rays may take longer than there is time for; other blocks are waited for once
+            waits=not self.job.job.rays,
+        )
         store.trace()
 
     def progress(self, store: Store) -> CertifyProgress:
