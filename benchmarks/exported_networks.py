@@ -37,30 +37,32 @@ class Conv(nn.Sequential):
         super().__init__(nn.Conv2d(cin, cout, k, stride, k // 2, bias=False), nn.BatchNorm2d(cout), act())
 
 
-class Block(nn.Module):
+class Stage(nn.Module):
     """YOLOv8's C2f: a split, bottlenecks, and everything joined."""
 
-    def __init__(self, cin: int, cout: int, short: bool) -> None:
+    def __init__(self, cin: int, cout: int, count: int, short: bool) -> None:
         super().__init__()
         self.half, self.short = cout // 2, short
         self.first = Conv(cin, cout, 1)
-        self.inner = nn.Sequential(Conv(self.half, self.half), Conv(self.half, self.half))
-        self.last = Conv(3 * self.half, cout, 1)
+        self.inner = nn.ModuleList(
+            [nn.Sequential(Conv(self.half, self.half), Conv(self.half, self.half)) for _ in range(count)]
+        )
+        self.last = Conv((2 + count) * self.half, cout, 1)
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
         parts = list(self.first(x).chunk(2, 1))
-        inner = self.inner(parts[1])
-        parts.append(parts[1] + inner if self.short else inner)
+        for inner in self.inner:
+            parts.append(parts[-1] + inner(parts[-1]) if self.short else inner(parts[-1]))
         return self.last(torch.cat(parts, 1))
 
 
 class Pyramid(nn.Module):
     """YOLOv8's pooling pyramid."""
 
-    def __init__(self, channels: int) -> None:
+    def __init__(self, channels: int, kernel: int = 3) -> None:
         super().__init__()
         self.first, self.last = Conv(channels, channels // 2, 1), Conv(channels * 2, channels, 1)
-        self.pool = nn.MaxPool2d(3, 1, 1)
+        self.pool = nn.MaxPool2d(kernel, 1, kernel // 2)
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
         parts = [self.first(x)]
@@ -75,10 +77,10 @@ class Yolo(nn.Module):
     def __init__(self, width: int = 8, outputs: int = 6) -> None:
         super().__init__()
         w = width
-        self.stem = nn.Sequential(Conv(3, w, 3, 2), Conv(w, 2 * w, 3, 2), Block(2 * w, 2 * w, True))
-        self.deep = nn.Sequential(Conv(2 * w, 4 * w, 3, 2), Block(4 * w, 4 * w, True), Pyramid(4 * w))
+        self.stem = nn.Sequential(Conv(3, w, 3, 2), Conv(w, 2 * w, 3, 2), Stage(2 * w, 2 * w, 1, True))
+        self.deep = nn.Sequential(Conv(2 * w, 4 * w, 3, 2), Stage(4 * w, 4 * w, 1, True), Pyramid(4 * w))
         self.up = nn.Upsample(scale_factor=2, mode="nearest")
-        self.neck = Block(6 * w, 2 * w, False)
+        self.neck = Stage(6 * w, 2 * w, 1, False)
         self.heads = nn.ModuleList([nn.Conv2d(2 * w, outputs, 1), nn.Conv2d(4 * w, outputs, 1)])
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
@@ -96,6 +98,42 @@ class YoloTwo(Yolo):
         one = self.stem(x)
         two = self.deep(one)
         return self.heads[0](self.neck(torch.cat([self.up(two), one], 1))), self.heads[1](two)
+
+
+class Nano(nn.Module):
+    """The layers of YOLOv8n: five levels, three of them joined up and down, a head each for boxes and classes."""
+
+    def __init__(self, classes: int = 4) -> None:
+        super().__init__()
+        self.one = nn.Sequential(Conv(3, 16, 3, 2), Conv(16, 32, 3, 2), Stage(32, 32, 1, True))
+        self.two = nn.Sequential(Conv(32, 64, 3, 2), Stage(64, 64, 2, True))
+        self.three = nn.Sequential(Conv(64, 128, 3, 2), Stage(128, 128, 2, True))
+        self.four = nn.Sequential(Conv(128, 256, 3, 2), Stage(256, 256, 1, True), Pyramid(256, 5))
+        self.up = nn.Upsample(scale_factor=2, mode="nearest")
+        self.joins = nn.ModuleList(
+            [Stage(384, 128, 1, False), Stage(192, 64, 1, False), Stage(192, 128, 1, False), Stage(384, 256, 1, False)]
+        )
+        self.downs = nn.ModuleList([Conv(64, 64, 3, 2), Conv(128, 128, 3, 2)])
+
+        def head(channels: int, inner: int, outputs: int) -> nn.Sequential:
+            return nn.Sequential(Conv(channels, inner), Conv(inner, inner), nn.Conv2d(inner, outputs, 1))
+
+        self.boxes = nn.ModuleList([head(c, 64, 64) for c in (64, 128, 256)])
+        self.classes = nn.ModuleList([head(c, 64, classes) for c in (64, 128, 256)])
+
+    def forward(self, x: torch.Tensor) -> torch.Tensor:
+        two = self.two(self.one(x))
+        three = self.three(two)
+        four = self.four(three)
+        middle = self.joins[0](torch.cat([self.up(four), three], 1))
+        fine = self.joins[1](torch.cat([self.up(middle), two], 1))
+        middle = self.joins[2](torch.cat([self.downs[0](fine), middle], 1))
+        coarse = self.joins[3](torch.cat([self.downs[1](middle), four], 1))
+        found = [
+            torch.cat([box(v), kind(v).sigmoid()], 1).flatten(2)
+            for box, kind, v in zip(self.boxes, self.classes, (fine, middle, coarse), strict=True)
+        ]
+        return torch.cat(found, 2)
 
 
 class UNet(nn.Module):
@@ -263,6 +301,15 @@ def _torchvision(name: str, **settings: Any) -> Callable[[], nn.Module]:
     return make
 
 
+def _timm(name: str, **settings: Any) -> Callable[[], nn.Module]:
+    def make() -> nn.Module:
+        import timm
+
+        return timm.create_model(name, pretrained=False, num_classes=10, **settings)
+
+    return make
+
+
 def _features(name: str, channels: int) -> Callable[[], nn.Module]:
     """Without the classifier, which wants larger images."""
 
@@ -303,6 +350,8 @@ NETWORKS: dict[str, tuple[Callable[[], nn.Module], int]] = {
     },
     "YOLO shape": (Yolo, 32),
     "YOLO shape, two outputs": (YoloTwo, 32),
+    "YOLOv8n's layers at 64": (Nano, 64),
+    "YOLOv8n's layers at 128": (Nano, 128),
     "U-Net transposed": (UNet, 16),
     "U-Net bilinear": (lambda: UNet("bilinear", nn.SiLU), 16),
     "U-Net nearest, group norm": (lambda: UNet("nearest", nn.SiLU, "group"), 16),
@@ -317,6 +366,10 @@ NETWORKS: dict[str, tuple[Callable[[], nn.Module], int]] = {
     "alexnet's features": (_features("alexnet", 256), 64),
     "vgg11's features": (_features("vgg11", 512), 32),
     "resnet18": (_torchvision("resnet18"), 32),
+    "resnet18 at 64": (_torchvision("resnet18"), 64),
+    "resnet18 at 128": (_torchvision("resnet18"), 128),
+    "resnet18 at 224": (_torchvision("resnet18"), 224),
+    "mobilenet_v2 at 128": (_torchvision("mobilenet_v2"), 128),
     "squeezenet1_1": (_torchvision("squeezenet1_1"), 32),
     "mobilenet_v2 x0.25": (_torchvision("mobilenet_v2", width_mult=0.25), 32),
     "mobilenet_v3_small x0.25": (_torchvision("mobilenet_v3_small", width_mult=0.25), 32),
@@ -329,6 +382,19 @@ NETWORKS: dict[str, tuple[Callable[[], nn.Module], int]] = {
     "convnext_tiny": (_torchvision("convnext_tiny"), 32),
     "swin_t": (_torchvision("swin_t"), 32),
     "vit_b_32": (_torchvision("vit_b_32", image_size=64), 64),
+    "timm resnet26d": (_timm("resnet26d"), 32),
+    "timm mobilenetv3_small_050": (_timm("mobilenetv3_small_050"), 32),
+    "timm lcnet_035": (_timm("lcnet_035"), 32),
+    "timm tinynet_e": (_timm("tinynet_e"), 32),
+    "timm ghostnet_050": (_timm("ghostnet_050"), 32),
+    "timm tf_efficientnet_lite0": (_timm("tf_efficientnet_lite0"), 32),
+    "timm repvgg_a2": (_timm("repvgg_a2"), 32),
+    "timm cspdarknet53": (_timm("cspdarknet53"), 32),
+    "timm dla34": (_timm("dla34"), 32),
+    "timm vit_tiny_patch16_224": (_timm("vit_tiny_patch16_224", img_size=32, depth=2), 32),
+    "timm mixer_s32_224": (_timm("mixer_s32_224", img_size=64, num_blocks=2), 64),
+    "timm resmlp_12_224": (_timm("resmlp_12_224", img_size=32, num_blocks=2), 32),
+    "timm poolformer_s12": (_timm("poolformer_s12"), 32),
     "inception_v3": (_torchvision("inception_v3", aux_logits=False, init_weights=False), 75),
 }
 
@@ -426,6 +492,7 @@ def measure(name: str, exporter: str, runs: int, width: float) -> dict[str, Any]
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--only", nargs="*", default=None, help="parts of names")
+    parser.add_argument("--exact", nargs="*", default=None, help="whole names")
     parser.add_argument("--exporters", nargs="*", default=["dynamo", "17"], help="dynamo, pt2 or operator sets")
     parser.add_argument("--runs", type=int, default=2000)
     parser.add_argument("--width", type=float, default=2e-3, help="how far an image moves with one parameter")
@@ -440,6 +507,8 @@ def main() -> None:
     signal.signal(signal.SIGALRM, _late)
     for name in NETWORKS:
         if arguments.only and not any(part in name for part in arguments.only):
+            continue
+        if arguments.exact is not None and name not in arguments.exact:
             continue
         for exporter in arguments.exporters:
             if arguments.together:

@@ -143,7 +143,7 @@ def main() -> int:
                 code, output, seconds = run_test(folder, mutant.test, compiled)
                 (folder / "ns_abstract" / mutant.file).write_text(original)
                 # an assertion that fails, not a crash
-                asserted = code == _FAILED and "AssertionError" in output
+                asserted = code == _FAILED and ("AssertionError" in output or "DID NOT RAISE" in output)
                 verdicts = {_PASSED: "survived", _FAILED: "killed" if asserted else "crashed"}
                 verdict = verdicts.get(code, f"pytest {code}")
             outcomes.append(Outcome(mutant, verdict, seconds))

@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import json
 import logging
-from collections.abc import Callable
+import os
+import signal
+import sys
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -13,6 +16,7 @@ import numba
 import numpy as np
 import pytest
 
+from ns_abstract.arithmetic.kernel_cache import store
 from ns_abstract.geometry.views import View, look_at, path_json
 from ns_abstract.methods.splat.scene import SplatScene
 from ns_abstract.methods.splat.write import write_splatfacto_run
@@ -20,6 +24,7 @@ from ns_abstract.methods.splat.write import write_splatfacto_run
 # what is said of compiling depends on what was compiled before
 logging.getLogger("ns_abstract.kernels").setLevel(logging.ERROR)
 
+ROOT = Path(__file__).resolve().parents[1]
 TIMESTAMP = "2026-01-01_000000"
 
 
@@ -27,6 +32,41 @@ TIMESTAMP = "2026-01-01_000000"
 def one_thread():
     """Small pictures gain nothing from threads, and waiting threads take the processor from other workers."""
     numba.set_num_threads(1)
+
+
+@pytest.fixture(autouse=True)
+def signals_as_before() -> Iterator[None]:
+    """Commands that tests call in this process handle signals, and leave it so."""
+    before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    yield
+    for number, handler in before.items():
+        signal.signal(number, handler)
+
+
+def environment() -> dict[str, str]:
+    """For processes of their own: they find this package wherever they run, and the kernels that were compiled here."""
+    store().publish()
+    return os.environ | {"PYTHONPATH": str(ROOT)}
+
+
+#: A command's ``main`` and its options to exit code, stdout and stderr.
+InProcess = Callable[[Callable[[], None], list[str]], tuple[int, str, str]]
+
+
+@pytest.fixture
+def in_process(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> InProcess:
+    """Runs a command in this process."""
+
+    def run(main: Callable[[], None], options: list[str]) -> tuple[int, str, str]:
+        monkeypatch.setattr(sys, "argv", ["command", *options])
+        capsys.readouterr()
+        with pytest.raises(SystemExit) as leave:
+            main()
+        assert isinstance(leave.value.code, int)
+        said = capsys.readouterr()
+        return leave.value.code, said.out, said.err
+
+    return run
 
 
 #: A sideways shift, wide enough for several cells.

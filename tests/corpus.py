@@ -24,6 +24,7 @@ import sys
 import time
 import traceback
 from collections.abc import Callable, Iterator, Mapping
+from contextlib import AbstractContextManager, ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -32,6 +33,8 @@ from typing import Any
 MEMORY = 256 << 20
 #: Seconds after which a command hangs; what does not hang takes one or two, on a busy machine a few more.
 HANG = 240.0
+#: Seconds of computing that no case may take, however busy the machine is.
+COMPUTING = 30.0
 #: Address space beside the memory: stacks of threads, mapped files and libraries, the allocator's arenas.
 _ADDRESSES = 768 << 20
 #: Address space that the commands ask for at least.
@@ -41,6 +44,7 @@ MODULES = {
     "render": "ns_abstract.cli.render",
     "nerf": "ns_abstract.cli.render",
     "certify": "ns_abstract.cli.certify",
+    "reach": "ns_abstract.cli.reach",
     "npz": "ns_abstract.cli.export",
     "png": "ns_abstract.cli.export",
     "mp4": "ns_abstract.cli.export",
@@ -55,13 +59,14 @@ MODULES = {
 _IMPORTS = (
     *sorted(set(MODULES.values())), "torch", "onnx", "onnxruntime", "plyfile", "ns_abstract.cli.rendering",
     "ns_abstract.cli.certifying", "ns_abstract.bench.sets", "ns_abstract.bench.stiff", "ns_abstract.report.export",
-    "ns_abstract.methods.splat.ply", "ns_abstract.verify.interop", "ns_abstract.report.picture",
+    "ns_abstract.api.reaching", "ns_abstract.methods.splat.ply", "ns_abstract.verify.interop",
+    "ns_abstract.report.picture",
 )  # fmt: skip
 _VIEWER_IMPORTS = ("ns_abstract.nerfstudio.torchvision_operators", "ns_abstract.nerfstudio.viewing")
 #: Names of files by what they are; a change may give another.
 _FILES = {
     "path": "path.json", "spec": "spec.json", "prop": "prop.json", "lib": "unsafe.vnnlib", "net": "net.onnx",
-    "grid": "grid.npz", "scene": "scene.ply", "indices": "chosen.txt",
+    "grid": "grid.npz", "scene": "scene.ply", "indices": "chosen.txt", "loop": "loop.json",
 }  # fmt: skip
 #: Options of the commands and the files that they name.
 _OPTIONS: dict[str, dict[str, str]] = {
@@ -78,6 +83,7 @@ _OPTIONS: dict[str, dict[str, str]] = {
         "load-config": "config", "camera-path-filename": "path", "perturbation-filename": "spec", "model": "net",
         "property": "prop",
     },
+    "reach": {"load-config": "config", "loop": "loop"},
     "npz": {"input-dir": "results"}, "png": {"input-dir": "results"}, "mp4": {"input-dir": "results"},
     "ply": {"load-config": "config"}, "occupancy": {"load-config": "config"},
     "bench": {"load-config": "config", "camera-path-filename": "path"}, "demo": {}, "viewer": {"load-config": "config"},
@@ -86,6 +92,9 @@ _OUTPUT = {"npz": "output-filename", "mp4": "output-filename", "ply": "output-fi
 
 #: Files of a folder of results that a command may replace.
 _RESULTS = ("report.json", "report.html", *(f"frame_{k:05d}.{kind}" for k in range(2) for kind in ("npz", "png")))
+
+#: The same of a search.
+_SEARCH = ("report.json", "report.html", *(f"cells.sqlite{more}" for more in ("", "-wal", "-shm")))
 
 #: What a file becomes: bytes, text, a JSON value, or a function that writes it (and may return another path).
 Change = bytes | str | Mapping[str, Any] | list[Any] | Callable[..., Any]
@@ -103,6 +112,9 @@ class Row:
         options: More of the command line; ``{here}`` is the case's folder, ``{spec}`` an unharmed file.
         code: Expected exit code.
         memory: Bytes that it may take.
+        signals: Sent one after another, each once the words of ``after`` have been said.
+        after: What the command says before.
+        room: Bytes that a file may have: the disk is full beyond them.
     """
 
     command: str
@@ -112,6 +124,9 @@ class Row:
     options: tuple[str, ...] = ()
     code: int = 2
     memory: int = MEMORY
+    signals: tuple[int, ...] = ()
+    after: str = ""
+    room: int | None = None
 
     @property
     def name(self) -> str:
@@ -126,21 +141,30 @@ def row(
     options: tuple[str, ...] | str = (),
     code: int = 2,
     memory: int = MEMORY,
+    signals: tuple[int, ...] = (),
+    after: str = "",
+    room: int | None = None,
     **changes: Change,
 ) -> Row:
     """A `Row` on one line."""
     given = tuple(options.split()) if isinstance(options, str) else options
-    return Row(command, title, words, changes, given, code, memory)
+    return Row(command, title, words, changes, given, code, memory, signals, after, room)
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """What a command did: exit code (negative: killed by a signal; None: it hung), words and cost."""
+    """What a command did: exit code (negative: killed by a signal; None: it hung), words and cost.
+
+    Attributes:
+        peak: Bytes beyond those of a process that has imported everything.
+        seconds, computing: By the clock, and of this process on a core.
+    """
 
     code: int | None
     said: str
     peak: int
     seconds: float
+    computing: float
 
 
 class Server:
@@ -158,10 +182,13 @@ class Server:
             text=True, env=environment,
         )  # fmt: skip
 
-    def run(self, module: str, arguments: list[str], folder: Path, memory: int) -> Outcome:
-        """Run ``module``'s main in ``folder`` with a limit on memory."""
+    def run(self, case: Row, arguments: list[str], folder: Path) -> Outcome:
+        """Run a command's main in ``folder`` within the case's limits."""
         assert self._process.stdin is not None and self._process.stdout is not None
-        asked = {"module": module, "arguments": arguments, "folder": str(folder), "memory": memory}
+        asked = {
+            "module": MODULES[case.command], "arguments": arguments, "folder": str(folder), "memory": case.memory,
+            "signals": [int(number) for number in case.signals], "after": case.after, "room": case.room,
+        }  # fmt: skip
         self._process.stdin.write(json.dumps(asked) + "\n")
         self._process.stdin.flush()
         answer = self._process.stdout.readline()
@@ -183,16 +210,47 @@ class Bench:
 
     Args:
         folder: For the base files and a folder by case.
-        base: Paths of unharmed files: config, nerf (a config.yml each), path, spec, prop, lib, net, grid, results.
+        base: Paths of unharmed files: config, nerf (a config.yml each), path, spec, prop, lib, net, grid, loop,
+            results, search (a folder of ns-abstract-certify).
+
+    Attributes:
+        outcomes: Of all cases so far.
+        greedy, foreign: Cases that took more memory than they may, and files that were not theirs and were touched.
+        held: What changes leave open until their case has ended: locks, sockets.
     """
 
     def __init__(self, folder: Path, base: Mapping[str, Path]) -> None:
         self.folder, self.base = folder, base
         self.server = Server(folder)
+        self.outcomes: list[Outcome] = []
+        self.greedy = self.foreign = 0
+        self.held = ExitStack()
+        self.port = ""
         self._count = 0
+
+    @property
+    def summary(self) -> str:
+        """Figures of all cases so far."""
+        found = self.outcomes
+        lines = sum("Traceback" in outcome.said for outcome in found)
+        hung = sum(outcome.code is None or outcome.computing > COMPUTING for outcome in found)
+        return (
+            f"{len(found)} cases: {lines} tracebacks, {hung} hung or computed for more than {COMPUTING:.0f} s, "
+            f"{self.greedy} took more memory than they may, {self.foreign} foreign files touched; at most "
+            f"{max((o.computing for o in found), default=0.0):.1f} s of computing and "
+            f"{max((o.seconds for o in found), default=0.0):.1f} s by the clock, at most "
+            f"{max((o.peak for o in found), default=0) >> 20} MiB"
+        )
 
     def run(self, case: Row) -> Outcome:
         """Write the case's files, run it, and check that nothing else was touched."""
+        with self.held:
+            outcome = self._run(case)
+        self.outcomes.append(outcome)
+        self.greedy += outcome.peak > case.memory
+        return outcome
+
+    def _run(self, case: Row) -> Outcome:
         self._count += 1
         here = self.folder / f"case_{self._count:04d}"
         here.mkdir()
@@ -214,23 +272,25 @@ class Bench:
             arguments += [f"--{target}", str(out if name is None else here / name)]
         more = case.options[1:] if case.command == "bench" else case.options
         arguments += [
-            text.replace("{here}", str(here)).replace("{spec}", str(self.base["spec"]))
+            text.replace("{here}", str(here)).replace("{spec}", str(self.base["spec"])).replace("{port}", self.port)
             for text in more
             if not text.startswith("--no-")
         ]
         before = _tree(here) | _tree(self.folder / "base")
-        outcome = self.server.run(MODULES[case.command], arguments, here, case.memory)
+        outcome = self.server.run(case, arguments, here)
         after = _tree(here) | _tree(self.folder / "base")
         own = (str(out), str(here / "out."))
         kept = dict(before)
-        if "{here}/results" in case.options:
-            # where results are continued, what is not one of them is to stay
-            own = (*own, str(here / "results"))
-            ours = {str(here / "results" / name) for name in _RESULTS}
-            kept = {name: digest for name, digest in before.items() if name not in ours}
+        for folder, names in (("results", _RESULTS), ("search", _SEARCH)):
+            if f"{{here}}/{folder}" in case.options:
+                # where results are continued, what is not one of them is to stay
+                own = (*own, str(here / folder))
+                ours = {str(here / folder / name) for name in names}
+                kept = {name: digest for name, digest in kept.items() if name not in ours}
         changed = sorted(name for name, digest in kept.items() if after.get(name) != digest)
-        assert not changed, f"touched {changed}"
         fresh = [name for name in after if name not in before and not name.startswith(own)]
+        self.foreign += len(changed) + len(fresh)
+        assert not changed, f"touched {changed}"
         assert not fresh, f"left {fresh} outside of the output"
         shutil.rmtree(here)
         return outcome
@@ -247,24 +307,33 @@ class Bench:
             shutil.copytree(files["config"].parent, copied)
             files["config"] = copied / "config.yml"
             if "yml" in run:
-                text = run["yml"](files["config"].read_text()) if callable(run["yml"]) else run["yml"]
+                text: Any = run["yml"](files["config"].read_text()) if callable(run["yml"]) else run["yml"]
                 files["config"].write_bytes(text if isinstance(text, bytes) else text.encode())
             if "ckpt" in run:
                 _write(run["ckpt"], next((copied / "nerfstudio_models").glob("step-*.ckpt")))
             if "transforms" in run:
                 _write(run["transforms"], copied / "dataparser_transforms.json")
-        if "results" in changes:
-            change = changes.pop("results")
-            files["results"] = here / "results"
-            shutil.copytree(self.base["results"], files["results"])
+        for kind in ("results", "search"):
+            if kind in changes:
+                change = changes.pop(kind)
+                files[kind] = here / kind
+                shutil.copytree(self.base[kind], files[kind])
+                assert callable(change)
+                if isinstance(held := change(files[kind]), AbstractContextManager):
+                    self.held.enter_context(held)
+                (files[kind] / "mine.txt").write_text("not to be touched")
+        if "listener" in changes:
+            change = changes.pop("listener")
             assert callable(change)
-            change(files["results"])
-            (files["results"] / "mine.txt").write_text("not to be touched")
+            self.port = str(self.held.enter_context(change()))
         for kind, change in changes.items():
             file = here / _FILES[kind]
             if kind in self.base and callable(change):
                 shutil.copy(self.base[kind], file)
             files[kind] = _write(change, file) or file
+        if case.command == "reach" and "net" not in changes:
+            # beside the loop's file, wherever that is
+            shutil.copy(self.base["net"], here / _FILES["net"])
         if "lib" in changes and "prop" not in changes:
             prop = json.loads(self.base["prop"].read_text())
             files["prop"] = here / "prop.json"
@@ -311,6 +380,7 @@ def check(case: Row, outcome: Outcome) -> None:
     said = outcome.said
     assert outcome.code is not None, f"hung: {said}"
     assert "Traceback" not in said, said
+    assert outcome.computing <= COMPUTING, f"{outcome.computing:.0f} s: {said}"
     assert outcome.code == case.code, said
     assert not CONTROL.search(said), ascii(said)
     for word in case.words:
@@ -342,7 +412,15 @@ def _serve() -> None:
         print(json.dumps(dataclasses.asdict(_tried(**asked))), file=answers, flush=True)
 
 
-def _tried(module: str, arguments: list[str], folder: str, memory: int) -> Outcome:
+def _tried(
+    module: str,
+    arguments: list[str],
+    folder: str,
+    memory: int,
+    signals: list[int],
+    after: str,
+    room: int | None,
+) -> Outcome:
     """Run one command in a child."""
     reader, writer = os.pipe()
     wait, go = os.pipe()
@@ -352,7 +430,7 @@ def _tried(module: str, arguments: list[str], folder: str, memory: int) -> Outco
         os.close(reader)
         os.read(wait, 1)
         os.close(wait)
-        _child(module, arguments, folder, memory, writer)
+        _child(module, arguments, folder, memory, writer, room)
     os.close(wait)
     os.close(writer)
     before = int(Path(f"/proc/{child}/statm").read_text().split()[1]) * resource.getpagesize() >> 10
@@ -370,15 +448,21 @@ def _tried(module: str, arguments: list[str], folder: str, memory: int) -> Outco
         if not part:
             break
         said.write(part)
+        if signals and after.encode() in said.getvalue():
+            os.kill(child, signals.pop(0))
+            after = "stopping" if signals else after
     os.close(reader)
     _, status, usage = os.wait4(child, 0)
     code = None if hung else os.waitstatus_to_exitcode(status)
     text = said.getvalue().decode(errors="backslashreplace")
-    return Outcome(code, text, max(0, usage.ru_maxrss - before) << 10, time.perf_counter() - begin)
+    peak = max(0, usage.ru_maxrss - before) << 10
+    return Outcome(code, text, peak, time.perf_counter() - begin, usage.ru_utime + usage.ru_stime)
 
 
-def _child(module: str, arguments: list[str], folder: str, memory: int, writer: int) -> None:
+def _child(module: str, arguments: list[str], folder: str, memory: int, writer: int, room: int | None) -> None:
     """The command itself."""
+    from ns_abstract.execution import engines
+
     code = 99
     try:
         os.dup2(os.open(os.devnull, os.O_RDONLY), 0)
@@ -389,6 +473,10 @@ def _child(module: str, arguments: list[str], folder: str, memory: int, writer: 
         sizes = Path("/proc/self/statm").read_text().split()
         limit = max(_LEAST, int(sizes[0]) * resource.getpagesize() + memory + _ADDRESSES)
         resource.setrlimit(resource.RLIMIT_AS, (limit, limit))
+        if room is not None:
+            resource.setrlimit(resource.RLIMIT_FSIZE, (room, room))
+        # a scheduler that does not answer is asked for that long
+        engines._CONNECT = 1.0
         sys.argv = ["command", *arguments]
         sys.stdout, sys.stderr = os.fdopen(1, "w"), os.fdopen(2, "w")
         importlib.import_module(module).main()

@@ -182,9 +182,9 @@ def test_interrupt_keeps_what_is_known(how: str, wall: nsa.Scene, request: pytes
 
 
 def test_certificate_ends_early_and_goes_on(wall: nsa.Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from ns_abstract.api import certifying
+    from ns_abstract.api import searching
 
-    monkeypatch.setattr(certifying, "_TRACE", 0.0)
+    monkeypatch.setattr(searching, "_TRACE", 0.0)
     rows = np.stack([np.ones(3 * 64), np.zeros(3 * 64)]) / 192
     net = linear(tmp_path / "net.onnx", rows, np.array([0.0, 0.6]), 8)
     poses = nsa.PoseSet(straight(8), translation={"x": 0.6}, frame="world")

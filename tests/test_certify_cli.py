@@ -13,7 +13,6 @@ import signal
 import sqlite3
 import subprocess
 import sys
-import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -23,10 +22,17 @@ import onnxruntime
 import pytest
 import torch
 from certifying import classifier, linear
-from conftest import Inputs, write_json
+from conftest import InProcess, Inputs, environment, write_json
+from interrupting import LONG, check_ended_in_a_library_call, check_interrupted, interrupted_at, stored, until
 
 from ns_abstract.api import certifying
-from ns_abstract.api.certification import Certification, CertifySettings, examine_block, open_certification
+from ns_abstract.api.certification import (
+    Certification,
+    CertifySettings,
+    FramePictures,
+    examine_block,
+    open_certification,
+)
 from ns_abstract.cli import certify as certify_command
 from ns_abstract.cli.certify import Certify, certify
 from ns_abstract.demo.writing import write_demo
@@ -35,9 +41,12 @@ from ns_abstract.execution.opening import forget
 from ns_abstract.io.errors import InputError
 from ns_abstract.methods.splat.method import SplatMethod
 from ns_abstract.methods.splat.reference import Reference
+from ns_abstract.perturbation.variations import SceneVariation, Selection
 from ns_abstract.verify import model
 from ns_abstract.verify.eight_bit import rounded
 from ns_abstract.verify.network import OutputBounds
+from ns_abstract.verify.response import Response
+from ns_abstract.verify.scene_margin import CAMERA_KINDS, KINDS
 
 MODULE = "ns_abstract.cli.certify"
 SIZE = 16
@@ -93,10 +102,6 @@ def cells(folder: Path) -> list[tuple[Any, ...]]:
     with sqlite3.connect(folder / "cells.sqlite") as base:
         rows = base.execute("SELECT frame, lower, upper, verdict, margin, counterexample FROM cells").fetchall()
     return sorted(rows, key=lambda row: (row[0], json.loads(row[1])))
-
-
-def environment() -> dict[str, str]:
-    return os.environ | {"PYTHONPATH": str(Path(certify_command.__file__).resolve().parents[2])}
 
 
 def start(options: list[str], **more: Any) -> subprocess.Popen[str]:
@@ -363,6 +368,49 @@ def test_partitions(blobs: Inputs, bright: tuple[Path, float, float], tmp_path: 
         assert round(size) == pytest.approx(size) and (verdict == "certified" or round(size) == 1)
 
 
+def test_parts_without_a_number_are_not_right(
+    blobs: Inputs, bright: tuple[Path, float, float], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Where the network's outputs are NaN, parts are neither certified nor right, and the report counts them."""
+    prop = {"type": "classification", "label": 0, "preprocess": PRE, "partitions": 20}
+    case = Case(tmp_path / "case", blobs, bright[0], prop)
+    outputs = model.NetworkModel.outputs
+    poses = np.linspace(-0.15, 0.15, 81)
+    contrast = outputs(case.job.model, np.stack([case.job.pictures(0).image(np.array([x])) for x in poses]))[:, 0]
+    limit = float(np.quantile(contrast, 0.8))
+
+    def without(self: Any, images: np.ndarray) -> np.ndarray:
+        found = np.array(outputs(self, images))
+        found[found[:, 0] > limit] = np.nan
+        return found
+
+    monkeypatch.setattr(model.NetworkModel, "outputs", without)
+    # bounds know nothing of it
+    document = case.run(tmp_path / "out")
+    parts, (frame,) = document["partitions"], document["frames"]
+    assert parts["undecided"] == frame["partition"]["undecided"] / 20 >= 0.1
+    assert parts["PCP-V"] <= parts["PCP-S"] <= 1.0 - parts["undecided"] - frame["coverage"]["falsified"]
+    assert document["unknown_because"]["the margin of a picture is no finite number"] >= 2
+    assert "undecided (no finite margin)" in (tmp_path / "out" / "report.html").read_text()
+    # no part with such a picture at its ends or middle is certified, and every one is counted
+    width, low = 0.3 / 20, -0.15
+    rows = [
+        (json.loads(lower)[0], json.loads(upper)[0], verdict)
+        for _, lower, upper, verdict, *_ in cells(tmp_path / "out")
+    ]
+    undecided = 0
+    for number in range(20):
+        ends = [low + width * (number + t) for t in (0.0, 0.5, 1.0)]
+        values = outputs(
+            case.job.model, np.stack([case.job.pictures(0).image(np.array([x]).clip(low, -low)) for x in ends])
+        )
+        lost = bool((values[:, 0] > limit).any())
+        undecided += lost
+        (verdict,) = {kind for a, b, kind in rows if a <= ends[1] <= b}
+        assert not (lost and verdict == "certified")
+    assert 0 < undecided <= frame["partition"]["undecided"]
+
+
 # ---------------------------------------------------------------- long runs
 
 
@@ -376,11 +424,9 @@ def test_killed_run_resumed_equals_an_uninterrupted_one(planted: Case, finished:
     kills = 0
     for round_ in range(40):
         process = start(planted.options(folder, resume=round_ > 0))
-        deadline = time.monotonic() + 120
-        known = settled(folder)
+        known = stored(folder)
         # killed as soon as it has stored something new
-        while process.poll() is None and settled(folder) < known + 2 and time.monotonic() < deadline:
-            time.sleep(0.02)
+        until(lambda: stored(folder) > known, process)  # noqa: B023
         if process.poll() is not None:
             assert process.returncode == 0, process.stderr and process.stderr.read()
             break
@@ -398,20 +444,12 @@ def test_killed_run_resumed_equals_an_uninterrupted_one(planted: Case, finished:
     assert one["frames"] == other["frames"]
 
 
-def settled(folder: Path) -> int:
-    """Blocks stored so far, read without disturbing the command: pages of the write-ahead log."""
-    return sum((folder / f"cells.sqlite{suffix}").stat().st_size // 16384 for suffix in ("", "-wal")
-               if (folder / f"cells.sqlite{suffix}").exists())  # fmt: skip
-
-
 def test_interrupt_leaves_what_is_finished(planted: Case, finished: Path, tmp_path: Path) -> None:
     folder = tmp_path / "out"
     process = start(planted.options(folder, workers=2))
-    deadline = time.monotonic() + 120
-    while process.poll() is None and settled(folder) < 3 and time.monotonic() < deadline:
-        time.sleep(0.02)
+    until(lambda: stored(folder) >= 3, process)
     process.send_signal(signal.SIGINT)
-    _, said = process.communicate(timeout=120)
+    _, said = process.communicate(timeout=LONG)
     if process.returncode == 0:
         pytest.skip("the command was quicker than the signal")
     assert process.returncode == 3 and "Traceback" not in said, said
@@ -420,6 +458,33 @@ def test_interrupt_leaves_what_is_finished(planted: Case, finished: Path, tmp_pa
     assert covered == pytest.approx(0.3)
     planted.run(folder, resume=True)
     assert cells(folder) == cells(finished)
+
+
+@pytest.mark.parametrize(
+    "place",
+    [
+        "ns_abstract.cli.certifying:open_certification",
+        "ns_abstract.cli.certifying:compile_beside",
+        "ns_abstract.api.certifying:preview",
+        "ns_abstract.api.certifying:examine_here",
+    ],
+)
+def test_interrupted_before_the_first_block(
+    place: str, planted: Case, finished: Path, tmp_path: Path, in_process: InProcess, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = tmp_path / "out"
+    with monkeypatch.context() as patched:
+        interrupted_at(place, patched)
+        check_interrupted(in_process, certify_command.main, planted.options(folder), folder)
+    assert folder.exists() == ("open_certification" not in place)
+    planted.run(folder, resume=True)
+    assert cells(folder) == cells(finished)
+
+
+def test_ended_while_kernels_are_compiled(planted: Case, tmp_path: Path) -> None:
+    folder = tmp_path / "out"
+    options = planted.options(folder)
+    check_ended_in_a_library_call(MODULE, "ns_abstract.cli.certifying.compile_beside", options, folder)
 
 
 def test_budget_ends_with_a_result_and_is_continued(planted: Case, finished: Path, tmp_path: Path) -> None:
@@ -469,9 +534,7 @@ def test_killed_worker_loses_nothing_and_counts_nothing_twice(tmp_path: Path) ->
         for number in range(8):
             engine.submit(number, sleep_or_die, str(tmp_path / "marker"), number)
         found: list[tuple[int, int]] = []
-        deadline = time.monotonic() + 120
-        while len(found) < 8 and time.monotonic() < deadline:
-            found += engine.collect(1.0)
+        until(lambda: bool(found.extend(engine.collect(1.0))) or len(found) >= 8)
         assert sorted(found) == [(n, n * n) for n in range(8)] and (tmp_path / "marker").exists()
         assert engine.collect(0.1) == []
     finally:
@@ -502,7 +565,7 @@ needs_dask = pytest.mark.skipif(importlib.util.find_spec("distributed") is None,
 def test_two_dask_workers_equal_one_process(planted: Case, finished: Path, tmp_path: Path) -> None:
     folder = tmp_path / "out"
     process = start(planted.options(folder, workers=2, engine="dask"), cwd=tmp_path)
-    _, said = process.communicate(timeout=400)
+    _, said = process.communicate(timeout=LONG)
     assert process.returncode == 0, said
     assert cells(folder) == cells(finished)
 
@@ -684,13 +747,10 @@ def test_foreign_text_is_escaped(blobs: Inputs, bright: tuple[Path, float, float
 
 
 @pytest.fixture
-def call(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Callable[[list[str]], tuple[int, str]]:
+def call(in_process: InProcess) -> Callable[[list[str]], tuple[int, str]]:
     def run(options: list[str]) -> tuple[int, str]:
-        monkeypatch.setattr(sys, "argv", ["command", *options])
-        capsys.readouterr()
-        with pytest.raises(SystemExit) as leave:
-            certify_command.main()
-        return int(leave.value.code or 0), capsys.readouterr().err
+        code, _, err = in_process(certify_command.main, options)
+        return code, err
 
     return run
 
@@ -795,6 +855,60 @@ def test_a_variation_of_the_scene_breaks_what_poses_do_not(
         assert np.abs(stored["scene_color"]).max() <= 1.0
         assert not np.subtract(*case.job.model.outputs(stored["image"][None])[0]) > 0.0
         assert not np.array_equal(stored["image"], case.job.pictures(0).image(np.zeros(0)))
+
+
+KINDS_BY_NAME = {kind.name: kind for kind in (*KINDS, *CAMERA_KINDS)}
+
+
+def test_scene_margin(blobs: Inputs, bright: tuple[Path, float, float], tmp_path: Path) -> None:
+    """Scenes at the ends of the certified radius break nothing, whatever varies; scenes that do lie farther off."""
+    spec = {"version": 1, "translation": {"x": [0.1, 0.11]}}
+    case = Case(tmp_path / "case", blobs, bright[0], {"type": "classification", "label": 0, "preprocess": PRE}, spec)
+    found = case.run(tmp_path / "out", time_budget=240.0, scene_margin=True)
+    assert found["verdict"] == "certified" and found["scene_margin"]["skipped"] is None
+    job, rng = case.job, np.random.default_rng(4)
+    kinds = {entry["kind"]: entry for entry in found["scene_margin"]["kinds"]}
+    assert list(kinds) == ["mean", "opacity", "color", "brightness", "white_balance", "gamma"]
+    for name, entry in kinds.items():
+        radius, broken = entry["radius"], entry["falsified"]
+        assert entry["state"] == "done" and radius > 0.0 and entry["runs"] >= entry["cells"]
+        # it was bisected to the end, and what was found to break the property lies beyond
+        assert radius < entry["not_certified"]["radius"] <= 1.2 * radius or radius == KINDS_BY_NAME[name].most
+        assert broken is None or broken["radius"] > radius
+        if (response := KINDS_BY_NAME[name].response) is not None:
+            set_ = Response(response, radius)
+            pictures = FramePictures(job.job.method, job.job.pose_sets[0], "float", set_)
+        else:
+            ends: dict[str, Any] = {name: (-radius, radius)}
+            pictures = job.around(SceneVariation(Selection(), **ends)).pictures(0)
+        claim = job.claim(job.pictures(0))
+
+        def loss(picture: torch.Tensor, values: torch.Tensor, claim: Any = claim) -> torch.Tensor:
+            return -claim.margin(job.model.differentiable(picture[None]), values[None])[0]
+
+        for number, member in enumerate(itertools.islice(pictures.members(2), 0, 24, 2)):
+            values = pictures.box.sample(1, rng)[0]
+            if number % 4 == 0:
+                values, member = member.pushed(pictures.box, values, loss, 2.0)
+            outputs = job.model.outputs(pictures.image(values, member)[None])
+            assert (
+                float(claim.margin(torch.from_numpy(np.asarray(outputs, np.float64)), torch.from_numpy(values)[None]))
+                > 0
+            )
+    assert any(entry["falsified"] for entry in kinds.values())
+    # factors of the channels are one factor, too
+    assert kinds["white_balance"]["radius"] <= kinds["brightness"]["radius"]
+    for name, entry in kinds.items():
+        files = list((tmp_path / "out" / "counterexamples").glob(f"scene_margin_{name}.npz"))
+        assert bool(files) == bool(entry["falsified"])
+        for file in files:
+            with np.load(file) as stored:
+                assert float(stored["radius"]) == entry["falsified"]["radius"]
+                assert not np.subtract(*job.model.outputs(stored["image"][None])[0]) > 0.0
+                of_camera = KINDS_BY_NAME[name].response is not None
+                assert stored["scene_response" if of_camera else f"scene_{name}"].shape[0] > 0
+    page = (tmp_path / "out" / "report.html").read_text()
+    assert "How wrong the scene may be" in page
 
 
 def test_a_variation_that_picks_nothing(

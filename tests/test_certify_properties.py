@@ -12,6 +12,7 @@ import pytest
 import torch
 from conftest import write_json
 
+from ns_abstract.api.certification import PropertySource
 from ns_abstract.geometry.camera_path import Camera
 from ns_abstract.geometry.poses import PoseSet
 from ns_abstract.geometry.views import look_at
@@ -19,7 +20,7 @@ from ns_abstract.io.errors import InputError
 from ns_abstract.perturbation.specification import parse_perturbation
 from ns_abstract.verify.network import OutputBounds
 from ns_abstract.verify.preprocess import Preprocess, parse_preprocess
-from ns_abstract.verify.properties import Claim, DetectionClaim, Truth, decode, load_property
+from ns_abstract.verify.properties import Claim, DetectionClaim, Truth, decode, parse_property
 from ns_abstract.verify.vnnlib import load_vnnlib
 
 SHAPE = (3, 16, 16)
@@ -35,7 +36,15 @@ def poses(spec: dict[str, Any] | None = None) -> PoseSet:
 
 
 def parsed(tmp_path: Path, value: Any, shapes: Any = (SHAPE, (10,))) -> Any:
-    return load_property(write_json(tmp_path / "prop.json", value), *shapes)
+    return loaded(write_json(tmp_path / "prop.json", value), *shapes)
+
+
+def loaded(file: Path, *shapes: Any) -> Any:
+    source = PropertySource.of(file)
+    try:
+        return parse_property(source.value, source.folder, *shapes)
+    except InputError as error:
+        raise source.within(error) from None
 
 
 # ---------------------------------------------------------------- mistakes
@@ -126,7 +135,7 @@ def test_broken_json(text: str, tmp_path: Path) -> None:
     file = tmp_path / "prop.json"
     file.write_text(text)
     with pytest.raises(InputError) as caught:
-        load_property(file, SHAPE, (10,))
+        loaded(file, SHAPE, (10,))
     assert caught.value.file == str(file)
 
 
@@ -294,6 +303,9 @@ def test_regression_uses_correlation(tmp_path: Path) -> None:
     assert 0.009 < claim.proved(query, bounds, [pose_set.box])[0] <= 0.01
     # without the lines nothing is proved
     assert claim.proved(query, OutputBounds(bounds.lower, 0.0 * a, bounds.lower), [pose_set.box])[0] < 0.0
+    # nor by lines that stay where they are while the truth moves
+    still = OutputBounds(np.full_like(b, -np.inf), 0.0 * a, b)
+    assert claim.proved(query, still, [pose_set.box])[0] < 0.0
     for bad in (np.nan, np.inf, -np.inf):
         broken = OutputBounds(*(np.full_like(v, bad) for v in (bounds.lower, a, b)))
         assert not claim.proved(query, broken, [pose_set.box])[0] > 0.0

@@ -18,12 +18,14 @@ from typing import Any
 
 import numpy as np
 import pytest
-from conftest import SHIFT, Inputs, blob_scene, ring, write_json
+from conftest import SHIFT, InProcess, Inputs, blob_scene, environment, ring, write_json
+from interrupting import LONG, check_ended_in_a_library_call, check_interrupted, interrupted_at, until
 
 from ns_abstract.api.files import Settings, open_job
 from ns_abstract.cli import demo as demo_command
 from ns_abstract.cli import render as render_command
 from ns_abstract.cli.common import complaint
+from ns_abstract.cli.rendering import listed
 from ns_abstract.geometry.views import View, path_json
 from ns_abstract.io.folder import MARK
 from ns_abstract.methods.splat.scene import SplatScene
@@ -35,16 +37,12 @@ SIX = {"translation": {"x": 0.2, "y": 0.2, "z": 0.2}, "rotation": {"yaw": 0.2, "
 
 
 @pytest.fixture
-def call(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Callable[..., tuple[int, str]]:
+def call(in_process: InProcess) -> Callable[..., tuple[int, str]]:
     """Runs a command in this process: exit code and what it wrote to stderr."""
 
     def run(options: list[str], main: Callable[[], None] = render_command.main) -> tuple[int, str]:
-        monkeypatch.setattr(sys, "argv", ["command", *options])
-        capsys.readouterr()
-        with pytest.raises(SystemExit) as leave:
-            main()
-        assert isinstance(leave.value.code, int)
-        return leave.value.code, capsys.readouterr().err
+        code, _, err = in_process(main, options)
+        return code, err
 
     return run
 
@@ -55,11 +53,6 @@ def outside(options: list[str], *python: str, module: str = MODULE, **more: Any)
         [sys.executable, *python, "-m", module, *options],
         capture_output=True, text=True, timeout=900, check=False, env=environment(), **more,
     )  # fmt: skip
-
-
-def environment() -> dict[str, str]:
-    """So that a fresh process finds this package wherever it runs."""
-    return os.environ | {"PYTHONPATH": str(Path(render_command.__file__).resolve().parents[2])}
 
 
 def one_line(code: int, text: str, *fragments: str) -> None:
@@ -634,14 +627,11 @@ def test_signal_saves_what_is_finished(number: int, make_blobs: Callable[..., In
     command = [sys.executable, "-m", MODULE, *options]
     process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True, env=environment())
     try:
-        deadline = time.monotonic() + 600
-        while not (folder / "frame_00001.png").exists():
-            assert process.poll() is None and time.monotonic() < deadline, "the first frames are not finished"
-            time.sleep(0.05)
+        until((folder / "frame_00001.png").exists, process)
         time.sleep(0.5)
         assert process.poll() is None
         process.send_signal(number)
-        _, said = process.communicate(timeout=60)
+        _, said = process.communicate(timeout=LONG)
     finally:
         process.kill()
         process.wait()
@@ -656,6 +646,35 @@ def test_signal_saves_what_is_finished(number: int, make_blobs: Callable[..., In
     assert all(frame(folder, entry["index"]).status == entry["status"] for entry in document["frames"])
     assert not list(folder.glob("*.part"))
     assert "</html>" in (folder / "report.html").read_text()
+
+
+@pytest.mark.parametrize(
+    "place",
+    [
+        "ns_abstract.cli.rendering:open_job",
+        "ns_abstract.cli.rendering:compile_beside",
+        "ns_abstract.api.job:Job.warm_up",
+        "ns_abstract.api.job:Job.bound_part",
+    ],
+)
+def test_interrupted_before_the_first_frame(
+    place: str, blobs: Inputs, finished: Path, tmp_path: Path, in_process: InProcess, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = tmp_path / "out"
+    options = blobs.options(folder, frames=[0], time_budget=120)
+    with monkeypatch.context() as patched:
+        interrupted_at(place, patched)
+        check_interrupted(in_process, render_command.main, options, folder)
+    assert folder.exists() == ("open_job" not in place)
+    if "bound_part" in place:
+        assert in_process(render_command.main, [*options, "--resume"])[0] == 0
+        same_pictures(frame(folder, 0), frame(finished, 0))
+
+
+def test_ended_while_kernels_are_compiled(blobs: Inputs, tmp_path: Path) -> None:
+    folder = tmp_path / "out"
+    options = blobs.options(folder, frames=[0])
+    check_ended_in_a_library_call(MODULE, "ns_abstract.cli.rendering.compile_beside", options, folder)
 
 
 # ---------------------------------------------------------------- cluster
@@ -722,7 +741,17 @@ def test_demo_writes_what_the_next_command_needs(
     tmp_path: Path, call: Callable[..., tuple[int, str]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     assert call(["--output-dir", str(tmp_path), "--splats-only"], demo_command.main)[0] == 0
-    job = open_job(Settings(next(tmp_path.rglob("config.yml")), tmp_path / "camera_path.json", tmp_path / "SPEC.json"))
+    job = open_job(
+        Settings(
+            next((tmp_path / "airfield").rglob("config.yml")), tmp_path / "camera_path.json", tmp_path / "SPEC.json"
+        )
+    )
     assert job.frame_count == 5
     assert job.pose_sets[0].box.names == ("x",)
     assert len(list((tmp_path / "data" / "images").glob("*.png"))) == 10
+
+
+def test_many_frames_are_told_in_few_words() -> None:
+    assert listed([]) == "" and listed([4]) == "4" and listed([0, 1]) == "0, 1" and listed([0, 1, 3]) == "0, 1, 3"
+    assert listed(range(7, 100000)) == "7 to 99999" and listed([0, 2, 3, 4, 9]) == "0, 2 to 4, 9"
+    assert listed(range(0, 100, 2)) == "0, 2, 4, 6, 8, 10, 12, 14 and others, 50 together"

@@ -18,8 +18,9 @@ from typing import Any
 
 import pytest
 from conftest import Inputs
+from interrupting import until
 from test_cli import call, environment, one_line  # noqa: F401
-from test_ending import alive, wait_for
+from test_ending import alive
 
 from ns_abstract.execution import engines
 from ns_abstract.execution.engines import Cluster, Tls, connected
@@ -44,7 +45,7 @@ class Parts:
         file = folder / "scheduler.json"
         self.scheduler = self._start("scheduler", "--host", "127.0.0.1", "--port", "0", "--no-dashboard",
                                      "--scheduler-file", str(file))  # fmt: skip
-        wait_for(file.exists)
+        until(file.exists)
         self.address: str = json.loads(file.read_text())["address"]
         self.workers = [self.worker() for _ in range(2)]
 
@@ -75,7 +76,7 @@ def parts(tmp_path: Path) -> Iterator[Parts]:
 
 def busy(client: Any, folder: Path) -> Cluster:
     """Two workers with much to do, and a first result."""
-    wait_for(lambda: len(client.nthreads()) == 2)
+    until(lambda: len(client.nthreads()) == 2)
     engine = Cluster(client)
     for number in range(1000):
         engine.submit(number, slow, str(folder), number)
@@ -87,7 +88,7 @@ def busy(client: Any, folder: Path) -> Cluster:
 
 def test_a_killed_worker_loses_nothing(parts: Parts, tmp_path: Path) -> None:
     with connected(parts.address) as client:
-        wait_for(lambda: len(client.nthreads()) == 2)
+        until(lambda: len(client.nthreads()) == 2)
         engine = Cluster(client)
         for number in range(12):
             engine.submit(number, slow, str(tmp_path), number)
@@ -159,10 +160,10 @@ def test_a_killed_client_leaves_nothing_behind(local: bool, tmp_path: Path) -> N
         process.send_signal(signal.SIGKILL)
         process.wait()
         if parts is None:
-            wait_for(lambda: not any(map(alive, pids)))
+            until(lambda: not any(map(alive, pids)))
         else:
             with connected(parts.address) as client:
-                wait_for(lambda: not any(client.processing().values()))
+                until(lambda: not any(client.processing().values()))
                 engine = Cluster(client)
                 engine.submit(0, slow, str(tmp_path / "done"), 7)
                 found: list[Any] = []
@@ -312,7 +313,7 @@ def test_tls_from_end_to_end(pem: dict[str, Path], tmp_path: Path) -> None:
         assert parts.address.startswith("tls://")
         tls = Tls.of(pem["ca_file"], pem["cert"], pem["key"], parts.address)
         with connected(parts.address.removeprefix("tls://"), 1, tls) as client:
-            wait_for(lambda: len(client.nthreads()) > 0)
+            until(lambda: len(client.nthreads()) > 0)
             engine = Cluster(client)
             engine.submit(0, slow, str(tmp_path), 5)
             found: list[Any] = []

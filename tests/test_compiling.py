@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import subprocess
 import sys
 from multiprocessing import Pipe
@@ -16,6 +17,7 @@ from conftest import Inputs
 from ns_abstract.api import compiling
 from ns_abstract.api.files import Settings, open_job
 from ns_abstract.arithmetic.kernel_cache import store
+from ns_abstract.cli.common import show_log
 from ns_abstract.methods.splat import bounds
 
 
@@ -99,6 +101,52 @@ def test_processes_that_fail_leave_the_work_to_this_one(blobs: Inputs, monkeypat
     monkeypatch.setattr(compiling.subprocess, "Popen", refuse)
     compiling.compile_beside(job, 0, 2)
     assert len(refreshed) == 2
+
+
+_BUSY = """
+import sys, time
+from multiprocessing.connection import Connection
+from pathlib import Path
+line = Connection(int(sys.argv[1]))
+line.recv()
+line.send(7)
+while not Path(sys.argv[2]).exists():
+    time.sleep(0.05)
+"""
+
+
+def test_what_is_compiled_is_told_where_there_is_no_terminal(
+    blobs: Inputs, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A line with a count and what is at work, every few seconds."""
+    job = open_job(Settings(blobs.config, blobs.path, blobs.spec))
+    popen, told = subprocess.Popen, logging.getLogger("ns_abstract.kernels")
+    wanted = "compiling kernels (first use only): 14 done; at work: gaussian stage, pixel stage, moving colors"
+
+    def seen(record: logging.LogRecord) -> bool:
+        # both processes work until it was said
+        if record.getMessage() == wanted:
+            (tmp_path / "said").touch()
+        return True
+
+    def busy(command: list[str], **more: Any) -> Any:
+        return popen([sys.executable, "-c", _BUSY, command[3], str(tmp_path / "said")], **more)
+
+    monkeypatch.setattr(compiling, "store", lambda: SimpleNamespace(empty=True, refresh=lambda: None))
+    monkeypatch.setattr(compiling.subprocess, "Popen", busy)
+    monkeypatch.setattr(compiling, "_PACE", 0.0)
+    monkeypatch.setattr(logging.getLogger("ns_abstract"), "handlers", [])
+    level = told.level
+    told.setLevel(logging.INFO)
+    told.addFilter(seen)
+    try:
+        show_log()
+        compiling.compile_beside(job, 0, 2)
+    finally:
+        told.removeFilter(seen)
+        told.setLevel(level)
+    said = capsys.readouterr().err.splitlines()
+    assert wanted in said and all(line.startswith("compiling kernels (first use only): ") for line in said)
 
 
 def test_worker_compiles_what_it_is_told(blobs: Inputs, tmp_path: Path) -> None:

@@ -2,7 +2,8 @@
 
 A case is the command, what is wrong, the words that the error must say, and the files or options that are changed;
 its exit code is 2 where nothing else stands. For every case: no traceback, no hanging, no control characters, one
-line that names a fix, memory within its limit, and no file touched but the command's own output.
+line that names a fix, memory within its limit, and no file touched but the command's own output. In the end
+``pytest tests/test_corpus.py`` prints figures of all cases.
 """
 
 # a line for a case, however long
@@ -15,8 +16,15 @@ import json
 import os
 import re
 import shutil
+import signal
+import socket
+import sqlite3
+import subprocess
+import sys
+import threading
 import zipfile
 from collections.abc import Iterator
+from contextlib import closing, contextmanager, nullcontext, suppress
 from pathlib import Path
 from typing import Any
 
@@ -29,21 +37,36 @@ from conftest import SHIFT, blob_scene, ring, write_json
 from corpus import Bench, Row, check, row, rows_by_name
 from nerfs import tiny_scene
 
+from ns_abstract.api.certification import CertifySettings, open_certification
+from ns_abstract.api.certifying import CertificateRun
 from ns_abstract.api.files import Settings, open_job
 from ns_abstract.geometry.views import path_json
+from ns_abstract.io.folder import MARK, claim
 from ns_abstract.methods.nerf.occupancy import OccupancyGrid
 from ns_abstract.methods.nerf.write import write_nerf_run
 from ns_abstract.methods.splat.load import load_scene
 from ns_abstract.methods.splat.ply import write_ply
 from ns_abstract.methods.splat.write import write_splatfacto_run
 from ns_abstract.refine.result import FrameResult, TracePoint
+from ns_abstract.report.certificate import write_certificate
 from ns_abstract.report.record import Report, Run, file_stamp
+from ns_abstract.verify.search import Findings, Leaf
 
 SIZE = 16
 PREPROCESS = {"resize": [SIZE, SIZE], "mean": [0.4, 0.45, 0.5], "std": [0.25, 0.25, 0.3]}
 PROPERTY = {"type": "classification", "label": 0, "preprocess": PREPROCESS}
 UNSAFE = "(declare-const Y_0 Real)\n(declare-const Y_1 Real)\n(assert (<= Y_0 Y_1))\n"
 GRID = {"occupied": np.ones((2, 2, 2), bool), "aabb": np.array([[-1.0] * 3, [1.0] * 3])}
+#: A step sideways by the first of the network's outputs.
+LOOP: dict[str, Any] = {
+    "version": 1, "state": ["x"], "initial": {"x": [-0.01, 0.01]}, "steps": 2, "sampling_time": 0.1,
+    "dynamics": {"type": "affine", "A": [[1.0]], "B": [[0.001, 0.0, 0.0]]},
+    "camera": {
+        "camera_to_world": [[0.0, 0.0, 1.0, 0.0], [1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]],
+        "position": {"offset": [1.6, 0.0, 0.0], "matrix": [[0.0], [1.0], [0.0]]},
+    },
+    "network": "net.onnx", "preprocess": PREPROCESS, "control": {}, "unsafe": [{"box": {"x": [0.5, None]}}],
+}  # fmt: skip
 #: Bytes of a case that really works.
 WORK = 4 << 30
 
@@ -52,7 +75,7 @@ WORK = 4 << 30
 
 
 @pytest.fixture(scope="module")
-def bench(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Bench]:
+def bench(tmp_path_factory: pytest.TempPathFactory, request: pytest.FixtureRequest) -> Iterator[Bench]:
     folder = tmp_path_factory.mktemp("corpus")
     base = folder / "base"
     base.mkdir()
@@ -67,7 +90,9 @@ def bench(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Bench]:
         "net": classifier(base / "net.onnx", SIZE),
         "grid": base / "grid.npz",
         "lib": base / "unsafe.vnnlib",
+        "loop": write_json(base / "loop.json", LOOP),
         "results": base / "results",
+        "search": base / "search",
     }
     files["lib"].write_text(UNSAFE)
     OccupancyGrid.of_box(-np.ones(3), np.ones(3), np.ones((2, 2, 2), bool)).write(files["grid"])
@@ -75,9 +100,14 @@ def bench(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Bench]:
     write_results(files)
     body = torch.nn.Sequential(torch.nn.Conv2d(3, 2, 4, 4), torch.nn.ReLU(), torch.nn.Flatten(), torch.nn.Linear(32, 3))
     torch.export.save(torch.export.export(body.eval(), (torch.zeros(1, 3, SIZE, SIZE),)), base / "net.pt2")
+    write_search(files)
     found = Bench(folder, files | {"scene_ply": base / "scene.ply"})
     yield found
     found.server.close()
+    # what is captured here, nobody sees
+    capture = request.config.pluginmanager.getplugin("capturemanager")
+    with capture.global_and_fixture_disabled() if capture else nullcontext():
+        print(f"\n{found.summary}")
 
 
 def write_results(files: dict[str, Path]) -> None:
@@ -95,6 +125,23 @@ def write_results(files: dict[str, Path]) -> None:
         trace = (TracePoint(1.0, 1, 0.1, 0.1),)
         report.add(FrameResult(index, box, low, high, low, high, image, 1.0, 1, trace), "done")
     report.finish("done")
+
+
+def write_search(files: dict[str, Path]) -> None:
+    """What ns-abstract-certify leaves, without the work: some cells with a verdict, some open blocks, a report."""
+    settings = CertifySettings(files["config"], files["path"], files["net"], files["prop"], files["spec"])
+    job = open_certification(settings)
+    # kernels are compiled here, which no case is charged for
+    job.job.warm_up(0)
+    run = CertificateRun(job, [0, 1], files["search"], {}, ("ns-abstract-certify",))
+    store = run.open(resume=False)
+    for block in store.pending(set(), 3):
+        leaves = tuple(Leaf(cell, "unknown", None, 0.1, reason="the finest cell") for cell in block.cells)
+        store.close_block(block, Findings(leaves, (), (), 0, 0.1), run.grids[block.frame])
+    run.shown = []
+    document, _ = run.document(store, "interrupted")
+    write_certificate(files["search"], document, "<html></html>")
+    store.close()
 
 
 # ---------------------------------------------------------------- rows
@@ -481,6 +528,225 @@ OUTPUTS = [
     row("certify", "authority without its fellows", "--tls-cert", options="--engine dask --workers 1 --scheduler-address h:1 --tls-ca-file {spec}"),
 ]  # fmt: skip
 
+ON = "--resume --output-dir {here}/search --workers 1 --time-budget 1"
+
+
+def database(change: Any) -> Any:
+    """A change of a search's cells.sqlite: a function of the file, or SQL."""
+
+    def write(search: Path) -> Any:
+        file = search / "cells.sqlite"
+        if not isinstance(change, str):
+            return change(file)
+        with closing(sqlite3.connect(file)) as base, base:
+            base.executescript(change)
+        return None
+
+    return write
+
+
+@contextmanager
+def _kept_busy(file: Path) -> Iterator[None]:
+    """Another program writes to a database all the time."""
+    code = (
+        "import sqlite3, sys; base = sqlite3.connect(sys.argv[1], isolation_level=None); "
+        "base.execute('PRAGMA locking_mode=EXCLUSIVE'); base.execute('BEGIN EXCLUSIVE'); print(flush=True); input()"
+    )
+    command = [sys.executable, "-c", code, str(file)]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        process.stdout.readline()
+        yield
+        process.kill()
+
+
+@contextmanager
+def _locked(search: Path) -> Iterator[None]:
+    """Another command works in the folder."""
+    with closing(claim(search)):
+        yield
+
+
+def replaced_by(content: bytes) -> Any:
+    """A file of other content."""
+    return lambda file: file.write_bytes(content)
+
+
+def spoilt(place: int, count: int) -> Any:
+    """A file in which some bytes are others."""
+
+    def write(file: Path) -> None:
+        data = bytearray(file.read_bytes())
+        data[place : place + count] = bytes(b ^ 0x5A for b in data[place : place + count])
+        file.write_bytes(bytes(data))
+
+    return write
+
+
+def beside(suffix: str, place: Any) -> Any:
+    """What lies beside cells.sqlite: its log, or what SQLite takes for it."""
+    return lambda file: place(file.with_name(file.name + suffix))
+
+
+def another_database(file: Path) -> None:
+    """The database of another program."""
+    file.unlink()
+    with closing(sqlite3.connect(file)) as base, base:
+        base.execute("CREATE TABLE search_state(key TEXT, value TEXT)")
+
+
+SEARCHES = [
+    row("certify", "search continued", "3 cells kept from before", search=lambda f: None, options=ON, code=0, memory=WORK),
+    row("certify", "search held by another program", "is locked", search=database(_kept_busy), options=ON),
+    row("certify", "search held by another command", "still running", search=_locked, options=ON),
+    row("certify", "search of another version", "another version", search=database("UPDATE search_state SET value = '1' WHERE key = 'version'"), options=ON),
+    row("certify", "search of another network", "model", search=lambda f: None, options=ON, net=onnx_file(lambda m: setattr(m, "producer_name", "x"))),
+    row("certify", "search of another property", "property", search=lambda f: None, options=ON, prop=edited(label=1)),
+    row("certify", "search of another set", "poses", search=lambda f: None, options=ON, spec={"version": 1, "translation": {"x": 0.2}}),
+    row("certify", "database empty", "cannot be used", search=database(replaced_by(b"")), options=ON),
+    row("certify", "database of zeros", "cannot be used", search=database(replaced_by(bytes(20000))), options=ON),
+    row("certify", "database of noise", "cannot be used", search=database(replaced_by(bytes(range(256)) * 80)), options=ON),
+    row("certify", "database of a text", "cannot be used", search=database(replaced_by(b"SQLite format 3\0" + b"x" * 5000)), options=ON),
+    row("certify", "database cut off", "cannot be used", search=database(cut(9000)), options=ON),
+    row("certify", "database cut to its head", "cannot be used", search=database(lambda f: f.write_bytes(f.read_bytes()[:100])), options=ON),
+    row("certify", "database with a spoilt head", "cannot be used", search=database(spoilt(0, 16)), options=ON),
+    row("certify", "database with a spoilt page size", "cannot be used", search=database(spoilt(16, 2)), options=ON),
+    row("certify", "database with a spoilt schema", "cannot be used", search=database(spoilt(100, 400)), options=ON),
+    row("certify", "database with spoilt pages", "cannot be used", search=database(spoilt(4096, 16000)), options=ON),
+    row("certify", "database is a folder", "no regular file", search=database(lambda f: (f.unlink(), f.mkdir())), options=ON),
+    row("certify", "database is a pipe", "no regular file", search=database(fifo), options=ON),
+    row("certify", "database is a link", "no regular file", search=database(lambda f: (f.rename(f.with_name("elsewhere")), f.symlink_to("elsewhere"))), options=ON),
+    row("certify", "database is a link to nowhere", "no regular file", search=database(lambda f: (f.unlink(), f.symlink_to("nowhere"))), options=ON),
+    row("certify", "database of another program", "another version", search=database(another_database), options=ON),
+    row("certify", "log is a folder", "cannot be used", search=database(beside("-wal", lambda f: f.mkdir())), options=ON),
+    row("certify", "log of noise", "cells kept from before", search=database(beside("-wal", lambda f: f.write_bytes(bytes(range(256)) * 40))), options=ON, code=0, memory=WORK),
+    row("certify", "cells dropped", "cannot be used", search=database("DROP TABLE cells"), options=ON),
+    row("certify", "cells made certified", "changed since", search=database("UPDATE cells SET verdict = 'certified', margin = 1.0"), options=ON),
+    row("certify", "cells doubled", "changed since", search=database("INSERT INTO cells SELECT * FROM cells"), options=ON),
+    row("certify", "cells without open blocks", "changed", search=database("DELETE FROM search_blocks"), options=ON),
+    row("certify", "cells that a view stands for", "tables", search=database("ALTER TABLE cells RENAME TO other; CREATE VIEW cells AS SELECT * FROM other"), options=ON),
+    row("certify", "cells with a trigger", "tables", search=database("CREATE TRIGGER t AFTER INSERT ON cells BEGIN UPDATE cells SET verdict = 'certified'; END"), options=ON),
+    row("certify", "blocks of cells outside", "changed", search=database("UPDATE search_blocks SET cells = '[[[99999999], [999999999]]]'"), options=ON),
+    row("certify", "state nested", "cannot be used", search=database("UPDATE search_state SET value = replace(hex(zeroblob(50000)), '0', '[') WHERE key = 'seals'"), options=ON),
+    row("certify", "state of NULL", "cannot be used", search=database("UPDATE search_state SET value = NULL WHERE key = 'fingerprint'"), options=ON),
+    row("certify", "state of bytes", "cannot be used", search=database("UPDATE search_state SET value = x'ff00' WHERE key = 'fingerprint'"), options=ON),
+    row("certify", "search without its report", "cells kept from before", search=lambda f: (f / "report.json").unlink(), options=ON, code=0, memory=WORK),
+    row("certify", "search with a report of noise", "cells kept from before", search=lambda f: (f / "report.json").write_bytes(bytes(range(256))), options=ON, code=0, memory=WORK),
+    row("certify", "lock is a folder", "cannot be written", search=lambda f: ((f / MARK).unlink(missing_ok=True), (f / MARK).mkdir()), options=ON),
+    row("certify", "lock is a link", "cannot be written", search=lambda f: ((f / MARK).unlink(missing_ok=True), (f / MARK).symlink_to("mine.txt")), options=ON),
+    row("certify", "output where nothing can be made", "cannot be written", options="--output-dir /proc/out"),
+    row("render", "output where nothing can be made", "cannot be written", options="--output-dir /proc/out"),
+    row("certify", "disk full at the beginning", "cannot be", options="--workers 1", room=4096, memory=WORK),
+    row("certify", "disk full in the middle", "make room", options="--workers 1", room=1 << 17, memory=WORK),
+    row("certify", "disk full, continued", "make room", search=lambda f: None, options=ON, room=1 << 15, memory=WORK),
+    row("render", "disk full", "make room", options="--target-ratio 3", room=1 << 10, memory=WORK),
+    row("npz", "disk full", "out.npz", room=1 << 10),
+    row("ply", "disk full", "out.ply", room=100),
+]  # fmt: skip
+
+
+@contextmanager
+def silent() -> Iterator[int]:
+    """A port that takes connections and says nothing."""
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        yield server.getsockname()[1]
+
+
+@contextmanager
+def rude() -> Iterator[int]:
+    """A port that answers in another language."""
+
+    def answer() -> None:
+        with suppress(OSError):
+            while True:
+                connection, _ = server.accept()
+                with connection, suppress(OSError):
+                    connection.sendall(b"HTTP/1.1 400 Bad Request\r\n\r\n" * 100)
+
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        threading.Thread(target=answer, daemon=True).start()
+        yield server.getsockname()[1]
+        server.shutdown(socket.SHUT_RDWR)
+
+
+DASK = "--engine dask --workers 1 --scheduler-address "
+
+CLUSTERS = [
+    row("certify", "scheduler that is not there", "no scheduler answers", options=DASK + "127.0.0.1:1"),
+    row("render", "scheduler that is not there", "no scheduler answers", options="--engine dask --scheduler-address 127.0.0.1:1"),
+    row("nerf", "scheduler that is not there", "no scheduler answers", options="--engine dask --scheduler-address 127.0.0.1:1"),
+    row("certify", "scheduler that says nothing", "no scheduler answers", options=DASK + "127.0.0.1:{port}", listener=silent),
+    row("certify", "scheduler of another kind", "no scheduler answers", options=DASK + "127.0.0.1:{port}", listener=rude),
+    row("certify", "scheduler without a port", "no scheduler answers", options=DASK + "tcp://"),
+    row("certify", "scheduler of a large port", "no scheduler answers", options=DASK + "127.0.0.1:99999999"),
+    row("certify", "scheduler of a negative port", "no scheduler answers", options=DASK + "127.0.0.1:-1"),
+    row("certify", "scheduler of a port in words", "no scheduler answers", options=DASK + "127.0.0.1:port"),
+    row("certify", "scheduler of another protocol", "no scheduler answers", options=DASK + "gopher://127.0.0.1:70"),
+    row("certify", "scheduler half in brackets", "no scheduler answers", options=DASK + "[::1"),
+    row("certify", "scheduler of no host", "no scheduler answers", options=DASK + "no.such.host.invalid:8786"),
+    row("certify", "scheduler with escapes", "no scheduler answers", options=DASK + "\x1b[31mred:1"),
+    row("certify", "scheduler of no name", "is empty", options=("--engine", "dask", "--scheduler-address", "")),
+    row("certify", "authority that is no certificate", "PEM", options=DASK + "127.0.0.1:1 --tls-ca-file {spec} --tls-cert {spec} --tls-key {spec}"),
+    row("certify", "engine unknown", "engine", options="--engine spark"),
+]  # fmt: skip
+
+LONG = "--time-budget 600"
+
+SIGNALS = [
+    row("certify", "SIGINT", "", options=f"{LONG} --workers 1", signals=(signal.SIGINT,), after="larger than", code=3, memory=WORK, prop={"type": "classification", "label": 0, "preprocess": PREPROCESS, "partitions": 100000}),
+    row("certify", "SIGTERM", "", options=f"{LONG} --workers 1", signals=(signal.SIGTERM,), after="larger than", code=3, memory=WORK, prop={"type": "classification", "label": 0, "preprocess": PREPROCESS, "partitions": 100000}),
+    row("certify", "SIGINT twice", "", options=f"{LONG} --workers 1", signals=(signal.SIGINT, signal.SIGINT), after="larger than", code=3, memory=WORK, prop={"type": "classification", "label": 0, "preprocess": PREPROCESS, "partitions": 100000}),
+    row("certify", "SIGTERM and SIGINT", "", options=f"{LONG} --workers 2", signals=(signal.SIGTERM, signal.SIGINT), after="larger than", code=3, memory=WORK, prop={"type": "classification", "label": 0, "preprocess": PREPROCESS, "partitions": 100000}),
+    row("certify", "SIGHUP", "", options=f"{LONG} --workers 1", signals=(signal.SIGHUP,), after="larger than", code=-1, memory=WORK),
+    row("render", "SIGINT", "", options=f"{LONG} --target-ratio 1.00001", signals=(signal.SIGINT,), after="gsplat", code=3, memory=WORK),
+    row("render", "SIGTERM", "", options=f"{LONG} --target-ratio 1.00001", signals=(signal.SIGTERM,), after="gsplat", code=3, memory=WORK),
+    row("render", "SIGINT twice", "", options=f"{LONG} --target-ratio 1.00001", signals=(signal.SIGINT, signal.SIGINT), after="gsplat", code=3, memory=WORK),
+    row("nerf", "SIGINT", "", options=f"{LONG} --target-ratio 1.00001 --workers 1", signals=(signal.SIGINT,), after="vanilla NeRF", code=3, memory=WORK),
+    row("nerf", "SIGTERM, hierarchical", "", options=f"{LONG} --target-ratio 1.00001 --workers 1 --sampling hierarchical", signals=(signal.SIGTERM,), after="vanilla NeRF", code=3, memory=WORK),
+]  # fmt: skip
+
+LOOPS = [
+    row("reach", "good", "safe: certified", code=0, memory=WORK),
+    row("reach", "done on a full disk", "cannot be used", room=1 << 15, memory=WORK),
+    row("reach", "SIGINT", "", signals=(signal.SIGINT,), after="safe", options="--time-budget 600", code=3, memory=WORK, loop=edited(initial={"x": [0.0, 0.9]}, unsafe=[{"box": {"x": [0.45, None]}}])),
+    row("reach", "loop absent", "none.json", options="--loop {here}/none.json"),
+    row("reach", "loop empty", "is empty", loop=b""),
+    row("reach", "loop not text", "UTF-8", loop=b"\xff\x00\xfe"),
+    row("reach", "loop nested", "JSON", loop="[" * 100000),
+    row("reach", "loop a list", "an object", loop=[]),
+    row("reach", "loop is a folder", "folder", loop=folder),
+    row("reach", "loop is a pipe", "regular file", loop=fifo),
+    row("reach", "unknown key", "bogus", loop=edited(bogus=1)),
+    row("reach", "version 2", "version", loop=edited(version=2)),
+    row("reach", "no states", "state", loop=edited(state=[])),
+    row("reach", "states of one name", "state", loop=edited(state=["x", "x"])),
+    row("reach", "name with escapes", "state", loop=edited(state=["\x1b[2J"])),
+    row("reach", "range upside down", "initial.x", loop=edited(initial={"x": [1.0, -1.0]})),
+    row("reach", "range infinite", "Infinity", loop=edited(initial={"x": [0.0, float("inf")]})),
+    row("reach", "range not a number", "NaN", loop=edited(initial={"x": [0.0, float("nan")]})),
+    row("reach", "range of 1e300", "initial.x", loop=edited(initial={"x": [0.0, 1e300]})),
+    row("reach", "10^9 steps", "steps", loop=edited(steps=10**9)),
+    row("reach", "half a step", "steps", loop=edited(steps=0.5)),
+    row("reach", "time stands still", "sampling_time", loop=edited(sampling_time=0.0)),
+    row("reach", "dynamics of another kind", "dynamics", loop=edited(dynamics={"type": "bogus"})),
+    row("reach", "dynamics of another size", "dynamics", loop=edited(dynamics={"type": "affine", "A": [[1.0, 2.0]], "B": [[1.0]]})),
+    row("reach", "dynamics not a number", "NaN", loop=edited(dynamics={"type": "affine", "A": [[float("nan")]], "B": [[1.0, 0.0, 0.0]]})),
+    row("reach", "disturbance negative", "disturbance", loop=edited(disturbance={"x": [1.0, 0.0]})),
+    row("reach", "camera that stands still", "camera", loop=edited(camera={**LOOP["camera"], "position": {"matrix": [[0.0], [0.0], [0.0]]}})),
+    row("reach", "camera no rotation", "camera", loop=edited(camera={**LOOP["camera"], "camera_to_world": [[0.0] * 4] * 4})),
+    row("reach", "network elsewhere", "network", loop=edited(network="../../../etc/passwd")),
+    row("reach", "network absent", "none.onnx", loop=edited(network="none.onnx")),
+    row("reach", "network empty", "net.onnx", net=b"", loop=edited()),
+    row("reach", "gain that does not fit", "control.gain", loop=edited(control={"gain": [[1.0], [1.0]]})),
+    row("reach", "clip upside down", "control.clip", loop=edited(control={"clip": [[1.0, -1.0]] * 3})),
+    row("reach", "10^4 unsafe sets", "unsafe", loop=edited(unsafe=[{"box": {"x": [0.5, None]}}] * 10000)),
+    row("reach", "unsafe of another kind", "unsafe[0]", loop=edited(unsafe=[{"ball": 1}])),
+    row("reach", "nothing asked", "unsafe", loop=edited(unsafe=...)),
+    row("reach", "goal at noon", "goal.when", loop=edited(goal={"box": {"x": [0.0, 1.0]}, "when": "noon"})),
+    row("reach", "no such option", "--bogus", options="--bogus 1"),
+    row("reach", "scene empty", "", scene=b""),
+]  # fmt: skip
+
 GOOD = [
     row("render", "resumed, nothing left to do", "kept from before: frames 0, 1", results=lambda f: None, options=RESUME, code=0, memory=WORK),
     row("npz", "good", "out.npz", code=0),
@@ -627,6 +893,7 @@ VIEWER = [
     row("viewer", "config that runs a command", "os.system", yml=lambda text: text + "\nx: !!python/object/apply:os.system ['touch hacked']\n", memory=WORK),
     row("viewer", "config that runs nerfstudio's command", "run_command", yml=lambda text: text + "\nx: !!python/object/apply:nerfstudio.utils.scripts.run_command ['touch hacked']\n", memory=WORK),
     row("viewer", "config that names a function", "subprocess.call", yml=lambda text: text.replace("!!python/name:nerfstudio.models.splatfacto.SplatfactoModel", "!!python/name:subprocess.call"), memory=WORK),
+    row("viewer", "config that takes an attribute", "builtins.getattr", yml=lambda text: text + "\nx: !!python/object/apply:builtins.getattr [!!python/name:nerfstudio.utils.writer.EventName '', __class__]\n", memory=WORK),
     row("viewer", "config that names a module", "names the Python object", yml=lambda text: text + "\nx: !!python/module:antigravity\n", memory=WORK),
     row("viewer", "config that makes an object anew", "names the Python object", yml=lambda text: text + "\nx: !!python/object/new:type ['a', [], {}]\n", memory=WORK),
     row("viewer", "config that names what is not there", "names the Python object", yml=lambda text: text + "\nx: !!python/name:nerfstudio.nowhere.Nothing ''\n", memory=WORK),
@@ -639,7 +906,24 @@ VIEWER = [
 
 ROWS = dict(
     rows_by_name(
-        [*GOOD, *OPTIONS, *RUNS, *PATHS, *SETS, *PROPERTIES, *NETWORKS, *GRIDS, *RESULTS, *MORE, *VIEWER, *OUTPUTS]
+        [
+            *GOOD,
+            *OPTIONS,
+            *RUNS,
+            *PATHS,
+            *SETS,
+            *PROPERTIES,
+            *NETWORKS,
+            *GRIDS,
+            *RESULTS,
+            *MORE,
+            *VIEWER,
+            *OUTPUTS,
+            *SEARCHES,
+            *CLUSTERS,
+            *SIGNALS,
+            *LOOPS,
+        ]
     )
 )
 

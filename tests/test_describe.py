@@ -6,12 +6,13 @@ import math
 import re
 import sys
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from conftest import TIMESTAMP, Inputs, blob_scene, write_json
+from conftest import TIMESTAMP, InProcess, Inputs, blob_scene, write_json
 from nerfs import tiny_scene
 
 from ns_abstract.api.files import Settings, open_job
@@ -24,19 +25,9 @@ Call = Callable[[list[str]], tuple[int, str, str]]
 
 
 @pytest.fixture
-def call(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Call:
+def call(in_process: InProcess) -> Call:
     """Runs the command in this process: exit code, stdout and stderr."""
-
-    def run(options: list[str]) -> tuple[int, str, str]:
-        monkeypatch.setattr(sys, "argv", ["command", *options])
-        capsys.readouterr()
-        with pytest.raises(SystemExit) as leave:
-            render_command.main()
-        assert isinstance(leave.value.code, int)
-        said = capsys.readouterr()
-        return leave.value.code, said.out, said.err
-
-    return run
+    return partial(in_process, render_command.main)
 
 
 def numbers(text: str, pattern: str) -> list[float]:

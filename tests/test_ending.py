@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import os
 import resource
 import signal
@@ -10,23 +11,40 @@ import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
-from conftest import Inputs
+from conftest import SHIFT, Inputs, environment, ring, write_json
+from interrupting import until
 from nerfs import UNIFORM, images, poses, tiny_scene
-from test_cli import call, environment, one_line  # noqa: F401
+from test_certify_search import fill, open_store, search_of
+from test_cli import call, one_line  # noqa: F401
 
+from ns_abstract.api import bounding
+from ns_abstract.api import job as job_module
+from ns_abstract.api.bounding import Part, bound, bound_frames, bound_part
+from ns_abstract.api.files import Settings, open_job
+from ns_abstract.api.job import Job
+from ns_abstract.api.poses import PoseSet
+from ns_abstract.api.scenes import load_scene
+from ns_abstract.api.searching import search_blocks
 from ns_abstract.cli import certify as certify_command
 from ns_abstract.cli import render as render_command
 from ns_abstract.cli.common import Stop, run
 from ns_abstract.execution.ending import AbandonedError, abandoning, checkpoint
-from ns_abstract.execution.engines import Processes
+from ns_abstract.execution.engines import Here, Machine, Processes
+from ns_abstract.execution.stopping import StopRequest
+from ns_abstract.geometry.views import path_json
+from ns_abstract.io.errors import InputError
 from ns_abstract.methods.nerf.bounds import NerfBounds
 from ns_abstract.methods.nerf.frame import NerfFrame
+from ns_abstract.methods.nerf.render import NerfRenderer
+from ns_abstract.methods.nerf.write import write_nerf_run
 from ns_abstract.refine.engine import Goal, Refinement
 from ns_abstract.verify.cells import Grid
+from ns_abstract.verify.search import Findings
 
 YAW = {"rotation": {"yaw": 0.02}}
 #: Long enough for any machine; what is waited for does not come by itself.
@@ -118,6 +136,99 @@ def test_refinement_ends_soundly_wherever_it_is_stopped(count: int) -> None:
             assert width[mine].sum() == pytest.approx(0.04)
 
 
+@pytest.fixture
+def nerf(tmp_path: Path) -> Settings:
+    config = write_nerf_run(tiny_scene(), tmp_path, timestamp="run", experiment_name="tiny", views=ring(2, 8))
+    path, spec = write_json(tmp_path / "path.json", path_json(ring(2, 8))), write_json(tmp_path / "spec.json", SHIFT)
+    return Settings(config, path, spec)
+
+
+def test_a_picture_that_takes_too_long_is_told_at_once(nerf: Settings, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Rays are costly: a few show that the time does not do for one picture."""
+    render = NerfFrame.render
+
+    def slowly(self: NerfFrame, *rest: Any) -> np.ndarray:
+        time.sleep(0.2)
+        return render(self, *rest)
+
+    job = open_job(nerf)
+    job.check_time(0, LONG)
+    monkeypatch.setattr(NerfFrame, "render", slowly)
+    monkeypatch.setattr(job_module, "_LOOK_RAYS", 2)
+    with pytest.raises(InputError, match="one picture of 8 x 8 pixels takes about") as caught:
+        list(bound_frames(job, [0], engine=Here(), budget=1.0))
+    assert caught.value.field == "--time-budget"
+    scene = load_scene(nerf.load_config)
+    with pytest.raises(InputError, match="one picture"):
+        bound(scene, PoseSet(job.pose_sets[0].camera, {"x": 0.01}), time_budget=1.0)
+
+
+@pytest.mark.parametrize("compiles", [False, True])
+def test_only_compiling_comes_on_top_of_the_budget(
+    compiles: bool, blobs: Inputs, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """By a clock that stands still but for the first look at a scene."""
+    job = open_job(Settings(blobs.config, blobs.path, blobs.spec))
+    clock, seen = SimpleNamespace(now=0.0, compiled=0), []
+
+    def warm_up(self: Job, index: int) -> None:
+        clock.now, clock.compiled = 60.0, clock.compiled + compiles
+
+    def bound_part(self: Job, index: int, goal: Goal, *rest: Any, **more: Any) -> Any:
+        seen.append(goal.seconds)
+        raise AbandonedError
+
+    monkeypatch.setattr(bounding, "perf_counter", lambda: clock.now)
+    monkeypatch.setattr(bounding, "kernels", lambda: clock)
+    monkeypatch.setattr(Job, "warm_up", warm_up)
+    monkeypatch.setattr(Job, "bound_part", bound_part)
+    assert list(bound_frames(job, [0], engine=Here(), budget=100.0)) == []
+    assert seen == [100.0 if compiles else 40.0]
+
+
+def test_a_ray_that_takes_long_is_given_up_when_kernels_are_compiled(
+    nerf: Settings, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """No command waits for a whole ray before its clock starts."""
+    job = open_job(nerf)
+    looks: list[int] = []
+
+    def endless(self: NerfBounds, *rest: Any) -> Any:
+        while True:
+            looks.append(1)
+            checkpoint()
+            time.sleep(0.01)
+
+    monkeypatch.setattr(job_module, "_WARM_RAY", 0.2)
+    monkeypatch.setattr(NerfBounds, "rays", endless)
+    job.warm_up(0)
+    assert looks
+
+
+def test_a_frame_ends_with_its_time_while_the_first_picture_is_rendered(
+    nerf: Settings, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The picture of a frame does not count for its clock, but for the time that there is."""
+    job = open_job(nerf)
+    pixels = NerfRenderer.pixels
+    shown: list[int] = []
+
+    def endless(self: NerfRenderer, camera: Any, pose: Any, rays: np.ndarray, shift: Any = None) -> np.ndarray:
+        while len(rays) == 64:
+            shown.append(1)
+            checkpoint()
+            time.sleep(0.01)
+        return pixels(self, camera, pose, rays, shift)
+
+    monkeypatch.setattr(NerfRenderer, "pixels", endless)
+    monkeypatch.setattr(job_module, "_LOOK_RAYS", 2)
+    assert list(bound_frames(job, [0], engine=Here(), budget=0.5)) == [] and shown
+    assert bound_part(job.recipe, Part(0, None), Goal(1.05, 0.5), False) is None
+    with pytest.raises(InputError, match="before one picture") as caught:
+        bound(load_scene(nerf.load_config), PoseSet(job.pose_sets[0].camera, {"x": 0.01}), time_budget=0.5)
+    assert caught.value.field == "time_budget"
+
+
 def count_checkpoints(file: str) -> int:
     """Works until it is asked to end."""
     Path(file).touch()
@@ -132,19 +243,12 @@ def square(number: int) -> int:
     return number * number
 
 
-def wait_for(condition: Callable[[], bool]) -> None:
-    deadline = time.monotonic() + LONG
-    while not condition():
-        assert time.monotonic() < deadline
-        time.sleep(0.02)
-
-
 def test_workers_are_asked_to_end_and_work_on(tmp_path: Path) -> None:
     engine = Processes(1)
     try:
         engine.submit(0, count_checkpoints, str(tmp_path / "begun"))
         engine.submit(1, square, 3)
-        wait_for((tmp_path / "begun").exists)
+        until((tmp_path / "begun").exists)
         (pid,) = engine.pids
         engine.abandon()
         found: list[tuple[int, Any]] = []
@@ -162,7 +266,8 @@ def test_workers_are_asked_to_end_and_work_on(tmp_path: Path) -> None:
 PARENT = """
 import sys, time
 from pathlib import Path
-from ns_abstract.execution.engines import Processes
+from ns_abstract.execution.engines import Here, Machine, Processes
+from ns_abstract.execution.stopping import StopRequest
 from test_ending import count_checkpoints
 if __name__ == "__main__":
     engine = Processes(2)
@@ -193,12 +298,12 @@ def test_workers_end_with_a_killed_parent(tmp_path: Path) -> None:
     try:
         assert process.stdout is not None
         pids = [int(word) for word in process.stdout.readline().split()]
-        wait_for(lambda: all((tmp_path / f"begun{k}").exists() for k in range(2)))
+        until(lambda: all((tmp_path / f"begun{k}").exists() for k in range(2)))
         assert len(pids) == 2 and all(map(alive, pids))
     finally:
         process.send_signal(signal.SIGKILL)
         process.wait()
-    wait_for(lambda: not any(map(alive, pids)))
+    until(lambda: not any(map(alive, pids)))
 
 
 # ---------------------------------------------------------------- signals
@@ -216,13 +321,36 @@ def test_a_signal_ends_at_once_where_nothing_is_to_be_saved() -> None:
     assert signal.getsignal(signal.SIGTERM) == signal.SIG_DFL
 
 
-def test_a_signal_is_noted_where_something_is(capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_signal_is_noted_where_something_is(capfd: pytest.CaptureFixture[str]) -> None:
     stop = Stop()
     with stop.installed():
         os.kill(os.getpid(), signal.SIGINT)
-        assert stop() and "being saved" in capsys.readouterr().err
+        assert stop() and "being saved" in capfd.readouterr().err
         with pytest.raises(KeyboardInterrupt):
             os.kill(os.getpid(), signal.SIGINT)
+
+
+def test_a_signal_in_the_middle_of_a_print() -> None:
+    """Python refuses to begin to print while it prints."""
+
+    class Stream(io.RawIOBase):
+        def writable(self) -> bool:
+            return True
+
+        def write(self, data: Any) -> int:
+            os.kill(os.getpid(), signal.SIGINT)
+            time.sleep(0.0)
+            return len(data)
+
+    buffer = io.BufferedWriter(Stream())
+    before, sys.stderr = sys.stderr, io.TextIOWrapper(buffer, write_through=True)
+    try:
+        stop = Stop()
+        with stop.installed():
+            print("told", file=sys.stderr, flush=True)
+        assert stop()
+    finally:
+        sys.stderr = before
 
 
 def test_a_signal_ends_a_library_call() -> None:
@@ -232,7 +360,11 @@ import ctypes
 from ns_abstract.cli.common import Stop
 library, mutex = ctypes.CDLL(None), ctypes.create_string_buffer(256)
 library.pthread_mutex_lock(mutex)
-with Stop().installed():
+stop = Stop()
+def fail():
+    print("saved", flush=True)
+    raise OSError("disk full")
+with stop.installed(), stop.last_words(lambda: None), stop.last_words(fail):
     print("ready", flush=True)
     # goes on after signals, without Python in between
     library.pthread_mutex_lock(mutex)
@@ -244,11 +376,33 @@ with Stop().installed():
         assert process.stdout is not None and process.stdout.readline() == "ready\n"
         time.sleep(0.5)
         process.send_signal(signal.SIGTERM)
-        _, said = process.communicate(timeout=LONG)
+        shown, said = process.communicate(timeout=LONG)
     finally:
         process.kill()
         process.wait()
-    assert process.returncode == 3 and said == "interrupted\n"
+    assert process.returncode == 3 and said == "interrupted\n" and shown == "saved\n"
+
+
+@pytest.mark.parametrize(
+    ("code", "said"),
+    [
+        ("atexit.register(lambda: os.kill(os.getpid(), signal.SIGINT)); run(lambda options: 0, lambda: None)", ""),
+        (
+            "atexit.register(lambda: os.kill(os.getpid(), signal.SIGTERM)); run(stopped, lambda: None)",
+            "interrupted\n",
+        ),
+        ("run(lambda options: os.kill(os.getpid(), signal.SIGTERM), lambda: None)", "interrupted\n"),
+        ("run(lambda options: 0, lambda: os.kill(os.getpid(), signal.SIGINT))", "interrupted\n"),
+    ],
+)
+def test_a_signal_before_and_after_the_work_is_no_traceback(code: str, said: str) -> None:
+    """Who presses Ctrl-C twice meets the end of the command with the second one."""
+    begin = "import atexit, os, signal\nfrom ns_abstract.cli.common import run\n"
+    begin += "def stopped(options):\n    raise KeyboardInterrupt\n"
+    done = subprocess.run(
+        [sys.executable, "-c", begin + code], capture_output=True, text=True, env=environment(), check=False
+    )
+    assert (done.returncode, done.stderr) == (3, said)
 
 
 # ---------------------------------------------------------------- memory and options
@@ -327,8 +481,6 @@ def test_empty_options_are_refused(
 
 
 def test_a_limit_beyond_all_memory_is_none(blobs: Inputs) -> None:
-    from ns_abstract.api.files import Settings, open_job
-
     job = open_job(Settings(blobs.config, blobs.path, blobs.spec, memory_limit=1e300))
     assert job.memory == 2**50
 
@@ -352,3 +504,85 @@ def test_first_blocks_are_small_and_hold_every_cell() -> None:
             found = Certification.first_blocks(stub, grid)
             assert [cell for part in found for cell in part] == grid.roots()
             assert len(found[0]) == 1 and max(map(len, found)) <= block
+
+
+class Starting:
+    """Workers that need a while: nothing comes for some looks, then all results do."""
+
+    capacity, threads, shares = 3, 3, False
+
+    def __init__(self, looks: int) -> None:
+        self.starting, self.looks, self.tasks = True, looks, []
+
+    def machine(self) -> Machine:
+        return Machine(3, 3)
+
+    def submit(self, key: int, function: Callable[..., Any], *arguments: Any) -> None:
+        self.tasks.append((key, function, arguments))
+
+    def collect(self, seconds: float) -> list[tuple[int, Any]]:
+        self.looks -= 1
+        if self.looks >= 0:
+            return []
+        self.starting = False
+        done, self.tasks = self.tasks, []
+        return [(key, function(*arguments)) for key, function, arguments in done]
+
+    def close(self) -> None:
+        self.tasks.clear()
+
+
+@pytest.mark.parametrize("looks", [0, 1, 4, 1000])
+def test_blocks_are_examined_while_workers_start(looks: int, tmp_path: Path) -> None:
+    """Each once, and the cells are those of an uninterrupted search; a stop is heeded meanwhile."""
+    search = search_of(coarse=(40,))
+    whole = open_store(tmp_path / "whole")
+    fill(whole, search)
+    expected = whole.tallies(), whole.leaves(0)
+    whole.close()
+    here: list[Any] = []
+    there: list[Any] = []
+
+    def told(list_: list[Any]) -> Callable[..., Findings]:
+        return lambda *found: (list_.append(found[-1]), search.examine(found[-1]))[1]
+
+    store = open_store(tmp_path / "out")
+    fill(store, search, 0)
+    kept: list[int] = []
+    arguments: Any = (told(there), None)
+    search_blocks(
+        store, Starting(looks), {0: search.grid}, told(here), arguments, deadline=time.perf_counter() + LONG,
+        stop=StopRequest(), keep=lambda block, findings: kept.append(block.number), between=lambda instant: None,
+    )  # fmt: skip
+    timeless = [[{**row, "seconds": 0.0} for row in rows] for rows in (store.leaves(0), expected[1])]
+    assert store.tallies() == expected[0] and timeless[0] == timeless[1]
+    assert len(kept) == len(set(kept)) == len(here) + len(there)
+    assert len(here) >= min(looks, 2) and (len(there) > 0 or looks == 1000)
+    store.close()
+    # a request to stop is asked for between blocks
+    store, stop = open_store(tmp_path / "stopped"), StopRequest()
+    fill(store, search, 0)
+    kept.clear()
+
+    def keep(block: Any, findings: Findings) -> None:
+        kept.append(block.number)
+        stop.ask()
+
+    search_blocks(
+        store, Starting(1000), {0: search.grid}, told(here), arguments, deadline=time.perf_counter() + LONG, stop=stop,
+        keep=keep, between=lambda instant: None,
+    )  # fmt: skip
+    assert len(kept) == 1
+    store.close()
+
+
+def test_processes_start_until_the_first_result() -> None:
+    engine = Processes(1)
+    try:
+        assert engine.starting
+        engine.submit(0, square, 3)
+        while not engine.collect(1.0):
+            assert engine.starting
+        assert not engine.starting
+    finally:
+        engine.close()

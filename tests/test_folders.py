@@ -6,23 +6,28 @@ import dataclasses
 import errno
 import json
 import os
+import re
 import signal
 import sqlite3
 import subprocess
 import sys
+from contextlib import closing
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from test_certify_search import fill, open_store, search_of
 from test_report import frame, read, run
 
+import ns_abstract
 from ns_abstract.io.errors import InputError
 from ns_abstract.io.folder import MARK, claim, remove_parts, unwritable
 from ns_abstract.report.export import Results
 from ns_abstract.report.files import load_frame, save_frame
 from ns_abstract.report.record import Report
-from ns_abstract.verify.store import IMAGES, Seal
+from ns_abstract.verify import store as store_module
+from ns_abstract.verify.store import IMAGES, Seal, Store
 
 FOREIGN = {
     "notes.txt": b"mine",
@@ -110,6 +115,25 @@ def test_only_own_parts_are_removed(tmp_path: Path) -> None:
     remove_parts(tmp_path)
     left = {".frame_00002.npz.0123abcd.part", ".report.json.0123abcd.part", MARK, *foreign}
     assert set(os.listdir(tmp_path)) == left
+
+
+def test_parts_of_images_are_removed(tmp_path: Path) -> None:
+    """A kill while the image of a counterexample is written."""
+    names = [
+        f".{name}.npz.0123abcd.part" for name in ("frame_00000_3-4", "frame_00012_3-4_0-1_2", "frame_00000_pose_7")
+    ]
+    images = tmp_path / "out" / IMAGES
+    put(images, dict.fromkeys(names, b"half"))
+    put(tmp_path / "out", FOREIGN)
+    open_store(tmp_path / "out").close()
+    assert not [name for name in names if (images / name).exists()]
+    untouched(tmp_path / "out")
+    # a link leads to a folder that is not locked
+    put(tmp_path / "elsewhere", dict.fromkeys(names, b"half"))
+    (tmp_path / "new").mkdir()
+    (tmp_path / "new" / IMAGES).symlink_to(tmp_path / "elsewhere")
+    open_store(tmp_path / "new").close()
+    untouched(tmp_path / "elsewhere", dict.fromkeys(names, b"half"))
 
 
 # ---------------------------------------------------------------- one at a time
@@ -246,6 +270,75 @@ def test_the_report_knows_the_cells(tmp_path: Path) -> None:
         open_store(tmp_path, resume=True)
 
 
+def test_a_search_killed_at_its_beginning_is_begun_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The file is there with its tables or not at all: half a file would be refused for ever."""
+
+    def killed(*files: Any) -> None:
+        raise KeyboardInterrupt
+
+    for target, name in ((store_module.os, "replace"), (Store, "_put")):
+        monkeypatch.setattr(target, name, killed)
+        with pytest.raises(KeyboardInterrupt):
+            open_store(tmp_path)
+        monkeypatch.undo()
+        assert {entry.name for entry in tmp_path.iterdir()} == {MARK}
+        store = open_store(tmp_path, resume=True)
+        assert not store.resumed and fill(store, search_of(), 1) == 1
+        store.close()
+        for entry in tmp_path.glob("cells.sqlite*"):
+            entry.unlink()
+
+
+def test_the_database_of_another_program_is_left_as_it_is(tmp_path: Path) -> None:
+    open_store(tmp_path / "out").close()
+    file, other = tmp_path / "out" / "cells.sqlite", tmp_path / "other.sqlite"
+    forge(other, "CREATE TABLE search_state(key TEXT, value TEXT)")
+    content = other.read_bytes()
+    file.unlink()
+    file.symlink_to(other)
+    with pytest.raises(InputError, match="no regular file"):
+        open_store(tmp_path / "out", resume=True)
+    file.unlink()
+    file.write_bytes(content)
+    with pytest.raises(InputError, match="another version"):
+        open_store(tmp_path / "out", resume=True)
+    assert other.read_bytes() == file.read_bytes() == content
+    assert not other.with_name("other.sqlite-wal").exists()
+
+
+def test_a_search_that_another_program_holds_is_not_given_up(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(store_module, "_BUSY", 0.1)
+    store = open_store(tmp_path)
+    fill(store, search_of(), 2)
+    count = store.count
+    store.close()
+    with closing(sqlite3.connect(tmp_path / "cells.sqlite", isolation_level=None)) as base:
+        base.execute("PRAGMA locking_mode=EXCLUSIVE")
+        base.execute("BEGIN EXCLUSIVE")
+        with pytest.raises(InputError, match="locked") as caught:
+            open_store(tmp_path, resume=True)
+        assert caught.value.fix is not None and "--resume; finished cells are kept" in caught.value.fix
+        base.execute("ROLLBACK")
+    store = open_store(tmp_path, resume=True)
+    assert store.count == count
+    store.close()
+
+
+@pytest.mark.parametrize("said", ["database or disk is full", "disk I/O error", "attempt to write a readonly database"])
+def test_no_room_is_no_reason_to_begin_anew(tmp_path: Path, said: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    store = open_store(tmp_path)
+    fill(store, search_of(), 2)
+    store.close()
+
+    def fails(*rest: Any) -> None:
+        raise sqlite3.OperationalError(said)
+
+    monkeypatch.setattr(Store, "_verify", fails)
+    with pytest.raises(InputError, match=said) as caught:
+        open_store(tmp_path, resume=True)
+    assert caught.value.fix is not None and "without --resume" not in caught.value.fix
+
+
 def test_seals_know_rows_and_no_order() -> None:
     rows = [(0, "[0.0]", 0.5, None), (1, "[0.0]", 0.5, None), (0, "[0.0]", 0.25, None)]
     one, other, less = Seal(), Seal(), Seal()
@@ -278,10 +371,29 @@ def test_an_edited_frame_is_computed_again(tmp_path: Path) -> None:
     again.add(frame(0, witness=0.97), picture=False)
     np.testing.assert_array_equal(load_frame(file).result.lower, frame(0).lower)
     assert Results(tmp_path).checked
+    # a frame that is edited while a command works is not made part of its own
+    file = tmp_path / "frame_00001.npz"
+    stored = load_frame(file)
+    middle = np.float32(0.5) * (stored.result.lower + stored.result.witness_lower)
+    save_frame(file, dataclasses.replace(stored.result, lower=middle), about=stored.about)
+    again.add(frame(1, witness=0.97), picture=False)
+    np.testing.assert_array_equal(load_frame(file).result.lower, frame(1).lower)
     # without its report nothing is believed, and exports say so
     (tmp_path / "report.json").unlink()
     assert not Results(tmp_path).checked
     assert Report.resume(tmp_path, run(frames=(0, 1))).kept == []
+
+
+def test_stored_frames_are_read_where_their_digests_are_known() -> None:
+    """By the report that goes on with them and by exports; what the viewer shows, it has computed itself."""
+    package = Path(ns_abstract.__file__).parent
+    readers = {
+        path.relative_to(package).as_posix(): text
+        for path in package.rglob("*.py")
+        if re.search(r"\bload_frame\b", text := path.read_text())
+    }
+    assert readers.keys() == {"report/files.py", "report/record.py", "report/export.py"}
+    assert all("frame_digests" in readers[name] for name in readers.keys() - {"report/files.py"})
 
 
 def test_digests_of_a_damaged_report(tmp_path: Path) -> None:

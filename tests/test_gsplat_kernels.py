@@ -10,6 +10,7 @@ import pytest
 import torch
 from conftest import blob_scene
 from gsplat_kernels import Kernels, Unavailable, library
+from scene_attacks import bound_cells
 
 from ns_abstract.bench.stiff import all_cases
 from ns_abstract.geometry.camera_path import Camera
@@ -19,7 +20,7 @@ from ns_abstract.methods.splat.constants import GSPLAT_1_4_0, GSPLAT_1_5_3, GSPL
 from ns_abstract.methods.splat.reference import Reference
 from ns_abstract.methods.splat.scene import SplatScene
 from ns_abstract.perturbation.specification import parse_perturbation
-from ns_abstract.verify.attack.soundness import bound_cells, compiled_renderer
+from ns_abstract.verify.attack.soundness import compiled_renderer
 
 torch.set_num_threads(1)
 

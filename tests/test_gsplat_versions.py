@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 from conftest import Inputs, blob_scene, ring
+from scene_attacks import bound_cells
 
 from ns_abstract.api.files import PathJob, Settings, open_job
 from ns_abstract.geometry.camera_path import Camera
@@ -16,7 +17,7 @@ from ns_abstract.geometry.poses import PoseSet
 from ns_abstract.io.errors import InputError
 from ns_abstract.methods.splat.constants import VERSIONS, installed_gsplat, rasteriser_named
 from ns_abstract.perturbation.specification import parse_perturbation
-from ns_abstract.verify.attack.soundness import bound_cells, compiled_renderer
+from ns_abstract.verify.attack.soundness import compiled_renderer
 
 
 def job(inputs: Inputs, **options: Any) -> PathJob:

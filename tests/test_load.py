@@ -10,6 +10,8 @@ import random
 import re
 import shutil
 import struct
+import subprocess
+import sys
 import warnings
 import zipfile
 from collections import OrderedDict
@@ -24,8 +26,9 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from plyfile import PlyData, PlyElement
 
+from ns_abstract.io import memory
 from ns_abstract.io.errors import InputError
-from ns_abstract.methods import runs
+from ns_abstract.methods import checkpoint, runs
 from ns_abstract.methods.splat.load import load_scene
 from ns_abstract.methods.splat.scene import SplatScene
 
@@ -758,6 +761,67 @@ def test_bad_checkpoint(run: Run, case: str) -> None:
     refused(run.config, *mentions)
 
 
+_GLOBALS = b"ccollections\nOrderedDict\n"
+HOSTILE_INDICES: dict[str, tuple[bytes, str]] = {
+    "a memo of many gigabytes": (b"\x80\x02}r\xff\xff\xff\x7f.", "LONG_BINPUT"),
+    "text of many gigabytes": (b"\x80\x02X\xff\xff\xff\x7fabc.", "damaged"),
+    "bytes of many gigabytes": (b"\x80\x05\x96\xff\xff\xff\xff\xff\x00\x00\x00abc.", "damaged"),
+    "an instance by name": (b"(icollections\nOrderedDict\n.", "INST"),
+    "a name from the stack": (b"\x80\x04\x8c\x02os\x8c\x06system\x93.", "nothing was run"),
+    "an extension's code": (b"\x80\x02\x82\x01.", "EXT1"),
+    "an object in text": (b"P1\n.", "PERSID"),
+    "a new object": (b"\x80\x02" + _GLOBALS + b")\x81.", "NEWOBJ"),
+    "attributes of a function": (b"\x80\x02" + _GLOBALS + b"N}X\x04\x00\x00\x00callNs\x86b.", "damaged"),
+    "a mapping of one number": (b"\x80\x02" + _GLOBALS + b"K\x01\x85R.", "damaged"),
+    "a tensor of nothing": (b"\x80\x02ctorch._utils\n_rebuild_tensor_v2\n(NK\x00))tR.", "storage"),
+    "a storage of another kind": (b"\x80\x02(X\x07\x00\x00\x00storageNX\x01\x00\x00\x000NK\x01tQ.", "unknown type"),
+    "nested without end": (b"\x80\x02" + b"]" * 100_000 + b"a" * 99_999 + b".", "pipeline"),
+}
+
+
+@pytest.mark.parametrize("case", HOSTILE_INDICES)
+def test_hostile_index(run: Run, case: str) -> None:
+    index, mention = HOSTILE_INDICES[case]
+    _index(lambda _data: index)(run)
+    refused(run.config, mention)
+
+
+def test_a_mapping_keeps_no_attributes(run: Run) -> None:
+    """torch.save stores those of a module's state; a file could hide methods by them."""
+    content = checkpoint_of(parameters())
+    content["pipeline"] = OrderedDict(content["pipeline"])
+    content["pipeline"].get = content["pipeline"].keys = None  # type: ignore[method-assign]
+    expected = load_scene(run.config)
+    run.save(content)
+    assert equal(expected, load_scene(run.config))
+
+
+def test_tensors_are_read_as_torch_reads_them(run: Run) -> None:
+    """Views with offsets and strides, shared storages, and other kinds in the same file."""
+    base = torch.arange(60, dtype=torch.float32).reshape(3, 4, 5)
+    found: dict[str, Any] = {
+        "base": base, "row": base[1], "column": base[:, 2], "turned": base.permute(2, 0, 1), "every": base[::2, 1::2],
+        "none": base[:0], "number": base[1, 2, 3], "half": base.half()[1:], "double": base.double() / 3,
+    }  # fmt: skip
+    torch.save({**found, "integers": base.long(), "text": "x", "list": [1, (2.5, None)]}, run.checkpoint)
+    read = checkpoint.read_checkpoint(run.checkpoint)
+    for name, tensor in found.items():
+        values = read[name].float32(run.checkpoint, name)
+        assert values.shape == tuple(tensor.shape) and np.array_equal(values, tensor.float().numpy()), name
+    assert read["integers"].kind == "int64" and read["text"] == "x" and read["list"] == [1, (2.5, None)]
+
+
+def test_another_byte_order_is_refused(run: Run) -> None:
+    _rewrite(run, lambda name, data: b"big" if name.endswith("byteorder") else data)
+    refused(run.config, "byte order")
+
+
+def test_splats_are_opened_without_torch(run: Run) -> None:
+    """It takes seconds to load."""
+    code = "import sys, ns_abstract; ns_abstract.load_scene(sys.argv[1]).method(); sys.exit('torch' in sys.modules)"
+    subprocess.run([sys.executable, "-c", code, str(run.config)], check=True)
+
+
 @pytest.mark.parametrize("place", ["root", "pipeline", "schedulers"])
 @pytest.mark.parametrize("function", [os.system, eval, Path, bytearray])
 def test_pickle_runs_nothing(run: Run, tmp_path: Path, place: str, function: Callable[..., Any]) -> None:
@@ -783,14 +847,14 @@ def test_archive_that_claims_more_than_it_holds(run: Run) -> None:
 
 
 def test_memory_is_checked_before_reading(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(runs, "available_memory", lambda: 1000)
+    monkeypatch.setattr(memory, "available_memory", lambda: 1000)
     refused(run.config, "GiB", "memory")
-    monkeypatch.setattr(runs, "available_memory", lambda: None)
+    monkeypatch.setattr(memory, "available_memory", lambda: None)
     assert load_scene(run.config).count == GAUSSIANS
 
 
 def test_available_memory() -> None:
-    found = runs.available_memory()
+    found = memory.available_memory()
     assert found is None or found > 2**20
 
 

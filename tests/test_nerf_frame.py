@@ -221,6 +221,42 @@ def test_bounds_that_are_no_numbers_are_not_kept(monkeypatch: pytest.MonkeyPatch
     assert torch.isfinite(torch.from_numpy(found.alpha)).all()
 
 
+def test_what_is_known_is_only_replaced_by_bounds() -> None:
+    """A NaN or an infinity at either end, crossed ends, and ends beside what is known change nothing."""
+    low = np.array([0.3, np.nan, 0.3, -np.inf, 0.6, 0.3, 0.9])
+    high = np.array([0.7, 0.7, np.nan, 0.7, 0.4, np.inf, 0.95])
+    lower, upper = np.full(7, 0.2), np.full(7, 0.8)
+    bounds_module._Work._keep(lower, upper, (np.arange(7),), low, high)
+    assert lower.tolist() == [0.3] + 6 * [0.2] and upper.tolist() == [0.7] + 6 * [0.8]
+
+
+def test_pieces_that_are_given_up_say_nothing() -> None:
+    scene, pose_set = tiny_scene(3), poses(SETS["yaw"])
+    bounds = NerfBounds(scene, UNIFORM, 1)
+    bounds.field.limit = 0
+    found = bounds.rays(pose_set, pose_set.box, pixels_of(pose_set.camera), 0.02)
+    assert (found.upper - found.lower).max() == 1.0, "nothing was given up"
+    assert attack(scene, pose_set, found)[1] == 0
+
+
+def test_rays_of_wide_sets_lie_in_their_polynomials() -> None:
+    """The Taylor models' own error counts where sets are wide and the degree is 1."""
+    pose_set = poses({"rotation": {"yaw": 0.2, "roll": 0.1}, "translation": {"x": 0.1}})
+    pencil = bounds_module.Pencil(pose_set, pose_set.box, pixels_of(pose_set.camera), 1)
+    ray, distance = np.repeat(np.arange(12), 2), np.tile([0.3, 3.9], 12)
+    lines, radius = pencil.points(ray, distance, 0.0 * distance)
+    directions = np.array([[(x + 0.5 - 2.0) / 5.0, -(y + 0.5 - 1.5) / 5.0, -1.0] for y in range(3) for x in range(4)])
+    worst = np.zeros_like(radius)
+    for values in np.random.default_rng(0).uniform(-1.0, 1.0, (300, 3)):
+        pose = pose_set.pose(pose_set.box.at(values))
+        world = directions @ pose[:, :3].T
+        points = pose[:, 3] + distance[:, None] * (world / np.linalg.norm(world, axis=1, keepdims=True))[ray]
+        monomials = np.prod(values**pencil.exponents, axis=1)
+        worst = np.maximum(worst, np.abs(points - np.einsum("m,kmc->kc", monomials, lines)))
+    assert (worst <= radius).all()
+    assert worst.max() > 0.1 * radius.max(), "far too wide"
+
+
 def test_processes_find_what_this_process_finds_and_survive_a_kill() -> None:
     scene, pose_set = tiny_scene(2, density=30.0), poses(SETS["yaw"])
     box = pose_set.box.split(0, 2)[0]

@@ -29,6 +29,7 @@ from ns_abstract.io.errors import InputError
 from ns_abstract.methods.load import load_any
 from ns_abstract.methods.nerf.render import NerfRenderer, Sampling
 from ns_abstract.methods.nerf.scene import Encoding, NerfScene
+from ns_abstract.methods.runs import Tagged
 from ns_abstract.methods.splat.activate import activate
 from ns_abstract.methods.splat.constants import GSPLAT_1_4_0
 from ns_abstract.methods.splat.load import load_scene
@@ -459,6 +460,27 @@ def test_render_thread_survives_interrupts(
     assert sys.gettrace() is None
 
 
+def test_requests_that_are_lost_are_made_again(nerfstudio: SimpleNamespace) -> None:
+    made: list[float] = []
+    heeded = threading.Event()
+
+    def draw() -> None:
+        made.append(time.monotonic())
+        if len(made) == 4:
+            heeded.set()
+
+    redraw = nerfstudio.panel.Insistent(draw, heeded.is_set, 0.01)
+    redraw()
+    assert heeded.wait(3600.0)
+    time.sleep(0.2)
+    assert len(made) == 4
+    # and from then on as before
+    heeded.clear()
+    del made[:]
+    redraw()
+    assert heeded.wait(3600.0) and len(made) >= 4
+
+
 def test_words_for_every_state(nerfstudio: SimpleNamespace) -> None:
     view = View(nerfstudio.panel.camera_of(cameras(nerfstudio)), perturbation_of({"x": 0.01}))
     text = nerfstudio.panel.describe(view, None, Status("failed", "out of memory"))
@@ -711,3 +733,21 @@ def test_render_writes_abstract_images(nerfstudio: SimpleNamespace, folder: Path
     rgb, lower, upper, _ = np.split(strip, 4, axis=1)
     # 8 bits each, rounded alike
     assert (lower <= rgb).all() and (rgb <= upper).all() and (upper > lower).any()
+
+
+def test_members_of_enumerations_as_some_pythons_write_them() -> None:
+    """Python 3.11.0 to 3.11.3 store a member as ``getattr(Class, "NAME")``: that much may be named, and no more."""
+    loading = importlib.import_module("ns_abstract.nerfstudio.loading")
+    python = "tag:yaml.org,2002:python/"
+
+    def taken(owner: str, *rest: Any) -> Tagged:
+        return Tagged(f"{python}object/apply:builtins.getattr", [Tagged(f"{python}name:{owner}", ""), *rest])
+
+    known = "nerfstudio.utils.writer.EventName"
+    loading.check_tags({"stats": [taken(known, "ITER_TRAIN_TIME")]}, Path("config.yml"))
+    for found in (
+        taken(known, "__class__"), taken(known, "NOWHERE"), taken(known), taken(known, "ITER_TRAIN_TIME", "x"),
+        taken("subprocess.call", "__call__"), taken("nerfstudio.utils.scripts", "run_command"),
+    ):  # fmt: skip
+        with pytest.raises(InputError, match="getattr"):
+            loading.check_tags([found], Path("config.yml"))

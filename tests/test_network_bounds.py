@@ -9,11 +9,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from onnx_files import OnnxFile, attack, image_sets, session
+from onnx_files import OnnxFile, attack, image_sets, members, session
 
 from ns_abstract.io.errors import InputError
-from ns_abstract.verify.network import ImageSets, Network, bound_outputs, load_network
+from ns_abstract.verify.network import ImageSets, Network, NetworkArithmetic, bound_outputs, load_network, schedule
 from ns_abstract.verify.network import bounds as module
+from ns_abstract.verify.network.layers import Convolution
 
 Vector = list[Fraction]
 SHAPE = (2, 4, 4)
@@ -123,6 +124,138 @@ def test_modes_are_ordered_on_average(tmp_path: Path) -> None:
         gains.append((everywhere - end).mean())
         assert ((everywhere >= end - 0.02 * (1 + np.abs(end))).mean()) > 0.9
     assert min(gains) > 0.0
+
+
+def residual(folder: Path) -> Path:
+    """Max pooling, two residual blocks with a stride between, and a linear layer."""
+    f = OnnxFile((2, 16, 16), 3)
+    f.conv(2, 6, pads=[1, 1, 1, 1])
+    f.node("Relu")
+    f.node("MaxPool", kernel_shape=[3, 3], strides=[2, 2], pads=[1, 1, 1, 1])
+    for stride, size in ((1, 6), (2, 8)):
+        before = f.last
+        f.conv(6, size, pads=[1, 1, 1, 1], strides=[stride, stride])
+        f.node("Relu")
+        f.conv(size, size, pads=[1, 1, 1, 1])
+        branch = f.last
+        f.last = before
+        if stride == 2:
+            f.conv(6, size, k=1, strides=[2, 2])
+        f.node("Add", branch, f.last)
+        f.node("Relu")
+    f.node("Flatten")
+    f.gemm(128, 3)
+    return f.write(folder / "residual.onnx")
+
+
+@pytest.mark.parametrize("allowed", [1e12, 3e6, 0.0])
+def test_deep_networks_are_bounded(allowed: float, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Rationed rows are sound, whatever they may take; with enough of them little is lost."""
+    file = residual(tmp_path)
+    network, rows = load_network(file), np.random.default_rng(0).normal(size=(4, 3))
+    images = image_sets((2, 16, 16), 2, 2, 0.01, 0.002)
+    plain = bound_outputs(network, images, rows, np.zeros(4))
+    monkeypatch.setattr(schedule, "_DEEP", 0.0)
+    monkeypatch.setattr(schedule, "_ALLOWED", allowed)
+    monkeypatch.setattr(schedule, "_GIVEN_UP", allowed)
+    threads = torch.get_num_threads()
+    found = []
+    try:
+        for count in (1, 3):
+            torch.set_num_threads(count)
+            found.append(bound_outputs(network, images, rows, np.zeros(4)))
+    finally:
+        torch.set_num_threads(threads)
+    middle = rows @ network(torch.from_numpy(0.5 * (images.lower + images.upper)).reshape(2, 2, 16, 16)).numpy().T
+    for cell in range(2):
+        least, _ = attack(network, session(file), images, cell, rows, 32, 5)
+        for one in found:
+            assert (one.lower[cell] <= least).all() and np.isfinite(one.lower).all()
+    np.testing.assert_allclose(found[0].lower, found[1].lower, rtol=1e-5)
+    gaps = [(middle.T - one.lower).mean() for one in (plain, found[0])]
+    assert gaps[1] <= (1.1 if allowed > 1e9 else 1e4) * gaps[0]
+    assert gaps[1] >= (0.9 if allowed else 1.1) * gaps[0]
+
+
+@pytest.mark.parametrize("arithmetic", ["float32", "real"])
+def test_chosen_slopes_are_never_worse_and_sound(arithmetic: NetworkArithmetic, tmp_path: Path) -> None:
+    gains = 0.0
+    for seed in range(6):
+        network, layers, _ = mlp(tmp_path, seed, 2.0)
+        rng = np.random.default_rng(seed)
+        b, a = rng.normal(size=(2, 3)), rng.normal(size=(2, 3, 1))
+        reach, rows = np.abs(a[..., 0]), rng.normal(size=(3, 2))
+        images = ImageSets(a, b, a, b, np.nextafter(b - reach, -np.inf), np.nextafter(b + reach, np.inf))
+        plain, chosen = (
+            bound_outputs(network, images, rows, np.zeros(3), arithmetic=arithmetic, slope_steps=steps)
+            for steps in (0, 12)
+        )
+        assert (chosen.lower >= plain.lower).all()
+        gains += (chosen.lower - plain.lower).sum()
+        for cell, k in itertools.product(range(2), range(3)):
+            least = exact_least(layers, b[cell], a[cell, :, 0], rows[k])
+            assert Fraction(float(chosen.lower[cell, k])) <= least
+    assert gains > 1.0
+
+
+def test_chosen_slopes_behind_maxima_and_products(tmp_path: Path) -> None:
+    """Planes with slopes of their own hold wherever images are; something is gained."""
+    f = OnnxFile((2, 16, 16), 3)
+    residual(tmp_path)
+    gate = OnnxFile((2, 8, 8), 5)
+    gate.conv(2, 4, pads=[1, 1, 1, 1])
+    one = gate.node("Relu")
+    gate.conv(4, 4, pads=[1, 1, 1, 1])
+    two = gate.node("Sigmoid")
+    gate.node("Mul", one, two)
+    gate.conv(4, 3, 3, pads=[1, 1, 1, 1])
+    gate.node("Relu")
+    gate.node("Flatten")
+    gate.gemm(192, 3)
+    for file, shape in ((tmp_path / "residual.onnx", f.shape), (gate.write(tmp_path / "gate.onnx"), gate.shape)):
+        network, rows = load_network(file), np.random.default_rng(1).normal(size=(4, 3))
+        images = image_sets(shape, 2, 2, 0.05, 0.02)
+        plain, chosen = (bound_outputs(network, images, rows, np.zeros(4), slope_steps=n) for n in (0, 8))
+        assert (chosen.lower >= plain.lower).all() and (chosen.lower > plain.lower + 1e-4).any()
+        run, rng = session(file), np.random.default_rng(0)
+        for cell in range(2):
+            least, _ = attack(network, run, images, cell, rows, 32, 5)
+            assert (chosen.lower[cell] <= least).all()
+            p, t = rng.uniform(-1, 1, (64, 2)), rng.uniform(size=(64, images.lower.shape[1]))
+            x, inside = members(images, cell, p, t)
+            y = run(x.reshape(-1, *shape)) @ rows.T
+            planes = p @ chosen.a[cell].T + chosen.b[cell]
+            assert inside.any() and (planes <= y)[inside].all()
+
+
+def test_chains_of_maxima_beside_their_input(tmp_path: Path) -> None:
+    """Pooling makes windows of rows as large as the map, beside windows of a single number."""
+    f = OnnxFile((2, 4, 4), 2)
+    f.conv(2, 4, pads=[1, 1, 1, 1])
+    parts = [f.node("Sigmoid")]
+    parts += [f.node("MaxPool", kernel_shape=[3, 3], pads=[1, 1, 1, 1]) for _ in range(3)]
+    f.node("Concat", *parts, axis=1)
+    f.conv(16, 4, pads=[1, 1, 1, 1])
+    f.node("Relu")
+    f.conv(4, 2)
+    file = f.write(tmp_path / "chain.onnx")
+    network, rows = load_network(file), np.random.default_rng(0).normal(size=(3, 8))
+    images = image_sets((2, 4, 4), 2, 2, 0.3, 0.1)
+    lower = bound_outputs(network, images, rows, np.zeros(3)).lower
+    for cell in range(2):
+        least, _ = attack(network, session(file), images, cell, rows, 32, 5)
+        assert (lower[cell] <= least).all() and np.isfinite(lower[cell]).all()
+
+
+def test_rows_cost_what_their_windows_hold(tmp_path: Path) -> None:
+    network = load_network(residual(tmp_path))
+    costs = schedule.Costs(network)
+    first = next(k for k, node in enumerate(network.nodes, 1) if node.op == "Conv")
+    layer = network.nodes[first - 1].layer
+    assert isinstance(layer, Convolution)
+    # one number of the first convolution: its channels there, the weights, and the image
+    assert costs.row(first) == schedule._PASSING * (6 + 512) + layer.weight.numel()
+    assert costs.row(len(network.nodes)) > 10 * costs.row(first)
 
 
 def test_a_point_and_a_constant_image(tmp_path: Path) -> None:

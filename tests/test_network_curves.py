@@ -180,6 +180,9 @@ class _Chord(curves.Silu):
     def bends(self) -> tuple[int, ...]:
         return 0, 0, 0
 
+    def straight(self, z: torch.Tensor) -> torch.Tensor:
+        return self.slope(z)
+
 
 class _Turned(curves.Silu):
     """Takes the wrong parts to be convex."""

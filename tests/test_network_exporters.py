@@ -32,7 +32,7 @@ class Flattened(nn.Module):
 
 
 class Pieces(nn.Module):
-    """Splits, steps, dropped channels, normalised weights and pads of a number."""
+    """Splits, steps, dropped channels, normalised weights, pads of a number, repeated axes and a second output."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -41,12 +41,13 @@ class Pieces(nn.Module):
         self.up, self.norm = nn.Upsample(scale_factor=2), nn.GroupNorm(2, 4)
         self.last = nn.ConvTranspose2d(4, 2, 2, 2)
 
-    def forward(self, x: torch.Tensor) -> torch.Tensor:
+    def forward(self, x: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         one, two = self.act(self.drop(self.first(x))).chunk(2, 1)
         three, four = (one * torch.sigmoid(two)).split([1, 3], 1)
         x = nn.functional.pad(torch.cat([four, three.clamp(-0.1, 0.2)], 1), (1, 0, 0, 1), value=0.3)
         x = self.norm(self.up(x[:, :, ::2, 1::2]))
-        return torch.flatten(self.last(x).mean(1, keepdim=True).softmax(-1), 1)
+        wide = two[:, :1, :2].expand(-1, 3, -1, -1)
+        return torch.flatten(self.last(x).mean(1, keepdim=True).softmax(-1), 1), nn.functional.logsigmoid(wide)
 
 
 def exported(module: nn.Module, file: Path, dynamo: bool) -> Path:
@@ -70,7 +71,7 @@ def test_pieces_are_bounded(kind: str, tmp_path: Path) -> None:
 
     def run(images: np.ndarray) -> np.ndarray:
         with torch.no_grad():
-            return module(torch.from_numpy(images)).numpy()
+            return np.concatenate([y.numpy().reshape(len(images), -1) for y in module(torch.from_numpy(images))], 1)
 
     x = np.random.default_rng(0).normal(size=(2, *SHAPE)).astype(np.float32)
     np.testing.assert_allclose(network(torch.from_numpy(x)).numpy(), run(x), rtol=1e-4, atol=1e-5)

@@ -86,6 +86,37 @@ def test_sums_that_lose_as_much_as_they_can(depth: int, tmp_path: Path) -> None:
     assert (lost > 0.85 * charge).all()
 
 
+def test_sums_that_cancel(tmp_path: Path) -> None:
+    """What is lost is relative to the largest partial sum, however small the sum is."""
+    weight = np.full((1, 122), LOST)
+    weight[0, 0], weight[0, 121] = 1.0, -1.0
+    layers = [(weight, np.zeros(1))]
+    network, _ = network_of(layers, tmp_path)
+    y = in_order(layers, np.ones(122), np.arange)
+    assert y[0] == 0.0 and float(exact(layers, np.ones(122))[0]) > 100 * LOST
+    rows = np.array([[1.0], [-1.0]])
+    lower = bound_outputs(network, still(np.ones((1, 122))), rows, np.zeros(2)).lower[0]
+    assert (lower <= rows @ y).all()
+    # the products' sizes together are twice the largest partial sum
+    assert float(exact(layers, np.ones(122))[0]) - lower[0] < 1.5 * 123 * 2.0**-24
+
+
+def test_sums_that_start_with_what_is_added(tmp_path: Path) -> None:
+    """A program may start a layer's sums with a branch that is added behind them."""
+    f = OnnxFile((121,))
+    small = np.full((121, 121), LOST)
+    start = f.node("Relu")
+    f.node("Gemm", start, f.constant(small), f.constant(np.zeros(121)), transB=1)
+    f.node("Add", f.last, start)
+    network = load_network(f.write(tmp_path / "skip.onnx"))
+    lower = bound_outputs(network, still(np.ones((1, 121))), np.eye(121)[:1], np.zeros(1)).lower[0]
+    total = np.float32(1.0)
+    for _ in range(121):
+        total = total + np.float32(LOST)
+    assert total == 1.0 and lower[0] <= 1.0
+    assert 1.0 + 121 * LOST - lower[0] < 1.5 * 121 * 2.0**-24
+
+
 def random_layers(sizes: tuple[int, ...], seed: int, scale: float = 2.0) -> Layers:
     rng = np.random.default_rng(seed)
     return [

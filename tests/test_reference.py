@@ -15,7 +15,7 @@ from ns_abstract.geometry.poses import rotation_about
 from ns_abstract.methods.splat.activate import activate
 from ns_abstract.methods.splat.constants import GSPLAT_1_4_0, PAPER, Rasteriser
 from ns_abstract.methods.splat.load import load_scene
-from ns_abstract.methods.splat.reference import Projection, Reference, project, reference_image, rotations, sh_colors
+from ns_abstract.methods.splat.reference import Projection, Reference, project, rotations, sh_colors
 from ns_abstract.methods.splat.render import Renderer
 from ns_abstract.methods.splat.scene import SplatScene
 
@@ -88,7 +88,7 @@ def compiled(scene: SplatScene, camera: Camera, rasteriser: Rasteriser = GSPLAT_
 
 
 def reference(scene: SplatScene, camera: Camera, rasteriser: Rasteriser = GSPLAT_1_4_0) -> np.ndarray:
-    return reference_image(scene, camera, pose_of(camera), rasteriser=rasteriser).numpy()
+    return Reference(scene, rasteriser).image(camera, pose_of(camera)).numpy()
 
 
 def apart(a: np.ndarray, b: np.ndarray) -> float:
@@ -229,7 +229,7 @@ def test_pixels_and_gradient() -> None:
     scene = make_scene(camera, 2, degree=2, antialiased=True)
     some = torch.tensor([[3, 4], [20, 30], [34, 43], [17, 16]])
     image = reference(scene, camera)
-    picked = reference_image(scene, camera, pose_of(camera), pixels=some)
+    picked = Reference(scene).pixels(camera, pose_of(camera), some)
     assert apart(picked.numpy(), image[some[:, 0], some[:, 1]]) <= 1e-12
     pose = pose_of(camera).requires_grad_(True)
     renderer = Reference(scene)

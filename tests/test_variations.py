@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import torch
 from conftest import SHIFT, Inputs, blob_scene, write_json
+from scene_attacks import VariedAttack, attack_varied, check_varied, show_compiled, show_reference
 
 from ns_abstract.api.files import Settings, open_job
 from ns_abstract.arithmetic.rounding import FLOAT32, REAL, Arithmetic
@@ -31,8 +32,6 @@ from ns_abstract.methods.splat.render import Renderer
 from ns_abstract.methods.splat.scene import SplatScene
 from ns_abstract.methods.splat.variations import VariedSplats, selected, vary
 from ns_abstract.perturbation.specification import load_perturbation, parse_perturbation
-from ns_abstract.verify.attack.soundness import check_run
-from ns_abstract.verify.varied import VariedAttack, attack_varied, check_varied, show_compiled, show_reference
 
 NONE = np.empty((0, 3))
 
@@ -450,5 +449,3 @@ def test_check(blobs: Inputs) -> None:
     found = check_varied(blobs.config, blobs.path, spec, 0, 2, members=6, targets=2, downscale_factor=2)
     assert found["violations"] == 0 and found["pictures"] == 2 * 2 * (7 + 2 * 4)
     assert 0.0 < found["mpg_witness"] < found["mpg"] < found["xpg"]
-    with pytest.raises(InputError, match="scene"):
-        check_run(blobs.config, blobs.path, spec, 0, 1, 4)

@@ -135,7 +135,7 @@ def test_unsafe_instances_are_never_proved(tmp_path: Path) -> None:
 def test_proofs_alone_never_decide_unsafe_instances(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Without any attack, what is unsafe in one corner of the box or by one of two cases is not proved."""
     monkeypatch.setattr(boxes._Search, "_attack", lambda self, region: False)
-    monkeypatch.setattr(boxes._Search, "_probe", lambda self, region, lower, upper, slopes: False)
+    monkeypatch.setattr(boxes._Search, "_probe", lambda self, region, boxes: False)
     monkeypatch.setattr(boxes, "_WAITING", 64)
     for seed in range(2):
         y = grid_outputs(net(tmp_path, seed))
@@ -154,7 +154,7 @@ def test_planted_faults_are_noticed(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     y = grid_outputs(file)
     both = f"(or (<= Y_0 {float(y[:, 0].min()) - 1.0!r}) (<= Y_1 {float(np.median(y[:, 1]))!r}))"
     monkeypatch.setattr(boxes._Search, "_attack", lambda self, region: False)
-    monkeypatch.setattr(boxes._Search, "_probe", lambda self, region, lower, upper, slopes: False)
+    monkeypatch.setattr(boxes._Search, "_probe", lambda self, region, boxes: False)
     assert decided(tmp_path, {"p": text(both)}, seconds=1.0)["p"] in ("unknown", "timeout")
     monkeypatch.setattr(boxes, "proves", lambda bounds, groups: (bounds.lower > 0.0).any(1))
     assert decided(tmp_path, {"p": text(both)}, seconds=1.0)["p"] == "unsat"

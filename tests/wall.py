@@ -149,6 +149,12 @@ class WallMethod:
     def describe(self) -> dict[str, Any]:
         return {"name": self.name, "source": "test"}
 
+    def easier(self, poses: PoseSet) -> Iterator[tuple[str, Any]]:
+        return iter(())
+
+    def holders(self, frame: Any, box: ParameterBox, tile: int, count: int) -> list[tuple[int, float]]:
+        return []
+
     def prepare(self, perturbations: Sequence[Perturbation]) -> None:
         for perturbation in perturbations:
             if perturbation.rotation or perturbation.scene:

@@ -28,6 +28,23 @@ _LEVELS = "test_eight_bit.py::test_sets_hold_rounded_pictures"
 
 CERTIFICATES = (
     Fault(
+        "scene margin: scenes of a tenth of the radius",
+        "api/certification.py", "Certification.settle.settle", "kind.variation(radius)", "kind.variation(0.1 * radius)",
+        "test_certify_cli.py::test_scene_margin", True,
+    ),
+    Fault(
+        "scene margin: parts that are not proved are passed over",
+        "verify/scene_margin.py", "_Bisection._examined", 'return "unknown", found.reason, count, None', "continue",
+        "test_scene_margin.py::test_parts_that_are_not_proved_count",
+    ),
+    Fault(
+        "scene margin: the largest radius of a cell is told",
+        "verify/scene_margin.py", "widest",
+        "found.reached, found.part = radius, found.part + cells[number].part",
+        "found.reached, found.part = max(radius, found.reached), found.part + cells[number].part",
+        "test_scene_margin.py::test_the_margin_is_that_of_the_weakest_cell",
+    ),
+    Fault(
         "8 bits: linear sets are not widened",
         _ROUNDED, "rounded_sets", "(0.5 + _STEP_ERROR) / _STEPS + _QUOTIENT", "0.0", _LEVELS,
     ),
@@ -75,7 +92,7 @@ CERTIFICATES = (
         "linear claims: one group is enough",
         _PROPERTIES, "LinearClaim.proved",
         "np.min([lower[:, list(group)].max(axis=1) for group in self.groups], axis=0)",
-        "np.max([lower[:, list(group)].max(axis=1) for group in self.groups], axis=0)", _LINEAR,
+        "np.max([lower[:, list(group)].max(axis=1) for group in self.groups], axis=0)", _UNSAFE,
     ),
     Fault(
         "linear claims: bounds that are no numbers are left in",
@@ -177,7 +194,7 @@ CERTIFICATES = (
     ),
     Fault(
         "search: linear sets that are no numbers are taken",
-        _SEARCH, "_sane", "(*linear, lower, upper)", "(lower, upper)", _IMAGES,
+        _SEARCH, "_sane", "(*linear, lower, upper)", "(lower, upper)", _IMAGES + "[NaN slope]",
     ),
     Fault(
         "search: infinite bounds of the network prove",
@@ -214,8 +231,9 @@ CERTIFICATES = (
         "self.claim.margin(self.model.differentiable(picture[None]), values[None])[0]", _SCENES,
     ),
     Fault(
-        "search: a scene that breaks the property leaves its pose whole",
-        _SEARCH, "_Seen.hopeless", "len(self._where(_spoilt)) == len(self.poses)", "False", _SCENES,
+        "search: cells are given up where one scene breaks one pose",
+        _SEARCH, "_Seen.hopeless", "len(self._where(_spoilt)) == len(self.poses)", "bool(self._where(_spoilt))",
+        _SCENES,
     ),
     Fault(
         "cells: parts of a cut leave a gap",
@@ -238,12 +256,13 @@ CERTIFICATES = (
     ),
     Fault(
         "store: what comes twice counts twice",
-        _STORE, "Store.close_block", "if gone is None:\n    return False", "pass",
+        _STORE, "Store.close_block", "if gone is None:\n    return False", "if gone is None:\n    return True",
         "test_certify_search.py::test_result_that_comes_twice_counts_once",
     ),
     Fault(
-        "store: what an ended run left open stays unknown",
-        _STORE, "Store._open_base", "self._put('open_rows', [])", "pass", _RESUMED,
+        "store: what was changed since is read",
+        _STORE, "Store._verify", "found.plain() != self._get('seals')", "False",
+        "test_folders.py::test_a_search_that_was_edited_is_not_continued",
     ),
     Fault(
         "store: another search is continued",

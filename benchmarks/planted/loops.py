@@ -8,8 +8,33 @@ _SETS = "test_reach.py::test_affine_sets_hold_their_images"
 _CLIP = "test_reach.py::test_a_clip_is_enclosed"
 _RUNS = "test_reach.py::test_tubes_hold_every_run"
 _VERDICTS = "test_reach.py::test_a_good_controller_is_certified_and_a_bad_one_falsified"
+_MARGIN = "test_reach_cli.py::test_scene_margin"
 
 LOOPS = (
+    Fault(
+        "scene margin: tubes of a tenth of the radius",
+        "api/reaching.py",
+        "LoopJob.settle.settle",
+        "kind.variation(radius)",
+        "kind.variation(0.1 * radius)",
+        _MARGIN,
+    ),
+    Fault(
+        "loops: a scene that stands elsewhere is not charged",
+        _TUBES,
+        "Reacher._advanced",
+        "self.shift + rounding * size",
+        "rounding * size",
+        "test_reach.py::test_tubes_hold_runs_in_a_scene_that_stands_elsewhere",
+    ),
+    Fault(
+        "scene margin: runs see the stored scene",
+        _SEARCH,
+        "simulate",
+        "reacher.view.image(pose, *more)",
+        "reacher.view.image(pose)",
+        _MARGIN,
+    ),
     Fault(
         "loops: the float64 step's rounding is not charged",
         _DYNAMICS,

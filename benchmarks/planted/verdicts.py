@@ -5,6 +5,7 @@ from planted.fault import Fault
 _SEARCH = "verify/search.py"
 _VNNLIB = "verify/vnnlib.py"
 _NETWORK = "verify/network/bounds.py"
+_RESPONSE = "verify/response.py"
 
 VERDICTS = (
     Fault(
@@ -34,10 +35,26 @@ VERDICTS = (
     Fault(
         "network: half of a sum's roundings are charged",
         _NETWORK,
-        "_Cells._combine",
-        "count + _FOLDING",
-        "0.5 * (count + _FOLDING)",
+        "_Cells._rounding",
+        "0.5 * (size + balance.abs())",
+        "0.25 * (size + balance.abs())",
         "test_network_rounding.py::test_sums_that_lose_as_much_as_they_can[1]",
+    ),
+    Fault(
+        "network: partial sums are taken to be no larger than the whole",
+        _NETWORK,
+        "_Cells._rounding",
+        "0.5 * (size + balance.abs())",
+        "balance.abs()",
+        "test_network_rounding.py::test_sums_that_cancel",
+    ),
+    Fault(
+        "network: sums that start with what is added behind them are not charged",
+        _NETWORK,
+        "_Cells._rounding",
+        "_gamma(own)",
+        "0.0 * own",
+        "test_network_rounding.py::test_sums_that_start_with_what_is_added",
     ),
     Fault(
         "network: the first layer's rounding is dropped",
@@ -59,8 +76,8 @@ VERDICTS = (
         "network: rounding is charged at the middle of a set alone",
         _NETWORK,
         "_Cells._combine",
-        "torch.maximum(f.interval.size, f.reference.abs())",
-        "f.reference.abs() + 0.0 * f.interval.size",
+        "torch.maximum(f.interval.spread, f.reference.abs())",
+        "f.reference.abs() + 0.0 * f.interval.spread",
         "test_network_rounding.py::test_rounding_counts_the_largest_image_of_a_set",
     ),
     Fault(
@@ -80,11 +97,51 @@ VERDICTS = (
         "test_network_rounding.py::test_exact_network_at_single_images[1024.0-False]",
     ),
     Fault(
+        "network: lines below ReLUs are steeper than the functions",
+        "verify/network/slopes.py",
+        "Ascent.climb",
+        "np.clip(self.slopes[k] + step, units.alpha, 1.0)",
+        "np.clip(self.slopes[k] + step, units.alpha, 1.5)",
+        "test_network_bounds.py::test_chosen_slopes_are_never_worse_and_sound[real]",
+    ),
+    Fault(
         "network: units that may be on count as zeros",
         _NETWORK,
         "_Cells._activate",
         "upper > 0.0",
         "lower > 0.0",
         "test_network_rounding.py::test_units_that_may_be_on_are_terms",
+    ),
+    Fault(
+        "camera: the darkest factor is forgotten",
+        _RESPONSE,
+        "Response.sets",
+        "low * (1.0 - r)",
+        "low * 1.0",
+        "test_response.py::test_every_camera_is_contained[0.3-0.01-brightness]",
+    ),
+    Fault(
+        "camera: lines are not scaled with the factor",
+        _RESPONSE,
+        "Response.sets",
+        "b_upper * grow",
+        "b_upper * 1.0",
+        "test_response.py::test_every_camera_is_contained[0.3-0.3-white balance]",
+    ),
+    Fault(
+        "camera: lines do not fall with the power",
+        _RESPONSE,
+        "Response.sets",
+        "b_lower * shrink - fall",
+        "b_lower * shrink",
+        "test_response.py::test_every_camera_is_contained[0.3-0.3-gamma]",
+    ),
+    Fault(
+        "camera: bounds that cross look like bounds",
+        _RESPONSE,
+        "Response.sets",
+        "np.where(lower <= upper, least, np.nan)",
+        "least",
+        "test_response.py::test_sets_that_cross_or_are_no_numbers_stay_so",
     ),
 )

@@ -14,6 +14,7 @@ import numpy as np
 from ns_abstract.api.job import Job
 from ns_abstract.api.poses import PoseSet
 from ns_abstract.api.scenes import Scene, platform_problems
+from ns_abstract.arithmetic.kernel_cache import store as kernels
 from ns_abstract.execution.ending import AbandonedError
 from ns_abstract.execution.engines import Engine, Here
 from ns_abstract.execution.opening import Recipe, opened
@@ -77,8 +78,10 @@ class Part(NamedTuple):
     tiles: np.ndarray | None
 
 
-def bound_part(recipe: Recipe[Job], part: Part, goal: Goal, keep_leaves: bool, neighbours: int = 1) -> PartResult:
-    """One task on a worker, which opens the scene once and keeps it.
+def bound_part(
+    recipe: Recipe[Job], part: Part, goal: Goal, keep_leaves: bool, neighbours: int = 1
+) -> PartResult | None:
+    """One task on a worker, which opens the scene once and keeps it; None if the time was over before there was any.
 
     Args:
         recipe: Of the job.
@@ -96,7 +99,10 @@ def bound_part(recipe: Recipe[Job], part: Part, goal: Goal, keep_leaves: bool, n
     numba.set_num_threads(max(1, min(len(os.sched_getaffinity(0)) // neighbours, most)))
     job = opened(recipe)
     job.warm_up(part.index)
-    return job.bound_part(part.index, goal, part.tiles, keep_leaves=keep_leaves)
+    try:
+        return job.bound_part(part.index, goal, part.tiles, keep_leaves=keep_leaves)
+    except AbandonedError:
+        return None
 
 
 def local_workers(job: Job) -> int:
@@ -125,14 +131,15 @@ def bound_frames(
         job: What is bounded.
         frames: Their numbers.
         engine: Where; closed at the end.
-        budget: Seconds for all of them, compiling not counted.
+        budget: Seconds for all of them, compiling at first use not counted.
         target_ratio: Where a frame is good enough.
         keep_leaves: Whether results carry linear sets.
         stop: Asked between cells in this process, and twice a second while others work.
         on_progress: Told where the work of this process stands.
 
     Raises:
-        InputError: The scene does not fit into the memory as often as there are workers on a machine.
+        InputError: The scene does not fit into the memory as often as there are workers on a machine, or the time does
+            not do for one picture.
     """
     if not frames:
         engine.close()
@@ -149,10 +156,15 @@ def bound_frames(
     flying = done = number = 0
     recipe = None if engine.shares else job.recipe
     request = StopRequest() if stop is None else stop
+    deadline = perf_counter() + budget
     if recipe is None:
         with request.at_once():
+            compiled = kernels().compiled
             job.warm_up(frames[0])
-    deadline = perf_counter() + budget
+            if kernels().compiled > compiled:
+                deadline = perf_counter() + budget
+            # a look at costly rays is part of the work
+            job.check_time(frames[0], budget)
 
     def here(part: Part, goal: Goal) -> PartResult | None:
         def told(point: TracePoint, covered: float) -> None:
@@ -165,7 +177,7 @@ def bound_frames(
         try:
             return job.bound_part(part.index, goal, part.tiles, keep_leaves=keep_leaves, stopped=request, progress=told)
         except AbandonedError:
-            # stopped before there was anything to keep
+            # over before there was anything to keep
             return None
 
     def offer(room: int) -> Iterator[Task]:
@@ -383,7 +395,9 @@ def bound(
         )  # fmt: skip
         frames = list(results)
     if not frames:
-        raise KeyboardInterrupt
+        if stop():
+            raise KeyboardInterrupt
+        raise InputError("over before one picture was rendered", field="time_budget", fix="give more")
     about = {"guarantee": guarantee, "renderer": job.method.program, "scene": job.describe()}
     return BoundResult.of(frames[0], guarantee=guarantee, interrupted=stop(), target_ratio=target_ratio, about=about)
 

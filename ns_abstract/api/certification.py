@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import hashlib
 import itertools
 import json
@@ -17,7 +18,7 @@ import numpy as np
 import torch
 
 from ns_abstract.api.files import Settings, path_sets, resized
-from ns_abstract.api.job import Job
+from ns_abstract.api.job import Job, warm_up
 from ns_abstract.api.scenes import platform_problems
 from ns_abstract.execution.ending import abandoning
 from ns_abstract.execution.opening import Recipe, opened
@@ -28,6 +29,7 @@ from ns_abstract.geometry.tiles import assemble
 from ns_abstract.io.errors import InputError
 from ns_abstract.io.jsonio import load_json
 from ns_abstract.perturbation.specification import Perturbation
+from ns_abstract.perturbation.variations import SceneVariation
 from ns_abstract.refine.protocol import Frame, Member, Method, RayFrame
 from ns_abstract.report.record import file_stamp
 from ns_abstract.verify.cells import Cell, Grid, coarse_parts
@@ -36,7 +38,9 @@ from ns_abstract.verify.model import NetworkModel, parametric
 from ns_abstract.verify.network import NetworkArithmetic, load_network
 from ns_abstract.verify.pixel_costs import pixel_costs
 from ns_abstract.verify.properties import Claim, LinearClaim, Property, parse_property
-from ns_abstract.verify.search import BLOCK, Findings, Search
+from ns_abstract.verify.response import Response, shown_sets
+from ns_abstract.verify.scene_margin import Kind, Settle, Settled
+from ns_abstract.verify.search import BLOCK, ContradictionError, Findings, Search
 
 if TYPE_CHECKING:
     from ns_abstract.verify.interop import Form
@@ -103,10 +107,13 @@ class FramePictures:
         method: The scene and its program.
         poses: The frame's set.
         picture: Whether the network is shown floats or rounded pictures.
+        response: The cameras that may show them; None: one that shows what is rendered.
     """
 
-    def __init__(self, method: Method, poses: PoseSet, picture: Picture = "float") -> None:
-        self._rounded = picture == "8-bit"
+    def __init__(
+        self, method: Method, poses: PoseSet, picture: Picture = "float", response: Response | None = None
+    ) -> None:
+        self._rounded, self._response = picture == "8-bit", response
         self.frame: Frame = method.frame(poses)
         #: What pixels of a cell cost, where pictures are made ray by ray: see `pixel_costs`.
         self.weigh: Callable[[ParameterBox], np.ndarray | None] = lambda box: None
@@ -137,16 +144,14 @@ class FramePictures:
         return rounded(image) if self._rounded else image
 
     def members(self, seed: int) -> Iterator[Member]:
-        return self.frame.members(seed)
+        return self.frame.members(seed) if self._response is None else self._response.members(self.frame, seed)
 
     def sets(self, box: ParameterBox) -> tuple[tuple[np.ndarray, ...], np.ndarray, np.ndarray, np.ndarray]:
         if self.frame.tilewise:
             found = cast("RayFrame", self.frame).sets(box, partial(self.weigh, box))
         else:
             found = self.frame.bound(box, self._tiles, keep_linear=True)
-        assert found.linear is not None
-        whole = [assemble(part, self.frame.camera) for part in (*found.linear, found.lower, found.upper)]
-        linear, lower, upper = (whole[0], whole[1], whole[2], whole[3]), whole[4], whole[5]
+        linear, lower, upper = shown_sets(found, self.frame.camera, self._response)
         if self._rounded:
             linear, lower, upper = rounded_sets(linear, lower, upper)
         return linear, lower, upper, found.slopes
@@ -356,6 +361,50 @@ class Certification:
             self._searches[key] = Search(pictures, self.model, claim, grid, every_unit=every_unit, block=self.block)
         return self._searches[key]
 
+    def around(self, extra: SceneVariation) -> Certification:
+        """The same with more scenes in the sets."""
+        other = copy.copy(self)
+        other.__dict__.pop("_fingerprint", None)
+        other.job, other._searches = self.job.around(extra), {}
+        return other
+
+    def settle(self, kind: Kind) -> Settle:
+        """Bounds and attacks cells for all scenes around the stored one (V13)."""
+        kept: dict[tuple[float, int], tuple[FramePictures, Claim]] = {}
+
+        def settle(radius: float, frame: int, box: ParameterBox) -> Settled:
+            key = radius, frame
+            if key not in kept:
+                # radii come one after the other
+                kept.clear()
+                if kind.response is not None:
+                    response = Response(kind.response, radius)
+                    pictures = FramePictures(self.job.method, self.job.pose_sets[frame], self.picture, response)
+                else:
+                    pictures = self.around(kind.variation(radius)).pictures(frame)
+                # what is claimed does not depend on the scenes
+                kept[key] = pictures, self.claim(self.pictures(frame))
+            pictures, claim = kept[key]
+            search = Search(pictures, self.model, claim, Grid.adaptive(box, [1] * box.dimensions), cuts=False)
+            (leaf,) = search.examine(search.grid.roots()).leaves
+            if leaf.verdict == "certified":
+                return Settled("holds", "", np.zeros(box.dimensions))
+            if leaf.verdict == "unknown":
+                # the network's bounds are there, and not above 0
+                reason = leaf.reason if leaf.margin is None else "the margin's bound is not above 0"
+                return Settled("unknown", reason, pictures.frame.motion(box))
+            if leaf.scene is None:
+                raise ContradictionError(
+                    f"internal error: the stored scene breaks at {leaf.counterexample} what was proved there"
+                )
+            assert leaf.image is not None and leaf.outputs is not None
+            example = {"image": leaf.image, "outputs": leaf.outputs, "values": np.array(leaf.counterexample)}
+            example |= {"names": np.array(box.names, str), "radius": np.array(radius)}
+            example |= {f"scene_{name}": array for name, array in leaf.scene.items()}
+            return Settled("falsified", "a scene breaks it", np.zeros(box.dimensions), example)
+
+        return settle
+
     def foresee(self, index: int, seconds: float) -> None:
         """Refuse a frame of which not even the first part can be bounded, where pictures are made ray by ray.
 
@@ -370,7 +419,7 @@ class Certification:
             return
         frame = cast("RayFrame", self.search_frame(index))
         # compiling says nothing about rays
-        frame.warm_up()
+        warm_up(frame)
         begin = time.perf_counter()
         with abandoning(lambda: time.perf_counter() - begin > _FORESEEN * seconds):
             by_ray, parts = frame.effort()

@@ -18,15 +18,16 @@ import numpy as np
 from ns_abstract.api.bounding import listener
 from ns_abstract.api.certification import MEMORY, Certification, PropertySource, Question, examine_block, examine_here
 from ns_abstract.api.job import MOST_MEMORY, Job
+from ns_abstract.api.margins import NOT_ASKED, SHARE, Margins, certified_cells
 from ns_abstract.api.poses import PoseSet
 from ns_abstract.api.scenes import Scene
-from ns_abstract.api.searching import search_blocks
+from ns_abstract.api.searching import paced, search_blocks
 from ns_abstract.execution.ending import AbandonedError, abandoning
 from ns_abstract.execution.engines import Engine, EngineName, started
 from ns_abstract.execution.stopping import StopRequest, interruptible
 from ns_abstract.geometry.box import ParameterBox
 from ns_abstract.io.errors import InputError
-from ns_abstract.methods.runs import available_memory
+from ns_abstract.io.memory import available_memory
 from ns_abstract.report.certificate import CertifiedRun, certificate_document, coverage, verdict, write_certificate
 from ns_abstract.report.certificate_page import certificate_page
 from ns_abstract.report.picture import preview, to_bytes
@@ -34,12 +35,11 @@ from ns_abstract.report.record import file_stamp
 from ns_abstract.verify.cells import Grid
 from ns_abstract.verify.eight_bit import Picture
 from ns_abstract.verify.network import NetworkArithmetic
+from ns_abstract.verify.scene_margin import SceneMargin, check_scenes
 from ns_abstract.verify.search import Findings
 from ns_abstract.verify.store import IMAGES, Block, Store, fractions
 from ns_abstract.verify.substitution import MODES, STEP, Comparison, compare, gains, spread_by_volume
 
-#: Seconds between notes of progress, and between reports.
-_TRACE, _REPORT = 1.0, 30.0
 #: Seconds that pictures for the last report may take beyond the budget, where they are made ray by ray.
 _LAST = 5.0
 #: Counterexamples in report.json by frame, and images of each kind on the page.
@@ -102,8 +102,11 @@ class CertificateRun:
         self.shown: list[dict[str, Any]] = []
         self.seen: dict[tuple[int, int], dict[str, Any]] = {}
         self.rows: dict[int, list[dict[str, Any]]] = {}
+        #: Content of the last report.json, and its cells by frame.
+        self.written: tuple[dict[str, Any], dict[int, list[dict[str, Any]]]] = {}, {}
         #: When no more pictures are rendered for the report.
         self.over = float("inf")
+        self.scene_margin: dict[str, Any] = {"skipped": NOT_ASKED, "kinds": []}
         prop = job.property
         self.about = CertifiedRun(
             guarantee=job.job.method.guarantee,
@@ -162,18 +165,6 @@ class CertificateRun:
             on_progress: Told about once a second.
             report: Whether to bring the report up to date now and then.
         """
-        traced = reported = time.perf_counter()
-
-        def between(instant: float) -> None:
-            nonlocal traced, reported
-            if instant - traced >= _TRACE:
-                traced = instant
-                store.trace()
-                on_progress(self.progress(store))
-            if report and instant - reported >= _REPORT:
-                reported = instant
-                self.report(store, "running")
-
         search_blocks(
             store,
             engine,
@@ -183,7 +174,11 @@ class CertificateRun:
             deadline=deadline,
             stop=stop,
             keep=lambda block, findings: self._keep_images(store, block, findings),
-            between=between,
+            between=paced(
+                store,
+                lambda: on_progress(self.progress(store)),
+                (lambda: self.report(store, "running")) if report else lambda: None,
+            ),
             # rays may take longer than there is time for; other blocks are waited for once
             waits=not self.job.job.rays,
         )
@@ -205,6 +200,8 @@ class CertificateRun:
         on_open: Callable[[Store], object] = lambda store: None,
         on_progress: Callable[[CertifyProgress], object] = lambda progress: None,
         report: bool = True,
+        scene_margin: bool = False,
+        on_margin: Callable[[SceneMargin], object] = lambda found: None,
     ) -> dict[str, Any]:
         """Search, and write the results as they come.
 
@@ -213,38 +210,55 @@ class CertificateRun:
             budget: Seconds.
             stop: Asked at least twice a second.
             resume: Whether to go on with what the folder holds.
-            on_open: Called with the store before the search.
+            on_open: Called with the store before the search, when there is a report.
             on_progress: Told about once a second.
             report: Whether to write report.json and report.html, and to compare with weaker bounds.
+            scene_margin: Whether to look for the largest variation of the scene for which what is certified holds, in
+                half of the time.
+            on_margin: Told what it is, kind by kind.
 
         Returns:
             Content of report.json.
 
         Raises:
-            InputError: The folder cannot be used, or there is not enough time to begin.
+            InputError: The folder cannot be used, there is not enough time to begin, or the scene has no margin.
         """
+        if scene_margin:
+            check_scenes(any(p.perturbation.scene for p in self.job.job.pose_sets), self.job.job.rays)
+        searching = (1.0 - SHARE) * budget if scene_margin else budget
         begin, rays = time.perf_counter(), self.job.job.rays
         with ExitStack() as stack:
-            with stop.at_once():
-                self.job.foresee(self.frames[0], budget)
-                store = self.open(resume=resume)
-                stack.callback(store.close)
+            # a signal waits until there is a store to report on
+            store = self.open(resume=resume)
+            stack.callback(store.close)
             stack.enter_context(store.told())
-            on_open(store)
+            stack.enter_context(stop.last_words(self.interrupted))
             substitution = None
             # where every ray is costly, all that is done is
             self.over = begin + budget if rays else float("inf")
             try:
-                if report:
-                    # renders pictures, for which kernels may have to be compiled
-                    with stop.at_once():
+                with stop.at_once():
+                    if report:
+                        self.report(store, "running", pictures=False)
+                    self._foresee(budget)
+                    on_open(store)
+                    if report:
+                        # renders pictures, for which kernels may have to be compiled
                         self.report(store, "running")
-                deadline = (begin if rays else time.perf_counter()) + (1.0 - _COMPARE_SHARE) * budget
+                deadline = (begin if rays else time.perf_counter()) + (1.0 - _COMPARE_SHARE) * searching
                 with ExitStack() as engines:
                     self.search(store, engine(engines), deadline, stop, on_progress, report)
                 if report and not stop():
                     with suppress(KeyboardInterrupt), stop.at_once():
                         substitution = self.compare(store)
+                if scene_margin and not stop():
+                    rows = {tally.frame: store.leaves(tally.frame, "certified") for tally in store.tallies()}
+                    margins = Margins(certified_cells(rows, self._box), self.job.settle, on_margin)
+                    try:
+                        margins.find(deadline + SHARE * budget, stop)
+                    finally:
+                        margins.keep(store)
+                        self.scene_margin = margins.entry
             finally:
                 # also after a failure: what is finished is written
                 self.over += _LAST
@@ -253,6 +267,14 @@ class CertificateRun:
                 document = self.report(store, state, substitution) if report else self.document(store, state)[0]
             self.rows = {tally.frame: store.leaves(tally.frame) for tally in store.tallies()}
         return document
+
+    def _foresee(self, budget: float) -> None:
+        try:
+            self.job.foresee(self.frames[0], budget)
+        except InputError:
+            # there is no time for pictures either
+            self.over = float("-inf")
+            raise
 
     def _keep_images(self, store: Store, block: Block, findings: Findings) -> None:
         """Store the images of counterexamples before the cells are said to be falsified."""
@@ -335,21 +357,35 @@ class CertificateRun:
             reasons=store.reasons,
             cells_seal={"rows": store.seal.rows, "sum": store.seal.text},
             substitution=substitution or substitution_entry([], "made when the search ends without being interrupted"),
+            scene_margin=self.scene_margin,
         )
         return document, rows
 
-    def report(self, store: Store, state: str, substitution: Mapping[str, Any] | None = None) -> dict[str, Any]:
-        """Write report.json and report.html; returns the former's content."""
+    def report(
+        self, store: Store, state: str, substitution: Mapping[str, Any] | None = None, *, pictures: bool = True
+    ) -> dict[str, Any]:
+        """Write report.json and report.html, with new pictures or those there are; returns the former's content."""
         document, rows = self.document(store, state, substitution)
         # kernels may have to be compiled for others
-        if state != "interrupted":
+        if pictures and state != "interrupted":
             self.shown = self._pictures(rows)
             # positions of cells change while they are split
             self.seen = {} if state == "running" else self._cell_pictures(rows)
         elif self.seen:
             self.seen = {}
-        write_certificate(self.folder, document, certificate_page(document, rows, self.shown, self.seen))
+        self.written = document, rows
+        self._write()
         return document
+
+    def interrupted(self) -> None:
+        """Say of the last report that it is one; nothing else is looked at."""
+        if self.written[0]:
+            self.written[0]["state"] = "interrupted"
+            self._write()
+
+    def _write(self) -> None:
+        document, rows = self.written
+        write_certificate(self.folder, document, certificate_page(document, rows, self.shown, self.seen))
 
     def _entry(self, tally: Any, rows: list[dict[str, Any]]) -> dict[str, Any]:
         shares = fractions(tally)
@@ -386,13 +422,14 @@ class CertificateRun:
                 "right": tally.holding,
                 "sampled_right": tally.holding / tally.poses if tally.poses else None,
             },
-            # unknown units were sampled and no sample broke the property
+            # unknown units were sampled; those count where the property was seen to hold at every sample
             "partition": None
             if total is None
             else {
                 "partitions": total,
                 "certified": tally.certified,
-                "right": tally.certified + tally.unknown,
+                "right": tally.certified + tally.unknown - tally.undecided,
+                "undecided": tally.undecided,
                 "not_examined": tally.open,
             },
             "least_margin": min(proven, default=None),
@@ -603,6 +640,7 @@ def certify(
     engine: EngineName = "local",
     scheduler_address: str | None = None,
     memory_limit: float | None = None,
+    scene_margin: bool = False,
 ) -> Certificate:
     """Prove, or break, a property of a network on every picture that a scene shows over sets of poses.
 
@@ -626,6 +664,8 @@ def certify(
         engine: "dask" spreads the cells over a Dask cluster.
         scheduler_address: HOST:PORT of its scheduler; None: a cluster on this machine.
         memory_limit: GiB; None: 80 % of what is free.
+        scene_margin: Whether to look, in half of the time, for the largest variation of the Gaussians for which what is
+            certified holds; see the report's key ``scene_margin``.
 
     Raises:
         InputError: An argument cannot be used.
@@ -667,6 +707,7 @@ def certify(
             resume=resume,
             on_progress=listener(stop, on_progress),
             report=output_dir is not None,
+            scene_margin=scene_margin,
         )
     return certificate(run, document)
 

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import copy
 import hashlib
+import time
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from functools import cached_property, partial
 from pathlib import Path
@@ -12,10 +15,12 @@ from typing import Any
 import numpy as np
 
 from ns_abstract.api.scenes import Scene, SceneSource
+from ns_abstract.execution.ending import AbandonedError, abandoning
 from ns_abstract.execution.opening import Recipe
 from ns_abstract.geometry.poses import PoseSet
 from ns_abstract.io.errors import InputError
-from ns_abstract.methods.runs import available_memory
+from ns_abstract.io.memory import available_memory
+from ns_abstract.perturbation.variations import SceneVariation
 from ns_abstract.refine.engine import Goal, Refinement
 from ns_abstract.refine.protocol import Frame, Method
 from ns_abstract.refine.result import LAYERS, FrameResult, PartResult, TracePoint, joined
@@ -24,6 +29,10 @@ from ns_abstract.refine.result import LAYERS, FrameResult, PartResult, TracePoin
 MOST_MEMORY = 2.0**20
 #: Bytes for leaves below which nothing can be done.
 _LEAST_LEAF_BYTES = 64 << 20
+#: Seconds that the ray with which kernels are compiled may take.
+_WARM_RAY = 2.0
+#: Rays that are rendered to see what a picture takes.
+_LOOK_RAYS = 128
 
 
 class Job:
@@ -96,6 +105,16 @@ class Job:
         """Bytes that a process needs beside the leaves."""
         return self.method.memory(max(poses.camera.width * poses.camera.height for poses in self.pose_sets))
 
+    def around(self, extra: SceneVariation) -> Job:
+        """The same sets with more scenes in them."""
+        other = copy.copy(self)
+        other.__dict__.pop("_fingerprint", None)
+        other.pose_sets = tuple(
+            replace(poses, perturbation=replace(poses.perturbation, scene=(*poses.perturbation.scene, extra)))
+            for poses in self.pose_sets
+        )
+        return other
+
     def _check_memory(self) -> None:
         limit = self.memory_limit
         if limit is not None and not 0.0 < limit < float("inf"):
@@ -125,8 +144,32 @@ class Job:
     def warm_up(self, index: int) -> None:
         """Compile the kernels that frame ``index`` needs, so that its clock measures bounding alone."""
         if index not in self._warm:
-            self.frame(index).warm_up()
+            warm_up(self.frame(index))
             self._warm.add(index)
+
+    def check_time(self, index: int, seconds: float) -> None:
+        """Refuse a frame of which not even one picture can be rendered in ``seconds``, where rays are costly.
+
+        Raises:
+            InputError: What it would take.
+        """
+        if not self.rays:
+            return
+        frame = self.frame(index)
+        some = np.unique(np.linspace(0, frame.tile_count - 1, _LOOK_RAYS).astype(np.int64))
+        begin = time.perf_counter()
+        with suppress(AbandonedError), abandoning(lambda: time.perf_counter() - begin > seconds):
+            frame.render(frame.box.middle, some)
+        least = (time.perf_counter() - begin) / some.size * frame.tile_count
+        if least > seconds:
+            camera = frame.camera
+            raise InputError(
+                f"{self.method.content}: one picture of {camera.width} x {camera.height} pixels takes about "
+                f"{least:,.0f} s to render, {seconds:,.0f} s given",
+                file=self.source.file,
+                field="--time-budget",
+                fix="give more, raise --downscale-factor, or take fewer samples",
+            )
 
     def bound(
         self,
@@ -150,11 +193,21 @@ class Job:
         stopped: Callable[[], bool] = lambda: False,
         progress: Callable[[TracePoint, float], None] = lambda point, share: None,
     ) -> PartResult:
-        """Refine some tiles of frame ``index``, or all of them."""
+        """Refine some tiles of frame ``index``, or all of them.
+
+        Raises:
+            AbandonedError: ``stopped`` was true, or the time was over, before a first picture was there.
+        """
         # kept leaves are boxes of the set's parameters
         frame = self.frame(index, slanted=not keep_leaves)
+        begin = time.perf_counter()
+
+        def over() -> bool:
+            # what is rendered first does not count for the goal, and may take long where every ray is costly
+            return stopped() or (self.rays and time.perf_counter() - begin >= goal.seconds)
+
         refinement = Refinement(
-            frame, index, goal, seed=self.seed, keep_leaves=keep_leaves, stopped=stopped, progress=progress,
+            frame, index, goal, seed=self.seed, keep_leaves=keep_leaves, stopped=over, progress=progress,
             members=frame.members(self.seed), tiles=tiles,
         )  # fmt: skip
         return refinement.run_part()
@@ -224,6 +277,13 @@ def _open(
     layers: tuple[str, ...],
 ) -> Job:
     return Job(source.open(), pose_sets, arithmetic=arithmetic, seed=seed, memory_limit=memory_limit, layers=layers)
+
+
+def warm_up(frame: Frame) -> None:
+    """Compile the kernels that a frame needs; where one ray takes long, it is given up once they are compiled."""
+    begin = time.perf_counter()
+    with suppress(AbandonedError), abandoning(lambda: frame.tilewise and time.perf_counter() - begin > _WARM_RAY):
+        frame.warm_up()
 
 
 def check_frames(frames: Sequence[int] | None, count: int) -> tuple[int, ...]:

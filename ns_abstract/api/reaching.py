@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import hashlib
 import io
 import json
@@ -10,7 +11,7 @@ import tempfile
 import time
 from collections.abc import Callable, Mapping
 from contextlib import ExitStack
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
@@ -20,29 +21,32 @@ import numpy as np
 from ns_abstract.api.bounding import listener
 from ns_abstract.api.certification import MEMORY
 from ns_abstract.api.job import Job
+from ns_abstract.api.margins import NOT_ASKED, SHARE, Margins, certified_cells
 from ns_abstract.api.scenes import Scene, platform_problems
-from ns_abstract.api.searching import search_blocks
+from ns_abstract.api.searching import paced, search_blocks
 from ns_abstract.execution.ending import AbandonedError, abandoning
 from ns_abstract.execution.engines import Engine, EngineName, started
 from ns_abstract.execution.opening import Recipe, opened
 from ns_abstract.execution.stopping import StopRequest, interruptible
 from ns_abstract.geometry.box import ParameterBox
 from ns_abstract.io.errors import InputError
-from ns_abstract.reach.loop import Loop, load_loop
+from ns_abstract.perturbation.specification import TRANSLATIONS
+from ns_abstract.perturbation.variations import SceneVariation
+from ns_abstract.reach.loop import Loop, load_loop, parse_loop
 from ns_abstract.reach.page import loop_page
 from ns_abstract.reach.search import QUESTIONS, LoopFindings, LoopSearch, Question, Run, pushes, simulate
 from ns_abstract.reach.tubes import Dependence, Pictures, Pilot, Reacher, Tube
-from ns_abstract.report.certificate import now, write_certificate
+from ns_abstract.report.certificate import SCENE_MARGIN, now, write_certificate
 from ns_abstract.report.record import file_stamp, guarantee_text, plain, versions
 from ns_abstract.verify.cells import Cell, Grid
 from ns_abstract.verify.model import NetworkModel
 from ns_abstract.verify.network import NetworkArithmetic, load_network
+from ns_abstract.verify.response import Response
+from ns_abstract.verify.scene_margin import CAMERA_KINDS, KINDS, REGISTRATION, Kind, SceneMargin, Settle, Settled
 from ns_abstract.verify.store import Block, Store, Tally, fractions
 
 #: Of the search's rules: results of different ones are not mixed.
 _RULES = 1
-#: Seconds between notes of progress, and between reports.
-_TRACE, _REPORT = 1.0, 30.0
 #: Random runs for the report, and part of the time for them; runs from a cell whose tube is shown; cells shown, and
 #: part of the time for them.
 _RUNS, _RUNS_SHARE, _CELL_RUNS, _SHOWN, _SHOWN_SHARE = 200, 0.1, 20, 2, 0.1
@@ -62,6 +66,7 @@ METRICS = {
     "about others",
     "width": "mean over the states of the width of the tube by step, and of the hull of simulated runs from the same "
     "cell",
+    "scene_margin": SCENE_MARGIN,
 }
 
 
@@ -119,6 +124,36 @@ class LoopJob:
         """The search."""
         return LoopSearch(self.reacher())
 
+    def around(self, extra: SceneVariation) -> LoopJob:
+        """The same in all scenes of a set."""
+        other = copy.copy(self)
+        for name in ("search", "_fingerprint"):
+            other.__dict__.pop(name, None)
+        other.job = self.job.around(extra)
+        return other
+
+    def settle(self, kind: Kind) -> Settle:
+        """Bounds and attacks cells for all scenes around the stored one (V13)."""
+        kept: dict[float, LoopSearch] = {}
+
+        def settle(radius: float, number: int, box: ParameterBox) -> Settled:
+            if radius not in kept:
+                # radii come one after the other
+                kept.clear()
+                if kind is REGISTRATION:
+                    kept[radius] = LoopSearch(replace(self.reacher(), registration=radius))
+                elif kind.response is not None:
+                    view = Pictures(self.job.method, self.job.pose_sets[0], Response(kind.response, radius))
+                    kept[radius] = LoopSearch(replace(self.reacher(), view=view))
+                else:
+                    kept[radius] = self.around(kind.variation(radius)).search
+            found = kept[radius].settle(QUESTIONS[number], box)
+            if found.example is None:
+                return found
+            return replace(found, example={**found.example, "radius": np.array(radius)})
+
+        return settle
+
     @property
     def questions(self) -> list[int]:
         """Numbers of the questions that are asked."""
@@ -127,8 +162,10 @@ class LoopJob:
     @property
     def recipe(self) -> Recipe[LoopJob]:
         """How another process opens it; files are looked for under the same paths."""
+        loop = self.loop
+        # laws of motion do not travel
         again = partial(
-            _open, self.job.recipe.open, self.loop, Path(self.loop.network).absolute(), self.model.arithmetic
+            _open, self.job.recipe.open, dict(loop.value), loop.network.absolute().parent, self.model.arithmetic
         )
         return Recipe(again, self.fingerprint, self.job.source.file)
 
@@ -149,11 +186,11 @@ class LoopJob:
         }
 
 
-def _open(open_job: Callable[[], Job], loop: Loop, network: Path, arithmetic: NetworkArithmetic) -> LoopJob:
+def _open(open_job: Callable[[], Job], value: dict[str, Any], folder: Path, arithmetic: NetworkArithmetic) -> LoopJob:
     job = LoopJob.__new__(LoopJob)
-    job.loop, job.job = loop, open_job()
-    job.network = load_network(network)
-    job.model = NetworkModel(job.network, loop.preprocess, MEMORY, arithmetic)
+    job.loop, job.job = parse_loop(value, folder), open_job()
+    job.network = load_network(job.loop.network)
+    job.model = NetworkModel(job.network, job.loop.preprocess, MEMORY, arithmetic)
     return job
 
 
@@ -211,6 +248,9 @@ class ReachRun:
         self.simulated: list[Run] = []
         self.tubes: list[dict[str, Any]] = []
         self.examples: list[dict[str, Any]] = []
+        self.scene_margin: dict[str, Any] = {"skipped": NOT_ASKED, "kinds": []}
+        #: Content of the last report.json.
+        self.written: dict[str, Any] = {}
 
     def run(
         self,
@@ -219,7 +259,10 @@ class ReachRun:
         stop: StopRequest,
         *,
         resume: bool = False,
+        on_open: Callable[[], object] = lambda: None,
         on_progress: Callable[[ReachProgress], object] = lambda progress: None,
+        scene_margin: bool = False,
+        on_margin: Callable[[SceneMargin], object] = lambda found: None,
     ) -> dict[str, Any]:
         """Search, and write the results as they come; returns the content of report.json.
 
@@ -228,28 +271,39 @@ class ReachRun:
             budget: Seconds.
             stop: Asked at least twice a second.
             resume: Whether to go on with what the folder holds.
+            on_open: Called before the search, when there is a report.
             on_progress: Told about once a second.
+            scene_margin: Whether to look for the largest variation of the scene for which what is certified holds, in
+                half of the time.
+            on_margin: Told what it is, kind by kind.
 
         Raises:
             InputError: The folder cannot be used.
         """
+        searching = (1.0 - SHARE) * budget if scene_margin else budget
         job, box = self.job, self.job.loop.box
-        begin = time.perf_counter()
         parameters = list(zip(box.names, box.units, strict=True))
         with ExitStack() as stack:
-            with stop.at_once():
-                fixed: dict[int, dict[str, float]] = {number: {} for number in job.questions}
-                store = Store(self.folder, job.fingerprint, parameters, fixed, resume=resume)
-                stack.callback(store.close)
+            fixed: dict[int, dict[str, float]] = {number: {} for number in job.questions}
+            # a signal waits until there is a store to report on
+            store = Store(self.folder, job.fingerprint, parameters, fixed, resume=resume)
+            stack.callback(store.close)
             stack.enter_context(store.told())
+            stack.enter_context(stop.last_words(self.interrupted))
             try:
+                self._begin(store, box)
                 with stop.at_once():
-                    self._begin(store, box)
+                    # before kernels are compiled
                     self.report(store, "running")
-                self._simulate(begin + _RUNS_SHARE * budget, stop)
+                    on_open()
+                    job.job.warm_up(0)
+                begin = time.perf_counter()
+                self._simulate(begin + _RUNS_SHARE * searching, stop)
                 with ExitStack() as engines:
-                    self._search(store, engine(engines), begin + (1.0 - _SHOWN_SHARE) * budget, stop, on_progress)
-                self._show(store, begin + budget, stop)
+                    self._search(store, engine(engines), begin + (1.0 - _SHOWN_SHARE) * searching, stop, on_progress)
+                self._show(store, begin + searching, stop)
+                if scene_margin and not stop():
+                    self._margins(store, begin + budget, stop, on_margin)
             finally:
                 # also after a failure: what is finished is written
                 store.finish(self.grids)
@@ -263,7 +317,6 @@ class ReachRun:
                 grid = Grid.adaptive(box, [1] * box.dimensions)
                 store.begin(number, grid, [grid.roots()])
             self.grids[number] = grid
-        self.job.job.warm_up(0)
 
     def _search(
         self,
@@ -273,18 +326,6 @@ class ReachRun:
         stop: StopRequest,
         on_progress: Callable[[ReachProgress], object],
     ) -> None:
-        traced = reported = time.perf_counter()
-
-        def between(instant: float) -> None:
-            nonlocal traced, reported
-            if instant - traced >= _TRACE:
-                traced = instant
-                store.trace()
-                on_progress(self.progress(store))
-            if instant - reported >= _REPORT:
-                reported = instant
-                self.report(store, "running")
-
         search_blocks(
             store,
             engine,
@@ -294,7 +335,7 @@ class ReachRun:
             deadline=deadline,
             stop=stop,
             keep=lambda block, findings: self._keep(store, block, findings),
-            between=between,
+            between=paced(store, lambda: on_progress(self.progress(store)), lambda: self.report(store, "running")),
         )
         store.trace()
         on_progress(self.progress(store))
@@ -348,6 +389,24 @@ class ReachRun:
             except AbandonedError:
                 return
 
+    def _margins(self, store: Store, deadline: float, stop: StopRequest, told: Callable[[SceneMargin], object]) -> None:
+        """How far the scene may vary, for the strongest question of which anything is certified."""
+        box = self.job.loop.box
+        rows = {number: found for number in self.job.questions if (found := store.leaves(number, "certified"))}
+        number = max(rows, default=0)
+        cells = certified_cells(
+            {number: rows.get(number, [])},
+            lambda _, row: ParameterBox(box.names, box.units, tuple(row["lower"]), tuple(row["upper"])),
+        )
+        margins = Margins(cells, self.job.settle, told)
+        try:
+            # a place that does not depend on the state is no parameter that could be off
+            moves = set(TRANSLATIONS) <= set(self.job.loop.camera.names)
+            margins.find(deadline, stop, (*KINDS, *CAMERA_KINDS, *([REGISTRATION] if moves else [])))
+        finally:
+            margins.keep(store)
+            self.scene_margin = {"question": QUESTIONS[number], **margins.entry}
+
     def document(self, store: Store, state: str) -> dict[str, Any]:
         """Content of report.json."""
         job, loop = self.job, self.job.loop
@@ -374,6 +433,7 @@ class ReachRun:
                 ],
                 "simulated_states": [run.states for run in self.simulated[:40]],
                 "tubes": self.tubes,
+                "scene_margin": self.scene_margin,
                 "falsifying": self.examples,
                 "trace": store.points,
                 "seconds": store.seconds,
@@ -412,9 +472,18 @@ class ReachRun:
 
     def report(self, store: Store, state: str) -> dict[str, Any]:
         """Write report.json and report.html; returns the former's content."""
-        document = self.document(store, state)
-        write_certificate(self.folder, document, loop_page(document, self.rows, self.job.loop))
-        return document
+        self.written = self.document(store, state)
+        self._write()
+        return self.written
+
+    def interrupted(self) -> None:
+        """Say of the last report that it is one; nothing else is looked at."""
+        if self.written:
+            self.written["state"] = "interrupted"
+            self._write()
+
+    def _write(self) -> None:
+        write_certificate(self.folder, self.written, loop_page(self.written, self.rows, self.job.loop))
 
 
 def verdict(entries: Mapping[str, Mapping[str, Any]]) -> str:
@@ -521,6 +590,7 @@ def reach(
     workers: int = 1,
     engine: EngineName = "local",
     scheduler_address: str | None = None,
+    scene_margin: bool = False,
 ) -> ReachResult:
     """Prove of a network in the loop that no run from a box of initial states goes wrong, or find one that does.
 
@@ -538,6 +608,8 @@ def reach(
         workers: Processes; with more than one, a script needs ``if __name__ == "__main__":``.
         engine: "dask" spreads the cells over a Dask cluster.
         scheduler_address: HOST:PORT of its scheduler; None: a cluster on this machine.
+        scene_margin: Whether to look, in half of the time, for the largest variation of the Gaussians for which what is
+            certified holds; see the report's key ``scene_margin``.
 
     Raises:
         InputError: An argument cannot be used.
@@ -562,6 +634,7 @@ def reach(
             stop,
             resume=resume,
             on_progress=listener(stop, on_progress),
+            scene_margin=scene_margin,
         )
     return result(run, document)
 

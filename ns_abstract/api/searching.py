@@ -6,6 +6,7 @@ import time
 from collections.abc import Callable, Iterator
 from typing import Any
 
+from ns_abstract.arithmetic.kernel_cache import store as kernels
 from ns_abstract.execution.ending import AbandonedError, abandoning
 from ns_abstract.execution.engines import Engine
 from ns_abstract.execution.scheduler import Task, work
@@ -14,8 +15,29 @@ from ns_abstract.verify.cells import Cell, Grid
 from ns_abstract.verify.search import Findings
 from ns_abstract.verify.store import Block, Store
 
+#: Seconds between notes of progress, and between reports.
+_TRACE, _REPORT = 1.0, 30.0
 #: Examines cells of a grid of the frame with this number.
 Examine = Callable[[int, Grid, tuple[Cell, ...]], Findings]
+
+
+def paced(
+    store: Store, told: Callable[[], object], report: Callable[[], object] = lambda: None
+) -> Callable[[float], None]:
+    """What a search does between results, by the clock: a point of the trace and ``told``, rarely ``report``."""
+    traced = reported = time.perf_counter()
+
+    def between(instant: float) -> None:
+        nonlocal traced, reported
+        if instant - traced >= _TRACE:
+            traced = instant
+            store.trace()
+            told()
+        if instant - reported >= _REPORT:
+            reported = instant
+            report()
+
+    return between
 
 
 def search_blocks(
@@ -33,11 +55,13 @@ def search_blocks(
 ) -> None:
     """Examine open blocks until none is left, the time is over or ``stop`` says so.
 
+    Until the engine's workers have started, this process examines blocks, too: a kill in the first seconds keeps those.
+
     Args:
         store: Where blocks come from and findings go.
         engine: Where blocks are examined; closed at the end.
         grids: By frame.
-        here: For an engine that shares this process.
+        here: In this process.
         there: For others: a function of a module, and what it takes before the arguments of ``here``.
         deadline: Reading of `time.perf_counter`.
         stop: Asked at least twice a second.
@@ -45,6 +69,8 @@ def search_blocks(
         between: Told the reading of the clock after results, and twice a second where others work.
         waits: Whether one block is waited for however late it is, so that resuming with any budget gets on.
     """
+    # workers take the kernels that were compiled here
+    kernels().publish()
     flying: dict[int, Block] = {}
     finished = 0 if waits else 1
 
@@ -73,12 +99,18 @@ def search_blocks(
         except (KeyboardInterrupt, AbandonedError):
             return None
 
+    def take(block: Block, findings: Findings | None) -> None:
+        nonlocal finished
+        if findings is None:
+            return
+        keep(block, findings)
+        store.close_block(block, findings, grids[block.frame])
+        finished += 1
+
     for results in work(engine, offer, over):
         for number, findings in results:
-            block = flying.pop(number)
-            if findings is None:
-                continue
-            keep(block, findings)
-            store.close_block(block, findings, grids[block.frame])
-            finished += 1
+            take(flying.pop(number), findings)
+        if engine.starting and not over():
+            for block in store.pending(set(flying), 1):
+                take(block, examined(block.frame, grids[block.frame], block.cells))
         between(time.perf_counter())

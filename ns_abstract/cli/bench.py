@@ -27,6 +27,7 @@ _TITLES = {
     "rules": "Our bounds and the paper's rules",
     "rays": "Rays of a NeRF",
     "certificates": "Certified fraction against time",
+    "loops": "A network in the loop: certified fraction against time",
 }
 
 
@@ -178,6 +179,28 @@ class Certificates(Scenes):
     """Processes."""
     marks: tuple[float, ...] = (30.0, 60.0, 120.0, 300.0, 600.0)
     """Seconds at which the certified fraction is told, up to the time that there is."""
+
+
+@dataclass
+class Loops:
+    """A network in the loop: certified fraction against time, tubes against runs, attacks on tubes."""
+
+    load_config: Path
+    """Run (config.yml or .ply)."""
+    loop: Path
+    """LOOP.json."""
+    output_dir: Path = Path("bench")
+    """Folder for the tables."""
+    seconds: float = 120.0
+    """Time for the search."""
+    workers: int = 2
+    """Processes."""
+    runs: int = 10_000
+    """Simulated runs from the whole initial box, and from one certified cell."""
+    marks: tuple[float, ...] = (30.0, 60.0, 120.0, 300.0, 600.0)
+    """Seconds at which the certified fraction is told, up to the time that there is."""
+    seed: int = 0
+    """Decides every random choice."""
 
 
 @dataclass
@@ -344,6 +367,26 @@ def certificates(options: Certificates) -> int:
     return DONE
 
 
+def loops(options: Loops) -> int:
+    """Measure a loop; the exit code is 1 if a run left a tube or a certified cell had a run that went wrong."""
+    from ns_abstract.api.scenes import load_scene
+    from ns_abstract.bench.loops import measure
+    from ns_abstract.bench.tables import markdown, write
+
+    if options.runs < 1:
+        raise InputError(f"found {options.runs}", field="--runs", fix="give a number of at least 1")
+    marks = [mark for mark in options.marks if mark <= options.seconds]
+    found = measure(
+        load_scene(options.load_config), options.loop, options.seconds, options.workers, options.runs, marks,
+        options.seed, lambda text: print(text, file=sys.stderr, flush=True),
+    )  # fmt: skip
+    for name, rows in (("loops", found.search), ("loops-steps", found.steps)):
+        if rows:
+            write(rows, options.output_dir, name, _TITLES["loops"] if name == "loops" else "Widths by step")
+            print(markdown(rows))
+    return 1 if found.search[0]["violations"] else DONE
+
+
 def rows_of(options: Cell | Soundness | Plan | Rules | Rays, job: PathJob, name: str) -> list[dict[str, Any]]:
     """What a benchmark without curves finds for one scene and set of poses."""
     if isinstance(options, Cell):
@@ -382,7 +425,7 @@ def rows_of(options: Cell | Soundness | Plan | Rules | Rays, job: PathJob, name:
 
 
 def bench(
-    options: Cell | Tightness | Soundness | Plan | Rules | Rays | Scale | Certificates | Stiff | Vnnlib,
+    options: Cell | Tightness | Soundness | Plan | Rules | Rays | Scale | Certificates | Loops | Stiff | Vnnlib,
 ) -> int:
     """Run one benchmark; the exit code is 1 if a bound was violated."""
     if isinstance(options, Vnnlib):
@@ -393,6 +436,8 @@ def bench(
         return scale(options)
     if isinstance(options, Certificates):
         return certificates(options)
+    if isinstance(options, Loops):
+        return loops(options)
     from ns_abstract.bench import paper
     from ns_abstract.bench.sets import open_jobs, pose_set
     from ns_abstract.bench.tables import markdown, write
@@ -451,6 +496,7 @@ def main() -> None:
             "rays": Rays(),
             "scale": Scale(),
             "certificates": Certificates(),
+            "loops": Loops(load_config=tyro.MISSING, loop=tyro.MISSING),
             "stiff": Stiff(),
             "vnnlib": Vnnlib(folder=tyro.MISSING),
         }

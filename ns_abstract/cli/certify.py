@@ -82,6 +82,9 @@ class Certify:
     core."""
     resume: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
     """Go on with the cells that an interrupted run with the same inputs has stored."""
+    scene_margin: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    """Splats: in half of the time, look for the largest variation of all Gaussians' means, opacities and colours for
+    which everything that is certified holds."""
     memory_limit: float | None = None
     """GiB that may be used. Default: 80 % of what is free."""
 
@@ -115,7 +118,7 @@ def certify(options: Certify) -> int:
         order = Order(
             CertifySettings(**given), options.frames, options.output_dir, options.time_budget or _SECONDS,
             options.engine, options.scheduler_address, tls, options.workers, options.resume, options.memory_limit,
-            vars(options),
+            options.scene_margin, vars(options),
         )  # fmt: skip
         complete = certify_path(order, stop)
     return DONE if complete and not stop() else INTERRUPTED

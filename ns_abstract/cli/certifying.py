@@ -15,6 +15,7 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, Ti
 
 from ns_abstract.api.certification import Certification, CertifySettings, open_certification
 from ns_abstract.api.certifying import CertificateRun, CertifyProgress, network_memory
+from ns_abstract.api.compiling import compile_beside
 from ns_abstract.api.job import check_frames
 from ns_abstract.cli.common import Stop, plain_console
 from ns_abstract.execution.engines import EngineName, Tls, started
@@ -35,6 +36,7 @@ class Order:
         engine, scheduler_address, tls, workers: Where the work is done; workers None: one by core.
         resume: Whether to go on.
         memory_limit: GiB, or None.
+        scene_margin: Whether to look for the largest variation of the scene.
         options: All options, for the report.
     """
 
@@ -48,6 +50,7 @@ class Order:
     workers: int | None
     resume: bool
     memory_limit: float | None
+    scene_margin: bool
     options: Mapping[str, Any]
 
 
@@ -90,6 +93,14 @@ def certify_path(order: Order, stop: Stop) -> bool:
         frames = check_frames(order.frames, job.job.frame_count)
         run = CertificateRun(job, frames, order.output_dir, order.options, ("ns-abstract-certify", *sys.argv[1:]))
     _introduce(console, job, run)
+
+    def opened(store: Store) -> None:
+        display.opened(store)
+        if order.engine == "local":
+            # once, and not in every worker
+            with stop.at_once():
+                compile_beside(job.job, frames[0])
+
     progress = Progress(
         TextColumn("{task.description}"), BarColumn(), TextColumn("{task.fields[state]}"), TimeElapsedColumn(),
         TimeRemainingColumn(), console=console, disable=not console.is_terminal, transient=True,
@@ -104,14 +115,17 @@ def certify_path(order: Order, stop: Stop) -> bool:
             order.budget,
             stop,
             resume=order.resume,
-            on_open=display.opened,
+            on_open=opened,
             on_progress=display.told,
+            scene_margin=order.scene_margin,
+            on_margin=lambda found: console.print(f"scene margin: {found.sentence}", markup=False, soft_wrap=True),
         )
     covered = coverage(document["frames"])
     parts = ", ".join(f"{kind} {percent(covered[kind])}" for kind in ("certified", "falsified", "unknown"))
     console.print(f"{document['verdict']}: {parts}", markup=False)
     if document["partitions"]:
         both = document["partitions"]
-        console.print(f"PCP-V {percent(both['PCP-V'])}, PCP-S {percent(both['PCP-S'])}", markup=False)
+        more = f", undecided {percent(both['undecided'])} (no finite margin)" if both["undecided"] else ""
+        console.print(f"PCP-V {percent(both['PCP-V'])}, PCP-S {percent(both['PCP-S'])}{more}", markup=False)
     console.print(f"report: {order.output_dir / 'report.html'}", markup=False, soft_wrap=True)
     return all(entry["sampled"]["poses"] for entry in document["frames"])

@@ -12,7 +12,7 @@ import socket
 import sys
 import threading
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, redirect_stderr
+from contextlib import contextmanager, redirect_stderr, suppress
 from types import FrameType
 from typing import Any, NoReturn
 
@@ -43,7 +43,9 @@ class Stop(StopRequest):
     def handle(self, number: int, frame: FrameType | None) -> None:
         self._heard.release()
         super().handle(number, frame)
-        print("stopping; what is finished is being saved (once more: stop at once)", file=sys.stderr, flush=True)
+        # the signal may have come in the middle of a print, which cannot begin another one
+        with suppress(OSError):
+            os.write(2, b"stopping; what is finished is being saved (once more: stop at once)\n")
 
     @contextmanager
     def installed(self) -> Iterator[Stop]:
@@ -62,6 +64,9 @@ class Stop(StopRequest):
             # ends when the other side is closed; the bytes are numbers of signals
             while number := receiver.recv(1):
                 if number[0] in _SIGNALS and not self._heard.acquire(timeout=_PATIENCE):
+                    # a full disk is no reason to stay
+                    with suppress(InputError, OSError):
+                        self.say_last_words()
                     print("interrupted", file=sys.stderr, flush=True)
                     os._exit(INTERRUPTED)
 
@@ -173,10 +178,25 @@ def run(
             # names of files need not be text
             stream.reconfigure(errors="backslashreplace")
     show_log()
+    over = False
+
+    def leave(number: int, frame: FrameType | None) -> None:
+        # once the work has ended, there is nothing left to be told
+        if over:
+            os._exit(INTERRUPTED)
+        raise KeyboardInterrupt
+
+    if threading.current_thread() is threading.main_thread():
+        # until `Stop` handles them, and after
+        for number in _SIGNALS:
+            signal.signal(number, leave)
     try:
-        given = parse(options)
-        _check_address_space()
-        code = main(given)
+        try:
+            given = parse(options)
+            _check_address_space()
+            code = main(given)
+        finally:
+            over = True
     except InputError as error:
         print(f"error: {error}", file=sys.stderr)
         code = BAD_INPUT

@@ -1,4 +1,4 @@
-"""``ns-abstract-demo``: an airfield as a Splatfacto run and a buoy as a vanilla-nerf run, with sets of poses."""
+"""``ns-abstract-demo``: scenes as runs of Splatfacto and vanilla-nerf, with sets of poses and a network in a loop."""
 
 from __future__ import annotations
 
@@ -14,10 +14,11 @@ from ns_abstract.io.errors import InputError, visible
 
 @dataclass
 class Demo:
-    """Write two scenes as real run folders, with camera paths and sets of poses.
+    """Write scenes as real run folders, with camera paths, sets of poses and a network in a loop.
 
-    An airfield as a Splatfacto run, and a buoy as a vanilla-nerf run of full size, whose network is fitted to an
-    analytic field: no network connection, a minute or two.
+    An airfield as a Splatfacto run; a gate as another one, with a network that steers towards it (LOOP.json); and a
+    buoy as a vanilla-nerf run of full size, whose network is fitted to an analytic field: no network connection, a
+    minute or two.
     """
 
     output_dir: Path
@@ -34,13 +35,15 @@ def demo(options: Demo) -> int:
     """
     from rich.console import Console
 
-    from ns_abstract.demo.writing import write_demo, write_nerf_demo
+    from ns_abstract.demo.writing import write_demo, write_loop_demo, write_nerf_demo
 
     folder = options.output_dir
     console = Console(stderr=True, highlight=False)
     try:
         with console.status("modelling the airfield, rendering its data set"):
             config, files = write_demo(folder)
+        with console.status("modelling the gate, fitting the network of its loop"):
+            course, loop = write_loop_demo(folder / "gate")
         nerf = None
         if not options.splats_only:
             with console.status("fitting the NeRF (about a minute)"):
@@ -56,6 +59,11 @@ def demo(options: Demo) -> int:
         "\nnext:\n"
         f"  ns-abstract-render --load-config {config} --camera-path-filename {files['path']} \\\n"
         f"    --perturbation-filename {files['spec']} --output-dir {folder / 'abstract'}"
+    )
+    lines.append(
+        f"\nloop         {loop}\n"
+        f"  ns-abstract-reach --load-config {course} --loop {loop} \\\n"
+        f"    --output-dir {folder / 'loop'} --time-budget 600"
     )
     if nerf is not None:
         config, path = nerf

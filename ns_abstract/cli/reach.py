@@ -49,6 +49,9 @@ class Reach:
     """HOST:PORT of a running Dask scheduler. Default: a cluster on this machine."""
     workers: int = 1
     """Processes on this machine; 1 works in this process."""
+    scene_margin: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    """In half of the time, look for the largest variation of all Gaussians' means, opacities and colours for which
+    everything that is certified holds."""
     resume: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
     """Go on with the cells that an interrupted run with the same inputs has stored."""
 
@@ -68,6 +71,7 @@ def reach(options: Reach) -> int:
     stop = Stop()
     with stop.installed():
         with stop.at_once():
+            from ns_abstract.api.compiling import compile_beside
             from ns_abstract.api.reaching import ReachProgress, ReachRun, open_loop
             from ns_abstract.api.scenes import SceneSource
             from ns_abstract.execution.engines import started
@@ -95,7 +99,10 @@ def reach(options: Reach) -> int:
             options.time_budget,
             stop,
             resume=options.resume,
+            on_open=lambda: compile_beside(job.job, 0) if options.engine == "local" else None,
             on_progress=told,
+            scene_margin=options.scene_margin,
+            on_margin=lambda found: console.print(f"scene margin: {found.sentence}", markup=False, soft_wrap=True),
         )
         for question, entry in document["questions"].items():
             console.print(

@@ -6,13 +6,19 @@ import os
 import sys
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
 from ns_abstract.cli.common import DONE, INTERRUPTED, Stop, run
 from ns_abstract.io.errors import InputError
 
+if TYPE_CHECKING:
+    from ns_abstract.api.files import PathJob
+    from ns_abstract.perturbation.specification import Perturbation
+
+#: Seconds by frame where --explain is given none.
+_EXPLAINED_S = 30.0
 #: Keys of a perturbation file, in the order of the options' numbers; their own module needs numpy, --help must not.
 _AXES = {"translation": ("x", "y", "z"), "rotation": ("yaw", "pitch", "roll")}
 
@@ -93,11 +99,22 @@ class Render:
     describe: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
     """Only tell what cameras, units and set mean, in pixels and distances, and do nothing else; needs no
     --output-dir."""
+    explain: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    """Splats: bound the frames and tell why their bounds are wider than renders, where, and what would help; writes
+    nothing and needs no --output-dir."""
 
 
 @dataclass
 class Describe(Render):
     """Tell what cameras, units and set mean, in pixels and distances, and do nothing else."""
+
+    output_dir: Path = Path()
+    """Not used."""
+
+
+@dataclass
+class Explain(Render):
+    """Bound the frames, tell why their bounds are wider than renders, and write nothing."""
 
     output_dir: Path = Path()
     """Not used."""
@@ -126,6 +143,42 @@ def given_set(options: Render) -> dict[str, Any] | None:
     return found
 
 
+def opened(options: Render, default: Perturbation | None = None) -> PathJob:
+    """The job of a command that runs in this process alone; ``default``: see `open_job`."""
+    from ns_abstract.api.files import Settings, open_job
+
+    names = {entry.name for entry in fields(Settings)}
+    given = {name: value for name, value in vars(options).items() if name in names}
+    return open_job(Settings(**given | {"workers": 1, "given_set": given_set(options)}), default=default)
+
+
+def explain(options: Explain) -> int:
+    """Bound and explain frame by frame; returns the exit code.
+
+    Raises:
+        InputError: A file, a field or an option cannot be used.
+    """
+    from ns_abstract.api.bounding import bound_frames
+    from ns_abstract.api.explaining import explain as explained
+    from ns_abstract.api.job import check_frames
+    from ns_abstract.execution.engines import Here
+
+    job = opened(options)
+    if job.rays:
+        raise InputError("is for splats, this run is a NeRF", field="--explain", fix="leave it out")
+    frames = check_frames(options.frames, job.frame_count)
+    stop = Stop()
+    with stop.installed():
+        results = bound_frames(
+            job, frames, engine=Here(), budget=options.time_budget or _EXPLAINED_S * len(frames),
+            target_ratio=options.target_ratio, keep_leaves=True, stop=stop,
+        )  # fmt: skip
+        for result in results:
+            for line in explained(job, result.index, result, options.seed).lines():
+                print(line, flush=True)
+    return INTERRUPTED if stop() else DONE
+
+
 def describe(options: Describe) -> int:
     """Print what is about to be bounded; returns the exit code.
 
@@ -133,16 +186,12 @@ def describe(options: Describe) -> int:
         InputError: A file, a field or an option cannot be used.
     """
     from ns_abstract.api.describe import describe as described
-    from ns_abstract.api.files import Settings, open_job
     from ns_abstract.api.job import check_frames
     from ns_abstract.io.errors import visible
     from ns_abstract.perturbation.specification import Perturbation
 
-    names = {entry.name for entry in fields(Settings)}
-    given = {name: value for name, value in vars(options).items() if name in names}
-    settings = Settings(**given | {"workers": 1, "given_set": given_set(options)})
     # a path that says nothing of a set is looked at all the same
-    job = open_job(settings, default=Perturbation())
+    job = opened(options, Perturbation())
     for line in described(job, check_frames(options.frames, job.frame_count)):
         print(visible(line))
     return DONE
@@ -190,6 +239,8 @@ def main() -> None:
     """Entry point of the console script."""
     if "--describe" in sys.argv[1:]:
         run(describe, lambda: tyro.cli(Describe, prog="ns-abstract-render"))
+    elif "--explain" in sys.argv[1:]:
+        run(explain, lambda: tyro.cli(Explain, prog="ns-abstract-render"))
     run(render, lambda: tyro.cli(Render, prog="ns-abstract-render"))
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
@@ -24,6 +24,8 @@ from ns_abstract.report.record import Report, Run
 
 #: Seconds by frame where no time budget is given.
 _SECONDS_BY_FRAME = 60.0
+#: Runs of numbers that a line lists.
+_RUNS = 8
 
 
 @dataclass(frozen=True)
@@ -96,12 +98,12 @@ def render_path(order: Order, stop: Stop) -> bool:
         for reason in report.ignored:
             console.print(f"not used: {reason}", markup=False)
         _introduce(console, job, report)
-        if report.pending and order.engine == "local":
-            with stop.at_once():
-                compile_beside(job, report.pending[0])
+        stack.enter_context(stop.last_words(report.interrupted))
         _fill(report, job, order, engine, stop, console)
     if report.missing:
-        console.print(f"no bounds yet for frames {', '.join(map(str, report.missing))}: raise --time-budget, --resume")
+        console.print(
+            f"no bounds yet for frames {listed(report.missing)}: raise --time-budget, --resume", soft_wrap=True
+        )
     console.print(f"report: {order.output_dir / 'report.html'}", markup=False, soft_wrap=True)
     return not report.missing
 
@@ -117,6 +119,9 @@ def _fill(report: Report, job: Job, order: Order, engine: Engine, stop: Stop, co
         console=console, disable=not console.is_terminal, transient=True,
     )  # fmt: skip
     try:
+        if pending and order.engine == "local":
+            with stop.at_once():
+                compile_beside(job, report.pending[0])
         with progress:
             meter = _Meter(progress, len(pending), order.target_ratio)
             results = bounding.bound_frames(
@@ -140,7 +145,19 @@ def _introduce(console: Console, job: Job, report: Report) -> None:
     for note in (*method.notes, *job.plan):
         console.print(f"  {note}", markup=False, soft_wrap=True)
     if report.kept:
-        console.print(f"  kept from before: frames {', '.join(map(str, report.kept))}", markup=False)
+        console.print(f"  kept from before: frames {listed(report.kept)}", markup=False, soft_wrap=True)
+
+
+def listed(numbers: Sequence[int]) -> str:
+    """Ascending ``numbers`` in words, runs of them by their ends, and how many where there are many runs."""
+    runs: list[list[int]] = []
+    for number in numbers:
+        if runs and number == runs[-1][1] + 1:
+            runs[-1][1] = number
+        else:
+            runs.append([number, number])
+    told = [f"{a} to {b}" if b > a + 1 else ", ".join(map(str, dict.fromkeys((a, b)))) for a, b in runs[:_RUNS]]
+    return ", ".join(told) + (f" and others, {len(numbers):,} together" if len(runs) > _RUNS else "")
 
 
 def _tell(console: Console, entry: dict[str, Any]) -> None:

@@ -1,8 +1,9 @@
-"""A loop for the airfield: an approach along the runway, flown by a small network that looks at 8 x 8 pixels.
+"""A loop for the gate: a drone flies towards it, steered by a small network that looks at 8 x 8 pixels.
 
-The network estimates how far the camera is off the centreline and off the glide path. It has one hidden layer of ReLUs
-on fixed random combinations of the pictures' principal components, and its last layer is a ridge regression on renders,
-so that it is made in seconds and always the same.
+The network estimates how far the camera is beside and above the gate's axis. Its hidden layer holds two linear
+estimates, ridge regressions on renders, cut by ReLUs at a few places; its last layer is a ridge regression on these. So
+it is made in seconds, is always the same, and its weights stay small: what bounds of pictures leave open is multiplied
+by them.
 """
 
 from __future__ import annotations
@@ -22,54 +23,54 @@ Float64 = NDArray[np.float64]
 
 SIZE = 8
 FOV = 60.0
-#: Start of the approach and its end, units along the runway; height of the glide path at the start, and its slope.
-_START, _END, _HEIGHT, _SLOPE = -1.0, -0.5, 0.08, 0.1
-_DT, _SPEED, _STEPS = 0.1, 0.25, 20
-#: The control: its gain, and at most, units a second.
-_GAIN, _MOST = 2.0, 0.15
-_HIDDEN, _COMPONENTS, _RIDGE, _PICTURES = 24, 8, 1e-3, 500
+#: Largest offsets at the start; length of the box of starts along the course.
+_ACROSS, _UP, _ALONG = 0.45, 0.3, 0.06
+_DT, _SPEED, _STEPS = 0.1, 0.35, 24
+#: The control: its gain, 1/s, and at most, units a second; time in which velocity follows, s.
+_GAIN, _MOST, _LAG = 1.2, 0.25, 0.3
+#: Half-width of the funnel that is not to be left, and by how much it narrows by unit; half-width of the goal.
+_MOUTH, _FUNNEL, _NEAR = 0.44, 0.35, 0.06
+#: Regressions: their ridges, places of the ReLUs, and pictures.
+_RIDGE, _LAST_RIDGE, _KNOT, _PICTURES = 1e-3, 1e-5, 0.15, 600
 
 
 def rotation() -> Float64:
-    """[4, 4] camera to world at the origin: along the runway, a little down."""
-    return look_at((0.0, 0.0, 0.0), (1.0, 0.0, -_SLOPE))
-
-
-def off_path(position: Float64) -> Float64:
-    """[n, 2] distance from the centreline and from the glide path of positions [n, 3]."""
-    height = _HEIGHT - _SLOPE * (position[:, 0] - _START)
-    return np.stack([position[:, 1], position[:, 2] - height], axis=1)
+    """[4, 4] camera to world at the origin: along the course."""
+    return look_at((0.0, 0.0, 0.0), (1.0, 0.0, 0.0))
 
 
 def samples(count: int = _PICTURES, seed: int = 0) -> Float64:
-    """[count, 3] positions about the approach to learn from."""
-    low, high = np.array([_START - 0.05, -0.09, -0.07]), np.array([_END + 0.05, 0.09, 0.07])
-    found = np.random.default_rng(seed).uniform(low, high, (count, 3))
-    found[:, 2] += _HEIGHT - _SLOPE * (found[:, 0] - _START)
-    return found
+    """[count, 3] positions about the approach to learn from; fewer are far off the axis late in the course."""
+    rng = np.random.default_rng(seed)
+    end = _ALONG + _DT * _SPEED * _STEPS
+    along = rng.uniform(0.0, end, count)
+    room = 1.1 - 0.5 * along / end
+    return np.stack([along, *(room * rng.uniform(-most, most, count) for most in (_ACROSS, _UP))], axis=1)
 
 
-def fit(images: Float64, targets: Float64, seed: int = 0) -> list[Float64]:
+def _ridge(features: Float64, targets: Float64, ridge: float) -> tuple[Float64, Float64]:
+    """Weights [o, n] and biases [o] of a regression that leaves the means alone."""
+    middle, level = features.mean(axis=0), targets.mean(axis=0)
+    away = features - middle
+    normal = away.T @ away + ridge * len(away) * np.eye(away.shape[1])
+    weights = np.linalg.solve(normal, away.T @ (targets - level)).T
+    return weights, level - weights @ middle
+
+
+def fit(images: Float64, targets: Float64) -> list[Float64]:
     """Weights and biases of the hidden layer [h, n], [h] and of the last one [o, h], [o].
 
     Args:
         images: [count, n].
         targets: [count, o].
-        seed: Of the hidden layer.
     """
-    rng = np.random.default_rng(seed)
-    mean = images.mean(axis=0)
-    _, scales, axes = np.linalg.svd(images - mean, full_matrices=False)
-    # signs of singular vectors are the library's choice
-    axes = axes[:_COMPONENTS] * np.sign(axes[:_COMPONENTS].sum(axis=1, keepdims=True))
-    spread = scales[0] / np.sqrt(len(images))
-    hidden = rng.standard_normal((_HIDDEN, len(axes))) @ axes / spread
-    bias = rng.standard_normal(_HIDDEN) - hidden @ mean
-    features = np.maximum(images @ hidden.T + bias, 0.0)
-    known = np.concatenate([features, np.ones((len(images), 1))], axis=1)
-    normal = known.T @ known + _RIDGE * len(images) * np.eye(_HIDDEN + 1)
-    last = np.linalg.solve(normal, known.T @ targets).T
-    return [hidden, bias, last[:, :-1], last[:, -1]]
+    weights, bias = _ridge(images, targets, _RIDGE)
+    # the first is always open
+    signs, places = [1.0, 1.0, -1.0], [1.0, -_KNOT, -_KNOT]
+    hidden = np.concatenate([sign * weights for sign in signs])
+    hidden_bias = np.concatenate([sign * bias + place for sign, place in zip(signs, places, strict=True)])
+    last, last_bias = _ridge(np.maximum(images @ hidden.T + hidden_bias, 0.0), targets, _LAST_RIDGE)
+    return [hidden, hidden_bias, last, last_bias]
 
 
 def write_network(file: Path, weights: list[Float64], size: int = SIZE) -> None:
@@ -98,26 +99,28 @@ def write_network(file: Path, weights: list[Float64], size: int = SIZE) -> None:
 
 
 def approach_loop(network: str = "estimator.onnx") -> dict[str, Any]:
-    """Content of LOOP.json: 3 states (along, across, up), 20 steps, a box of initial states and a touchdown zone."""
-    end = _HEIGHT - _SLOPE * (_END - _START)
+    """Content of LOOP.json: position and two velocities, a box of starts in three dimensions, a funnel."""
+    a, b = np.eye(5), np.zeros((5, 2))
+    for k in range(2):
+        a[1 + k, 3 + k] = _DT
+        a[3 + k, 3 + k] -= _DT / _LAG
+        b[3 + k, k] = _DT / _LAG
+    names = ["along", "across", "up", "v_across", "v_up"]
     return {
         "version": 1,
-        "state": ["along", "across", "up"],
-        "units": ["units", "units", "units"],
-        "initial": {"along": [_START, _START + 0.04], "across": [-0.04, 0.04], "up": [_HEIGHT - 0.03, _HEIGHT + 0.03]},
+        "state": names,
+        "units": ["units", "units", "units", "units/s", "units/s"],
+        "initial": {
+            "along": [0.0, _ALONG], "across": [-_ACROSS, _ACROSS], "up": [-_UP, _UP], "v_across": 0.0, "v_up": 0.0,
+        },
         "steps": _STEPS,
         "sampling_time": _DT,
-        "dynamics": {
-            "type": "affine",
-            "A": np.eye(3).tolist(),
-            "B": [[0.0, 0.0], [_DT, 0.0], [0.0, _DT]],
-            "c": [_DT * _SPEED, 0.0, -_DT * _SPEED * _SLOPE],
-        },
-        "disturbance": {"across": 0.0002, "up": 0.0002},
+        "dynamics": {"type": "affine", "A": a.tolist(), "B": b.tolist(), "c": [_DT * _SPEED, 0.0, 0.0, 0.0, 0.0]},
+        "disturbance": {"v_across": 0.002, "v_up": 0.002},
         "camera": {
             "camera_to_world": rotation().tolist(),
             "fov": FOV,
-            "position": {"offset": [0.0, 0.0, 0.0], "matrix": np.eye(3).tolist()},
+            "position": {"offset": [0.0, 0.0, 0.0], "matrix": np.eye(3, 5).tolist()},
         },
         "network": network,
         "preprocess": {"resize": [SIZE, SIZE]},
@@ -127,30 +130,26 @@ def approach_loop(network: str = "estimator.onnx") -> dict[str, Any]:
             "clip": [[-_MOST, _MOST], [-_MOST, _MOST]],
         },
         "unsafe": [
-            {"box": {"up": [None, -0.02]}},
-            {"half_space": {"normal": [0.0, 1.0, 0.0], "at_least": 0.07}},
-            {"half_space": {"normal": [0.0, -1.0, 0.0], "at_least": 0.07}},
+            {"half_space": {"normal": [_FUNNEL, *side, 0.0, 0.0], "at_least": _MOUTH}}
+            for side in ((1.0, 0.0), (-1.0, 0.0), (0.0, 1.0), (0.0, -1.0))
         ],
-        "goal": {"box": {"across": [-0.025, 0.025], "up": [end - 0.025, end + 0.03]}, "when": "end"},
-    }
+        "goal": {"box": {"across": [-_NEAR, _NEAR], "up": [-_NEAR, _NEAR]}, "when": "end"},
+    }  # fmt: skip
 
 
-def write_approach(folder: Path, render: Callable[[Float64], NDArray[np.float32]]) -> tuple[Path, Path]:
-    """Render, fit and write ``estimator.onnx`` and ``LOOP.json``.
+def write_approach(folder: Path, render: Callable[[Float64], NDArray[np.float32]]) -> Path:
+    """Render, fit and write ``estimator.onnx`` and ``LOOP.json``; returns the latter.
 
     Args:
         folder: Where; made if missing.
         render: Position [3] to the picture [SIZE, SIZE, 3] of the camera there, with `rotation` and `FOV`.
-
-    Returns:
-        LOOP.json and the network.
     """
     folder.mkdir(parents=True, exist_ok=True)
     places = samples()
     # as the network's input lies: channels first
     images = np.stack([np.moveaxis(render(place), -1, 0).reshape(-1) for place in places]).astype(np.float64)
     network, loop = folder / "estimator.onnx", folder / "LOOP.json"
-    write_network(network, fit(images, off_path(places)))
+    write_network(network, fit(images, places[:, 1:]))
     text = json.dumps(approach_loop(network.name), indent=1) + "\n"
     write_atomic(loop, lambda stream: stream.write(text.encode()))
-    return loop, network
+    return loop

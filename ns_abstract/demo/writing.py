@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ns_abstract.demo.airfield import airfield
-from ns_abstract.demo.approach import FOV, SIZE, rotation, write_approach
+from ns_abstract.demo.approach import FOV, SIZE, rotation, samples, write_approach
 from ns_abstract.demo.buoy import buoy_path, buoy_scene, buoy_views
+from ns_abstract.demo.gate import gate
 from ns_abstract.demo.paths import dataset_views, write_airfield_paths
 from ns_abstract.geometry.camera_path import Camera, focal_length
 from ns_abstract.geometry.views import View
@@ -33,13 +36,11 @@ def write_nerf_demo(folder: Path) -> tuple[Path, Path]:
     return config, path
 
 
-def write_demo(folder: Path) -> tuple[Path, dict[str, Path]]:
-    """Write run, camera paths and perturbation; returns config.yml and the files by name."""
-    scene = airfield()
-    renderer = Renderer(activate(scene, GSPLAT_1_4_0), GSPLAT_1_4_0)
+def _picture(renderer: Renderer) -> Callable[[View], NDArray[np.float64]]:
+    """Gives the image [H, W, 3] of a view."""
 
-    def picture(view: View) -> np.ndarray:
-        focal = 0.5 * view.height / np.tan(np.radians(view.fov) / 2.0)
+    def picture(view: View) -> NDArray[np.float64]:
+        focal = focal_length(view.fov, view.height, "fov")
         camera = Camera(
             camera_to_world=view.camera_to_world,
             fx=focal,
@@ -53,6 +54,13 @@ def write_demo(folder: Path) -> tuple[Path, dict[str, Path]]:
         rotation = np.ascontiguousarray(pose[:3, :3].T * np.array([1.0, -1.0, -1.0])[:, None])
         return renderer.image(camera, rotation, np.ascontiguousarray(pose[:3, 3]))
 
+    return picture
+
+
+def write_demo(folder: Path) -> tuple[Path, dict[str, Path]]:
+    """Write run, camera paths and perturbation; returns config.yml and the files by name."""
+    scene = airfield()
+    picture = _picture(Renderer(activate(scene, GSPLAT_1_4_0), GSPLAT_1_4_0))
     config = write_splatfacto_run(
         scene, folder, timestamp=TIMESTAMP, experiment_name="airfield", views=dataset_views(), render=picture
     )
@@ -60,10 +68,17 @@ def write_demo(folder: Path) -> tuple[Path, dict[str, Path]]:
 
 
 def write_loop_demo(folder: Path) -> tuple[Path, Path]:
-    """Fit and write the network and LOOP.json of an approach to the airfield of `write_demo`; returns both files."""
-    renderer = Renderer(activate(airfield(), GSPLAT_1_4_0), GSPLAT_1_4_0)
-    focal = focal_length(FOV, SIZE, "fov")
-    pose = rotation()
-    camera = Camera(pose[:3], focal, focal, 0.5 * SIZE, 0.5 * SIZE, SIZE, SIZE)
-    view = np.ascontiguousarray(pose[:3, :3].T * np.array([1.0, -1.0, -1.0])[:, None])
-    return write_approach(folder, lambda place: renderer.image(camera, view, place).astype(np.float32))
+    """Write the gate's run, and the network and LOOP.json of a flight towards it; returns config.yml and LOOP.json."""
+    scene = gate()
+    picture = _picture(Renderer(activate(scene, GSPLAT_1_4_0), GSPLAT_1_4_0))
+
+    def seen(place: NDArray[np.float64], size: int) -> View:
+        pose = rotation()
+        pose[:3, 3] = place
+        return View(pose, FOV, size, size)
+
+    config = write_splatfacto_run(
+        scene, folder, timestamp=TIMESTAMP, experiment_name="gate", render=picture,
+        views=[seen(place, 200) for place in samples(10)],
+    )  # fmt: skip
+    return config, write_approach(folder, lambda place: picture(seen(place, SIZE)).astype(np.float32))

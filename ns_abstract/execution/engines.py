@@ -10,6 +10,7 @@ import multiprocessing
 import os
 import secrets
 import signal
+import ssl
 import threading
 import time
 from collections import Counter
@@ -31,8 +32,8 @@ _GIVE_UP = signal.SIGUSR1
 #: Times that a task is begun again when its worker dies.
 _RETRIES = 3
 _LOOPBACK = "127.0.0.1"
-#: Time that a scheduler is given to answer.
-_CONNECT = "10s"
+#: Seconds that a scheduler is given to be reached, and as many to say that it is one.
+_CONNECT = 10.0
 #: Seconds that a cluster without workers, or a scheduler that does not answer, is waited for.
 _GONE = 30.0
 #: Seconds that the first try to fetch a finished result may take; each further one has twice as many.
@@ -70,6 +71,11 @@ class Engine(Protocol):
         """Whether tasks see the objects of this process."""
         ...
 
+    @property
+    def starting(self) -> bool:
+        """Whether workers are still on their way to a first result, which takes them seconds."""
+        ...
+
     def machine(self) -> Machine:
         """The machine with most to do."""
         ...
@@ -98,6 +104,7 @@ class Here:
     capacity = 1
     threads = 1
     shares = True
+    starting = False
 
     def __init__(self) -> None:
         self._tasks: list[tuple[int, Task]] = []
@@ -137,6 +144,7 @@ class Processes:
         self._idle: list[_Worker] = []
         self._busy: dict[Connection, tuple[_Worker, int, Task]] = {}
         self._deaths: dict[int, int] = {}
+        self.starting = True
         self.capacity = count
         self._waiting: list[tuple[int, Task]] = []
 
@@ -217,6 +225,7 @@ class Processes:
                 continue
             worker, key, _ = self._busy.pop(connection)
             self._idle.append(worker)
+            self.starting = False
             if not good:
                 raise value
             found.append((key, value))
@@ -266,6 +275,7 @@ class Cluster:
     """
 
     shares = False
+    starting = False
 
     def __init__(self, client: Any) -> None:
         self.client = client
@@ -444,7 +454,64 @@ class Tls:
         if address is None:
             raise InputError("given without --scheduler-address", field="--tls-ca-file", fix="leave it out")
         assert ca_file is not None and cert is not None and key is not None
+        _check_pem(ca_file, cert, key)
         return cls(ca_file, cert, key)
+
+
+def _check_pem(ca_file: Path, cert: Path, key: Path) -> None:
+    """Refuse files that hold no certificates.
+
+    Raises:
+        InputError: A file is no PEM file, or the key is another one's or needs a password.
+    """
+
+    def password() -> str:
+        raise ValueError("the key needs a password")
+
+    context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
+    for name, file, load in (
+        ("--tls-ca-file", ca_file, lambda: context.load_verify_locations(ca_file)),
+        ("--tls-cert", cert, lambda: context.load_cert_chain(cert, key, password)),
+    ):
+        try:
+            load()
+        except (OSError, ValueError) as error:
+            words = " ".join(str(getattr(error, "reason", None) or error).replace("_", " ").lower().split())
+            raise InputError(
+                f"no certificate in PEM form, or not with this key ({words[:80]})",
+                file=file,
+                field=name,
+                fix="give the files that `dask scheduler` was started with",
+            ) from None
+
+
+def _within(seconds: float, make: Callable[[], Any]) -> Any:
+    """What ``make`` returns, if it does so in time: Dask waits for ever where a port takes connections in silence.
+
+    Raises:
+        OSError: It does not, or what answers is no scheduler.
+        ValueError, TypeError: As ``make``.
+    """
+    made: list[Any] = []
+    failed: list[Exception] = []
+
+    def work() -> None:
+        try:
+            made.append(make())
+        except Exception as error:
+            failed.append(error)
+
+    thread = threading.Thread(target=work, name="connecting", daemon=True)
+    thread.start()
+    thread.join(seconds)
+    if failed and isinstance(failed[0], (OSError, ValueError, TypeError)):
+        raise failed[0]
+    if failed:
+        # what is no message of Dask's is taken for one, and its first bytes for sizes
+        raise ConnectionError(type(failed[0]).__name__)
+    if not made:
+        raise TimeoutError
+    return made[0]
 
 
 @contextmanager
@@ -473,7 +540,7 @@ def connected(address: str | None, workers: int = 1, tls: Tls | None = None) -> 
             with config.set({name: kept}):
                 client: Any = Client(n_workers=workers, threads_per_worker=1, host=_LOOPBACK, dashboard_address=None)
         elif tls is None:
-            client = Client(address, timeout=_CONNECT)
+            client = _within(2.0 * _CONNECT, lambda: Client(address, timeout=_CONNECT))
         else:
             security = Security(
                 require_encryption=True,
@@ -482,7 +549,7 @@ def connected(address: str | None, workers: int = 1, tls: Tls | None = None) -> 
                 tls_client_key=str(tls.key),
             )
             where = address if "://" in address else f"tls://{address}"
-            client = Client(where, timeout=_CONNECT, security=security)
+            client = _within(2.0 * _CONNECT, lambda: Client(where, timeout=_CONNECT, security=security))
     except (OSError, ValueError, TypeError) as error:
         raise InputError(
             f"no scheduler answers at {address} ({type(error).__name__})",

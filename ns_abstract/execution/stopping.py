@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import signal
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from types import FrameType
 
@@ -16,6 +16,7 @@ class StopRequest:
         self.signal: int | None = None
         self._asked = False
         self._raising = 0
+        self._last: Callable[[], object] = lambda: None
 
     def __call__(self) -> bool:
         return self._asked
@@ -38,6 +39,23 @@ class StopRequest:
             yield
         finally:
             self._raising -= 1
+
+    @contextmanager
+    def last_words(self, write: Callable[[], object]) -> Iterator[None]:
+        """Inside the block, ``write`` says what is there wherever the process is ended in the middle of a library call.
+
+        Args:
+            write: May be called by another thread while this one is in the call.
+        """
+        before, self._last = self._last, write
+        try:
+            yield
+        finally:
+            self._last = before
+
+    def say_last_words(self) -> None:
+        """Called by who ends the process."""
+        self._last()
 
     def handle(self, number: int, frame: FrameType | None) -> None:
         """Handle a signal: take it as a request, or end the work where it is."""

@@ -17,8 +17,10 @@ from ns_abstract.io.jsonio import load_json
 MARK = ".ns-abstract.lock"
 #: What results are called; see `ns_abstract.report.files` and `ns_abstract.verify.store`.
 _RESULT = re.compile(r"frame_\d{5,}\.(npz|png)|report\.(json|html)|cells\.sqlite(-wal|-shm)?")
+#: The same of images of counterexamples, in a folder below.
+_IMAGE = re.compile(r"frame_\d{5,}_(pose|\d[\d_-]*)(_\d+)?\.npz")
 #: What a killed command may leave of a result; see `ns_abstract.io.atomic`.
-_PART = re.compile(rf"\.({_RESULT.pattern})\.[0-9a-f]{{8}}\.part")
+_PART = re.compile(rf"\.({_RESULT.pattern}|{_IMAGE.pattern})\.[0-9a-f]{{8}}\.part")
 #: Keys that report.json of every command has.
 _REPORT_KEYS = {"version", "guarantee", "fingerprint", "command"}
 _REPORT_LIMIT = 2**30
@@ -87,7 +89,7 @@ def _locked(folder: Path) -> BinaryIO:
 
 
 def remove_parts(folder: Path) -> None:
-    """Remove what killed commands left of unfinished results; the folder must be locked."""
+    """Remove what killed commands left of unfinished results; the folder, or the one above it, must be locked."""
     for entry in list(os.scandir(folder)):
         if _PART.fullmatch(entry.name) and stat.S_ISREG(entry.stat(follow_symlinks=False).st_mode):
             Path(entry.path).unlink(missing_ok=True)

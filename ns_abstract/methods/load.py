@@ -8,7 +8,7 @@ from typing import Any
 
 from ns_abstract.io.errors import InputError
 from ns_abstract.methods import runs
-from ns_abstract.methods.nerf.method import NERF
+from ns_abstract.methods.nerf.opening import NERF
 from ns_abstract.methods.representation import Representation
 from ns_abstract.methods.splat.method import SPLAT
 

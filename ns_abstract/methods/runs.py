@@ -9,17 +9,10 @@ from __future__ import annotations
 
 import math
 import os
-import pickle
-import pickletools
 import re
-import warnings
-import zipfile
-from collections import Counter
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath, PureWindowsPath
-from typing import TYPE_CHECKING, Any, cast
+from typing import Any, cast
 
 import numpy as np
 import yaml
@@ -27,12 +20,10 @@ import yaml.composer
 import yaml.constructor
 from numpy.typing import NDArray
 
-from ns_abstract.io.errors import InputError, visible
+from ns_abstract.io.errors import InputError, first_line, visible
 from ns_abstract.io.jsonio import FIX_ACCESS, file_size, is_number, load_json, read_text, show
+from ns_abstract.methods.checkpoint import RECOPY, read_checkpoint
 from ns_abstract.methods.transform import DataparserTransform
-
-if TYPE_CHECKING:
-    import torch
 
 CONFIG_NAME = "config.yml"
 TRANSFORMS_NAME = "dataparser_transforms.json"
@@ -43,26 +34,11 @@ CONFIG_NODES_LIMIT = 100_000
 CONFIG_DEPTH_LIMIT = 64
 NUMBER_CHARACTERS_LIMIT = 300
 TRANSFORMS_BYTES_LIMIT = 2**20
-PICKLE_BYTES_LIMIT = 16 * 2**20
-ARCHIVE_MEMBERS_LIMIT = 100_000
 
 _PYTHON_TAG = "tag:yaml.org,2002:python/"
 _MERGE_TAG = "tag:yaml.org,2002:merge"
 _NUMBER_TAGS = {f"tag:yaml.org,2002:{python}{kind}" for python in ("", "python/") for kind in ("int", "long", "float")}
 _CHECKPOINT_NAME = re.compile(r"step-(\d{1,18})\.ckpt")
-_RECOPY = "copy the checkpoint again from the run"
-_PICKLE_MODULES = {"torch", "collections", "numpy", "_codecs"}
-# Schedulers and optimizers hold numpy scalars; none of their values is used.
-_NUMPY_NAMES = (
-    "numpy.core.multiarray.scalar",
-    "numpy._core.multiarray.scalar",
-    "numpy.dtype",
-    *(
-        f"numpy.dtypes.{kind}DType"
-        for kind in ("Bool", "Float16", "Float32", "Float64", "Int8", "Int16", "Int32", "Int64")
-    ),
-    *(f"numpy.dtypes.UInt{bits}DType" for bits in (8, 16, 32, 64)),
-)
 # nerfstudio/utils/colors.py; "random" is what Splatfacto shows outside training.
 _COLORS = {
     "white": (1.0, 1.0, 1.0),
@@ -249,37 +225,8 @@ def read_dataparser_transform(run: RunConfig) -> tuple[DataparserTransform, tupl
     return DataparserTransform(matrix=matrix, scale=float(scale)), ()
 
 
-def available_memory() -> int | None:
-    """Bytes of memory this process may still take, or None where the system does not say."""
-    amounts = []
-    try:
-        for line in Path("/proc/meminfo").read_text().splitlines():
-            if line.startswith("MemAvailable:"):
-                amounts.append(int(line.split()[1]) * 1024)
-    except (OSError, ValueError, IndexError):
-        pass
-    try:
-        amounts.append(int(Path("/sys/fs/cgroup/memory.max").read_text()))
-    except (OSError, ValueError):
-        pass
-    return min(amounts) if amounts else None
-
-
-def check_memory(needed: int, file: Path, what: str) -> None:
-    """Raise InputError if ``needed`` bytes are more than the memory available."""
-    available = available_memory()
-    if available is not None and needed > available:
-        raise InputError(
-            f"{what} needs about {needed / 2**30:.1f} GiB of memory, {available / 2**30:.1f} GiB are free",
-            file=file,
-            fix="use a machine with more memory or a smaller scene",
-        )
-
-
-def read_model_state(path: Path) -> dict[str, torch.Tensor]:
-    """Read the model's tensors from a checkpoint, on the CPU, without running code in the file.
-
-    Checksums of all members are compared first. Tensors are views of the mapped file.
+def read_model_state(path: Path) -> dict[str, Any]:
+    """The model's tensors (`StoredTensor`) in a checkpoint, read without running code in the file.
 
     Args:
         path: A ``step-*.ckpt`` file.
@@ -292,17 +239,14 @@ def read_model_state(path: Path) -> dict[str, torch.Tensor]:
         InputError: The file is damaged, holds other Python objects than tensors and plain
             values, or has no ``pipeline``.
     """
-    size = file_size(path, "checkpoint")
-    check_memory(size, path, "the checkpoint")
-    _check_archive(path, size)
-    root = _load_checkpoint(path)
+    root = read_checkpoint(path)
     pipeline = root.get("pipeline") if isinstance(root, dict) else None
     if not isinstance(pipeline, dict):
         raise InputError("no model state", file=path, field="pipeline", fix="give a checkpoint that ns-train wrote")
     state = {}
     for key, value in pipeline.items():
         if not isinstance(key, str):
-            raise InputError(f"key {show(key)} is not text", file=path, field="pipeline", fix=_RECOPY)
+            raise InputError(f"key {show(key)} is not text", file=path, field="pipeline", fix=RECOPY)
         name = key.removeprefix("module.")
         if name.startswith("_model."):
             state[name.removeprefix("_model.")] = value
@@ -310,188 +254,6 @@ def read_model_state(path: Path) -> dict[str, torch.Tensor]:
     if state and all(key.startswith("module.") for key in state):
         state = {key.removeprefix("module."): value for key, value in state.items()}
     return state
-
-
-def tensor_to_float32(value: Any, file: Path, field: str) -> NDArray[np.float32]:
-    """A checkpoint tensor as a float32 array of the same shape, copied out of the file.
-
-    Args:
-        value: What the checkpoint holds under ``field``.
-        file: The checkpoint.
-        field: Name for messages.
-
-    Raises:
-        InputError: Not a dense tensor of float16, bfloat16, float32 or float64, or a value is
-            not finite in float32.
-    """
-    import torch
-
-    if not isinstance(value, torch.Tensor):
-        raise InputError(f"found {show(value)}, not a tensor", file=file, field=field, fix=_RECOPY)
-    kind = _unusual_kind(value)
-    if kind:
-        raise InputError(f"{kind} tensor", file=file, field=field, fix="save it as a dense float32 tensor")
-    # Strides of 0 let a small file claim any size.
-    if value.numel() * value.element_size() > value.untyped_storage().nbytes():
-        raise InputError("claims more values than the file holds", file=file, field=field, fix=_RECOPY)
-    try:
-        array = np.array(value.detach().resolve_neg().to(torch.float32).numpy(), np.float32, order="C")
-    except (RuntimeError, TypeError, ValueError) as error:
-        problem = f"cannot be read: {_first_line(error)}"
-        raise InputError(problem, file=file, field=field, fix=_RECOPY) from None
-    require_finite(array, file, field)
-    return array
-
-
-def require_finite(array: NDArray[np.float32], file: Path, field: str) -> None:
-    """Raise InputError that names the first row and the count of values that are NaN or infinite."""
-    bad = ~np.isfinite(array)
-    if bad.any():
-        rows = np.flatnonzero(bad.reshape(array.shape[0], -1).any(axis=1)) if array.ndim else np.zeros(1, int)
-        raise InputError(
-            f"{int(bad.sum())} values are not finite in float32, the first in row {int(rows[0])}",
-            file=file,
-            field=field,
-            fix="remove these rows or train again",
-        )
-
-
-class _Inert:
-    """Stands for a numpy object in a checkpoint and keeps nothing of it."""
-
-    def __init__(self, *_arguments: Any) -> None:
-        pass
-
-    def __setstate__(self, _state: Any) -> None:
-        pass
-
-
-def _unusual_kind(tensor: torch.Tensor) -> str | None:
-    import torch
-
-    tests = (
-        (tensor.is_nested, "nested"),
-        (tensor.layout != torch.strided, "sparse"),
-        (tensor.is_quantized, "quantized"),
-        (tensor.device.type == "meta", "empty (meta)"),
-        (tensor.dtype.is_complex, "complex"),
-    )
-    for found, kind in tests:
-        if found:
-            return kind
-    if tensor.dtype not in (torch.float16, torch.bfloat16, torch.float32, torch.float64):
-        return str(tensor.dtype).removeprefix("torch.")
-    return None
-
-
-def _first_line(error: BaseException) -> str:
-    text = " ".join(str(error).split()) or type(error).__name__
-    return text if len(text) <= 160 else f"{text[:157]}..."
-
-
-def _check_archive(path: Path, size: int) -> None:
-    """Refuse archives that torch.save does not write, before torch sees them."""
-    try:
-        with path.open("rb") as stream:
-            if stream.read(4) != b"PK\x03\x04":
-                raise InputError("not a PyTorch checkpoint", file=path, fix=_RECOPY)
-        with zipfile.ZipFile(path) as archive:
-            _check_members(archive, path, size)
-            names = [m.filename for m in archive.infolist() if m.filename.endswith("/data.pkl")]
-            data = archive.read(names[0])
-            # pickletools prints nothing and builds nothing: it only lists the instructions.
-            wanted = {
-                str(argument or "unnamed").replace(" ", ".")
-                for opcode, argument, _ in pickletools.genops(data)
-                if opcode.name in ("GLOBAL", "INST", "STACK_GLOBAL")
-            }
-    except InputError:
-        raise
-    except MemoryError:
-        raise
-    except OSError as error:
-        problem = f"checkpoint cannot be read: {error.strerror or type(error).__name__}"
-        raise InputError(problem, file=path, fix="check the permissions") from None
-    except Exception as error:  # zipfile and pickletools raise many types on damaged files
-        raise InputError(f"damaged checkpoint: {_first_line(error)}", file=path, fix=_RECOPY) from None
-    for name in sorted(wanted):
-        if name.partition(".")[0] not in _PICKLE_MODULES:
-            raise _forbidden(name, path)
-
-
-def _forbidden(name: str, path: Path) -> InputError:
-    return InputError(
-        f"asks for the Python object {show(name)}; nothing was run",
-        file=path,
-        field="data.pkl",
-        fix="use only checkpoints that ns-train wrote",
-    )
-
-
-def _check_members(archive: zipfile.ZipFile, path: Path, size: int) -> None:
-    members = archive.infolist()
-    names = Counter(member.filename.casefold() for member in members)
-    pickles = [m for m in members if m.filename.endswith("/data.pkl")]
-    problem = None
-    if len(members) > ARCHIVE_MEMBERS_LIMIT:
-        problem = f"{len(members)} members in the archive"
-    elif any(member.compress_type != zipfile.ZIP_STORED for member in members):
-        problem = "compressed members, which torch.save never writes"
-    elif sum(member.file_size for member in members) > size:
-        problem = "members larger than the file"
-    elif names and names.most_common(1)[0][1] > 1:
-        problem = f"member {show(names.most_common(1)[0][0])} stands twice"
-    elif len(pickles) != 1 or any(m.filename.endswith("/constants.pkl") for m in members):
-        problem = "not an archive of torch.save"
-    elif pickles[0].file_size > PICKLE_BYTES_LIMIT:
-        problem = f"its index has {pickles[0].file_size} bytes, more than {PICKLE_BYTES_LIMIT}"
-    if problem is None:
-        broken = archive.testzip()
-        problem = None if broken is None else f"checksum of {show(broken)} does not match"
-    if problem:
-        raise InputError(f"damaged checkpoint: {problem}", file=path, fix=_RECOPY)
-
-
-@contextmanager
-def _allowed_alone(names: list[Any]) -> Iterator[None]:
-    """Let ``torch.load`` see these names only: others' objects of the same names would take turns with ours."""
-    import torch
-
-    others = torch.serialization.get_safe_globals()
-    torch.serialization.clear_safe_globals()
-    torch.serialization.add_safe_globals(names)
-    try:
-        yield
-    finally:
-        torch.serialization.clear_safe_globals()
-        torch.serialization.add_safe_globals(others)
-
-
-def _load_checkpoint(path: Path) -> Any:
-    import torch
-
-    inert: list[Any] = [(_Inert, name) for name in _NUMPY_NAMES]
-    try:
-        with _allowed_alone(inert), warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            try:
-                return torch.load(str(path), map_location="cpu", weights_only=True, mmap=True)
-            except RuntimeError as error:
-                # Some network file systems cannot map files.
-                if "mmap" not in str(error):
-                    raise
-                return torch.load(str(path), map_location="cpu", weights_only=True)
-    except MemoryError:
-        raise
-    except pickle.UnpicklingError as error:
-        # The rest of torch's text recommends to load without restrictions.
-        name = re.search(r"GLOBAL ([\w.]+)", str(error))
-        if name:
-            raise _forbidden(name[1], path) from None
-        raise InputError("damaged checkpoint: unusual contents", file=path, fix=_RECOPY) from None
-    except Exception as error:  # torch.load raises many types on damaged files
-        problem = f"checkpoint cannot be read: {_first_line(error)}"
-        raise InputError(problem, file=path, fix=_RECOPY) from None
 
 
 def _is_list(value: Any, length: int) -> bool:
@@ -547,7 +309,7 @@ def _parse_yaml(text: str, file: Path) -> Any:
     except MemoryError:
         raise
     except Exception as error:  # PyYAML raises KeyError, ValueError, AttributeError... on bad scalars
-        raise InputError(f"not valid YAML: {_first_line(error)}", file=file, fix=fix) from None
+        raise InputError(f"not valid YAML: {first_line(error)}", file=file, fix=fix) from None
 
 
 def _composer_error(problem: str, mark: Any) -> yaml.MarkedYAMLError:

@@ -22,6 +22,7 @@ from ns_abstract.methods.runs import Tagged
 #: Packages whose objects a run may name, by the way of naming them.
 _OURS = ("nerfstudio.", "ns_abstract.")
 _MODULES = {"name": (*_OURS, "torch.optim."), "object": _OURS, "object/apply": _OURS}
+_PYTHON = "tag:yaml.org,2002:python/"
 _FUNCTIONS = ("nerfstudio.data.utils.nerfstudio_collate.nerfstudio_collate",)
 
 
@@ -86,7 +87,9 @@ def check_tags(value: Any, file: Path) -> None:
         InputError: Names the first other object.
     """
     if isinstance(value, Tagged):
-        kind, _, name = value.tag.removeprefix("tag:yaml.org,2002:python/").partition(":")
+        if _is_member(value):
+            return
+        kind, _, name = value.tag.removeprefix(_PYTHON).partition(":")
         if not _expected(kind, name):
             raise InputError(
                 f"names the Python object {show(name or value.tag)} ({kind}); nothing was run",
@@ -101,6 +104,21 @@ def check_tags(value: Any, file: Path) -> None:
     elif isinstance(value, (list, tuple)):
         for item in value:
             check_tags(item, file)
+
+
+def _is_member(value: Tagged) -> bool:
+    """Whether this is a member of an enumeration as Python 3.11.0 to 3.11.3 write it: ``getattr(Class, "NAME")``."""
+    parts = value.value
+    if value.tag != f"{_PYTHON}object/apply:builtins.getattr" or not isinstance(parts, list) or len(parts) != 2:
+        return False
+    owner, member = parts
+    if not isinstance(owner, Tagged) or not owner.tag.startswith(f"{_PYTHON}name:") or owner.value != "":
+        return False
+    name = owner.tag.removeprefix(f"{_PYTHON}name:")
+    if not _expected("object/apply", name):
+        return False
+    module, _, last = name.rpartition(".")
+    return isinstance(member, str) and member in getattr(importlib.import_module(module), last).__members__
 
 
 def _expected(kind: str, name: str) -> bool:

@@ -122,7 +122,7 @@ class AbstractNerfModel(AbstractOutputs, NeRFModel):
         exponents = (8.0, 4.0)
         if c.num_direction_frequencies:
             exponents = c.max_frequency_exponent, c.num_direction_frequencies - 1.0
-        state = {name: value.detach().cpu() for name, value in self.state_dict().items()}
+        state = {name: value.detach().cpu().float().numpy() for name, value in self.state_dict().items()}
         coarse, fine = (
             field_weights(state, name, Path("the loaded model"), exponents) for name in ("field_coarse", "field_fine")
         )

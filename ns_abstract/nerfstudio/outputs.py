@@ -16,7 +16,7 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from ns_abstract.arithmetic.selfcheck import check_functions
 from ns_abstract.io.errors import InputError
 from ns_abstract.nerfstudio.loading import lpips_known
-from ns_abstract.nerfstudio.panel import AbstractPanel, camera_of
+from ns_abstract.nerfstudio.panel import AbstractPanel, Insistent, camera_of
 from ns_abstract.perturbation.specification import ROTATIONS, TRANSLATIONS
 from ns_abstract.perturbation.variations import VARIATIONS
 from ns_abstract.refine.engine import Goal, Refinement
@@ -143,6 +143,7 @@ class AbstractOutputs(_Base):
             refine=lambda seconds: (model := here()) and model._background.more(seconds),
         )
         self._background = Background(lambda: (model := here()) and model._news())
+        self._redraw = Insistent(self.abstract.control.draw, lambda: (model := here()) is None or model._current())
         self._source: Source | None = None
         self._evaluating = False
         self._problems: list[str] | None = None
@@ -221,7 +222,12 @@ class AbstractOutputs(_Base):
 
     def _news(self) -> None:
         if self._background.status.state != "off":
-            self.abstract.control.draw()
+            self._redraw()
+
+    def _current(self) -> bool:
+        """Whether the panel tells what the background does, or nobody looks."""
+        told, now = self.abstract.told, self._background.status
+        return told in (None, now) or now.state == "off" or not self.abstract.control.watched
 
     def get_image_metrics_and_images(
         self, outputs: dict[str, torch.Tensor], batch: dict[str, torch.Tensor]

@@ -94,6 +94,11 @@ class Attached(ViewerControl):
         return self._present.is_set()
 
     @property
+    def watched(self) -> bool:
+        """Whether somebody looks."""
+        return self.present and bool(self.viewer.render_statemachines)
+
+    @property
     def folder(self) -> Path:
         """The run's folder."""
         return self.viewer.log_filename.parent
@@ -104,6 +109,40 @@ class Attached(ViewerControl):
             return
         for machine in list(self.viewer.render_statemachines.values()):
             machine.action(RenderAction("step", self.viewer.get_camera_state(machine.client)))
+
+
+class Insistent:
+    """Draws again until what is on screen is what is known.
+
+    nerfstudio's render thread loses a request that comes while it takes up another (render_state_machine.py, run:
+    ``next_action`` is read and then cleared).
+
+    Args:
+        draw: Asks for a new picture.
+        current: Whether the last picture told what is known.
+        seconds: From a request to the look whether it was heeded.
+    """
+
+    def __init__(self, draw: Callable[[], object], current: Callable[[], bool], seconds: float = 1.0) -> None:
+        self._draw, self._current, self._seconds = draw, current, seconds
+        self._lock, self._waiting = threading.Lock(), False
+
+    def __call__(self) -> None:
+        """Draw; never waits."""
+        self._draw()
+        with self._lock:
+            if self._waiting:
+                return
+            self._waiting = True
+        timer = threading.Timer(self._seconds, self._look)
+        timer.daemon = True
+        timer.start()
+
+    def _look(self) -> None:
+        with self._lock:
+            self._waiting = False
+        if not self._current():
+            self()
 
 
 class AbstractPanel(torch.nn.Module):
@@ -130,6 +169,8 @@ class AbstractPanel(torch.nn.Module):
         super().__init__()
         self._refine = refine
         self._last: View | None = None
+        #: what the text says of the background; None: nothing
+        self.told: Status | None = None
         self._certified = select is not None
         self._figures = Figures("Abstract images: no view yet")
         self._sliders: dict[str, ViewerSlider] = {}
@@ -203,12 +244,12 @@ class AbstractPanel(torch.nn.Module):
 
     def show(self, view: View, snapshot: Snapshot | None, status: Status, about: str = "") -> None:
         """Say what is known of the view on screen; ``about`` as `ns_abstract.viewer.views.Source.about`."""
-        self._last = view
+        self._last, self.told = view, status
         self._figures.show(describe(view, snapshot, status, about))
 
     def refuse(self, error: InputError) -> None:
         """Say why there is no set."""
-        self._last = None
+        self._last = self.told = None
         self._figures.show(f"**Abstract images**: no bounds, [0, 1] is shown  \n{error}")
 
     def send(self) -> None:

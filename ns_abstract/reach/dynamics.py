@@ -206,12 +206,63 @@ def double_integrator(dt: float, axes: int, linear: float, quadratic: float) -> 
     return Dynamics("double integrator", 2 * axes, axes, law, text)
 
 
+def fixed_wing(dt: float, speed: float) -> Dynamics:
+    """An aeroplane at constant speed, ``(x, y, z, heading, climb)``, by Euler's rule; angles in radians.
+
+    ``x' = x + dt v cos(climb) cos(heading)``, ``y' = y + dt v cos(climb) sin(heading)``, ``z' = z + dt v sin(climb)``;
+    the controls are the rates of heading and climb.
+    """
+
+    def law(x: Sequence[Any], u: Sequence[Any], kind: type[Floats]) -> list[Any]:
+        ahead, across = kind.cos_sin(x[3])
+        level, up = kind.cos_sin(x[4])
+        moved = [kind.scaled(part, dt * speed) for part in (level * ahead, level * across, up)]
+        return [*(x[k] + moved[k] for k in range(3)), *(x[k] + kind.scaled(u[k - 3], dt) for k in (3, 4))]
+
+    text = (
+        "x' = x + dt v cos(c) cos(h), y' = y + dt v cos(c) sin(h), z' = z + dt v sin(c), h' = h + dt r, c' = c + dt q"
+    )
+    return Dynamics("fixed wing", 5, 2, law, text)
+
+
+def quadrotor(dt: float, lag: float, gravity: float) -> Dynamics:
+    """A quadrotor in the plane across its view, ``(across, up, v_across, v_up, roll)``, by Euler's rule.
+
+    An inner loop lets the roll follow its command: ``roll' = roll + dt / lag (command - roll)``. With the thrust
+    T = ``gravity`` + its command (accelerations), ``v_across' = v_across + dt T sin(roll)`` and ``v_up' = v_up + dt
+    (T cos(roll) - gravity)``; the controls are the commands of roll and thrust.
+    """
+
+    def law(x: Sequence[Any], u: Sequence[Any], kind: type[Floats]) -> list[Any]:
+        upright, tilted = kind.cos_sin(x[4])
+        thrust = u[1] + gravity
+        weight = dt * gravity if kind is Sizes else -dt * gravity
+        return [
+            x[0] + kind.scaled(x[2], dt),
+            x[1] + kind.scaled(x[3], dt),
+            x[2] + kind.scaled(thrust * tilted, dt),
+            x[3] + kind.scaled(thrust * upright, dt) + weight,
+            x[4] + kind.scaled(u[0] + kind.scaled(x[4], -1.0), dt / lag),
+        ]
+
+    text = (
+        "y' = y + dt v, z' = z + dt w, v' = v + dt T sin(r), w' = w + dt (T cos(r) - g), r' = r + dt / lag (u - r), "
+        "T = g + thrust"
+    )
+    return Dynamics("quadrotor", 5, 2, law, text)
+
+
 # ---------------------------------------------------------------- LOOP.json
+
+#: m / s^2.
+_GRAVITY = 9.81
 
 _KEYS = {
     "affine": ("type", "A", "B", "c"),
     "unicycle": ("type", "speed"),
     "double integrator": ("type", "axes", "drag", "quadratic_drag"),
+    "fixed wing": ("type", "speed"),
+    "quadrotor": ("type", "lag", "gravity"),
 }
 
 
@@ -282,6 +333,11 @@ def parse_dynamics(value: Any, states: int, dt: float, fail: Fail) -> Dynamics:
     elif kind == "unicycle":
         speed = None if "speed" not in value else number(value["speed"], "dynamics.speed", fail)
         found = unicycle(dt, speed)
+    elif kind == "fixed wing":
+        found = fixed_wing(dt, number(value.get("speed"), "dynamics.speed", fail, positive=True))
+    elif kind == "quadrotor":
+        lag = number(value.get("lag"), "dynamics.lag", fail, positive=True)
+        found = quadrotor(dt, lag, number(value.get("gravity", _GRAVITY), "dynamics.gravity", fail, positive=True))
     else:
         axes = value.get("axes")
         if type(axes) is not int or not 1 <= axes <= MOST // 3:

@@ -12,6 +12,7 @@ from ns_abstract.reach.loop import Loop
 from ns_abstract.reach.search import QUESTIONS
 from ns_abstract.report.certificate_page import percent
 from ns_abstract.report.figures import interval, number
+from ns_abstract.report.margins import scene_margin
 from ns_abstract.report.page import Axis, draw_legend, draw_line, draw_plot, reproduce, whole_page
 
 _STYLE = """
@@ -65,6 +66,7 @@ def loop_page(document: Mapping[str, Any], rows: Mapping[int, Sequence[Mapping[s
         + "</div>",
         *_pictures(document, rows, loop),
         _widths(document),
+        scene_margin(document["scene_margin"]),
         _guarantee(document),
         reproduce(document),
     ]

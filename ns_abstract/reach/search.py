@@ -6,10 +6,11 @@ well ("reaches")? What becomes of a cell depends on the cell alone.
 
 from __future__ import annotations
 
+import itertools
 import math
 import time
 from collections import OrderedDict
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Literal
 
@@ -20,8 +21,10 @@ from ns_abstract.geometry.box import ParameterBox
 from ns_abstract.io.errors import InputError
 from ns_abstract.reach.loop import Loop
 from ns_abstract.reach.tubes import Reacher, Tube
+from ns_abstract.refine.protocol import Member
 from ns_abstract.verify.cells import Cell, Grid
-from ns_abstract.verify.search import FAILURES, ContradictionError, Findings, Leaf
+from ns_abstract.verify.scene_margin import Settled
+from ns_abstract.verify.search import FAILURES, ContradictionError, Findings, Leaf, failure_text
 
 Float64 = NDArray[np.float64]
 Question = Literal["safe", "reaches"]
@@ -33,10 +36,15 @@ _EARLY, _CORNERS, _RANDOM = 2, 2, 1
 #: Runs of the search for a smaller margin where a cell is proved and where not, and its first step as a part of the
 #: cell.
 _STEPS, _STEPS_OPEN, _FIRST_STEP = 3, 1, 0.25
+#: Scenes of a set that are shown where a cell is not proved; one of them where it is.
+_SCENES = 20
 #: Ranks of cells, as in `ns_abstract.verify.search`: nothing is known; some run goes wrong.
 _RANK_UNKNOWN, _RANK_BROKEN = 1e6, 2e3
 #: Tubes and runs kept for the other question.
-_KEPT, _KEPT_RUNS = 64, 1024
+_KEPT, _KEPT_RUNS = 256, 4096
+#: Parts that a cell is cut into, at most and where its tube ends before this part of the steps; what the cuts aim at.
+_FEW, _MANY, _SOON = 2, 8, 0.75
+_SHRINK = {_FEW: 1.0, _MANY: 0.5}
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,22 +74,32 @@ class Run:
         return float(min(found)) if found else math.inf
 
 
-def simulate(reacher: Reacher, start: Float64, disturbances: Float64) -> Run:
+def simulate(
+    reacher: Reacher,
+    start: Float64,
+    disturbances: Float64,
+    member: Member | None = None,
+    shift: Float64 | None = None,
+) -> Run:
     """One run with the real renderer and the deployed network, in float64 but for these.
 
     Args:
         reacher: The loop.
         start: [n] initial state.
         disturbances: [steps, n], added to every next state.
+        member: The scene that is seen throughout; None: the stored one.
+        shift: [d] added to the pose's parameters throughout, for a scene that stands elsewhere; None: nothing.
     """
     loop = reacher.loop
+    more = () if member is None else (member,)
     states, controls = [np.asarray(start, np.float64)], []
     with np.errstate(all="ignore"):
         for push in disturbances:
             x = states[-1]
             if not np.isfinite(x).all():
                 break
-            u = reacher.pilot.concrete(reacher.view.image(loop.camera.values(x)))
+            pose = loop.camera.values(x) if shift is None else loop.camera.values(x) + shift
+            u = reacher.pilot.concrete(reacher.view.image(pose, *more))
             controls.append(u)
             states.append(loop.dynamics.step(x, u) + push)
     missing = loop.steps + 1 - len(states)
@@ -163,7 +181,7 @@ class LoopSearch:
             except InputError:
                 raise
             except FAILURES as error:
-                self._tubes[box] = " ".join(f"{type(error).__name__}: {error}".split())[:200]
+                self._tubes[box] = failure_text(error)
         return self._tubes[box]
 
     def proved(self, tube: Tube, question: Question) -> float:
@@ -178,6 +196,59 @@ class LoopSearch:
             # some one step is in the goal for all runs
             found = min(found, max(tube.inside(k, goal.faces) for k in steps))
         return found if math.isfinite(found) or found == math.inf else -math.inf
+
+    def _scenes(self, generator: np.random.Generator) -> Iterator[tuple[Member | None, Float64 | None]]:
+        """Scenes of the set, without end: other Gaussians, or the stored ones elsewhere, corners first."""
+        reach = self.reacher.shift
+        if not reach.any():
+            yield from ((member, None) for member in self.reacher.view.members(0))
+            return
+        for signs in itertools.product((-1.0, 1.0), repeat=int(np.count_nonzero(reach))):
+            corner = reach.copy()
+            corner[reach > 0.0] *= signs
+            yield None, corner
+        while True:
+            yield None, generator.uniform(-1.0, 1.0, len(reach)) * reach
+
+    def settle(self, question: Question, box: ParameterBox) -> Settled:
+        """A cell as it is, for all scenes of the view: its tube, and runs in some of them (V13).
+
+        Raises:
+            ContradictionError: A run leaves its tube: the program has a fault.
+        """
+        tube = self.tube(box)
+        known = not isinstance(tube, str)
+        bound = self.proved(tube, question) if known else -math.inf
+        proved, width = bound > 0.0, np.array(box.upper) - np.array(box.lower)
+        generator = np.random.default_rng(np.frombuffer(np.array(box.lower + box.upper).tobytes(), np.uint32))
+        starts = [box.middle, np.array(box.lower), np.array(box.upper)]
+        first = int(generator.integers(_SCENES)) if proved else 0
+        scenes = itertools.islice(self._scenes(generator), first, first + 1 if proved else _SCENES)
+        for number, (member, shift) in enumerate(scenes):
+            state = self.loop.state(box, starts[number % len(starts)])
+            push = pushes(self.loop, generator, "ends" if number % 2 else "middle")
+            run = simulate(self.reacher, state, push, member, shift)
+            outside = first_outside(tube, run) if known else None
+            margin = run.margin(self.loop, question)
+            if outside is not None or (proved and margin <= 0.0):
+                raise ContradictionError(
+                    f"internal error: in a scene, the run from {state.tolist()} has the margin {margin}, proved to be "
+                    f"at least {bound}; outside: {outside}"
+                )
+            if math.isnan(margin):
+                return Settled("unknown", "the states of a run are no finite numbers", width)
+            if margin <= 0.0 and simulate(self.reacher, state, push, member, shift).margin(self.loop, question) <= 0.0:
+                arrays = {"states": run.states, "controls": run.controls, "disturbances": run.disturbances}
+                arrays |= {"names": np.array(self.loop.names, str)}
+                varied = {} if member is None else member.arrays
+                arrays |= {f"scene_{name}": array for name, array in varied.items()}
+                arrays |= {} if shift is None else {"shift": shift}
+                return Settled("falsified", "a run goes wrong", width, arrays)
+        if proved:
+            return Settled("holds", "", width)
+        reason = tube.reason if known else str(tube)
+        slopes = tube.slopes if known and tube.slopes.any() else width
+        return Settled("unknown", reason or "the margin's bound is not above 0", slopes)
 
     def examine(self, number: int, grid: Grid, block: Sequence[Cell]) -> LoopFindings:
         """Examine cells for the question of this number.
@@ -195,8 +266,7 @@ class LoopSearch:
         bounded = 0
         for cell in block:
             begun = time.perf_counter()
-            found = self._one(question, grid, cell, runs)
-            seen, bound, reason, slopes = found
+            seen, bound, reason, slopes, parts = self._one(question, grid, cell)
             bounded += bound is not None
             samples.append((cell, seen.margins[0] > 0.0))
             seconds = time.perf_counter() - begun
@@ -209,7 +279,7 @@ class LoopSearch:
             hopeless = seen.broken + seen.undecided == len(seen.margins)
             if cell.volume > 1 and not hopeless:
                 rank = self._rank(seen, bound, cell.volume / grid.volume)
-                children += [(rank, part) for part in grid.divide(cell, slopes, 1.0, 2)]
+                children += [(rank, part) for part in grid.divide(cell, slopes, _SHRINK[parts], parts)]
             elif seen.broken:
                 leaf, run = self._counterexample(question, seen, seconds)
                 leaves.append(leaf)
@@ -227,10 +297,8 @@ class LoopSearch:
             tuple(runs),
         )
 
-    def _one(
-        self, question: Question, grid: Grid, cell: Cell, runs: list[tuple[Cell, Run]]
-    ) -> tuple[_Seen, float | None, str, Float64]:
-        """Runs, proven margin or None, why there is none, and what a cut along each parameter may gain."""
+    def _one(self, question: Question, grid: Grid, cell: Cell) -> tuple[_Seen, float | None, str, Float64, int]:
+        """Runs, proven margin or None, why there is none, what a cut along each parameter may gain, parts to cut."""
         box = grid.box_of(cell)
         seen, generator = _Seen(cell, box), np.random.default_rng([*cell.first, *cell.past])
         self._run(question, seen, box.middle, pushes(self.loop, generator, "middle"))
@@ -238,10 +306,10 @@ class LoopSearch:
             self._run(question, seen, np.array(end), pushes(self.loop, generator, "ends"))
         width = np.array(box.upper) - np.array(box.lower)
         if seen.broken or seen.undecided:
-            return seen, None, "", width
+            return seen, None, "", width, _FEW
         tube = self.tube(box)
         if isinstance(tube, str):
-            return seen, None, tube, width
+            return seen, None, tube, width, _FEW
         bound = self.proved(tube, question)
         # no proof is believed without an attack, and no doubt is left without one
         proved = bound > 0.0
@@ -261,7 +329,9 @@ class LoopSearch:
                 f"{seen.margins[seen.worst]} from {seen.starts[seen.worst].tolist()}"
             )
         slopes = tube.slopes if tube.slopes.any() else width
-        return seen, bound if bound > -math.inf else None, tube.reason, slopes
+        # a tube that ends far from the end is far too wide
+        parts = _MANY if tube.reason and len(tube.sets) < _SOON * self.loop.steps else _FEW
+        return seen, bound if bound > -math.inf else None, tube.reason, slopes, parts
 
     def _run(self, question: Question, seen: _Seen, start: Float64, disturbances: Float64) -> float:
         state = self.loop.state(seen.box, start)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Literal, Protocol
 
@@ -14,11 +14,13 @@ from ns_abstract.execution.ending import checkpoint
 from ns_abstract.geometry.box import ParameterBox
 from ns_abstract.geometry.poses import PoseSet
 from ns_abstract.geometry.tiles import assemble
+from ns_abstract.perturbation.specification import TRANSLATIONS
 from ns_abstract.reach.dynamics import middle_half
 from ns_abstract.reach.loop import Control, Face, Loop
-from ns_abstract.refine.protocol import Frame, Method
+from ns_abstract.refine.protocol import Frame, Member, Method
 from ns_abstract.verify.model import NetworkModel
 from ns_abstract.verify.properties import Query
+from ns_abstract.verify.response import Response, shown_sets
 
 Float64 = NDArray[np.float64]
 #: What is kept from step to step: how states depend on the initial state and on earlier disturbances ("kept"); only how
@@ -143,8 +145,12 @@ class View(Protocol):
 
     pose_set: PoseSet
 
-    def image(self, values: Float64) -> np.ndarray:
-        """[H, W, 3] float32 at pose parameters [d]."""
+    def image(self, values: Float64, member: Member | None = None) -> np.ndarray:
+        """[H, W, 3] float32 at pose parameters [d], of another scene of the set if one is named."""
+        ...
+
+    def members(self, seed: int) -> Iterator[Member]:
+        """Other scenes of the set, without end; none where only poses vary."""
         ...
 
     def sets(self, box: ParameterBox) -> tuple[tuple[np.ndarray, ...], np.ndarray, np.ndarray, np.ndarray]:
@@ -158,22 +164,27 @@ class Pictures:
     Args:
         method: The scene and its program.
         poses: All poses that may be looked at; boxes of them are bounded.
+        response: The cameras that may show them; None: one that shows what is rendered.
     """
 
-    def __init__(self, method: Method, poses: PoseSet) -> None:
+    def __init__(self, method: Method, poses: PoseSet, response: Response | None = None) -> None:
         self.frame: Frame = method.frame(poses)
+        self._response = response
         self.pose_set = self.frame.pose_set
         self._tiles = np.arange(self.frame.tile_count)
 
-    def image(self, values: Float64) -> np.ndarray:
+    def image(self, values: Float64, member: Member | None = None) -> np.ndarray:
         checkpoint()
-        return assemble(self.frame.render(np.asarray(values, np.float64)), self.frame.camera)
+        shown = self.frame.render if member is None else member
+        return assemble(shown(np.asarray(values, np.float64)), self.frame.camera)
+
+    def members(self, seed: int) -> Iterator[Member]:
+        return self.frame.members(seed) if self._response is None else self._response.members(self.frame, seed)
 
     def sets(self, box: ParameterBox) -> tuple[tuple[np.ndarray, ...], np.ndarray, np.ndarray, np.ndarray]:
         found = self.frame.bound(box, self._tiles, keep_linear=True)
-        assert found.linear is not None
-        whole = [assemble(part, self.frame.camera) for part in (*found.linear, found.lower, found.upper)]
-        return (whole[0], whole[1], whole[2], whole[3]), whole[4], whole[5], found.slopes
+        linear, lower, upper = shown_sets(found, self.frame.camera, self._response)
+        return linear, lower, upper, found.slopes
 
 
 @dataclass(frozen=True)
@@ -324,17 +335,25 @@ class Reacher:
         view: Its pictures.
         pilot: Its network and control.
         dependence: What is kept from step to step.
+        registration: How far the scene may stand from its place along every world axis, all of a run through; needs a
+            camera that moves along all of them.
     """
 
     loop: Loop
     view: View
     pilot: Pilot
     dependence: Dependence = "kept"
+    registration: float = 0.0
     _limits: tuple[Float64, Float64] = field(init=False)
 
     def __post_init__(self) -> None:
         box = self.view.pose_set.box
         self._limits = np.array(box.lower), np.array(box.upper)
+
+    @property
+    def shift(self) -> Float64:
+        """[d] how far pose parameters may be off, as seen from the scene."""
+        return np.array([self.registration if name in TRANSLATIONS else 0.0 for name in self.loop.camera.names])
 
     def tube(self, cell: ParameterBox, *, whole: bool = False) -> Tube:
         """The tube of a cell of the initial box; it ends early where an unsafe set cannot be ruled out.
@@ -378,8 +397,9 @@ class Reacher:
         """One step (L4): the next set, least and most controls [2, m], and how much the picture moves by symbol."""
         loop, camera = self.loop, self.loop.camera
         rounding = 2.0 * gamma(len(loop.names) + _FEW)
-        size = np.abs(camera.factors) @ state.size + np.abs(camera.offset)
-        pose = state.mapped(camera.factors, camera.offset, rounding * size)
+        size = np.abs(camera.factors) @ state.size + np.abs(camera.offset) + self.shift
+        # a scene elsewhere is a camera elsewhere (V13)
+        pose = state.mapped(camera.factors, camera.offset, self.shift + rounding * size)
         low, high = pose.hull()
         if not ((low >= self._limits[0]) & (high <= self._limits[1])).all():
             return "the camera may leave the range of poses"

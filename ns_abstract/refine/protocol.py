@@ -309,6 +309,14 @@ class Method(Protocol):
         """
         ...
 
+    def easier(self, poses: PoseSet) -> Iterator[tuple[str, Frame]]:
+        """What makes bounds of a set loose, in words, and its frame without that: not the one asked for."""
+        ...
+
+    def holders(self, frame: Frame, box: ParameterBox, tile: int, count: int) -> list[tuple[int, float]]:
+        """Scene elements without which the mean gap of a tile over a cell is less, and by how much, in that order."""
+        ...
+
     def differentiable(self, poses: PoseSet) -> Callable[[torch.Tensor], torch.Tensor] | None:
         """Parameter values [d] to the picture [H, W, 3] by differentiable operations, for the search.
 

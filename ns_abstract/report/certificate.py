@@ -15,6 +15,16 @@ from ns_abstract.report.record import guarantee_text, plain, versions
 
 VERSION = 1
 
+#: What the key ``scene_margin`` of report.json tells.
+SCENE_MARGIN = (
+    "by what varies, of every Gaussian by itself, (brightness, white_balance, gamma) of the camera "
+    "or (registration) of the scene as a whole: radius of the largest "
+    "variation for which every certified cell is certified again; not_certified: the smallest radius that was "
+    "tried in vain, and why; falsified: the smallest for which a scene, stored under counterexamples/, breaks "
+    "what is certified; reached: radius at which the part of the certified volume holds that was looked at before "
+    "the time ended"
+)
+
 METRICS = {
     "certified": "part of the parameter volume where the property is proved for every image",
     "falsified": "part in cells with a pose, stored and rendered again, whose image breaks the property",
@@ -25,8 +35,11 @@ METRICS = {
     "substitution": "certified cells bounded in weaker ways, too: margin on the cell, and the largest half-widths "
     "about its middle that each way certifies, on a ladder of steps by the given factor; says how much the shared "
     "parameters are worth, and is no part of the certificate",
+    "scene_margin": SCENE_MARGIN,
     "cells_seal": "rows of cells that have a verdict, and the sum of their SHA-256: --resume refuses other rows",
-    "PCP-S": "parts of the fixed partition where no sample breaks the property (certified ones cannot be broken)",
+    "PCP-S": "parts of the fixed partition where the property holds at every sample, or is proved",
+    "undecided": "parts of the fixed partition with a sample that neither holds nor breaks the property: its margin is "
+    "no finite number; not in PCP-S",
     "PCP-V": "parts of the fixed partition that are certified as a whole",
 }
 
@@ -98,6 +111,7 @@ def certificate_document(
     reasons: Mapping[str, int],
     cells_seal: Mapping[str, Any],
     substitution: Mapping[str, Any],
+    scene_margin: Mapping[str, Any],
 ) -> dict[str, Any]:
     """Content of report.json.
 
@@ -112,6 +126,7 @@ def certificate_document(
         reasons: Why cells are unknown, and how many.
         cells_seal: Number of rows of ``cells`` with a verdict, and the sum of their hashes.
         substitution: A few certified cells bounded in weaker ways, too.
+        scene_margin: Largest variations of the scene for which what is certified holds.
     """
     covered = coverage(frames)
     poses = sum(entry["sampled"]["poses"] for entry in frames)
@@ -138,6 +153,7 @@ def certificate_document(
                 "partitions": total,
                 "PCP-S": sum(part["right"] for part in parts) / total,
                 "PCP-V": sum(part["certified"] for part in parts) / total,
+                "undecided": sum(part["undecided"] for part in parts) / total,
             }
             if total
             else None,
@@ -148,6 +164,7 @@ def certificate_document(
             "unknown_because": reasons,
             "cells_seal": cells_seal,
             "substitution": substitution,
+            "scene_margin": scene_margin,
             "plan": run.plan,
             "limits": run.limits,
             "state": state,

@@ -9,6 +9,7 @@ from html import escape
 from typing import Any
 
 from ns_abstract.report.figures import interval, number
+from ns_abstract.report.margins import scene_margin
 from ns_abstract.report.page import Axis, counted, draw_line, draw_plot, reproduce, script, uri, whole_page
 from ns_abstract.report.record import plain
 
@@ -75,6 +76,7 @@ def certificate_page(
         _counterexamples(document),
         _time(document),
         _substitution(document),
+        scene_margin(document["scene_margin"]),
         _frames(document),
         _guarantee(document),
         _files(),
@@ -159,7 +161,8 @@ def _verdict(document: Mapping[str, Any], name: str) -> str:
     if parts:
         lines.append(
             f"Fixed partition of {parts['partitions']:,} parts: PCP-V {percent(parts['PCP-V'])} certified, PCP-S "
-            f"{percent(parts['PCP-S'])} right under sampling."
+            f"{percent(parts['PCP-S'])} right under sampling"
+            + (f", {percent(parts['undecided'])} undecided (no finite margin)." if parts["undecided"] else ".")
         )
     state = {
         "running": "The command was still running, or was killed, when this page was written.",

@@ -20,7 +20,7 @@ from ns_abstract.io.arrays import Archive, open_archive
 from ns_abstract.io.atomic import write_atomic
 from ns_abstract.io.errors import InputError
 from ns_abstract.io.jsonio import parse_json
-from ns_abstract.methods.runs import check_memory
+from ns_abstract.io.memory import check_memory
 from ns_abstract.refine.result import LAYER_ARRAYS, LAYERS, FrameResult, Layer, Leaves, TracePoint, Views
 
 FORMAT = "ns-abstract frame"

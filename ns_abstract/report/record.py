@@ -412,7 +412,9 @@ class Report:
         check_frame(result)
         index = result.index
         path = self.folder / frame_name(index, "npz")
-        if index in self._entries and path.exists():
+        # a file that others have changed since is replaced
+        known = self._digests.get(path.name)
+        if index in self._entries and path.exists() and file_stamp(path)["sha256"] == known:
             seconds, cells, trace = self._before.get(index, (0.0, 0, ()))
             stored = load_frame(path, leaves=False).result
             result = merged(replace(stored, seconds=seconds, cells=cells, trace=trace), result)
@@ -473,6 +475,11 @@ class Report:
             self.draw(index)
         self._publish(page=True)
         return self.document()
+
+    def interrupted(self) -> None:
+        """Say that the work was ended where it was; nothing is drawn."""
+        self._state = "interrupted"
+        self._publish(page=True)
 
     def _entry(self, result: FrameResult, status: str) -> dict[str, Any]:
         height, width = result.lower.shape[:2]

@@ -21,10 +21,13 @@ Word = Literal["sat", "unsat", "unknown", "timeout"]
 
 #: Inputs up to which every input is a parameter of its own.
 _PARAMETERS = 16
-#: Boxes bounded together, and the most that wait.
-_TOGETHER, _WAITING = 8, 1 << 14
+#: Boxes bounded together: as many as have so many numbers of layers between them, and no more than the second number;
+#: and the most that wait.
+_TOGETHER, _MOST, _WAITING = 1 << 18, 256, 1 << 14
 #: Boxes of many inputs that are cut: their halves are hardly easier.
 _CUTS = 64
+#: Steps towards the best slopes of rows over such boxes; inner rows take longer.
+_SLOPE_STEPS = 12
 #: Starts and steps of the first attack on a region.
 _STARTS, _STEPS = 12, 25
 
@@ -83,6 +86,8 @@ class _Search:
         self.network, self.run, self.memory = network, run, memory
         self.arithmetic: NetworkArithmetic = arithmetic
         self.boxes = 0
+        total = sum(int(np.prod(network.shape(k))) for k in range(len(network.nodes) + 1))
+        self.together = min(_MOST, max(8, _TOGETHER // total))
         self.undecided = False
         self.found: tuple[np.ndarray, np.ndarray] = (np.zeros(0), np.zeros(0))
 
@@ -102,16 +107,16 @@ class _Search:
         done = 0
         while waiting:
             checkpoint()
-            boxes, waiting = waiting[-_TOGETHER:], waiting[:-_TOGETHER]
+            boxes, waiting = waiting[-self.together :], waiting[: -self.together]
             bounds = self._bound(region, boxes)
             proved = proves(bounds, region.unsafe.groups)
             self.boxes += len(boxes)
             done += len(boxes)
-            for k in np.flatnonzero(~proved):
-                lower, upper = boxes[k]
-                if self._probe(region, lower, upper, bounds.a[k]):
-                    return True
-                halves = self._cut(region, lower, upper, bounds.a[k])
+            left = np.flatnonzero(~proved)
+            if len(left) and self._probe(region, [(*boxes[k], bounds.a[k]) for k in left]):
+                return True
+            for k in left:
+                halves = self._cut(region, *boxes[k], bounds.a[k])
                 if halves is None or len(waiting) > most or (n > _PARAMETERS and done > most):
                     self.undecided = True
                     return False
@@ -131,9 +136,11 @@ class _Search:
             half = np.nextafter(np.maximum(upper - middle, middle - lower), np.inf)
             a = half[:, :, None] * np.eye(n)
             images = ImageSets(a, middle, a, middle, lower, upper)
+            steps = 0
         else:
             none = np.zeros((m, n, 1))
             images = ImageSets(none, lower, none, upper, lower, upper)
+            steps = _SLOPE_STEPS
         return bound_outputs(
             self.network,
             images,
@@ -141,6 +148,7 @@ class _Search:
             region.unsafe.offset,
             memory=self.memory,
             arithmetic=self.arithmetic,
+            slope_steps=steps,
         )
 
     def _cut(
@@ -197,11 +205,13 @@ class _Search:
             step *= 0.85
         return False
 
-    def _probe(self, region: Region, lower: np.ndarray, upper: np.ndarray, slopes: np.ndarray) -> bool:
-        """The middle of a box, and the corners where planes below are least."""
-        x = [0.5 * (lower + upper)]
-        if slopes.shape[1] == len(lower):
-            x += [np.where(row > 0.0, lower, upper) for row in slopes]
+    def _probe(self, region: Region, boxes: Sequence[tuple[np.ndarray, np.ndarray, np.ndarray]]) -> bool:
+        """The middles of boxes (lower, upper, slopes of planes below), and the corners where the planes are least."""
+        x = []
+        for lower, upper, slopes in boxes:
+            x.append(0.5 * (lower + upper))
+            if slopes.shape[1] == len(lower):
+                x += [np.where(row > 0.0, lower, upper) for row in slopes]
         with torch.no_grad():
             tried = torch.from_numpy(np.stack(x))
             return self._any(region, tried, self._value(region, tried))

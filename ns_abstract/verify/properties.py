@@ -23,7 +23,7 @@ from ns_abstract.geometry.box import ParameterBox
 from ns_abstract.geometry.differentiable_pose import differentiable_pose
 from ns_abstract.geometry.poses import PoseSet
 from ns_abstract.io.errors import InputError
-from ns_abstract.io.jsonio import FIX_MODERATE, MODERATE, file_beside, is_moderate, is_number, load_json, show
+from ns_abstract.io.jsonio import FIX_MODERATE, MODERATE, file_beside, is_moderate, is_number, show
 from ns_abstract.verify.preprocess import Preprocess, parse_preprocess
 from ns_abstract.verify.vnnlib import UnsafeSet, load_vnnlib
 
@@ -494,19 +494,6 @@ _KEYS = {
     "detection": ("class", "iou", "confidence", "box"),
     "vnnlib": ("file",),
 }
-
-
-def load_property(path: Path, input_shape: tuple[int, ...], output_shape: tuple[int, ...]) -> Property:
-    """Read PROP.json for a network with these shapes (one item each, without batch).
-
-    Raises:
-        InputError: The file or a field in it cannot be used.
-    """
-    root = load_json(path, "property file")
-    try:
-        return parse_property(root, path.parent, input_shape, output_shape)
-    except InputError as error:
-        raise error.within(path) from None
 
 
 def _fail(name: str, found: Any, fix: str) -> InputError:

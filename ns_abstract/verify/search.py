@@ -50,6 +50,8 @@ _STEPS = 6
 _FIRST_STEP = 0.25
 #: Scenes of a set tried in a cell without a proof.
 _MEMBERS = 4
+#: Why a cell is unknown where a sample's margin decides nothing.
+NO_NUMBER = "the margin of a picture is no finite number"
 #: A scene among so many, in their order, attacks a proof.
 _ATTACKERS = 24
 
@@ -109,6 +111,7 @@ class Leaf:
         image: [H, W, 3] float32 picture of the counterexample, or None.
         outputs: [n] what the network says about it, or None.
         reason: Why nothing is known, or "".
+        undecided: Whether some picture of the cell says neither that the property holds nor that it fails.
         scene: What tells the counterexample's scene from others of the set, by name; None: only poses vary.
     """
 
@@ -120,6 +123,7 @@ class Leaf:
     image: np.ndarray | None = field(default=None, repr=False)
     outputs: np.ndarray | None = field(default=None, repr=False)
     reason: str = ""
+    undecided: bool = False
     scene: Mapping[str, np.ndarray] | None = field(default=None, repr=False)
 
 
@@ -219,6 +223,7 @@ class Search:
         grid: The frame's cells.
         every_unit: Whether each unit of the grid needs a verdict of its own where the property fails (PCP-S).
         block: Most cells examined together.
+        cuts: Whether cells without a verdict are cut; else they are done with.
     """
 
     def __init__(
@@ -230,9 +235,10 @@ class Search:
         *,
         every_unit: bool = False,
         block: int = BLOCK,
+        cuts: bool = True,
     ) -> None:
         self.scene, self.model, self.claim, self.grid = scene, model, claim, grid
-        self.every_unit, self.block = every_unit, block
+        self.every_unit, self.block, self.cuts = every_unit, block, cuts
         self._latest: dict[tuple[bytes, int], np.ndarray] = {}
         self.varies = next(iter(scene.members(0)), None) is not None
 
@@ -434,7 +440,7 @@ class Search:
             except InputError:
                 raise
             except FAILURES as error:
-                reasons[number] = _told(error)
+                reasons[number] = failure_text(error)
                 continue
             slopes[number] = slope
             if not _sane(linear, lower, upper):
@@ -455,7 +461,7 @@ class Search:
         except InputError:
             raise
         except FAILURES as error:
-            reasons.update(dict.fromkeys(kept, _told(error)))
+            reasons.update(dict.fromkeys(kept, failure_text(error)))
             return
         for number, margin in zip(kept, np.asarray(found, np.float64).tolist(), strict=True):
             # infinite or NaN bounds prove nothing
@@ -505,7 +511,7 @@ class Search:
         return float(lost) / here if here > 0.0 else math.nan
 
     def _splittable(self, cell: Cell) -> bool:
-        return cell.volume > 1
+        return self.cuts and cell.volume > 1
 
     # ---------------------------------------------------------------- verdicts
 
@@ -533,7 +539,7 @@ class Search:
                     continue
                 bound = None
             if cell.undecided:
-                reasons.setdefault(number, "the margin of a picture is no finite number")
+                reasons[number] = NO_NUMBER
             hopeless = cell.hopeless and not self.every_unit
             if self._splittable(cell.cell) and not hopeless:
                 rank = self._rank(cell, bound, costs[number])
@@ -542,7 +548,8 @@ class Search:
             elif cell.broken:
                 leaves.append(self._counterexample(cell))
             else:
-                leaves.append(Leaf(cell.cell, "unknown", bound, 0.0, reason=reasons.get(number, "the finest cell")))
+                reason, undecided = reasons.get(number, "the finest cell"), cell.undecided > 0
+                leaves.append(Leaf(cell.cell, "unknown", bound, 0.0, reason=reason, undecided=undecided))
         return leaves, children
 
     def _rank(self, cell: _Seen, bound: float | None, cost: float) -> float:
@@ -578,7 +585,7 @@ class Search:
         margins, outputs = self.margins([(values, member)])
         margin = float(margins[0])
         if not -math.inf < margin <= 0.0 or not cell.box.contains(values):
-            return Leaf(cell.cell, "unknown", None, 0.0, reason="a counterexample was not confirmed")
+            return Leaf(cell.cell, "unknown", None, 0.0, reason="a counterexample was not confirmed", undecided=True)
         return Leaf(
             cell.cell,
             "falsified",
@@ -599,7 +606,8 @@ class ContradictionError(RuntimeError):
 FAILURES = (ArithmeticError, ValueError, IndexError, KeyError, TypeError, RuntimeError, AssertionError)
 
 
-def _told(error: Exception) -> str:
+def failure_text(error: Exception) -> str:
+    """One of `FAILURES` in a line."""
     return " ".join(f"{type(error).__name__}: {error}".split())[:200]
 
 

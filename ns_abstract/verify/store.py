@@ -13,7 +13,10 @@ from __future__ import annotations
 import hashlib
 import json
 import math
+import os
+import secrets
 import sqlite3
+import stat
 import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager, suppress
@@ -24,14 +27,14 @@ from urllib.parse import quote
 
 from ns_abstract.geometry.box import ParameterBox
 from ns_abstract.io.atomic import write_atomic
-from ns_abstract.io.errors import InputError
+from ns_abstract.io.errors import InputError, first_line
 from ns_abstract.io.folder import claim, remove_parts, unwritable
 from ns_abstract.io.jsonio import load_json
 from ns_abstract.verify.cells import Cell, Grid
 from ns_abstract.verify.search import RANK_FIRST, Findings, Leaf, Verdict
 
 NAME = "cells.sqlite"
-VERSION = 3
+VERSION = 4
 #: One open block of so many is the one with the largest cells, all others are those nearest to a proof.
 _LARGEST_EVERY = 4
 #: Folder of the images of counterexamples.
@@ -41,7 +44,7 @@ CREATE TABLE parameters(position INTEGER, name TEXT, unit TEXT);
 CREATE TABLE cells(frame INTEGER, lower TEXT, upper TEXT, verdict TEXT, margin REAL, seconds REAL, counterexample TEXT);
 CREATE TABLE search_state(key TEXT PRIMARY KEY, value TEXT);
 CREATE TABLE search_frames(frame INTEGER PRIMARY KEY, units TEXT, coarse TEXT, lower TEXT, upper TEXT, total TEXT,
-  certified TEXT, falsified TEXT, unknown TEXT, poses INTEGER, holding INTEGER);
+  certified TEXT, falsified TEXT, unknown TEXT, undecided TEXT, poses INTEGER, holding INTEGER);
 CREATE TABLE search_blocks(id INTEGER PRIMARY KEY AUTOINCREMENT, frame INTEGER, volume REAL, rank REAL, depth INTEGER,
   cells TEXT);
 CREATE INDEX search_near ON search_blocks(rank, volume, id);
@@ -52,9 +55,15 @@ CREATE TABLE search_images(name TEXT PRIMARY KEY, sha256 TEXT);
 """
 _REPORT_LIMIT = 2**30
 #: What a file that others have changed may raise when it is read.
-_DAMAGE = (sqlite3.DatabaseError, ValueError, TypeError, LookupError, AttributeError, ArithmeticError)
+_DAMAGE = (
+    sqlite3.DatabaseError, ValueError, TypeError, LookupError, AttributeError, ArithmeticError, RecursionError,
+)  # fmt: skip
+#: Seconds that another program may keep the file to itself.
+_BUSY = 5.0
+#: What SQLite says where the disk or another program is in the way.
+_PASSING = ("locked", "full", "disk I/O", "readonly", "unable to open")
 _CELL = "frame, lower, upper, verdict, margin, seconds, counterexample"
-_FRAME = "frame, units, coarse, lower, upper, total, certified, falsified, unknown, poses, holding"
+_FRAME = "frame, units, coarse, lower, upper, total, certified, falsified, unknown, undecided, poses, holding"
 _BLOCK = "id, frame, volume, rank, depth, cells"
 
 
@@ -107,11 +116,12 @@ class Block:
 
 @dataclass(frozen=True)
 class Tally:
-    """Parts of a frame's parameter volume; what is left is open.
+    """Parts of a frame's parameter volume (V7); what is left is open.
 
     Attributes:
         frame: Entry of the camera path.
         units, certified, falsified, unknown: Volumes in grid units.
+        undecided: The part of unknown in cells with a picture that neither holds nor breaks the property.
         poses: First cells whose middle was rendered, evenly spread over the set.
         holding: At how many of them the property holds.
     """
@@ -121,6 +131,7 @@ class Tally:
     certified: int
     falsified: int
     unknown: int
+    undecided: int
     poses: int
     holding: int
 
@@ -154,6 +165,7 @@ class Store:
         resume: bool,
     ) -> None:
         self._base: Any = None
+        self._fresh = not resume
         self._turn = 0
         self._names, self._fixed = [name for name, _ in parameters], fixed
         self.folder, self.file = folder, folder / NAME
@@ -170,9 +182,9 @@ class Store:
             raise
         except _DAMAGE as error:
             self.close()
-            if isinstance(error, sqlite3.DatabaseError) and not resume:
+            if isinstance(error, sqlite3.DatabaseError) and (self._fresh or _passes(error)):
                 raise self._failure(error) from None
-            raise self._damaged(" ".join(str(error).split()) or type(error).__name__) from None
+            raise self._damaged(first_line(error)) from None
         except BaseException:
             self.close()
             raise
@@ -185,12 +197,10 @@ class Store:
 
     def _failure(self, error: sqlite3.Error) -> InputError:
         """What a user is told when the file cannot be read or written."""
-        return InputError(
-            f"cannot be used: {error}",
-            file=self.file,
-            field="--output-dir",
-            fix="make room there and --resume, or choose a folder on another disk; finished cells are kept",
-        )
+        fix = "make room there and --resume, or choose a folder on another disk; finished cells are kept"
+        if "locked" in str(error):
+            fix = "end the program that writes to it and --resume; finished cells are kept"
+        return InputError(f"cannot be used: {error}", file=self.file, field="--output-dir", fix=fix)
 
     @contextmanager
     def told(self) -> Iterator[None]:
@@ -206,25 +216,25 @@ class Store:
 
     def _open_base(self, fingerprint: Mapping[str, Any], parameters: Sequence[tuple[str, str]], resume: bool) -> bool:
         """Open the file; whether it is a new one."""
-        fresh = not (resume and self.file.exists())
+        fresh = self._fresh = not (resume and os.path.lexists(self.file))
         remove_parts(self.folder)
+        images = self.folder / IMAGES
+        # what a link leads to is not locked
+        if images.is_dir() and not images.is_symlink():
+            remove_parts(images)
         if fresh:
             self._remove_images()
             for suffix in ("", "-wal", "-shm"):
                 Path(f"{self.file}{suffix}").unlink(missing_ok=True)
-        self._base = sqlite3.connect(self.file, isolation_level=None)
+            self._create(fingerprint, parameters)
+        elif not stat.S_ISREG(self.file.lstat().st_mode):
+            # a link would lead to a file of others
+            raise self._damaged("it is no regular file")
+        self._base = sqlite3.connect(self.file, timeout=_BUSY, isolation_level=None)
+        self._check(fingerprint)
         # others may read while cells come in, and a kill leaves whole transactions
         self._base.execute("PRAGMA journal_mode=WAL")
         self._base.execute("PRAGMA synchronous=NORMAL")
-        if fresh:
-            with self._transaction():
-                for statement in _SCHEMA.split(";\n"):
-                    self._base.execute(statement)
-                self._put("version", VERSION)
-                self._put("fingerprint", dict(fingerprint))
-                rows = [(k, *names) for k, names in enumerate(parameters)]
-                self._base.executemany("INSERT INTO parameters VALUES (?, ?, ?)", rows)
-        self._check(fingerprint)
         if not fresh:
             self._verify(parameters)
             with self._transaction():
@@ -232,6 +242,25 @@ class Store:
                 self._base.execute("DELETE FROM cells WHERE rowid IN (SELECT value FROM json_each(?))", self._left())
                 self._put("open_rows", [])
         return fresh
+
+    def _create(self, fingerprint: Mapping[str, Any], parameters: Sequence[tuple[str, str]]) -> None:
+        """Write the file without cells, which is seen whole or not at all: a kill may come at any time."""
+        part = self.folder / f".{NAME}.{secrets.token_hex(4)}.part"
+        try:
+            self._base = sqlite3.connect(part, isolation_level=None)
+            self._base.execute("PRAGMA journal_mode=OFF")
+            with self._transaction():
+                for statement in _SCHEMA.split(";\n"):
+                    self._base.execute(statement)
+                self._put("version", VERSION)
+                self._put("fingerprint", dict(fingerprint))
+                rows = [(k, *names) for k, names in enumerate(parameters)]
+                self._base.executemany("INSERT INTO parameters VALUES (?, ?, ?)", rows)
+            self._base.close()
+            os.replace(part, self.file)
+        except BaseException:
+            part.unlink(missing_ok=True)
+            raise
 
     def _left(self) -> tuple[str]:
         """Rows of ``cells`` that stand for open blocks, as a JSON list."""
@@ -246,6 +275,12 @@ class Store:
         (state,) = self._base.execute("PRAGMA quick_check(1)").fetchone()
         if state != "ok":
             raise self._damaged(state)
+        # a trigger would change rows behind the seals
+        with closing(sqlite3.connect(":memory:")) as empty:
+            empty.executescript(_SCHEMA)
+            parts = _parts_of(empty)
+        if _parts_of(self._base) != parts:
+            raise self._damaged("its tables are others")
         known = self._base.execute("SELECT * FROM parameters ORDER BY position").fetchall()
         if known != [(k, *names) for k, names in enumerate(parameters)]:
             raise self._damaged("its parameters are others")
@@ -301,10 +336,14 @@ class Store:
         """
         folder = self.folder / IMAGES
         file, number = folder / f"{name}.npz", 1
-        known = dict(self._base.execute("SELECT name, sha256 FROM search_images"))
+
+        def ours() -> bool:
+            row = self._base.execute("SELECT sha256 FROM search_images WHERE name = ?", (file.name,)).fetchone()
+            return row is not None and row[0] == _digest(file)
+
         try:
             folder.mkdir(exist_ok=True)
-            while file.exists() and known.get(file.name) != _digest(file):
+            while os.path.lexists(file) and not ours():
                 number += 1
                 file = folder / f"{name}_{number}.npz"
             with self._transaction():
@@ -378,7 +417,7 @@ class Store:
                 *(json.dumps(v) for v in (grid.units, grid.coarse, box.lower, box.upper)),
                 str(grid.volume),
             )
-            row = (*row, "0", "0", "0", 0, 0)
+            row = (*row, "0", "0", "0", "0", 0, 0)
             self._base.execute(f"INSERT INTO search_frames VALUES ({', '.join('?' * len(row))})", row)
             self._seals.frames.add(row)
             self._open(frame, 0, grid, ((cells, RANK_FIRST) for cells in blocks))
@@ -425,11 +464,12 @@ class Store:
                 return False
             self._base.execute("DELETE FROM search_blocks WHERE id = ?", (block.number,))
             self._seals.blocks.add(gone, -1)
-            volumes: dict[str, int] = {"certified": 0, "falsified": 0, "unknown": 0}
+            volumes: dict[str, int] = {"certified": 0, "falsified": 0, "unknown": 0, "undecided": 0}
             for leaf in findings.leaves:
                 self._add(block.frame, leaf, grid)
                 volumes[leaf.verdict] += leaf.cell.volume
                 if leaf.verdict == "unknown":
+                    volumes["undecided"] += leaf.cell.volume * leaf.undecided
                     self._base.execute(
                         "INSERT INTO search_reasons VALUES (?, 1) ON CONFLICT(reason) DO UPDATE SET cells = cells + 1",
                         (leaf.reason,),
@@ -438,11 +478,11 @@ class Store:
             self._open(block.frame, block.depth + 1, grid, zip(findings.blocks, ranks, strict=True))
             query = f"SELECT {_FRAME} FROM search_frames WHERE frame = ?"
             row = self._base.execute(query, (block.frame,)).fetchone()
-            sums = [str(int(old) + new) for old, new in zip(row[6:9], volumes.values(), strict=True)]
+            sums = [str(int(old) + new) for old, new in zip(row[6:10], volumes.values(), strict=True)]
             # the first cells alone are evenly spread
             first = list(findings.samples) if block.depth == 0 else []
             self._base.execute(
-                "UPDATE search_frames SET certified = ?, falsified = ?, unknown = ?, poses = poses + ?, "
+                "UPDATE search_frames SET certified = ?, falsified = ?, unknown = ?, undecided = ?, poses = poses + ?, "
                 "holding = holding + ? WHERE frame = ?",
                 (*sums, len(first), sum(holds for _, holds in first), block.frame),
             )
@@ -531,7 +571,8 @@ class Store:
     def tallies(self) -> list[Tally]:
         """The frames that were begun, in order."""
         rows = self._base.execute(
-            "SELECT frame, total, certified, falsified, unknown, poses, holding FROM search_frames ORDER BY frame"
+            "SELECT frame, total, certified, falsified, unknown, undecided, poses, holding FROM search_frames "
+            "ORDER BY frame"
         )
         return [Tally(row[0], *map(int, row[1:])) for row in rows]
 
@@ -553,6 +594,17 @@ class Store:
             if verdict in (None, kind)
         ]
         return sorted(found, key=lambda row: row["lower"])
+
+
+def _parts_of(base: sqlite3.Connection) -> set[tuple[str, str, str]]:
+    """Tables and indices, and what else a database defines."""
+    rows = base.execute("SELECT type, name, sql FROM sqlite_master WHERE sql IS NOT NULL")
+    return {(kind, name, " ".join(text.split())) for kind, name, text in rows}
+
+
+def _passes(error: sqlite3.DatabaseError) -> bool:
+    """Whether the file is whole, but cannot be used now."""
+    return isinstance(error, sqlite3.OperationalError) and any(word in str(error) for word in _PASSING)
 
 
 def _digest(file: Path) -> str | None:

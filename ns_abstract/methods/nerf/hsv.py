@@ -91,7 +91,8 @@ def shifted_bounds(
     width = (last - first + 6.0 * (hue[1] - hue[0]) + 8.0 * HUE_ROUNDING)[:, None]
     start = np.mod(start - 4.0 * HUE_ROUNDING + 3.0, 6.0) - 3.0
     end = start + width
-    far = np.where(end >= 3.0, 3.0, np.maximum(np.abs(start), np.abs(end)))
+    # where a range goes on beyond half a turn, so does its end, and the share is 0
+    far = np.maximum(np.abs(start), np.abs(end))
     near = np.minimum(np.abs(start), np.abs(np.where(end >= 3.0, end - 6.0, end)))
     near = np.where(((start <= 0.0) & (end >= 0.0)) | (end >= 6.0), 0.0, near)
     share_low, share_high = np.clip(2.0 - far, 0.0, 1.0), np.clip(2.0 - near, 0.0, 1.0)

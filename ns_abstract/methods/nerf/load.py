@@ -14,6 +14,7 @@ from typing import Any
 from ns_abstract.io.errors import InputError
 from ns_abstract.io.jsonio import is_number, show
 from ns_abstract.methods import runs
+from ns_abstract.methods.checkpoint import to_float32
 from ns_abstract.methods.nerf.scene import Encoding, FieldWeights, Layer, NerfScene
 
 _FIX = "give a run of vanilla-nerf or abstract-nerf"
@@ -146,8 +147,8 @@ def field_weights(
         for part in ("weight", "bias"):
             if f"{name}.{key}.{part}" not in state:
                 raise InputError("missing", file=file, field=f"{where}.{part}", fix=_FIX)
-        weight = runs.tensor_to_float32(state[f"{name}.{key}.weight"], file, f"{where}.weight")
-        bias = runs.tensor_to_float32(state[f"{name}.{key}.bias"], file, f"{where}.bias")
+        weight = to_float32(state[f"{name}.{key}.weight"], file, f"{where}.weight")
+        bias = to_float32(state[f"{name}.{key}.bias"], file, f"{where}.bias")
         if weight.ndim != 2 or 0 in weight.shape or bias.shape != weight.shape[:1]:
             problem = f"shapes {list(weight.shape)} and {list(bias.shape)} are not those of a linear layer"
             raise InputError(problem, file=file, field=where, fix=_FIX)

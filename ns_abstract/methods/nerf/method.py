@@ -3,23 +3,21 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from ns_abstract.geometry.box import ParameterBox
 from ns_abstract.geometry.poses import PoseSet
 from ns_abstract.io.errors import InputError
 from ns_abstract.methods.nerf.frame import NerfFrame
-from ns_abstract.methods.nerf.load import holds_nerf, load_nerf
-from ns_abstract.methods.nerf.occupancy import VOXEL_BYTES, OccupancyGrid, load_grid
+from ns_abstract.methods.nerf.occupancy import VOXEL_BYTES, OccupancyGrid
 from ns_abstract.methods.nerf.render import Sampling
 from ns_abstract.methods.nerf.scene import NerfScene
-from ns_abstract.methods.representation import ProgramOptions, Representation
-from ns_abstract.methods.runs import RunConfig
 from ns_abstract.perturbation.specification import Perturbation
+from ns_abstract.refine.protocol import Frame
 
 if TYPE_CHECKING:
     import torch
@@ -142,6 +140,14 @@ class NerfMethod:
             raise InputError("depth and accumulation of a NeRF are not bounded", field="--outputs", fix="leave it out")
         return NerfFrame(self.scene, self.sampling, poses, workers=self.workers)
 
+    def easier(self, poses: PoseSet) -> Iterator[tuple[str, NerfFrame]]:
+        """None are known."""
+        return iter(())
+
+    def holders(self, frame: Frame, box: ParameterBox, tile: int, count: int) -> list[tuple[int, float]]:
+        """A field has no elements."""
+        return []
+
     def prepare(self, perturbations: Sequence[Perturbation]) -> None:
         """Refuse what needs Gaussians.
 
@@ -215,19 +221,3 @@ class NerfMethod:
         renderer, pose = NerfRenderer(self.scene, self.sampling), differentiable_pose(poses.geometry)
         count, camera = poses.geometry.box.dimensions, poses.camera
         return lambda values: renderer.picture(camera, pose(values[:count]), color_shift(poses, values.unbind()))
-
-
-def _load(source: RunConfig | Path) -> NerfScene:
-    assert isinstance(source, RunConfig)
-    return load_nerf(source)
-
-
-def _method(scene: NerfScene, options: ProgramOptions, arithmetic: str | None, workers: int) -> NerfMethod:
-    options.refuse(("gsplat_version",), "is for splats, this run is a NeRF")
-    grid = None if options.occupancy_grid is None else load_grid(options.occupancy_grid)
-    return NerfMethod(
-        scene, options.renderer, arithmetic, options.sampling, options.num_samples, options.near_plane, grid, workers
-    )
-
-
-NERF = Representation(lambda source: isinstance(source, RunConfig) and holds_nerf(source), _load, _method, rays=True)

@@ -21,7 +21,7 @@ from ns_abstract.arithmetic.rounding import UNIT64
 from ns_abstract.io.arrays import open_archive
 from ns_abstract.io.atomic import write_atomic
 from ns_abstract.io.errors import InputError
-from ns_abstract.methods.runs import check_memory
+from ns_abstract.io.memory import check_memory
 
 #: Most voxels of a grid.
 _MOST = 1 << 27

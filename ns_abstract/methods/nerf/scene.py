@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ns_abstract.methods.nerf.occupancy import OccupancyGrid
 from ns_abstract.methods.transform import DataparserTransform
+
+if TYPE_CHECKING:
+    from ns_abstract.methods.nerf.occupancy import OccupancyGrid
 
 Float32Array = NDArray[np.float32]
 

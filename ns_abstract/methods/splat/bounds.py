@@ -198,9 +198,6 @@ class SplatBounds:
         colors = self._colors(forms, camera_magnitude, candidates, alive, n)
         mask = tile_mask(wanted, across * down)
         offsets, entries = tile_lists(depth_order(alive, gaussians.depth), gaussians.tiles, mask, across)
-        # the third row of the rotation; its float32 rounding is the same for every Gaussian
-        slope = np.ascontiguousarray(rotation[:, 6:9])
-        slope[m] += self.charges.viewing_axis * rotation_magnitude[6:9]
         pixels = (wanted.size, self.side, self.side, 3)
         found = PixelBounds(
             lower=np.zeros(pixels),
@@ -218,7 +215,7 @@ class SplatBounds:
         pixel_stage(
             TileLists(wanted, offsets, entries),
             gaussians,
-            ViewingAxes(slope, np.ascontiguousarray(rotation[0]), self._tied(forms.origin)),
+            self._viewing_axes(forms, rotation_magnitude, gaussians),
             view,
             Colors(colors, splats.background, self._color_radius, 4 if layers else 3, common),
             self.rules,
@@ -234,6 +231,16 @@ class SplatBounds:
             found.slopes.sum(axis=0) / (max(wanted.size, 1) * self.side**2 * 3),
             found.statistics.sum(axis=0),
         )  # fmt: skip
+
+    def _viewing_axes(
+        self, forms: PoseForms, rotation_magnitude: np.ndarray, gaussians: ProjectedGaussians
+    ) -> ViewingAxes:
+        """What decides the order of ``gaussians``."""
+        rotation = forms.rotation.data
+        # the third row of the rotation; its float32 rounding is the same for every Gaussian
+        slope = np.ascontiguousarray(rotation[:, 6:9])
+        slope[form_shape(forms.rotation.basis).monomials] += self.charges.viewing_axis * rotation_magnitude[6:9]
+        return ViewingAxes(slope, np.ascontiguousarray(rotation[0]), self._tied(forms.origin))
 
     def _depths(
         self, poses: CellPoses, candidates: np.ndarray, alive: np.ndarray, delta: np.ndarray, m: int

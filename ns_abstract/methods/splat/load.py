@@ -18,7 +18,9 @@ import numpy as np
 
 from ns_abstract.io.errors import InputError, visible
 from ns_abstract.io.jsonio import file_size, show
+from ns_abstract.io.memory import check_memory
 from ns_abstract.methods import runs
+from ns_abstract.methods.checkpoint import require_finite, to_float32
 from ns_abstract.methods.splat.scene import DataparserTransform, Float32Array, SplatScene
 
 # nerfstudio/models/splatfacto.py: SplatfactoModel.load_state_dict sets this step.
@@ -104,7 +106,7 @@ def scene_from_parameters(
     """
     found = {key: np.array(parameters[key], np.float32) for key in _PARAMETERS}
     for key, array in found.items():
-        runs.require_finite(array, Path(source), key)
+        require_finite(array, Path(source), key)
     rest = found["features_rest"][:, : (sh_degree + 1) ** 2 - 1]
     arrays = _Arrays(
         means=found["means"],
@@ -218,7 +220,7 @@ def _run_arrays(state: dict[str, Any], file: Path, degree_stored: int, degree: i
         "opacities": (count, 1),
     }
     # Twice: the arrays and one copy while rows are selected.
-    runs.check_memory(2 * 4 * count * (11 + 3 * bands), file, f"the scene of {count} Gaussians")
+    check_memory(2 * 4 * count * (11 + 3 * bands), file, f"the scene of {count} Gaussians")
     arrays = {}
     for name, shape in shapes.items():
         if name == "features_rest" and state[name] is None and bands == 1:
@@ -231,7 +233,7 @@ def _run_arrays(state: dict[str, Any], file: Path, degree_stored: int, degree: i
                 fix += f": pipeline.model.sh_degree {degree_stored} there needs {bands - 1} bands"
             problem = f"shape {_shape(found)}, expected {_shape(shape)}"
             raise InputError(problem, file=file, field=_run_field(name), fix=fix)
-        arrays[name] = runs.tensor_to_float32(state[name], file, _run_field(name)).reshape(shape)
+        arrays[name] = to_float32(state[name], file, _run_field(name)).reshape(shape)
     kept = (degree + 1) ** 2
     first, rest = arrays["features_dc"][:, None, :], arrays["features_rest"][:, : kept - 1, :]
     return _Arrays(
@@ -361,7 +363,7 @@ def _columns(vertex: Any, names: tuple[str, ...], path: Path) -> Float32Array:
     for i, name in enumerate(names):
         with np.errstate(over="ignore", under="ignore", invalid="ignore"):
             array[:, i] = vertex[name]
-        runs.require_finite(array[:, i], path, f"vertex.{name}")
+        require_finite(array[:, i], path, f"vertex.{name}")
     return array
 
 
@@ -395,7 +397,7 @@ def _check_ply(path: Path) -> tuple[_PlyElement, int]:
     if vertex is None or vertex.count < 1:
         raise InputError("no Gaussians", file=path, field="element vertex", fix=_PLY_FIX)
     bands = _vertex_bands(vertex, path)
-    runs.check_memory(2 * 4 * vertex.count * (11 + 3 * bands), path, f"the scene of {vertex.count} Gaussians")
+    check_memory(2 * 4 * vertex.count * (11 + 3 * bands), path, f"the scene of {vertex.count} Gaussians")
     return vertex, bands
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -11,6 +11,7 @@ import numpy as np
 
 from ns_abstract.arithmetic.rounding import Arithmetic
 from ns_abstract.arithmetic.rounding import arithmetic as arithmetic_named
+from ns_abstract.geometry.box import ParameterBox
 from ns_abstract.geometry.poses import COLOR_SHIFTS, PoseSet
 from ns_abstract.io.errors import InputError
 from ns_abstract.methods.representation import ProgramOptions, Representation
@@ -23,6 +24,7 @@ from ns_abstract.methods.splat.scene import SplatScene
 from ns_abstract.methods.splat.variations import VariedSplats, vary
 from ns_abstract.perturbation.specification import Perturbation
 from ns_abstract.perturbation.variations import SceneVariation
+from ns_abstract.refine.protocol import Frame
 
 if TYPE_CHECKING:
     import torch
@@ -33,6 +35,8 @@ if TYPE_CHECKING:
 _BYTES_BY_GAUSSIAN = 1200
 #: The same of the ranges of a varied scene and of the member that is rendered.
 _BYTES_BY_VARIED = 400
+#: Sets of scenes at hand.
+_KEPT = 8
 
 
 class SplatMethod:
@@ -99,6 +103,19 @@ class SplatMethod:
             reference=self._slow,
         )  # fmt: skip
 
+    def easier(self, poses: PoseSet) -> Iterator[tuple[str, SplatFrame]]:
+        """See `Method.easier`."""
+        from ns_abstract.methods.splat.causes import easier
+
+        return easier(self.scene, self.rasteriser, self.arithmetic, poses, self.varied(poses.perturbation.scene))
+
+    def holders(self, frame: Frame, box: ParameterBox, tile: int, count: int) -> list[tuple[int, float]]:
+        """See `Method.holders`."""
+        from ns_abstract.methods.splat.causes import holders
+
+        assert isinstance(frame, SplatFrame)
+        return holders(frame, box, tile, count)
+
     def prepare(self, perturbations: Sequence[Perturbation]) -> None:
         """Find the Gaussians that vary.
 
@@ -115,6 +132,8 @@ class SplatMethod:
     def varied(self, variations: tuple[SceneVariation, ...]) -> VariedSplats:
         """The scenes of a set."""
         if variations not in self._varied:
+            while len(self._varied) >= _KEPT:
+                self._varied.pop(next(iter(self._varied)))
             self._varied[variations] = vary(self.scene, self.splats, variations)
         return self._varied[variations]
 

@@ -377,26 +377,3 @@ def project(
 ) -> Projection:
     """What gsplat's projection and tile stages say about a scene; see `Reference.project`."""
     return Reference(scene, rasteriser).project(camera, camera_to_world)
-
-
-def reference_image(
-    scene: SplatScene,
-    camera: Camera,
-    camera_to_world: Tensor,
-    *,
-    rasteriser: Rasteriser = GSPLAT_1_4_0,
-    pixels: Tensor | None = None,
-) -> Tensor:
-    """The picture of ``scene``, float64 in [0, 1]: [H, W, 3], or [k, 3] for ``pixels`` [k, 2] (row, column).
-
-    Args:
-        scene: The stored parameters.
-        camera: Intrinsics and size; its own pose is not used.
-        camera_to_world: [3, 4], OpenGL axes; gradients flow back to it.
-        rasteriser: The rules.
-        pixels: Which pixels to compute; all if None.
-    """
-    reference = Reference(scene, rasteriser)
-    if pixels is None:
-        return reference.image(camera, camera_to_world)
-    return reference.pixels(camera, camera_to_world, pixels)

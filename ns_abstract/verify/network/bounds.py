@@ -1,8 +1,9 @@
-"""Bounds of a network's outputs over sets of images (docs/design.md, N, N0, N1, N2, N6, N12)."""
+"""Bounds of a network's outputs over sets of images (docs/design.md, N, N0, N1, N2, N6, N12, N13, N14)."""
 
 from __future__ import annotations
 
 import functools
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Literal, NamedTuple
 
@@ -13,10 +14,13 @@ from torch import Tensor
 
 from ns_abstract.execution.ending import checkpoint
 from ns_abstract.verify.network.graph import Network, NetworkArithmetic
-from ns_abstract.verify.network.layers import Activation, LeakyRelu, Linear, Scale, Sum
+from ns_abstract.verify.network.layers import Activation, Convolution, LeakyRelu, Linear, Matrix, Scale, Sum
+from ns_abstract.verify.network.maps import TransposedConvolution
 from ns_abstract.verify.network.maxima import Candidates, MaxPool, upper_planes
 from ns_abstract.verify.network.products import Product
 from ns_abstract.verify.network.rows import Rows, charge, concretize, full, grid, join, pass_activation, pass_maximum
+from ns_abstract.verify.network.schedule import Schedule, on_threads
+from ns_abstract.verify.network.slopes import Ascent, Chosen, OpenUnits, derivatives
 
 Float64 = NDArray[np.float64]
 Int64 = NDArray[np.int64]
@@ -110,6 +114,7 @@ def bound_outputs(
     substitution: Substitution = "everywhere",
     memory: int = 1 << 30,
     arithmetic: NetworkArithmetic = "float32",
+    slope_steps: int = 0,
 ) -> OutputBounds:
     """Lower bounds of ``rows @ network(x) + offset`` over every image set.
 
@@ -122,6 +127,8 @@ def bound_outputs(
             ("everywhere"), only in the result ("end"), or not at all ("box").
         memory: Bytes to stay within, roughly; cells and rows are worked on in parts.
         arithmetic: Whether the bounds hold for every float32 evaluation and the exact network, or for that alone.
+        slope_steps: Steps towards the best slopes below open ReLUs, for every row of its own (N14); a bound never
+            is worse for them, and each takes as long as two passes of the rows.
     """
     offset = np.asarray(offset, np.float64)
     if images.a_lower.shape[1] != network.input_size:
@@ -134,7 +141,7 @@ def bound_outputs(
     step = max(1, int(0.5 * memory) // by_cell)
     parts = []
     for first in range(0, images.count, step):
-        cells = _Cells(network, images[first : first + step], substitution, memory, arithmetic)
+        cells = _Cells(network, images[first : first + step], substitution, memory, arithmetic, slope_steps)
         parts.append(cells.outputs(rows, offset))
     if not parts:
         d = images.dimensions
@@ -151,6 +158,11 @@ class _Interval(NamedTuple):
     @property
     def size(self) -> Tensor:
         return torch.maximum(self.lower.abs(), self.upper.abs())
+
+    @property
+    def spread(self) -> Tensor:
+        """What they are above and below zero, together."""
+        return self.upper.clamp(min=0.0) - self.lower.clamp(max=0.0)
 
 
 @dataclass
@@ -203,11 +215,16 @@ class _Cells:
         substitution: Substitution,
         memory: int,
         arithmetic: NetworkArithmetic = "float32",
+        slope_steps: int = 0,
     ) -> None:
         self.network = network
+        self.slope_steps = slope_steps
+        #: units whose lower lines may have other slopes
+        self.open: dict[int, OpenUnits] = {}
         self.count, self.d = images.count, images.dimensions
         self.memory = memory
         self.single = arithmetic == "float32"
+        self.schedule = Schedule(network)
         self.good = np.ones(self.count, bool)
         self.flush = np.zeros(self.count)
         fields = self._fields(images)
@@ -307,9 +324,8 @@ class _Cells:
                 # what is known better of the input is also known to its other readers
                 source = node.inputs[0]
                 open_ = node.layer.open(*inputs[0].interval)
-                decides = isinstance(node.layer, LeakyRelu)
-                forms[source] = inputs[0] = self._tighten(source, inputs[0], open_, decides)
-                if decides:
+                forms[source] = inputs[0] = self._known_better(source, inputs[0], open_, node.layer)
+                if isinstance(node.layer, LeakyRelu):
                     self.unsure = float(node.layer.open(*inputs[0].interval).double().mean())
                 forms.append(self._activate(k, source, node.layer, inputs[0]))
                 if self.network.depth[source] > 1:
@@ -317,7 +333,7 @@ class _Cells:
             elif isinstance(node.layer, Product):
                 open_ = node.layer.open(inputs[0].interval, inputs[1].interval)
                 for position, source in enumerate(node.inputs):
-                    forms[source] = inputs[position] = self._tighten(source, inputs[position], open_)
+                    forms[source] = inputs[position] = self._known_better(source, inputs[position], open_)
                 forms.append(self._multiply(k, node.inputs, node.layer, inputs[0], inputs[1]))
             elif isinstance(node.layer, MaxPool):
                 forms.append(self._maximum(k, node.inputs[0], node.layer, inputs[0]))
@@ -342,7 +358,8 @@ class _Cells:
         own = (layer.terms + len(inputs) + 8) * 2.0**-52
         radii, sizes = [], []
         for f in inputs:
-            size = torch.maximum(f.interval.size, f.reference.abs())
+            # at least what an input may be on one side of zero and on the other together
+            size = torch.maximum(f.interval.spread, f.reference.abs())
             sizes.append(size)
             radii.append(torch.cat([f.r + own * (f.c.abs() + f.a.abs().sum(1)), f.width, size]))
         radius, width, size = layer.magnitude(radii).reshape(3, m, *layer.shape) * (1.0 + 2.0**-28)
@@ -357,7 +374,7 @@ class _Cells:
         elif self.single:
             count = self._roundings(sources, layer, inputs)
             self.terms[k] = count
-            moves = moves + _gamma(count + _FOLDING) * size + layer.spare(sizes)
+            moves = moves + self._rounding(sources, layer, inputs, count, size) + layer.spare(sizes)
         rows = _gamma(layer.row_terms + _SPARE + max(self.network.readers[i] for i in sources))
         noise = (moves + rows * width) * (1.0 + 2.0**-40)
         form = _Form.ranged(reference, moved[:, 0], moved[:, 1:], radius + moves, active)
@@ -374,6 +391,30 @@ class _Cells:
                     self.folded.add(source)
         self.noise[k] = noise * (1.0 + 2.0**-40)
         return self._within(form, form.lower, form.upper)
+
+    def _rounding(
+        self, sources: tuple[int, ...], layer: Linear, inputs: list[_Form], count: Tensor | int, size: Tensor
+    ) -> Tensor:
+        """What a float32 evaluation of a layer may be off, [m, *shape], for ``size`` = |W| |x| + |bias| (N2)."""
+        few = _gamma(_FOLDING + 3 + len(inputs)) * size
+        if isinstance(layer, Scale):
+            # sums before it may start with the offset
+            first = torch.zeros(()) if layer.bias is None else layer.bias.abs()
+            return _gamma(count) * first * (1.0 + _gamma(count + _FOLDING)) + few
+        if isinstance(layer, Sum):
+            # the sum of one input may start with the others
+            charges = []
+            for i, f in zip(sources, inputs, strict=True):
+                others = size - f.interval.size * (1.0 - 2.0**-40)
+                own = torch.as_tensor(self.terms.get(i, 0), dtype=torch.float64)
+                charges.append(_gamma(own) * others * (1.0 + _gamma(own + _FOLDING)))
+            return few + (torch.maximum(*charges) if len(charges) == 2 else sum(charges))
+        if not isinstance(layer, (Convolution, Matrix, TransposedConvolution)):
+            return _gamma(count + _FOLDING) * size
+        # partial sums are no larger than the positive products together, or the negative ones
+        balance = layer([f.interval.upper.clamp(min=0.0) + f.interval.lower.clamp(max=0.0) for f in inputs])
+        peak = 0.5 * (size + balance.abs()) * (1.0 + 2.0**-40)
+        return _gamma(count) * (peak + _gamma(count + _FOLDING + 1) * size) + few
 
     def _roundings(self, sources: tuple[int, ...], layer: Linear, inputs: list[_Form]) -> Tensor | int:
         """Roundings that a layer's sums may suffer; what is added behind sums may be added within them (N2)."""
@@ -430,6 +471,10 @@ class _Cells:
             stored += [_outward(offset + base + side * give, side), _outward(other + base - side * give, -side)]
         if fold:
             self.folded.add(source)
+        if self.slope_steps and isinstance(layer, LeakyRelu):
+            loose = unit * z.width + (self.noise[source] if fold else 0.0)
+            given = (lower, upper, z.reference, reference, loose, room + torch.zeros_like(lower))
+            self.open[k] = _open_units(layer, given)
         self.lines[k] = torch.stack(stored).reshape(6, self.count, *grid(layer.shape)).numpy()
         lost = int(np.prod(layer.shape)) * 2 * _FLUSH
         self.flush += lost * z.width.reshape(self.count, -1).amax(1).numpy()
@@ -576,6 +621,8 @@ class _Cells:
         # (window, number, number)
         window, number = rivals().nonzero()
         pairs = np.stack([window, winner[window], number], 1)
+        if self.schedule.deep and not self.schedule.takes(len(pairs) * self.schedule.costs.row(source)):
+            return apart
         if len(pairs) > _SOME:
             first = np.arange(0, len(pairs), len(pairs) // _SOME)
             if self._differences(source, layer, where.numpy(), known, pairs[first], apart) < _CLOSES * len(first):
@@ -628,7 +675,13 @@ class _Cells:
         found = zip((slopes, offsets, form.lower, form.upper), sizes, strict=True)
         return _Planes(*(t.reshape(size).contiguous().numpy() for t, size in found))
 
-    def _tighten(self, index: int, form: _Form, open_: Tensor, decides: bool = False) -> _Form:
+    def _known_better(self, index: int, form: _Form, open_: Tensor, layer: Activation | None = None) -> _Form:
+        """The form of node ``index`` with better bounds of what is open before an activation or a product (None)."""
+        if self.schedule.deep:
+            return self._renew(index, form, open_, layer)
+        return self._tighten(index, form, open_, isinstance(layer, LeakyRelu))
+
+    def _tighten(self, index: int, form: _Form, open_: Tensor, decides: bool) -> _Form:
         """Better bounds of the numbers of node ``index`` that are open; a sign may be all that is asked (N6)."""
         if self.network.depth[index] < 2:
             return form
@@ -653,18 +706,68 @@ class _Cells:
                 return found
             form, open_ = found, open_ & ~first
             where = open_.nonzero().numpy()
-        cell, flat = where[:, 0], np.ravel_multi_index(tuple(where[:, 1:].T), shape)
+        return self._bounded(index, form, where, decides, decides)
+
+    def _renew(self, index: int, form: _Form, open_: Tensor, layer: Activation | None) -> _Form:
+        """Better bounds of a deep network's node, within the work allowed; of closed numbers, too (N13).
+
+        Rows for numbers that are open are all that the lines ask for. But forms forget what neighbours share: behind
+        two or three layers they leave nearly everything open. Where they leave much open, rows bound all numbers
+        that matter further on, so that forms start again from there.
+        """
+        shape = grid(self.network.shape(index))
+        open_ = open_.reshape(self.count, *shape) & torch.from_numpy(self.good).reshape(-1, 1, 1, 1)
+        count = int(open_.sum())
+        if self.network.depth[index] < 2 or not count:
+            return form
+        decides = isinstance(layer, LeakyRelu)
+        where, early = open_, decides
+        if self.schedule.renews(count / open_.numel()):
+            early = False
+            where = torch.from_numpy(self.good).reshape(-1, 1, 1, 1) & torch.ones_like(open_)
+            if isinstance(layer, LeakyRelu) and layer.alpha == 0.0:
+                # what is certainly cut off is exact behind the layer
+                where &= form.interval.upper.reshape(open_.shape) > 0.0
+        chosen = where.nonzero().numpy()
+        cost = self.schedule.costs.row(index)
+        if len(chosen) * cost > self.schedule.left:
+            chosen, early = open_.nonzero().numpy(), decides
+        if not self.schedule.takes(len(chosen) * cost):
+            return form
+        if len(chosen) >= _MANY:
+            # some first, of the open ones: where they gain nothing, the others are not worth their rows
+            some = open_.nonzero().numpy()
+            some = some[:: max(1, len(some) // _SOME)]
+            found = self._bounded(index, form, some, False, decides)
+            at = tuple(torch.from_numpy(some.T))
+            widths = [(f.upper - f.lower).reshape(open_.shape)[at] for f in (form, found)]
+            lower, upper = (v.reshape(open_.shape)[at] for v in found.interval)
+            form = found
+            if self.schedule.hopeless(
+                float((widths[1] / widths[0]).median()),
+                float(((lower < 0.0) & (upper > 0.0)).double().mean()) if decides else 0.0,
+            ):
+                return form
+        return self._bounded(index, form, chosen, early, decides)
+
+    def _bounded(self, index: int, form: _Form, where: Int64, early: bool, decides: bool) -> _Form:
+        """The form with bounds by rows of the numbers ``where`` [R, (cell, channel, row, column)] of node ``index``.
+
+        ``early``: rows end where a sign is found out; ``decides``: the other side is not asked for then.
+        """
+        item = self.network.shape(index)
+        cell, flat = where[:, 0], np.ravel_multi_index(tuple(where[:, 1:].T), grid(item))
         at = torch.from_numpy(cell), torch.from_numpy(flat)
         # the likelier side first; what it decides needs no other
         reference = form.reference.flatten(1)[at].numpy()
         sign = np.where(reference + form.c.flatten(1)[at].numpy() >= 0.0, 1.0, -1.0)
-        found = self._one_hot(index, where, sign, -sign * reference if decides else None)
+        found = self._one_hot(index, where, sign, -sign * reference if early else None)
         found.turn(sign < 0.0)
         lower, upper = form.lower.flatten(1).clone(), form.upper.flatten(1).clone()
         low = np.maximum(lower[at].numpy(), found.lower) + reference
         high = np.minimum(upper[at].numpy(), found.upper) + reference
         left = np.flatnonzero((low < 0.0) & (high > 0.0)) if decides else np.arange(len(where))
-        need = sign[left] * reference[left] if decides else None
+        need = sign[left] * reference[left] if early else None
         again = self._one_hot(index, where[left], -sign[left], need)
         again.turn(sign[left] > 0.0)
         found.meet(left, again, sign[left] < 0.0)
@@ -695,12 +798,20 @@ class _Cells:
         channels = grid(self.network.shape(index))[0]
         found = _Reached.unknown(len(where), self.d)
         step = max(1, _ROWS_AT_ONCE // (16 * channels))
-        for first in range(0, len(where), step):
+        threads = torch.get_num_threads() if self.schedule.deep else 1
+        if threads > 1:
+            # as many rows as stay together to the image
+            step = min(step, max(16, -(-len(where) // (4 * threads))))
+
+        def bound(first: int) -> tuple[Int64, _Reached]:
             number = np.arange(first, min(len(where), first + step))
             cell, channel, y, x = (np.ascontiguousarray(v) for v in where[number].T)
             value = np.zeros((len(cell), channels, 1, 1), np.float32)
             value[np.arange(len(cell)), channel, 0, 0] = sign[number]
-            found.put(number, self._backward(index, Rows(value, y, x), cell, None if need is None else need[number]))
+            return number, self._backward(index, Rows(value, y, x), cell, None if need is None else need[number])
+
+        for number, part in on_threads(bound, range(0, len(where), step), threads):
+            found.put(number, part)
         return found
 
     def _backward(self, index: int, rows: Rows, cell: Int64, need: Float64 | None = None) -> _Reached:
@@ -734,8 +845,14 @@ class _Cells:
                     return
             here = batch.waiting.pop(at)
             node = self.network.nodes[at - 1]
+            if batch.chosen is not None and not isinstance(node.layer, Linear):
+                here = full(here, node.layer.shape, force=True)
+                batch.chosen.keep(at, here.value, batch.number, len(found.lower))
             if isinstance(node.layer, Activation):
-                pass_activation(here.value, here.y, here.x, batch.cell, self.lines[at], batch.total)
+                lines, which = self.lines[at], batch.cell
+                if batch.chosen is not None and at in batch.chosen.lines:
+                    lines, which = batch.chosen.lines[at], batch.number
+                pass_activation(here.value, here.y, here.x, which, lines, batch.total)
                 parts = [here]
             elif isinstance(node.layer, MaxPool):
                 parts = [self.maxima[at].backward(here, node.layer, batch)]
@@ -754,6 +871,9 @@ class _Cells:
                 known = batch.waiting.get(source)
                 shape = self.network.shape(source)
                 batch.waiting[source] = full(part, shape) if known is None else join(known, part, shape)
+        if batch.chosen is not None and 0 in batch.waiting:
+            whole = full(batch.waiting[0], self.network.input_shape, force=True)
+            batch.chosen.keep(0, whole.value, batch.number, len(found.lower))
         self._bound_rows(0, batch, self.image, found)
 
     def _bound_rows(self, at: int, batch: _Batch, planes: _Planes, found: _Reached) -> None:
@@ -769,6 +889,57 @@ class _Cells:
         plane[:, :, -1] += lost
         box += lost
         found.improve(batch.number, plane, box)
+
+    def _climb(self, index: int, rows: Rows, cell: Int64) -> _Reached:
+        """Bounds below of rows on node ``index``, with the best slopes that were tried (N14)."""
+        if not self.slope_steps:
+            return self._backward(index, rows, cell)
+        start = Rows(rows.value.copy(), rows.y, rows.x)
+        best = self._backward(index, rows, cell)
+        for k in np.unique(cell):
+            units = {at: opened.of(k) for at, opened in self.open.items()}
+            units = {at: opened for at, opened in units.items() if len(opened.flat)}
+            own = np.flatnonzero(cell == k)
+            if not units or not self.good[k]:
+                continue
+            first = {at: self.lines[at][0, k].reshape(-1)[opened.flat] for at, opened in units.items()}
+            ascent = Ascent(units, first, len(own))
+            for _ in range(self.slope_steps + 1):
+                chosen = ascent.lines(self.lines, k)
+                found = _Reached.unknown(len(own), self.d)
+                # rows are changed in place
+                part = Rows(start.value[own], start.y[own], start.x[own])
+                total, number = np.zeros((len(own), 2)), np.arange(len(own))
+                self._descend(index, index, _Batch({index: part}, cell[own], total, number, chosen), found, None)
+                better = found.lower > best.lower[own]
+                best.lower[own[better]], best.plane[own[better]] = found.lower[better], found.plane[better]
+                ascent.climb(self._derivatives(k, chosen, found, units))
+        return best
+
+    def _derivatives(
+        self, cell: int, chosen: Chosen, found: _Reached, units: Mapping[int, OpenUnits]
+    ) -> dict[int, Float64]:
+        """How the bounds of a cell's rows change with slopes."""
+        planes = self.image
+        rows = chosen.trace.get(0)
+        if rows is None:
+            return {k: np.zeros((len(found.lower), len(v.flat))) for k, v in units.items()}
+        p = -np.sign(np.nan_to_num(found.plane[:, 0, :-1]))
+        ends = np.einsum("schwd,rd->srchw", planes.slopes[cell], p) + planes.offsets[cell][:, None]
+        image = np.where(rows >= 0.0, ends[0], ends[1]).astype(np.float32)
+        others: dict[int, Any] = {}
+        for k, (one, two) in self.products.items():
+            others[k] = functools.partial(_product, torch.from_numpy(one[:, cell]), torch.from_numpy(two[:, cell]))
+        for k, maxima in self.maxima.items():
+            layer = self.network.nodes[k - 1].layer
+            assert isinstance(layer, MaxPool)
+            others[k] = functools.partial(maxima.forward, layer, cell)
+
+        def lines(k: int) -> np.ndarray:
+            return chosen.lines[k] if k in chosen.lines else self.lines[k][:, cell : cell + 1]
+
+        shaped = torch.from_numpy(image).reshape(-1, *self.network.input_shape)
+        return derivatives(self.network, shaped, chosen.trace, lines, units, others)
 
     def outputs(self, rows: Any, offset: Float64) -> OutputBounds:
         """Bounds of ``rows @ y + offset`` in every cell."""
@@ -790,7 +961,7 @@ class _Cells:
                 which = np.arange(first, min(m * len(number), first + step))
                 cell, row = which // len(number), number[which % len(number)]
                 rows = Rows(np.ascontiguousarray(part[row]), np.full(len(which), top), np.full(len(which), left))
-                found = self._backward(index, rows, cell)
+                found = self._climb(index, rows, cell)
                 plane[cell, row], lower[cell, row] = found.plane[:, 0], found.lower
         room = 2.0**-48 * (np.abs(plane).sum(-1) + np.abs(offset) + missing) + missing
         lower, b = lower + offset - room, plane[..., -1] + offset - room
@@ -800,6 +971,22 @@ class _Cells:
         return OutputBounds(
             np.where(known, lower, -np.inf), np.where(usable[..., None], a, 0.0), np.where(usable, b, -np.inf)
         )
+
+
+def _open_units(layer: LeakyRelu, given: tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]) -> OpenUnits:
+    """The units [m, *shape] of a ReLU that are open, with what `OpenUnits` holds of them."""
+    where = layer.open(given[0], given[1]).flatten(1).nonzero()
+    at = where[:, 0], where[:, 1]
+    lower, upper, reference, image, loose, room = (v.flatten(1)[at].numpy() for v in given)
+    cell, flat = (v.numpy() for v in at)
+    return OpenUnits(cell, flat, lower, upper, reference, image, loose, room, layer.alpha)
+
+
+def _product(one: Tensor, two: Tensor, rows: Tensor, inputs: list[Tensor]) -> Tensor:
+    """The planes that ``rows`` take of a product's factors."""
+    x, y = (v.reshape(rows.shape) for v in inputs)
+    offset = torch.where(rows >= 0.0, one[1] + two[1], one[4] + two[4])
+    return one[0] * x + two[0] * y + offset
 
 
 def _windows(rows: np.ndarray) -> list[tuple[int, int, int, int, Int64]]:
@@ -844,6 +1031,19 @@ class _Maxima(NamedTuple):
     slopes: np.ndarray
     offsets: np.ndarray
 
+    def forward(self, layer: MaxPool, cell: int, rows: Tensor, inputs: list[Tensor]) -> Tensor:
+        """The planes that ``rows`` [R, C, H, W] take, of inputs [R, C, H', W'] of one cell."""
+        taps = layer.taps(inputs[0], 0.0)
+        winner = torch.from_numpy(self.winner[cell].astype(np.int64)).flatten(1)[None, :, None]
+        value = taps.gather(2, winner.expand(len(taps), -1, -1, -1))[:, :, 0]
+        offsets = torch.from_numpy(self.offsets[:, cell]).flatten(2)
+        which = torch.from_numpy(self.which[cell].astype(np.int64)).flatten(1)
+        a = rows.flatten(2)
+        if len(self.slopes):
+            slopes = torch.from_numpy(self.slopes)[which.clamp(min=0)].movedim(2, 1)
+            value = torch.where((a >= 0.0) | (which < 0), value, (taps * slopes).sum(2))
+        return value + torch.where(a >= 0.0, offsets[0], offsets[2])
+
     def backward(self, rows: Rows, layer: MaxPool, batch: _Batch) -> Rows:
         """Rows on the input; what they gather on the way goes to the batch."""
         height, width = rows.value.shape[2:]
@@ -863,16 +1063,18 @@ class _Batch:
         cell: [R] of every row.
         total: [R, 2] what rows gathered so far, at least and at most.
         number: [R] positions in the result.
+        chosen: Lines of rows' own, and a place for what rows are on the way.
     """
 
     waiting: dict[int, Rows]
     cell: Int64
     total: Float64
     number: Int64
+    chosen: Chosen | None = None
 
-    def __getitem__(self, chosen: Any) -> _Batch:
-        waiting = {k: rows[chosen] for k, rows in self.waiting.items()}
-        return _Batch(waiting, self.cell[chosen], self.total[chosen], self.number[chosen])
+    def __getitem__(self, part: Any) -> _Batch:
+        waiting = {k: rows[part] for k, rows in self.waiting.items()}
+        return _Batch(waiting, self.cell[part], self.total[part], self.number[part], self.chosen)
 
     @property
     def bytes(self) -> int:

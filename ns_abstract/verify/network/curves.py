@@ -9,6 +9,7 @@ The slope is that of the concave (or convex) envelope at the middle, where a lin
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import ClassVar, NamedTuple
 
@@ -17,6 +18,8 @@ from torch import Tensor
 
 from ns_abstract.verify.network.layers import Activation, Lines
 
+#: Intervals worked on at a time.
+_TOGETHER = 1 << 13
 #: Even parts of an interval where a function bends.
 _PARTS = 16
 #: Steps towards the best slope; any slope is sound.
@@ -124,30 +127,82 @@ class Curve(Activation):
         least = self.least_input
         return (lower, upper) if least == -math.inf else (lower.clamp(min=least), upper.clamp(min=least))
 
+    def straight(self, z: Tensor) -> Tensor:
+        """The slope at ``z`` of a function without curved parts."""
+        raise AssertionError
+
+    #: The greatest slope of a function without curved parts.
+    steepest: ClassVar[float] = 1.0
+
     def lines(self, lower: Tensor, upper: Tensor) -> Lines:
+        return self._by_parts(self._lines, lower, upper)
+
+    def band(self, lower: Tensor, upper: Tensor) -> Lines:
+        return self._by_parts(self._band, lower, upper)
+
+    def range(self, lower: Tensor, upper: Tensor) -> tuple[Tensor, Tensor]:
+        level = self._by_parts(self._level, lower, upper)
+        return level.lower_offset, level.upper_offset
+
+    def _by_parts(self, work: Callable[[Tensor, Tensor], Lines], lower: Tensor, upper: Tensor) -> Lines:
+        """Lines of many intervals: as many at a time as a processor's cache holds, straight parts by themselves."""
+        low, high = lower.reshape(-1), upper.reshape(-1)
+        if any(self.bends):
+            parts = [work(*ends) for ends in zip(low.split(_TOGETHER), high.split(_TOGETHER), strict=True)]
+            found = [torch.cat(v) for v in zip(*(_fields(part) for part in parts), strict=True)]
+            return Lines(*(v.reshape(lower.shape) for v in found))
+        middle = 0.5 * (low + high)
+        slope, value = self.straight(middle), self.function(middle)
+        # a stored kink is off by a rounding
+        room = _OWN * (value.abs() + self.steepest * _size(low, high) + _OWN)
+        if work == self._level:
+            ends = self.function(low), self.function(high)
+            room = room + _OWN * _size(*ends)
+            found = [torch.zeros_like(low), torch.minimum(*ends) - room, slope, torch.maximum(*ends) + room]
+        else:
+            offset = value - slope * middle
+            found = [slope, offset - room, slope.clone(), offset + room]
+        kinked = torch.zeros_like(low, dtype=torch.bool)
+        for point in self.breaks:
+            kinked |= (low < point) & (high > point)
+        at = kinked.nonzero()[:, 0]
+        for part in at.split(_TOGETHER):
+            for whole, own in zip(found, _fields(work(low[part], high[part])), strict=True):
+                whole[part] = own
+        return Lines(*(v.reshape(lower.shape) for v in found))
+
+    def _lines(self, lower: Tensor, upper: Tensor) -> Lines:
         cuts = self._cuts(*self._inside(lower, upper))
         below, above = self._tangent(cuts, -1.0), self._tangent(cuts, 1.0)
         return Lines(below, self._extreme(cuts, below, -1.0), above, self._extreme(cuts, above, 1.0))
 
-    def band(self, lower: Tensor, upper: Tensor) -> Lines:
+    def _band(self, lower: Tensor, upper: Tensor) -> Lines:
         cuts = self._cuts(*self._inside(lower, upper))
         width = cuts.z[-1] - cuts.z[0]
         slope = torch.where(width > 0.0, (cuts.value[-1] - cuts.value[0]) / width, torch.zeros_like(width))
         slope = torch.where(torch.isfinite(slope), slope, torch.zeros_like(slope))
         return Lines(slope, self._extreme(cuts, slope, -1.0), slope, self._extreme(cuts, slope, 1.0))
 
-    def range(self, lower: Tensor, upper: Tensor) -> tuple[Tensor, Tensor]:
+    def _level(self, lower: Tensor, upper: Tensor) -> Lines:
+        """Lines without a slope."""
         cuts = self._cuts(*self._inside(lower, upper))
         flat = torch.zeros_like(lower)
-        return self._extreme(cuts, flat, -1.0), self._extreme(cuts, flat, 1.0)
+        return Lines(flat, self._extreme(cuts, flat, -1.0), flat, self._extreme(cuts, flat, 1.0))
 
     def open(self, lower: Tensor, upper: Tensor) -> Tensor:
         band = self.band(lower, upper)
-        return ~(band.upper_offset - band.lower_offset <= _APART * (upper - lower))
+        width = upper - lower
+        # rounding alone keeps the lines of a point apart
+        wide = ~(width <= 2.0**-36 * _size(lower, upper))
+        return wide & ~(band.upper_offset - band.lower_offset <= _APART * width)
 
 
 class Assumed(Curve):
     """A curve whose float32 evaluation uses a library's exponential, logarithm or error function."""
+
+
+def _fields(lines: Lines) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    return lines.lower_slope, lines.lower_offset, lines.upper_slope, lines.upper_offset
 
 
 def _size(lower: Tensor, upper: Tensor) -> Tensor:
@@ -167,6 +222,10 @@ class Clip(Curve):
     offset: float = 0.0
 
     @property
+    def steepest(self) -> float:  # type: ignore[override]
+        return self.factor
+
+    @property
     def breaks(self) -> tuple[float, ...]:
         return (self.least - self.offset) / self.factor, (self.most - self.offset) / self.factor
 
@@ -176,6 +235,10 @@ class Clip(Curve):
 
     def function(self, z: Tensor) -> Tensor:
         return (self.factor * z + self.offset).clamp(self.least, self.most)
+
+    def straight(self, z: Tensor) -> Tensor:
+        low, high = self.breaks
+        return torch.where((z >= low) & (z <= high), torch.full_like(z, self.factor), torch.zeros_like(z))
 
     def error(self, lower: Tensor, upper: Tensor) -> Tensor | float:
         if (self.factor, self.offset) == (1.0, 0.0):
@@ -198,6 +261,9 @@ class Abs(Curve):
 
     def function(self, z: Tensor) -> Tensor:
         return z.abs()
+
+    def straight(self, z: Tensor) -> Tensor:
+        return torch.where(z >= 0.0, torch.ones_like(z), -torch.ones_like(z))
 
 
 # ---------------------------------------------------------------- algebraic

@@ -16,11 +16,10 @@ from typing import Any
 
 import numpy as np
 import torch
-from torch import Tensor
 
 from ns_abstract.io.errors import InputError
 from ns_abstract.io.jsonio import file_size, show
-from ns_abstract.methods.runs import check_memory
+from ns_abstract.io.memory import check_memory
 from ns_abstract.verify.network import curves
 from ns_abstract.verify.network.compose import Composer, interpolation
 from ns_abstract.verify.network.graph import Network, item
@@ -188,14 +187,18 @@ class _Reader:
             if stored not in weights:
                 raise InputError(f"input {stored!r} ({kind}) is not stored", file=path, fix=_FIX)
             self.constants[content["arg"]["name"]] = weights[stored]
-        results = [spec for spec in module["signature"]["output_specs"] if "user_output" in spec]
-        if len(images) != 1 or len(results) != 1 or len(module["signature"]["output_specs"]) != 1:
+        results = [spec["user_output"]["arg"] for spec in module["signature"]["output_specs"] if "user_output" in spec]
+        if len(images) != 1 or not results or len(results) != len(module["signature"]["output_specs"]):
             raise InputError(
                 f"has {len(images)} inputs and {len(results)} outputs",
                 file=path,
-                fix="one image and one output expected",
+                fix="one image and outputs that are tensors expected",
             )
-        self.image, self.output = images[0], results[0]["user_output"]["arg"]["as_tensor"]["name"]
+        if not all("as_tensor" in result for result in results):
+            raise InputError("has outputs that are no tensors", file=path, fix="return tensors alone")
+        self.image = images[0]
+        #: all outputs, bounded one after another
+        self.outputs = [str(result["as_tensor"]["name"]) for result in results]
         sizes = [size.get("as_int", 0) for size in self.graph["tensor_values"][self.image]["sizes"]]
         if len(sizes) < 2 or min(sizes[1:]) < 1:
             raise InputError(f"input has sizes {sizes}", file=path, fix="only the batch may be free")
@@ -254,10 +257,16 @@ class _Reader:
                 if isinstance(value, _Index):
                     self.builder.name(value.number, output, target)
                 self.values[output] = value
-        result = self.values.get(self.output)
-        if not isinstance(result, _Index):
-            raise InputError("output does not depend on the image", file=self.path)
-        return self.builder.network(result.number)
+        found = []
+        for name in self.outputs:
+            result = self.values.get(name)
+            if not isinstance(result, _Index):
+                raise InputError(f"output {name} does not depend on the image", file=self.path)
+            found.append(result.number)
+        if len(found) > 1:
+            flat = [self.builder.reshape(k, (math.prod(self.builder.shape(k)),)) for k in found]
+            found = [self.builder.concat(flat, 0)]
+        return self.builder.network(found[0])
 
     def _forget_changed(self, target: str, node: dict[str, Any]) -> None:
         """What an operator changes in place, or may share memory with that, is not to be read again."""
@@ -300,9 +309,7 @@ class _Reader:
                 found = getattr(getattr(torch.ops.aten, operator), overload)(*positional, **named)
                 names = _outputs(node)
                 values.update(zip(names, found if len(names) > 1 else [found], strict=True))
-        result = values[self.output]
-        assert isinstance(result, Tensor)
-        return result[:1].numpy()
+        return np.concatenate([values[name][0].reshape(-1).numpy() for name in self.outputs])
 
 
 def _output(node: dict[str, Any]) -> str:
@@ -426,6 +433,24 @@ def _sum(sign: int) -> Rule:
         return _Index(r.builder.scale(x, first * np.ones(()), constant * (sign if name == "self" else 1)))
 
     return rule
+
+
+def _expand(r: _Reader, a: _Arguments) -> _Index:
+    x, sizes = a.image("self"), [int(v) for v in a.get("size")]
+    a.ignore("implicit")
+    shape = r.builder.shape(x)
+    if len(sizes) != 1 + len(shape) or sizes[0] not in (-1, 1, r.batch):
+        raise InputError(f"argument size = {sizes} of an item {item(shape)}", fix="keep the batch and the axes")
+    whole = tuple(n if size == -1 else size for n, size in zip(shape, sizes[1:], strict=True))
+    if any(n not in (1, size) for n, size in zip(shape, whole, strict=True)):
+        raise InputError(f"argument size = {sizes} of an item {item(shape)}", fix="only axes of 1 are repeated")
+    return _Index(r.builder.spread(x, whole))
+
+
+def _log_sigmoid(b: Composer, x: int, a: _Arguments) -> int:
+    # log sigmoid z = -softplus(-z)
+    minus = -np.ones(())
+    return b.scale(b.curve(b.scale(x, minus, None), curves.Softplus), minus, None)
 
 
 def _rsub(r: _Reader, a: _Arguments) -> _Index:
@@ -764,9 +789,21 @@ def _batch_size(r: _Reader, a: _Arguments) -> int:
 
 
 _VIEWS = frozenset(
-    ("alias", "chunk", "contiguous", "dropout", "feature_dropout", "flatten", "permute", "reshape", "select", "slice")
+    (
+        "alias",
+        "chunk",
+        "contiguous",
+        "dropout",
+        "expand",
+        "feature_dropout",
+        "flatten",
+        "permute",
+        "reshape",
+        "select",
+        "slice",
+    )
 )
-_VIEWS |= {"split", "split_with_sizes", "squeeze", "transpose", "unbind", "unsqueeze", "view"}
+_VIEWS |= {"expand", "split", "split_with_sizes", "squeeze", "transpose", "unbind", "unsqueeze", "view"}
 _RULES: dict[str, Rule] = {
     "_weight_norm.default": _weight_norm,
     "abs.default": _curve(curves.Abs),
@@ -791,6 +828,7 @@ _RULES: dict[str, Rule] = {
     "elu.default": _unary(_elu),
     "erf.default": _curve(curves.Erf),
     "exp.default": _curve(curves.Exp),
+    "expand.default": _expand,
     "feature_dropout.default": _dropout,
     "flatten.using_ints": _flatten,
     "flip.default": _flip,
@@ -807,6 +845,7 @@ _RULES: dict[str, Rule] = {
     "leaky_relu_.default": _unary(lambda b, x, a: b.prelu(x, np.asarray(_number(a, "negative_slope", 0.01)))),
     "linear.default": _linear,
     "log.default": _unary(lambda b, x, a: b.logarithm(x)),
+    "log_sigmoid.default": _unary(_log_sigmoid),
     "log_softmax.int": _softmax(True),
     "matmul.default": _matmul,
     "max_pool2d.default": _max_pool,

@@ -163,7 +163,25 @@ class Convolution(Linear):
     def magnitude(self, inputs: Sequence[Tensor]) -> Tensor:
         return self._convolve(inputs[0], self.weight.abs())
 
+    @cached_property
+    def _trims(self) -> bool:
+        """Whether a transposed convolution of whole maps is to be cut by the first pads on both sides."""
+        (top, left, _, _), (kh, kw) = self.pads, self.weight.shape[2:]
+        (_, height, width), (_, high, wide) = self.input_shapes[0], self.shape
+        spread = high + (kh - 1) * self.dilation[0], wide + (kw - 1) * self.dilation[1]
+        return self.stride == (1, 1) and spread == (height + 2 * top, width + 2 * left)
+
     def backward(self, rows: Rows) -> list[Rows]:
+        if self._trims and rows.covers(self.shape):
+            # nothing outside of the map is computed
+            whole = functional.conv_transpose2d(
+                torch.from_numpy(rows.value),
+                self._single,
+                padding=(self.pads[0], self.pads[1]),
+                groups=self.groups,
+                dilation=self.dilation,
+            )
+            return [Rows.whole(whole.numpy())]
         value = self._transposed(torch.from_numpy(rows.value)).numpy()
         y, x = rows.y * self.stride[0] - self.pads[0], rows.x * self.stride[1] - self.pads[1]
         return [full(Rows(value, y, x), self.input_shapes[0])]

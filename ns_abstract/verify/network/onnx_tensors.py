@@ -11,7 +11,7 @@ from onnx import numpy_helper
 
 from ns_abstract.io.errors import InputError
 from ns_abstract.io.jsonio import file_size, show
-from ns_abstract.methods.runs import check_memory
+from ns_abstract.io.memory import check_memory
 
 #: Numbers that one stored tensor may have.
 _LARGEST = 1 << 28

@@ -61,6 +61,7 @@ class Rows:
 
 def join(one: Rows, two: Rows, shape: tuple[int, ...]) -> Rows:
     """Sum of two sets of rows on a node of ``shape``."""
+    one, two = full(one, shape), full(two, shape)
     if one.covers(shape) or two.covers(shape):
         one, two = full(one, shape, force=True), full(two, shape, force=True)
         one.value += two.value
@@ -104,7 +105,7 @@ def unflatten(rows: Rows, shape: tuple[int, ...], before: tuple[int, ...]) -> Ro
     return Rows.whole(whole.value.reshape(whole.value.shape[0], *grid(before)))
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", nogil=True)
 def _place(value, y, x, target):
     """Copy windows to where they lie in ``target`` [R, C, H, W]."""
     count, channels, h, w = value.shape
@@ -117,7 +118,7 @@ def _place(value, y, x, target):
                     target[r, c, y[r] + i, x[r] + j] = value[r, c, i, j]
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", nogil=True)
 def _scale(value, y, x, factor):
     count, channels, h, w = value.shape
     H, W = factor.shape[1:]
@@ -129,7 +130,37 @@ def _scale(value, y, x, factor):
                     value[r, c, i, j] *= factor[c, Y, X] if 0 <= Y < H and 0 <= X < W else np.float32(0.0)
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", nogil=True, inline="always")
+def _one(rows, at, line, here, plane):
+    """Pass one number; returns what it adds below and above."""
+    a = rows[at]
+    # signs are as good as random: a branch would be guessed wrong half of the time
+    k = here + 3 * plane * np.int64(a < 0.0)
+    b = np.float64(a)
+    rows[at] = a * line[k]
+    return b * np.float64(line[k + plane]), b * np.float64(line[k + 2 * plane])
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def _pass_whole(rows, at, line, here, size, plane, total):
+    """A row that covers its map, in four sums at a time: one alone waits for every addition."""
+    l0, l1, l2, l3 = 0.0, 0.0, 0.0, 0.0
+    m0, m1, m2, m3 = 0.0, 0.0, 0.0, 0.0
+    for j in range(0, size - 3, 4):
+        p0, q0 = _one(rows, at + j, line, here + j, plane)
+        p1, q1 = _one(rows, at + j + 1, line, here + j + 1, plane)
+        p2, q2 = _one(rows, at + j + 2, line, here + j + 2, plane)
+        p3, q3 = _one(rows, at + j + 3, line, here + j + 3, plane)
+        l0, l1, l2, l3 = l0 + p0, l1 + p1, l2 + p2, l3 + p3
+        m0, m1, m2, m3 = m0 + q0, m1 + q1, m2 + q2, m3 + q3
+    for j in range(size - size % 4, size):
+        p0, q0 = _one(rows, at + j, line, here + j, plane)
+        l0, m0 = l0 + p0, m0 + q0
+    total[0] += (l0 + l1) + (l2 + l3)
+    total[1] += (m0 + m1) + (m2 + m3)
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
 def pass_activation(value, y, x, cell, lines, total):
     """Rows [R, C, h, w] on an activation's output become rows on its input, in place (N4).
 
@@ -145,6 +176,10 @@ def pass_activation(value, y, x, cell, lines, total):
     rows, line = pointer(value), pointer(lines)
     for r in range(count):
         top, left = y[r], x[r]
+        if top == 0 and left == 0 and h == H and w == W:
+            size = channels * H * W
+            _pass_whole(rows, r * size, line, cell[r] * size, size, plane, total[r])
+            continue
         first, past = min(w, max(0, -left)), max(0, min(w, W - left))
         least, most = 0.0, 0.0
         for c in range(channels):
@@ -171,7 +206,7 @@ def pass_activation(value, y, x, cell, lines, total):
         total[r, 1] += most
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", nogil=True)
 def pass_maximum(value, y, x, cell, winner, which, slopes, offsets, steps, stride, total, target):
     """Rows [R, C, h, w] on maxima of windows become rows ``target`` on the numbers of the windows (N12).
 
@@ -184,38 +219,40 @@ def pass_maximum(value, y, x, cell, winner, which, slopes, offsets, steps, strid
         target: [R, C, h', w'], zero.
     """
     count, channels, h, w = value.shape
-    H, W = winner.shape[2:]
+    m, (H, W) = winner.shape[0], winner.shape[2:]
+    high, wide = target.shape[2:]
+    plane, taps = m * channels * H * W, steps.shape[0]
+    rows, found, line = pointer(value), pointer(target), pointer(offsets)
+    first, chosen, slope = pointer(winner), pointer(which), pointer(slopes)
+    ahead = steps[:, 0] * wide + steps[:, 1]
     for r in range(count):
-        k = cell[r]
         least, most = 0.0, 0.0
         for c in range(channels):
             for i in range(max(0, -y[r]), min(h, H - y[r])):
+                at = ((r * channels + c) * h + i) * w
+                here = ((cell[r] * channels + c) * H + y[r] + i) * W + x[r]
+                there = ((r * channels + c) * high + i * stride[0]) * wide
                 for j in range(max(0, -x[r]), min(w, W - x[r])):
-                    a = value[r, c, i, j]
+                    a = rows[at + j]
                     if a == 0.0:
                         continue
-                    Y, X = y[r] + i, x[r] + j
-                    b = np.float64(a)
-                    number = which[k, c, Y, X]
-                    if a > 0.0:
-                        least += b * np.float64(offsets[0, k, c, Y, X])
-                        most += b * np.float64(offsets[1, k, c, Y, X])
-                    else:
-                        least += b * np.float64(offsets[2, k, c, Y, X])
-                        most += b * np.float64(offsets[3, k, c, Y, X])
+                    b, k = np.float64(a), here + j + 2 * plane * np.int64(a < 0.0)
+                    least += b * np.float64(line[k])
+                    most += b * np.float64(line[k + plane])
+                    number = np.int64(chosen[here + j])
+                    to = there + j * stride[1]
                     if a > 0.0 or number < 0:
-                        t = winner[k, c, Y, X]
-                        target[r, c, i * stride[0] + steps[t, 0], j * stride[1] + steps[t, 1]] += a
-                    else:
-                        for t in range(steps.shape[0]):
-                            s = slopes[number, t]
-                            if s != 0.0:
-                                target[r, c, i * stride[0] + steps[t, 0], j * stride[1] + steps[t, 1]] += a * s
+                        found[to + ahead[first[here + j]]] += a
+                        continue
+                    for t in range(taps):
+                        s = slope[number * taps + t]
+                        if s != 0.0:
+                            found[to + ahead[t]] += a * s
         total[r, 0] += least
         total[r, 1] += most
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", nogil=True)
 def charge(value, y, x, cell, noise, total):
     """Charge rows on a linear layer's output with its rounding and their own, ``noise`` [m, C, H, W] (N2)."""
     count, channels, h, w = value.shape
@@ -243,7 +280,7 @@ def charge(value, y, x, cell, noise, total):
         total[r, 1] += shaken
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", nogil=True)
 def concretize(value, y, x, cell, slopes, offsets, lower, upper, total, plane, box):
     """Bounds of rows on a node of which planes and intervals are known (N5).
 

@@ -9,17 +9,21 @@ from __future__ import annotations
 
 import itertools
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 import torch
 
+from ns_abstract.arithmetic.outward import outward
+from ns_abstract.arithmetic.rounding import arithmetic as arithmetic_of
 from ns_abstract.geometry.box import Float64Array, ParameterBox
 from ns_abstract.geometry.camera_path import load_camera_path
 from ns_abstract.geometry.poses import PoseSet
+from ns_abstract.geometry.tiles import assemble
 from ns_abstract.methods.splat.activate import Splats, activate
+from ns_abstract.methods.splat.bounds import SplatBounds
 from ns_abstract.methods.splat.constants import GSPLAT_1_4_0, Rasteriser
 from ns_abstract.methods.splat.descent import pushed
 from ns_abstract.methods.splat.load import load_scene
@@ -28,7 +32,6 @@ from ns_abstract.methods.splat.render import Renderer
 from ns_abstract.methods.splat.scene import SplatScene
 from ns_abstract.methods.splat.variations import VariedSplats, vary
 from ns_abstract.perturbation.specification import parse_perturbation
-from ns_abstract.verify.attack.soundness import bound_cells, equal_cells
 
 #: Parameter values [d] and a member of the set to a picture [H, W, 3].
 Show = Callable[[Float64Array, Splats], np.ndarray]
@@ -161,6 +164,39 @@ def _target(
     flat = order[number // 4 % usable] if number % 4 < 2 else order[generator.integers(usable)]
     row, column, channel = (int(v) for v in np.unravel_index(flat, lower.shape))
     return row, column, channel, sign
+
+
+def equal_cells(box: ParameterBox, parts: int | Sequence[int]) -> list[ParameterBox]:
+    """The box cut into equal cells: ``parts`` along the first parameter, or one number per parameter."""
+    counts = [parts] if isinstance(parts, int) else list(parts)
+    cells = [box]
+    for axis, count in enumerate(counts[: box.dimensions]):
+        cells = [piece for cell in cells for piece in cell.split(axis, count)]
+    return cells
+
+
+def bound_cells(
+    scene: SplatScene,
+    pose_set: PoseSet,
+    cells: Sequence[ParameterBox],
+    *,
+    rasteriser: Rasteriser = GSPLAT_1_4_0,
+    arithmetic: str = "real",
+    order: int = 1,
+    varied: VariedSplats | None = None,
+) -> tuple[list[tuple[np.ndarray, np.ndarray]], np.ndarray]:
+    """float32 bounds [H, W, 3] (lower, upper) of every cell, and the summed statistics of the bounds.
+
+    The bounds hold for every scene of ``varied``, if given.
+    """
+    bounds = SplatBounds(activate(scene, rasteriser), rasteriser, arithmetic_of(arithmetic), varied)
+    camera = pose_set.camera
+    out, statistics = [], np.zeros(5, np.int64)
+    for cell in cells:
+        result = bounds.cell(camera, pose_set.enclosure(cell, order))
+        out.append(outward(assemble(result.lower, camera), assemble(result.upper, camera)))
+        statistics += result.statistics
+    return out, statistics
 
 
 def check_varied(

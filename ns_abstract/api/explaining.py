@@ -1,0 +1,139 @@
+"""Why bounds are loose: what would make them tighter, where, and which scene elements hold most of it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from ns_abstract.api.job import Job
+from ns_abstract.geometry.box import ParameterBox
+from ns_abstract.refine.protocol import Frame
+from ns_abstract.refine.result import FrameResult, Leaves
+
+#: Leaves looked at, poses rendered in each, regions and scene elements told.
+_LEAVES, _POSES, _REGIONS, _ELEMENTS = 24, 12, 3, 5
+#: What to do about a cause, by its name.
+_ADVICE = {
+    "rounding of float32": "--arithmetic real bounds the real-number picture, where that is what is asked for",
+    "the order of depth": "time, a smaller set of rotations, or fewer Gaussians at nearly the same depth",
+    "the stop where little light is left": "time, or fewer nearly opaque Gaussians behind one another",
+    "the alpha threshold and tiles": "time; --gsplat-version 1.5.3 and later have no tiles to miss",
+    "colours that depend on the view": "a smaller set, or a run with a lower sh_degree",
+    "variations of the scene": "smaller ranges in the perturbation file",
+}
+_REST = "motion over a cell, and what is loose only together"
+
+
+@dataclass(frozen=True)
+class Explanation:
+    """Why a frame's bounds are wider than what was rendered.
+
+    Attributes:
+        index: Number of the frame.
+        gap, excess: Mean over pixels of the bounds' width, and what of it no render reached.
+        leaves: Leaf cells (one tile each) that were bounded again.
+        causes: Part of these leaves' excess that goes away without each, taken one at a time.
+        regions: Share of the excess, first and past row, first and past column, of the tiles that hold most.
+        elements: Number of a scene element, and the part of the widest leaf's gap that goes away without it.
+    """
+
+    index: int
+    gap: float
+    excess: float
+    leaves: int
+    causes: dict[str, float]
+    regions: tuple[tuple[float, int, int, int, int], ...]
+    elements: tuple[tuple[int, float], ...]
+
+    @property
+    def rest(self) -> float:
+        """What no single cause explains."""
+        return max(0.0, 1.0 - sum(self.causes.values()))
+
+    def lines(self) -> Iterator[str]:
+        """It in words."""
+        yield f"frame {self.index}: mean gap {self.gap:.4f}, of which renders did not reach {self.excess:.4f}"
+        if not self.leaves:
+            yield "  nothing to explain"
+            return
+        yield f"  of that in {self.leaves} leaf cells looked at, taken one at a time:"
+        for name, share in sorted(self.causes.items(), key=lambda item: -item[1]):
+            advice = f" ({_ADVICE[name]})" if share >= 0.1 and name in _ADVICE else ""
+            yield f"  {share:6.1%}  {name}{advice}"
+        yield f"  {self.rest:6.1%}  {_REST} (time, or a smaller set)"
+        for share, top, bottom, left, right in self.regions:
+            yield f"  {share:6.1%}  lies in rows {top} to {bottom - 1}, columns {left} to {right - 1}"
+        for number, share in self.elements:
+            yield f"  {share:6.1%}  of the gap of the widest leaf goes away without Gaussian {number}"
+
+
+def explain(job: Job, index: int, result: FrameResult, seed: int = 0) -> Explanation:
+    """Bound some of a frame's leaf cells again, each time with one difficulty less.
+
+    Args:
+        job: The scene with its sets.
+        index: Number of the frame.
+        result: What was found, with its leaves.
+        seed: Of the leaves that are looked at.
+    """
+    leaves, frame = result.leaves, job.frame(index)
+    over = np.asarray(result.upper, np.float64) - result.lower
+    over -= np.asarray(result.witness_upper, np.float64) - result.witness_lower
+    tiles = [_mean(frame, over, tile) for tile in range(frame.tile_count)]
+    excess, gap = float(over.mean()), float((result.upper.astype(np.float64) - result.lower).mean())
+    total = sum(tiles)
+    if leaves is None or not leaves.tile.size or not total > 0.0:
+        return Explanation(index, gap, excess, 0, {}, (), ())
+    chosen = _chosen(frame, leaves, np.array(tiles), np.random.default_rng(seed))
+    now = [_excess(frame, box, tile, seed) for box, tile in chosen]
+    causes = {}
+    for name, other in job.method.easier(frame.pose_set):
+        left = sum(_excess(other, box, tile, seed) for box, tile in chosen)
+        causes[name] = float(min(1.0, max(0.0, 1.0 - left / max(sum(now), 1e-300))))
+    most = np.argsort(tiles)[::-1][:_REGIONS]
+    regions = tuple((tiles[k] / total, *_extent(frame, int(k))) for k in most if tiles[k] > 0.0)
+    box, tile = chosen[int(np.argmax(now))]
+    bounds = frame.bound(box, np.array([tile]))
+    width = float((bounds.upper - bounds.lower).mean())
+    elements = tuple(
+        (number, gain / width) for number, gain in job.method.holders(frame, box, tile, _ELEMENTS) if width > 0.0
+    )
+    return Explanation(index, gap, excess, len(chosen), causes, regions, elements)
+
+
+def _extent(frame: Frame, tile: int) -> tuple[int, int, int, int]:
+    """First and past row, first and past column of a tile's pixels in the picture."""
+    row, column = (frame.side * n for n in divmod(tile, frame.across))
+    return row, min(row + frame.side, frame.camera.height), column, min(column + frame.side, frame.camera.width)
+
+
+def _mean(frame: Frame, values: np.ndarray, tile: int) -> float:
+    """Sum over a tile's pixels."""
+    top, bottom, left, right = _extent(frame, tile)
+    return float(values[top:bottom, left:right].sum())
+
+
+def _chosen(
+    frame: Frame, leaves: Leaves, excess: np.ndarray, rng: np.random.Generator
+) -> list[tuple[ParameterBox, int]]:
+    """Leaves of tiles drawn by their ``excess``, all where there are few."""
+    numbers = leaves.tile[:, 0] // frame.side * frame.across + leaves.tile[:, 1] // frame.side
+    weights = np.maximum(excess[numbers], 0.0)
+    weights = weights / np.bincount(numbers, minlength=excess.size)[numbers]
+    count = min(_LEAVES, int((weights > 0.0).sum()))
+    names, units = frame.box.names, frame.box.units
+    return [
+        (ParameterBox(names, units, tuple(leaves.box_lower[k]), tuple(leaves.box_upper[k])), int(numbers[k]))
+        for k in rng.choice(weights.size, count, replace=False, p=weights / weights.sum())
+    ]
+
+
+def _excess(frame: Frame, box: ParameterBox, tile: int, seed: int) -> float:
+    """Mean gap of a tile over a cell beyond what renders of some of its poses reach."""
+    tiles = np.array([tile])
+    bounds = frame.bound(box, tiles)
+    poses = [box.middle, *box.corners()[:_POSES], *box.sample(_POSES, np.random.default_rng(seed))]
+    seen = np.stack([frame.render(values, tiles) for values in poses])
+    return float((bounds.upper - bounds.lower).mean() - (seen.max(axis=0) - seen.min(axis=0)).mean())

@@ -1,0 +1,138 @@
+"""A network in the loop: certified fraction against time, tubes against the hull of many runs, and attacks on tubes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from ns_abstract.api.reaching import LoopJob, ReachCell, ReachProgress, ReachResult, open_loop, reach, widths
+from ns_abstract.api.scenes import Scene
+from ns_abstract.geometry.box import ParameterBox
+from ns_abstract.reach.search import QUESTIONS, Run, first_outside, pushes, simulate
+from ns_abstract.reach.tubes import Dependence, Tube
+
+#: What tubes keep, by how a table calls it.
+_MODES: dict[Dependence, str] = {"kept": "kept", "step": "within a step", "none": "none"}
+
+
+class LoopTables(NamedTuple):
+    """Rows of a benchmark.
+
+    Attributes:
+        search: One row: certified fraction by time, the part of random runs that go well, states compared with tubes.
+        steps: A row by step: mean widths of a certified cell's tubes, and of the hull of runs from it.
+    """
+
+    search: list[dict[str, Any]]
+    steps: list[dict[str, Any]]
+
+
+def measure(
+    scene: Scene,
+    loop: Path,
+    seconds: float,
+    workers: int,
+    runs: int,
+    marks: Sequence[float],
+    seed: int = 0,
+    said: Callable[[str], object] = lambda text: None,
+) -> LoopTables:
+    """Search a loop, then attack its certified cells and compare one of them with simulated runs.
+
+    Args:
+        scene, loop: What is searched.
+        seconds, workers: Time and processes.
+        runs: Random runs from the whole initial box, each compared with the tube of its cell; and as many from one
+            cell.
+        marks: Seconds at which the certified fraction is told.
+        seed: Decides every random choice.
+        said: Told what is done next.
+    """
+    points: list[ReachProgress] = []
+    said(f"searching for {seconds:g} s")
+    found = reach(scene, loop, time_budget=seconds, workers=workers, on_progress=points.append)
+    job, rng = open_loop(scene, loop), np.random.default_rng(seed)
+    question = QUESTIONS[job.questions[-1]]
+    cells = [cell for cell in found.cells if cell.question == question]
+    row: dict[str, Any] = {"question": question, "seconds": found.seconds}
+    for mark in marks:
+        reached = [getattr(point, question) for point in points if point.seconds <= mark]
+        row[f"at {mark:g} s"] = getattr(found, question) if found.seconds <= mark else reached[-1] if reached else 0.0
+    said(f"{runs} runs from the whole box")
+    row |= _attack(job, found, cells, runs, rng)
+    certified = [cell for cell in cells if cell.verdict == "certified"]
+    if not certified:
+        return LoopTables([row], [])
+    middle = sorted(certified, key=lambda cell: float(np.prod(cell.upper - cell.lower)))[len(certified) // 2]
+    said(f"{runs} runs from one cell")
+    steps, outside = _by_step(job, _box(job, middle), runs, rng)
+    row["violations"] += outside
+    row["states compared"] += runs * (job.loop.steps + 1)
+    return LoopTables([row], steps)
+
+
+def _box(job: LoopJob, cell: ReachCell) -> ParameterBox:
+    box = job.loop.box
+    return ParameterBox(box.names, box.units, tuple(cell.lower.tolist()), tuple(cell.upper.tolist()))
+
+
+def _runs(job: LoopJob, box: ParameterBox, count: int, rng: np.random.Generator) -> Iterator[tuple[np.ndarray, Run]]:
+    """Random starts and their runs, with disturbances at an end throughout and anywhere by turns."""
+    reacher = job.search.reacher
+    for number, start in enumerate(box.sample(count, rng)):
+        push = pushes(job.loop, rng, "ends" if number % 2 else "random")
+        yield start, simulate(reacher, job.loop.state(box, start), push)
+
+
+def _attack(
+    job: LoopJob, found: ReachResult, cells: Sequence[ReachCell], count: int, rng: np.random.Generator
+) -> dict[str, Any]:
+    """Random runs: how many go well, and whether all stay inside the tube of their cell."""
+    question = QUESTIONS[job.questions[-1]]
+    low, high = np.stack([cell.lower for cell in cells]), np.stack([cell.upper for cell in cells])
+    by_cell: dict[int, list[Run]] = {}
+    well = 0
+    for start, run in _runs(job, job.loop.box, count, rng):
+        by_cell.setdefault(int(np.argmax(((low <= start) & (start <= high)).all(axis=1))), []).append(run)
+        well += run.margin(job.loop, question) > 0.0
+    compared = outside = wrong = 0
+    for number, runs in by_cell.items():
+        tube = job.search.reacher.tube(_box(job, cells[number]))
+        for run in runs:
+            outside += first_outside(tube, run) is not None
+            compared += len(tube.sets)
+            wrong += cells[number].verdict == "certified" and not run.margin(job.loop, question) > 0.0
+    certified = getattr(found, question)
+    return {
+        "certified": certified,
+        "falsified": found.falsified,
+        "went well": well / count,
+        "certified / went well": certified * count / well if well else float("nan"),
+        "cells": len(cells),
+        "runs": count,
+        "states compared": compared,
+        "violations": outside + wrong,
+    }
+
+
+def _by_step(job: LoopJob, box: ParameterBox, count: int, rng: np.random.Generator) -> tuple[list[dict[str, Any]], int]:
+    """Widths by step of tubes that keep more or less, against the hull of runs; and runs that leave a tube."""
+    tubes: dict[str, Tube] = {name: job.reacher(mode).tube(box, whole=True) for mode, name in _MODES.items()}
+    corners = [
+        simulate(job.search.reacher, job.loop.state(box, c), pushes(job.loop, rng, "ends")) for c in box.corners()
+    ]
+    runs = [*corners, *(run for _, run in _runs(job, box, count - len(corners), rng))]
+    outside = sum(first_outside(tube, run) is not None for tube in tubes.values() for run in runs)
+    states = np.stack([run.states for run in runs])
+    hull = (states.max(axis=0) - states.min(axis=0)).mean(axis=1)
+    rows = []
+    for step, width in enumerate(hull):
+        row = {"step": step, "simulated": float(width)}
+        for name, tube in tubes.items():
+            found = widths(tube)
+            row[name] = found[step] if step < len(found) else float("inf")
+        rows.append(row | {"kept / simulated": row["kept"] / float(width)})
+    return rows, outside

@@ -1,0 +1,373 @@
+"""Read checkpoints that ``torch.save`` wrote, without torch and without running code in them.
+
+The format is torch's (``torch/serialization.py``): an uncompressed zip archive with one pickle of the structure and
+one member by storage. Of the pickle's instructions only those are followed that structures of tensors need, and of the
+names in it only those of `_NAMES`, each of which stands for a function of this file.
+"""
+
+from __future__ import annotations
+
+import io
+import math
+import mmap
+import pickle
+import pickletools
+import struct
+import zipfile
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ns_abstract.io.errors import InputError, first_line
+from ns_abstract.io.jsonio import file_size, show
+from ns_abstract.io.memory import check_memory
+
+PICKLE_BYTES_LIMIT = 16 * 2**20
+ARCHIVE_MEMBERS_LIMIT = 100_000
+
+RECOPY = "copy the checkpoint again from the run"
+_PICKLE_MODULES = {"torch", "collections", "numpy", "_codecs"}
+_INSTRUCTIONS = frozenset(
+    """PROTO FRAME STOP MARK POP POP_MARK NONE NEWTRUE NEWFALSE BININT BININT1 BININT2 LONG1 BINFLOAT BINUNICODE
+    SHORT_BINUNICODE BINSTRING SHORT_BINSTRING BINBYTES SHORT_BINBYTES EMPTY_DICT EMPTY_LIST EMPTY_TUPLE EMPTY_SET
+    TUPLE TUPLE1 TUPLE2 TUPLE3 SETITEM SETITEMS APPEND APPENDS ADDITEMS BINPUT LONG_BINPUT BINGET LONG_BINGET MEMOIZE
+    GLOBAL REDUCE BUILD BINPERSID""".split()  # noqa: SIM905
+)
+#: By torch's name of a storage: numpy's type of its bytes, and torch's name of its values' type.
+_STORAGES = {
+    "FloatStorage": ("<f4", "float32"),
+    "DoubleStorage": ("<f8", "float64"),
+    "HalfStorage": ("<f2", "float16"),
+    "BFloat16Storage": ("<u2", "bfloat16"),
+    "LongStorage": ("<i8", "int64"),
+    "IntStorage": ("<i4", "int32"),
+    "ShortStorage": ("<i2", "int16"),
+    "CharStorage": ("i1", "int8"),
+    "ByteStorage": ("u1", "uint8"),
+    "BoolStorage": ("u1", "bool"),
+    "ComplexFloatStorage": ("<c8", "complex64"),
+    "ComplexDoubleStorage": ("<c16", "complex128"),
+    "QInt8Storage": ("i1", "quantized"),
+    "QUInt8Storage": ("u1", "quantized"),
+    "QInt32Storage": ("<i4", "quantized"),
+}
+_FLOATS = ("float16", "bfloat16", "float32", "float64")
+
+
+@dataclass(frozen=True)
+class StoredTensor:
+    """A tensor as a checkpoint describes it; nothing of it is read or allocated.
+
+    Attributes:
+        kind: torch's name of its type ("float32"), or what it is where it is not dense ("sparse").
+        shape: Its shape.
+        strides: In elements.
+        offset: Of its first element in ``storage``, in elements.
+        storage: The values of the file that it is a view of; None where it is not dense.
+    """
+
+    kind: str
+    shape: tuple[int, ...]
+    strides: tuple[int, ...] = ()
+    offset: int = 0
+    storage: NDArray[Any] | None = None
+
+    def float32(self, file: Path, field: str) -> NDArray[np.float32]:
+        """Its values, copied out of the file.
+
+        Args:
+            file: The checkpoint, for messages.
+            field: Its name, for messages.
+
+        Raises:
+            InputError: Not a dense tensor of float16, bfloat16, float32 or float64, or a value is not finite in
+                float32.
+        """
+        if self.kind not in _FLOATS or self.storage is None:
+            fix = "save it as a dense float32 tensor"
+            raise InputError(f"{self.kind} tensor", file=file, field=field, fix=fix)
+        # Strides of 0 let a small file claim any size.
+        if math.prod(self.shape) > self.storage.size:
+            raise InputError("claims more values than the file holds", file=file, field=field, fix=RECOPY)
+        strides = [stride * self.storage.itemsize for stride in self.strides]
+        view = np.lib.stride_tricks.as_strided(self.storage[self.offset :], self.shape, strides, writeable=False)
+        if self.kind == "bfloat16":
+            array = (view.astype(np.uint32) << np.uint32(16)).view(np.float32)
+        else:
+            with np.errstate(over="ignore"):
+                array = np.array(view, np.float32, order="C")
+        require_finite(array, file, field)
+        return array
+
+
+def to_float32(value: Any, file: Path, field: str) -> NDArray[np.float32]:
+    """`StoredTensor.float32` of what a checkpoint holds under ``field``; arrays of float32 are checked alone.
+
+    Raises:
+        InputError: Also where that is neither.
+    """
+    if isinstance(value, np.ndarray) and value.dtype == np.float32:
+        require_finite(value, file, field)
+        return value
+    if not isinstance(value, StoredTensor):
+        raise InputError(f"found {show(value)}, not a tensor", file=file, field=field, fix=RECOPY)
+    return value.float32(file, field)
+
+
+def require_finite(array: NDArray[np.float32], file: Path, field: str) -> None:
+    """Raise InputError that names the first row and the count of values that are NaN or infinite."""
+    bad = ~np.isfinite(array)
+    if bad.any():
+        rows = np.flatnonzero(bad.reshape(array.shape[0], -1).any(axis=1)) if array.ndim else np.zeros(1, int)
+        raise InputError(
+            f"{int(bad.sum())} values are not finite in float32, the first in row {int(rows[0])}",
+            file=file,
+            field=field,
+            fix="remove these rows or train again",
+        )
+
+
+def read_checkpoint(path: Path) -> Any:
+    """What ``torch.save`` was given: mappings, lists and plain values with `StoredTensor` in them.
+
+    Checksums of all members are compared first. What else torch and numpy put there (random states, devices) is None.
+
+    Raises:
+        InputError: The file is damaged, or asks for other Python objects.
+    """
+    size = file_size(path, "checkpoint")
+    check_memory(size, path, "the checkpoint")
+    try:
+        with path.open("rb") as stream:
+            if stream.read(4) != b"PK\x03\x04":
+                raise InputError("not a PyTorch checkpoint", file=path, fix=RECOPY)
+        with zipfile.ZipFile(path) as archive:
+            index = _check_members(archive, path, size)
+            data = archive.read(index)
+            _check_instructions(data, path)
+            return _Reader(data, _Storages(path, archive, index.filename.removesuffix("data.pkl"))).load()
+    except (InputError, MemoryError):
+        raise
+    except OSError as error:
+        problem = f"checkpoint cannot be read: {error.strerror or type(error).__name__}"
+        raise InputError(problem, file=path, fix="check the permissions") from None
+    except Exception as error:  # zipfile and pickle raise many types on damaged files
+        raise InputError(f"damaged checkpoint: {first_line(error)}", file=path, fix=RECOPY) from None
+
+
+def _check_members(archive: zipfile.ZipFile, path: Path, size: int) -> zipfile.ZipInfo:
+    """The pickle of an archive that torch.save wrote."""
+    members = archive.infolist()
+    names = Counter(member.filename.casefold() for member in members)
+    pickles = [m for m in members if m.filename.endswith("/data.pkl")]
+    order = [m for m in members if m.filename.endswith("/byteorder")]
+    problem = None
+    if len(members) > ARCHIVE_MEMBERS_LIMIT:
+        problem = f"{len(members)} members in the archive"
+    elif any(member.compress_type != zipfile.ZIP_STORED for member in members):
+        problem = "compressed members, which torch.save never writes"
+    elif sum(member.file_size for member in members) > size:
+        problem = "members larger than the file"
+    elif names and names.most_common(1)[0][1] > 1:
+        problem = f"member {show(names.most_common(1)[0][0])} stands twice"
+    elif len(pickles) != 1 or any(m.filename.endswith("/constants.pkl") for m in members):
+        problem = "not an archive of torch.save"
+    elif pickles[0].file_size > PICKLE_BYTES_LIMIT:
+        problem = f"its index has {pickles[0].file_size} bytes, more than {PICKLE_BYTES_LIMIT}"
+    if problem is None:
+        broken = archive.testzip()
+        problem = None if broken is None else f"checksum of {show(broken)} does not match"
+    if problem is None and any(archive.read(member) != b"little" for member in order):
+        problem = "written on a machine of another byte order"
+    if problem:
+        raise InputError(f"damaged checkpoint: {problem}", file=path, fix=RECOPY)
+    return pickles[0]
+
+
+def _check_instructions(data: bytes, path: Path) -> None:
+    """Refuse pickles with other names or instructions; pickletools builds nothing, it only lists them."""
+    wanted, unusual = set(), None
+    for opcode, argument, _ in pickletools.genops(data):
+        if opcode.name in ("GLOBAL", "INST", "STACK_GLOBAL"):
+            wanted.add(str(argument or "unnamed").replace(" ", "."))
+        if opcode.name not in _INSTRUCTIONS or (opcode.name.endswith("PUT") and int(argument or 0) > len(data)):
+            # a memo of a large number takes memory up to it
+            unusual = unusual or opcode.name
+    # names outside of torch and numpy first: they are what an attack needs
+    for name in sorted(wanted, key=lambda n: (n.partition(".")[0] in _PICKLE_MODULES, n)):
+        if name not in _NAMES:
+            raise InputError(
+                f"asks for the Python object {show(name)}; nothing was run",
+                file=path,
+                field="data.pkl",
+                fix="use only checkpoints that ns-train wrote",
+            )
+    if unusual:
+        raise InputError(f"damaged checkpoint: unusual contents ({unusual})", file=path, fix=RECOPY)
+
+
+class _Storages:
+    """The members of an archive that hold values."""
+
+    def __init__(self, path: Path, archive: zipfile.ZipFile, folder: str) -> None:
+        self._path, self._archive, self._folder = path, archive, folder
+        self._bytes: Any = None
+        self._found: dict[tuple[str, str], NDArray[Any]] = {}
+
+    def values(self, kind: str, key: str, count: int) -> NDArray[Any]:
+        """``count`` values of a storage, a read-only view of the mapped file."""
+        if (kind, key) not in self._found:
+            member = self._archive.getinfo(f"{self._folder}data/{key}")
+            self._found[kind, key] = np.frombuffer(
+                self._file(), _STORAGES[kind][0], member.file_size // np.dtype(_STORAGES[kind][0]).itemsize,
+                self._start(member),
+            )  # fmt: skip
+        values = self._found[kind, key]
+        if not 0 <= count <= values.size:
+            raise ValueError(f"storage {key} holds {values.size} values of {count}")
+        return values[:count]
+
+    def _file(self) -> Any:
+        if self._bytes is None:
+            with self._path.open("rb") as stream:
+                try:
+                    self._bytes = mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ)
+                except OSError:
+                    # Some network file systems cannot map files.
+                    self._bytes = stream.read()
+        return self._bytes
+
+    def _start(self, member: zipfile.ZipInfo) -> int:
+        """Where a member's bytes begin: after the local header, whose lengths are its own (APPNOTE.TXT, 4.3.7)."""
+        at = member.header_offset
+        name, extra = struct.unpack("<HH", self._file()[at + 26 : at + 30])
+        return at + 30 + name + extra
+
+
+class _Mapping(dict[Any, Any]):
+    """An ordered or counting mapping of a checkpoint, without attributes that the file could set."""
+
+    __slots__ = ()
+
+    def __setstate__(self, _state: Any) -> None:
+        pass
+
+
+class _Nothing:
+    """Stands for an object in a checkpoint that nobody here asks for."""
+
+    __slots__ = ()
+
+    def __setstate__(self, _state: Any) -> None:
+        pass
+
+
+@dataclass(frozen=True)
+class _Storage:
+    kind: str
+    values: NDArray[Any]
+
+
+def _mapping(*arguments: Any) -> _Mapping:
+    return _Mapping(*arguments)
+
+
+def _nothing(*_arguments: Any) -> _Nothing:
+    return _Nothing()
+
+
+def _tensor(
+    storage: Any, offset: Any, shape: Any, strides: Any, _grad: Any = None, _hooks: Any = None, metadata: Any = None
+) -> StoredTensor:
+    """torch._utils._rebuild_tensor_v2."""
+    counts = [offset, *shape, *strides]
+    if not isinstance(storage, _Storage) or len(shape) != len(strides):
+        raise ValueError("a tensor without its storage")
+    if not all(isinstance(n, int) and 0 <= n < 2**62 for n in counts):
+        raise ValueError("a tensor of negative size")
+    last = offset + sum((n - 1) * step for n, step in zip(shape, strides, strict=True))
+    if 0 not in shape and last >= storage.values.size:
+        raise ValueError("a tensor larger than its storage")
+    kind = "negated" if metadata else _STORAGES[storage.kind][1]
+    return StoredTensor(kind, tuple(shape), tuple(strides), offset, storage.values)
+
+
+def _parameter(data: Any, *_rest: Any) -> Any:
+    """torch._utils._rebuild_parameter."""
+    return data
+
+
+def _other(kind: str, place: int, *arguments: Any) -> StoredTensor:
+    """A tensor that is not dense; its shape is argument ``place``."""
+    shape: Any = arguments[1][2] if kind == "sparse" else arguments[place]
+    return StoredTensor(kind, tuple(int(n) for n in shape))
+
+
+class _Function:
+    """A function that a checkpoint may call; has no attributes that the file could set."""
+
+    __slots__ = ("__call",)
+
+    def __init__(self, call: Callable[..., Any]) -> None:
+        object.__setattr__(self, "_Function__call", call)
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        raise AttributeError(name)
+
+    def __call__(self, *arguments: Any) -> Any:
+        return self.__call(*arguments)
+
+
+_NUMBERS = ("Bool", "Float16", "Float32", "Float64", *(f"{sign}Int{n}" for sign in ("", "U") for n in (8, 16, 32, 64)))
+_NAMES: dict[str, Any] = {
+    "collections.OrderedDict": _Function(_mapping),
+    "collections.Counter": _Function(_mapping),
+    "torch.Size": _Function(tuple),
+    "torch._utils._rebuild_tensor_v2": _Function(_tensor),
+    "torch._utils._rebuild_parameter": _Function(_parameter),
+    "torch._utils._rebuild_parameter_with_state": _Function(_parameter),
+    "torch._utils._rebuild_sparse_tensor": _Function(partial(_other, "sparse", 0)),
+    "torch._utils._rebuild_qtensor": _Function(partial(_other, "quantized", 2)),
+    "torch._utils._rebuild_meta_tensor_no_storage": _Function(partial(_other, "empty (meta)", 1)),
+    **{f"torch.{name}": name for name in _STORAGES},
+    # Schedulers and optimizers hold numpy scalars and torch's types; none of their values is used.
+    **dict.fromkeys(
+        (
+            "torch.device",
+            "torch.serialization._get_layout",
+            "torch.per_tensor_affine",
+            "torch.per_channel_affine",
+            *(f"torch.{kind}" for _, kind in _STORAGES.values() if kind != "quantized"),
+            "_codecs.encode",
+            "numpy.core.multiarray.scalar",
+            "numpy._core.multiarray.scalar",
+            "numpy.dtype",
+            *(f"numpy.dtypes.{kind}DType" for kind in _NUMBERS),
+        ),
+        _Function(_nothing),
+    ),
+}
+
+
+class _Reader(pickle.Unpickler):
+    """Builds what a checked pickle describes."""
+
+    def __init__(self, data: bytes, storages: _Storages) -> None:
+        super().__init__(io.BytesIO(data), fix_imports=False)
+        self._storages = storages
+
+    def find_class(self, module: str, name: str, /) -> Any:
+        return _NAMES[f"{module}.{name}"]
+
+    def persistent_load(self, pid: Any, /) -> Any:
+        """torch.serialization.persistent_id: ("storage", type, key, device, number of values)."""
+        kind, storage, key, _device, count = pid
+        if kind != "storage" or storage not in _STORAGES or not isinstance(count, int):
+            raise ValueError("a storage of an unknown type")
+        return _Storage(storage, self._storages.values(storage, str(key), count))

@@ -1,0 +1,33 @@
+"""How a NeRF's run is opened; torch and the bounds are loaded once there is one."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from ns_abstract.methods.nerf.load import holds_nerf, load_nerf
+from ns_abstract.methods.nerf.scene import NerfScene
+from ns_abstract.methods.representation import ProgramOptions, Representation
+from ns_abstract.methods.runs import RunConfig
+
+if TYPE_CHECKING:
+    from ns_abstract.methods.nerf.method import NerfMethod
+
+
+def _load(source: RunConfig | Path) -> NerfScene:
+    assert isinstance(source, RunConfig)
+    return load_nerf(source)
+
+
+def _method(scene: NerfScene, options: ProgramOptions, arithmetic: str | None, workers: int) -> NerfMethod:
+    from ns_abstract.methods.nerf.method import NerfMethod
+    from ns_abstract.methods.nerf.occupancy import load_grid
+
+    options.refuse(("gsplat_version",), "is for splats, this run is a NeRF")
+    grid = None if options.occupancy_grid is None else load_grid(options.occupancy_grid)
+    return NerfMethod(
+        scene, options.renderer, arithmetic, options.sampling, options.num_samples, options.near_plane, grid, workers
+    )
+
+
+NERF = Representation(lambda source: isinstance(source, RunConfig) and holds_nerf(source), _load, _method, rays=True)

@@ -1,0 +1,153 @@
+"""What rows cost, and how many of them a deep network is worth (docs/design.md, N13)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextvars import copy_context
+from functools import cached_property
+from typing import TypeVar
+
+import numpy as np
+import torch
+
+from ns_abstract.verify.network.graph import Network
+from ns_abstract.verify.network.layers import Activation, Channels, Convolution, Linear, Matrix, Pad, Scale, Sum
+from ns_abstract.verify.network.maps import Sparse, TransposedConvolution
+from ns_abstract.verify.network.maxima import MaxPool
+from ns_abstract.verify.network.products import Product
+from ns_abstract.verify.network.rows import grid
+
+#: Products of a convolution in the time in which a kernel passes one number of a row.
+_PASSING = 40.0
+#: A network is deep if rows for all of its numbers take more products than this; about a minute of one core.
+_DEEP = 2e12
+#: Products that rows for numbers of inner nodes may take in one cell of a deep network; the same where not even the
+#: part of all numbers that is needed as a rule could be bounded.
+_ALLOWED, _GIVEN_UP, _NEEDED = 2e12, 1e11, 0.35
+#: Part of a node's numbers past which all of them are bounded by rows.
+_RENEW = 0.15
+#: Parts of widths and of signs not found out past which rows are given up.
+_KEPT, _LOST = 0.9, 0.9
+#: Layers whose rows stay in their windows.
+_WINDOWED = (Activation, Channels, Pad, Product, Scale, Sum)
+
+
+Found = TypeVar("Found")
+
+
+class Costs:
+    """Products that rows of one network take."""
+
+    def __init__(self, network: Network) -> None:
+        self.network = network
+        self._rows: dict[int, float] = {}
+
+    def row(self, index: int) -> float:
+        """Products that a row of one number of node ``index`` takes to the image."""
+        if index not in self._rows:
+            self._rows[index] = self._passed(index)
+        return self._rows[index]
+
+    def _passed(self, index: int) -> float:
+        """The same, window by window."""
+        windows, total = {index: (1, 1)}, 0.0
+        for at in range(index, 0, -1):
+            if at not in windows:
+                continue
+            h, w = windows.pop(at)
+            node = self.network.nodes[at - 1]
+            layer = node.layer
+            total += _PASSING * grid(self.network.shape(at))[0] * h * w
+            whole = False
+            if isinstance(layer, Convolution):
+                total += float(layer.weight.numel()) * h * w
+                size = layer.weight.shape[2:]
+                h, w = (
+                    (n - 1) * s + (k - 1) * d + 1
+                    for n, s, k, d in zip((h, w), layer.stride, size, layer.dilation, strict=True)
+                )
+            elif isinstance(layer, MaxPool):
+                extent = layer.steps.max(0) + 1
+                h, w = ((n - 1) * s + int(e) for n, s, e in zip((h, w), layer.stride, extent, strict=True))
+            elif isinstance(layer, Matrix):
+                total += float(np.prod(layer.shape)) * layer.weight.shape[1]
+                whole = True
+            elif isinstance(layer, TransposedConvolution):
+                total += float(np.prod(layer.input_shapes[0])) * float(np.prod(layer.weight.shape[1:]))
+                whole = True
+            elif isinstance(layer, Sparse):
+                total += _PASSING * float(layer.weight.numel())
+                whole = True
+            elif not isinstance(layer, _WINDOWED):
+                assert isinstance(layer, Linear)
+                whole = True
+            for source in node.inputs:
+                _, height, width = grid(self.network.shape(source))
+                size = (height, width) if whole or h * w >= height * width else (h, w)
+                known = windows.get(source, (0, 0))
+                windows[source] = max(known[0], size[0]), max(known[1], size[1])
+        return total + _PASSING * float(np.prod(self.network.input_shape))
+
+    @cached_property
+    def total(self) -> float:
+        """Products that rows for every number before an activation or a product take."""
+        total = 0.0
+        for node in self.network.nodes:
+            if isinstance(node.layer, (Activation, Product)) and self.network.depth[node.inputs[0]] > 1:
+                for source in set(node.inputs):
+                    total += float(np.prod(self.network.shape(source))) * self.row(source)
+        return total
+
+
+class Schedule:
+    """How far the work of one cell has gone."""
+
+    def __init__(self, network: Network) -> None:
+        self.costs = costs_of(network)
+        total = self.costs.total
+        self.deep = total > _DEEP
+        # where rows would end on the way, what they are worth before is lost behind
+        self.left = _ALLOWED if _NEEDED * total <= _ALLOWED else _GIVEN_UP
+
+    def renews(self, part: float) -> bool:
+        """Whether all numbers of a node are bounded by rows if ``part`` of them is open."""
+        return part > _RENEW
+
+    def takes(self, products: float) -> bool:
+        """Whether so many products are left; they are taken then."""
+        if products > self.left:
+            return False
+        self.left -= products
+        return True
+
+    def hopeless(self, kept: float, open_: float) -> bool:
+        """Give inner nodes up if rows leave so large a part of widths, or of signs not found out."""
+        given = kept > _KEPT or open_ > _LOST
+        if given:
+            self.left = 0.0
+        return given
+
+
+def costs_of(network: Network) -> Costs:
+    """The costs of a network, worked out once."""
+    found = network.__dict__.get("_costs")
+    if found is None:
+        found = network.__dict__["_costs"] = Costs(network)
+    return found
+
+
+def on_threads(work: Callable[[int], Found], parts: Iterable[int], threads: int) -> Iterator[Found]:
+    """``work`` of every part, in order; kernels and torch let other threads run meanwhile, each torch on one."""
+    if threads < 2:
+        yield from map(work, parts)
+        return
+    with ThreadPoolExecutor(threads, initializer=torch.set_num_threads, initargs=(1,)) as pool:
+        # every part in a copy of the context, which says when work is to be given up
+        waiting = [pool.submit(copy_context().run, work, part) for part in parts]
+        try:
+            for found in waiting:
+                yield found.result()
+        finally:
+            for found in waiting:
+                found.cancel()

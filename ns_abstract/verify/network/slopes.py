@@ -1,0 +1,179 @@
+"""Lower lines of open ReLUs with slopes chosen for a row (docs/design.md, N14)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from ns_abstract.verify.network.graph import Network
+from ns_abstract.verify.network.layers import Activation, Linear
+from ns_abstract.verify.network.maxima import MaxPool
+from ns_abstract.verify.network.products import Product
+
+Float64 = NDArray[np.float64]
+Float32 = NDArray[np.float32]
+Int64 = NDArray[np.int64]
+
+#: First step of slopes, what each is of the one before, and Adam's parts of what was known before.
+_STEP, _DECAY, _FIRST, _SECOND = 0.3, 0.88, 0.8, 0.95
+#: Room for rounding of what is computed here in float64: a few operations.
+_ROOM = 2.0**-46
+
+
+@dataclass(frozen=True)
+class OpenUnits:
+    """Units of one node that may be on either side of their kink, in all cells.
+
+    Attributes:
+        cell, flat: [U] where they are.
+        lower, upper: [U] what they are at least and at most.
+        reference, image: [U] their reference and that of what they become.
+        loose: [U] charged for every part of a slope: rounding of rows and of the layer before.
+        room: [U] charged besides.
+        alpha: Slope below the kink.
+    """
+
+    cell: Int64
+    flat: Int64
+    lower: Float64
+    upper: Float64
+    reference: Float64
+    image: Float64
+    loose: Float64
+    room: Float64
+    alpha: float
+
+    def of(self, cell: int) -> OpenUnits:
+        """Those of one cell."""
+        at = np.flatnonzero(self.cell == cell)
+        names = ("cell", "flat", "lower", "upper", "reference", "image", "loose", "room")
+        return replace(self, **{name: getattr(self, name)[at] for name in names})
+
+    def offsets(self, slope: Float32) -> tuple[Float32, Float32]:
+        """Of lines with ``slope`` [R, U] between `alpha` and 1: below and above the function, as rows want them."""
+        s = slope.astype(np.float64)
+        base = s * self.reference - self.image
+        size = np.abs(self.reference) + np.abs(self.image) + np.abs(self.lower) + np.abs(self.upper)
+        give = s * self.loose + self.room + _ROOM * size
+        # the function is convex: above a line by most at an end
+        top = np.maximum(self.alpha * self.lower - s * self.lower, self.upper - s * self.upper)
+        low, high = (base - give).astype(np.float32), (top + base + give).astype(np.float32)
+        return np.nextafter(low, np.float32(-np.inf)), np.nextafter(high, np.float32(np.inf))
+
+
+@dataclass
+class Chosen:
+    """Slopes of a cell's rows, and what rows are on the way.
+
+    Attributes:
+        lines: By node: as `pass_activation` wants them, with rows in place of cells.
+        trace: By node: [R, C, H, W] rows on its output, and on the image (0).
+    """
+
+    lines: dict[int, Float32]
+    trace: dict[int, Float32] = field(default_factory=dict)
+
+    def keep(self, at: int, value: Float32, number: Int64, count: int) -> None:
+        """Remember rows ``number`` of ``count`` on the output of node ``at``."""
+        if at not in self.trace:
+            self.trace[at] = np.zeros((count, *value.shape[1:]), np.float32)
+        self.trace[at][number] = value
+
+
+class Ascent:
+    """Adam's steps on the slopes of a cell's rows.
+
+    Args:
+        units: Open units of the cell by node.
+        start: [U] slopes to start from, by node.
+        rows: Number of rows.
+    """
+
+    def __init__(self, units: Mapping[int, OpenUnits], start: Mapping[int, Float32], rows: int) -> None:
+        self.units = units
+        self.slopes = {k: np.repeat(start[k][None], rows, 0) for k in units}
+        self._mean = {k: np.zeros(v.shape) for k, v in self.slopes.items()}
+        self._square = {k: np.zeros(v.shape) for k, v in self.slopes.items()}
+        self._step, self._count = _STEP, 0
+
+    def lines(self, known: Mapping[int, Float32], cell: int) -> Chosen:
+        """Lines of every row: those of the cell, with the slopes of open units."""
+        found = {}
+        for k, units in self.units.items():
+            slope = self.slopes[k]
+            lines = np.repeat(known[k][:, cell : cell + 1], len(slope), 1)
+            flat = lines.reshape(6, len(slope), -1)
+            flat[0][:, units.flat] = slope
+            flat[1][:, units.flat], flat[2][:, units.flat] = units.offsets(slope)
+            found[k] = lines
+        return Chosen(found)
+
+    def climb(self, slopes: Mapping[int, Float64]) -> None:
+        """Step along derivatives [R, U] of the bounds, within what slopes may be."""
+        self._count += 1
+        for k, units in self.units.items():
+            g = slopes[k]
+            mean, square = self._mean[k], self._square[k]
+            mean += (1.0 - _FIRST) * (g - mean)
+            square += (1.0 - _SECOND) * (g * g - square)
+            size = np.sqrt(square / (1.0 - _SECOND**self._count)) + 1e-30
+            step = self._step * mean / (1.0 - _FIRST**self._count) / size
+            self.slopes[k] = np.clip(self.slopes[k] + step, units.alpha, 1.0).astype(np.float32)
+        self._step *= _DECAY
+
+
+def derivatives(
+    network: Network,
+    image: Tensor,
+    trace: Mapping[int, Float32],
+    lines: Callable[[int], Float32],
+    units: Mapping[int, OpenUnits],
+    others: Mapping[int, Any],
+) -> dict[int, Float64]:
+    """By node [R, U]: how bounds of rows change with the slopes of lower lines.
+
+    A row's bound is a sum of products along the lines that it took; read forwards from the image where it is least,
+    these lines give a value to every node, and a slope counts its row's coefficient times that value.
+
+    Args:
+        network: The network.
+        image: [R, *input_shape] float32 relative to the reference, where each row's bound is least.
+        trace: Rows on the outputs of activations, products and maxima.
+        lines: Of an activation's node: [6, R, C, H, W].
+        units: Open units of activations.
+        others: Of products' and maxima's nodes: a function of rows and inputs that gives the output.
+    """
+    values: list[Tensor | None] = [image]
+    left = list(network.readers)
+    count, found = image.shape[0], {}
+    for k, node in enumerate(network.nodes, 1):
+        inputs = [v for v in (values[i] for i in node.inputs) if v is not None]
+        rows = trace.get(k)
+        if isinstance(node.layer, Linear):
+            values.append(node.layer.apply(inputs))
+        elif rows is None:
+            values.append(torch.zeros((count, *node.layer.shape)))
+        elif isinstance(node.layer, (Product, MaxPool)):
+            values.append(others[k](torch.from_numpy(rows), inputs).reshape(count, *node.layer.shape))
+        else:
+            assert isinstance(node.layer, Activation)
+            own = torch.from_numpy(lines(k)).reshape(6, -1, *node.layer.shape)
+            a, u = torch.from_numpy(rows).reshape(inputs[0].shape), inputs[0]
+            slope, offset = torch.where(a >= 0.0, own[0], own[3]), torch.where(a >= 0.0, own[1], own[4])
+            values.append(slope * u + offset)
+            if k in units:
+                at = units[k]
+                coefficient = rows.reshape(count, -1)[:, at.flat].astype(np.float64)
+                value = u.flatten(1).numpy()[:, at.flat] + at.reference
+                found[k] = np.maximum(coefficient, 0.0) * value
+        for i in node.inputs:
+            left[i] -= 1
+            if not left[i]:
+                values[i] = None
+    return {k: found.get(k, np.zeros((count, len(v.flat)))) for k, v in units.items()}

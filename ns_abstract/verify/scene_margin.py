@@ -1,0 +1,340 @@
+"""How far a scene may vary before what is certified is lost: bisection over sound runs (docs/design.md, V13).
+
+Cells that were certified for the stored scene are bounded again for all scenes around it. Sets of scenes are nested, so
+what is proved of a radius holds of every smaller one, and one pass over the cells with the smallest radius so far does.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+import numpy as np
+
+from ns_abstract.execution.ending import AbandonedError, abandoning, checkpoint
+from ns_abstract.geometry.box import ParameterBox
+from ns_abstract.io.errors import InputError
+from ns_abstract.perturbation.variations import SceneVariation, Selection
+from ns_abstract.verify.cells import Cell, Grid
+from ns_abstract.verify.response import ResponseName
+
+Outcome = Literal["holds", "falsified", "unknown"]
+
+#: Bisection ends where the ends are this close, by their quotient; radii tried first grow and shrink by `_STRIDE`.
+_CLOSE, _STRIDE = 1.1, 4.0
+#: A radius below this part of the first one is called 0.
+_LEAST = 2.0**-20
+#: Cuts of a cell one inside the other, parts by cut, and most parts that a cell is examined in.
+_DEPTH, _PARTS, _MOST = 2, 4, 24
+#: Doublings of the radius in search of a scene that breaks what is certified.
+_DOUBLINGS = 6
+#: Trials that a report lists.
+_LISTED = 200
+
+
+@dataclass(frozen=True)
+class Kind:
+    """What varies; of `KINDS`, of every Gaussian independently; of `CAMERA_KINDS`, of the camera.
+
+    Attributes:
+        name: Key of a scene variation, of `KINDS`.
+        text, unit: For people.
+        first: Radius that is tried first.
+        most: Radius beyond which none is tried.
+        response: What of the camera varies, if it is not the scene.
+    """
+
+    name: str
+    text: str
+    unit: str
+    first: float
+    most: float
+    response: ResponseName | None = None
+
+    def variation(self, radius: float) -> SceneVariation:
+        """All scenes around the stored one."""
+        ends: dict[str, Any] = {self.name: (-radius, radius)}
+        return SceneVariation(Selection(), **ends)
+
+
+KINDS = (
+    Kind("mean", "every coordinate of every Gaussian's mean", "normalised units", 1e-3, 10.0),
+    Kind("opacity", "every Gaussian's opacity", "of 1", 1e-2, 1.0),
+    Kind("color", "every channel of every Gaussian's colour", "of 1", 1e-2, 1.0),
+)
+
+#: Of the camera, the same all over the picture (V14).
+CAMERA_KINDS: tuple[Kind, ...] = (
+    Kind("brightness", "the factor of the camera's brightness", "of 1", 1e-2, 0.9, "brightness"),
+    Kind("white_balance", "the factor of every channel", "of 1", 1e-2, 0.9, "white balance"),
+    Kind("gamma", "the power of the camera's response", "of 1", 1e-2, 0.9, "gamma"),
+)
+
+#: Not of single Gaussians: the scene as a whole, the same for a whole run of a loop.
+REGISTRATION = Kind(
+    "registration", "the place of the whole scene along every world axis", "normalised units", 1e-3, 10.0
+)
+
+
+@dataclass(frozen=True)
+class Settled:
+    """What is known of a cell for all scenes of a set.
+
+    Attributes:
+        outcome: "holds": proved; "falsified": a scene was found, and rendered again, that breaks it; "unknown".
+        reason: Why it is not proved.
+        slopes: [d] what a cut along each parameter may gain.
+        example: Arrays that tell a scene that breaks it, or None.
+    """
+
+    outcome: Outcome
+    reason: str
+    slopes: np.ndarray
+    example: Mapping[str, np.ndarray] | None = None
+
+
+#: A cell as it is (it is not cut), by radius, frame and box.
+Settle = Callable[[float, int, ParameterBox], Settled]
+
+
+@dataclass(frozen=True)
+class Certified:
+    """A certified cell.
+
+    Attributes:
+        frame: Number of its set.
+        box: The cell.
+        margin: What was proved; cells with little of it come first.
+        part: Of all that is certified, by volume.
+    """
+
+    frame: int
+    box: ParameterBox
+    margin: float
+    part: float
+
+
+@dataclass(frozen=True)
+class Trial:
+    """A cell at a radius."""
+
+    cell: int
+    radius: float
+    outcome: Outcome
+    reason: str
+    parts: int
+    seconds: float
+
+
+@dataclass
+class SceneMargin:
+    """What a bisection found.
+
+    Attributes:
+        kind: What varies.
+        radius: All that was certified holds for all scenes this far from the stored one; 0: nothing more is known.
+        reached, part: Radius at which the part of the certified volume holds that was looked at.
+        state: "done", or "ended": by the time, or by a request to stop.
+        trials: Runs, in order.
+        cells: How many are certified.
+        seconds: Time spent.
+        example: Arrays that tell the scene of the smallest falsified radius, or None.
+    """
+
+    kind: Kind
+    cells: int
+    radius: float = 0.0
+    reached: float = 0.0
+    part: float = 0.0
+    state: Literal["done", "ended"] = "done"
+    trials: list[Trial] = field(default_factory=list)
+    seconds: float = 0.0
+    example: Mapping[str, np.ndarray] | None = None
+
+    def _least(self, *outcomes: Outcome) -> Trial | None:
+        found = [trial for trial in self.trials if trial.outcome in outcomes]
+        return min(found, key=lambda trial: trial.radius, default=None)
+
+    @property
+    def failing(self) -> Trial | None:
+        """The smallest radius that is not certified."""
+        return self._least("falsified", "unknown")
+
+    @property
+    def falsified(self) -> Trial | None:
+        """The smallest radius at which a scene was found that breaks what is certified."""
+        return self._least("falsified")
+
+    @property
+    def sentence(self) -> str:
+        """All of it for people."""
+        kind, failing = self.kind, self.failing
+        if self.radius > 0.0:
+            more = " (no larger one was tried)" if self.radius >= kind.most else ""
+            text = f"{kind.text} may be off by {self.radius:.4g} {kind.unit}{more}"
+        elif self.state == "ended":
+            text = (
+                f"0, as the work ended first: {self.part:.2%} of what is certified holds for {kind.text} off by "
+                f"{self.reached:.4g} {kind.unit}"
+            )
+        else:
+            text = f"0: not even the smallest radius tried is proved for {kind.text}"
+        if failing is not None:
+            why = "a scene breaks it" if failing.outcome == "falsified" else f"not proved: {failing.reason}"
+            text += f"; at {failing.radius:.4g}: {why}"
+        if self.falsified is not None and self.falsified is not failing:
+            text += f"; at {self.falsified.radius:.4g} a scene breaks it"
+        return text
+
+    @property
+    def entry(self) -> dict[str, Any]:
+        """What report.json holds."""
+
+        def told(trial: Trial | None) -> dict[str, Any] | None:
+            return None if trial is None else vars(trial)
+
+        # cells that held at once say little
+        told_of = {trial.cell for trial in self.trials if trial.outcome != "holds"}
+        listed = [trial for trial in self.trials if trial.cell in told_of or trial.radius == self.radius]
+        return {
+            "kind": self.kind.name,
+            "unit": self.kind.unit,
+            "radius": self.radius,
+            "not_certified": told(self.failing),
+            "falsified": told(self.falsified),
+            "reached": {"radius": self.reached, "part": self.part},
+            "state": self.state,
+            "cells": self.cells,
+            "runs": len(self.trials),
+            "trials": [vars(trial) for trial in listed[:_LISTED]],
+            "seconds": self.seconds,
+            "text": self.sentence,
+        }
+
+
+def widest(kind: Kind, cells: Sequence[Certified], settle: Settle, over: Callable[[], bool]) -> SceneMargin:
+    """The largest radius, within a tenth, for which every cell is proved again (V13).
+
+    Args:
+        kind: What varies.
+        cells: What is certified.
+        settle: Sound bounds and an attack of one cell.
+        over: Whether to end with what is known; asked about once a second.
+    """
+    begin = time.perf_counter()
+    found = SceneMargin(kind, len(cells))
+    work = _Bisection(found, settle)
+    try:
+        with abandoning(over):
+            # those that are nearest to failing decide
+            order = sorted(range(len(cells)), key=lambda k: (cells[k].margin, cells[k].frame, cells[k].box.lower))
+            for place, number in enumerate(order):
+                radius = work.largest(number, cells[number], found.reached if place else None)
+                found.reached, found.part = radius, found.part + cells[number].part
+                if radius == 0.0:
+                    break
+            else:
+                found.radius = found.reached
+            failing = found.failing
+            if failing is not None and found.falsified is None:
+                work.attack(failing, cells[failing.cell])
+    except AbandonedError:
+        found.state = "ended"
+    found.seconds = time.perf_counter() - begin
+    return found
+
+
+def _told(radius: float) -> float:
+    """Of three digits, so that a report tells exactly what was proved."""
+    return float(f"{radius:.3g}")
+
+
+class _Bisection:
+    """Runs of one kind."""
+
+    def __init__(self, found: SceneMargin, settle: Settle) -> None:
+        self.found, self.kind, self.settle = found, found.kind, settle
+
+    def largest(self, number: int, cell: Certified, ceiling: float | None) -> float:
+        """The largest radius for one cell, of which more than ``ceiling`` is of no use; None: it is the first."""
+        most = self.kind.most if ceiling is None else ceiling
+        radius = min(self.kind.first, most) if ceiling is None else ceiling
+        low, high = 0.0, math.inf
+        while low < most and not (low > 0.0 and high <= _CLOSE * low):
+            radius = min(most, _told(radius))
+            if radius < _LEAST * self.kind.first:
+                return 0.0
+            if self._try(number, cell, radius):
+                low = radius
+            else:
+                high = radius
+            if high == math.inf:
+                radius = min(most, _STRIDE * low)
+            else:
+                radius = math.sqrt(low * high) if low > 0.0 else high / _STRIDE
+        return low
+
+    def attack(self, failing: Trial, cell: Certified) -> None:
+        """Larger radii, until a scene breaks what is certified."""
+        radius = failing.radius
+        for _ in range(_DOUBLINGS):
+            if radius >= self.kind.most:
+                return
+            radius = min(_told(2.0 * radius), self.kind.most)
+            self._try(failing.cell, cell, radius, cuts=False)
+            if self.found.trials[-1].outcome != "unknown":
+                return
+
+    def _try(self, number: int, cell: Certified, radius: float, *, cuts: bool = True) -> bool:
+        """Whether a cell is proved for a radius."""
+        begin = time.perf_counter()
+        outcome, reason, parts, example = self._examined(cell, radius, cuts)
+        trial = Trial(number, radius, outcome, reason, parts, time.perf_counter() - begin)
+        least = self.found.falsified
+        self.found.trials.append(trial)
+        if outcome == "falsified" and (least is None or radius < least.radius):
+            self.found.example = example
+        return outcome == "holds"
+
+    def _examined(
+        self, cell: Certified, radius: float, cuts: bool
+    ) -> tuple[Outcome, str, int, Mapping[str, np.ndarray] | None]:
+        """The cell, cut where it is not proved as a whole: all parts must be."""
+        grid = Grid.adaptive(cell.box, [1] * cell.box.dimensions)
+        waiting: list[tuple[Cell, int]] = [(part, 0) for part in grid.roots()]
+        count = 0
+        while waiting:
+            part, depth = waiting.pop()
+            checkpoint()
+            found = self.settle(radius, cell.frame, grid.box_of(part))
+            count += 1
+            if found.outcome == "falsified":
+                return "falsified", found.reason, count, found.example
+            if found.outcome == "holds":
+                continue
+            parts = grid.divide(part, found.slopes, 1.0 / _PARTS, _PARTS) if cuts and depth < _DEPTH else []
+            if not parts or count + len(waiting) + len(parts) > _MOST:
+                return "unknown", found.reason, count, None
+            waiting += [(entry, depth + 1) for entry in parts]
+        return "holds", "", count, None
+
+
+def check_scenes(varied: bool, rays: bool) -> None:
+    """Refuse what has no margin.
+
+    Args:
+        varied: Whether the sets hold several scenes already.
+        rays: Whether the scene is one of rays.
+
+    Raises:
+        InputError: There are no Gaussians, or they vary already.
+    """
+    if rays:
+        raise InputError("Gaussians vary, a NeRF has none", field="--scene-margin", fix="leave it out")
+    if varied:
+        raise InputError(
+            'the set has the key "scene" already', field="--scene-margin", fix="remove the key, or leave the option out"
+        )

@@ -1,0 +1,301 @@
+"""``ns-abstract-reach`` on the demo's gate: what is certified is attacked, whatever runs the search finds the same."""
+
+from __future__ import annotations
+
+import importlib.util
+import itertools
+import json
+import signal
+import sqlite3
+import subprocess
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from conftest import InProcess, environment
+from interrupting import LONG, check_ended_in_a_library_call, check_interrupted, interrupted_at, stored, until
+
+from ns_abstract.api.reaching import LoopJob, open_loop, reach
+from ns_abstract.api.scenes import load_scene
+from ns_abstract.cli import reach as reach_command
+from ns_abstract.demo.gate import gate
+from ns_abstract.demo.writing import write_loop_demo
+from ns_abstract.geometry.box import ParameterBox
+from ns_abstract.perturbation.variations import SceneVariation, Selection
+from ns_abstract.reach.search import Run, first_outside, pushes, simulate
+from ns_abstract.reach.tubes import Pictures
+from ns_abstract.verify.response import Response
+from ns_abstract.verify.scene_margin import CAMERA_KINDS
+
+MODULE = "ns_abstract.cli.reach"
+#: A part of the demo's box that takes seconds.
+PART = {"along": [0.0, 0.03], "across": [-0.04, 0.04], "up": [0.0, 0.03], "v_across": 0.0, "v_up": 0.0}
+#: Starts on both sides of where the funnel is left, which is asked alone.
+EDGE: dict[str, Any] = {
+    "initial": {"along": 0.0, "across": [0.40, 0.44], "up": 0.02, "v_across": 0.0, "v_up": 0.0},
+    "steps": 12,
+}
+
+
+@dataclass(frozen=True)
+class Course:
+    """The demo's files."""
+
+    config: Path
+    loop: Path
+
+    def changed(self, name: str, without: str = "", **changes: Any) -> Course:
+        """The same with other values in LOOP.json, and without a key."""
+        file = self.loop.with_name(name)
+        value = json.loads(self.loop.read_text()) | changes
+        file.write_text(json.dumps({key: v for key, v in value.items() if key != without}))
+        return Course(self.config, file)
+
+    def options(self, folder: Path, **more: Any) -> list[str]:
+        values = {"load_config": self.config, "loop": self.loop, "output_dir": folder, "time_budget": 300} | more
+        found = []
+        for name, value in values.items():
+            found += ["--" + name.replace("_", "-")] + ([] if value is True else [str(value)])
+        return found
+
+    @property
+    def job(self) -> LoopJob:
+        return open_loop(load_scene(self.config), self.loop)
+
+    def run(self, folder: Path, **more: Any) -> dict[str, Any]:
+        return reach(load_scene(self.config), self.loop, time_budget=300.0, output_dir=folder, **more).report
+
+
+@pytest.fixture(scope="module")
+def course(tmp_path_factory: pytest.TempPathFactory) -> Course:
+    return Course(*write_loop_demo(tmp_path_factory.mktemp("course")))
+
+
+@pytest.fixture(scope="module")
+def edge(course: Course) -> Course:
+    return course.changed("edge.json", "goal", **EDGE)
+
+
+@pytest.fixture(scope="module")
+def finished(edge: Course, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """An uninterrupted search."""
+    folder = tmp_path_factory.mktemp("finished") / "out"
+    edge.run(folder)
+    return folder
+
+
+def cells(folder: Path) -> list[tuple[Any, ...]]:
+    with sqlite3.connect(folder / "cells.sqlite") as base:
+        return sorted(base.execute("SELECT frame, lower, upper, verdict, margin, counterexample FROM cells").fetchall())
+
+
+def test_no_two_gaussians_are_equally_deep() -> None:
+    assert np.diff(np.sort(gate().means[:, 0])).min() > 5e-4
+
+
+def test_a_part_of_the_box_is_certified(course: Course, tmp_path: Path) -> None:
+    """Three dimensions, 24 steps, all of it; then hundreds of runs stay inside the tubes of its cells."""
+    part = course.changed("part.json", initial=PART)
+    document = part.run(tmp_path / "out")
+    assert document["verdict"] == "reaches"
+    for entry in document["questions"].values():
+        assert entry["certified"] == 1.0 and entry["simulated"]["went_well"] == 1.0
+    tube = document["tubes"][0]
+    # what is kept matters: without it, the same cell's tubes are several times as wide
+    none = tube["width_by_dependence"]["none"]
+    assert len(none) < 25 or none[-1] > 3.0 * tube["width"][-1]
+    assert all(a >= b for a, b in zip(tube["width"], tube["width_simulated"], strict=True))
+    job = part.job
+    reacher, loop, rng = job.reacher(), job.loop, np.random.default_rng(1)
+    compared = 0
+    for row in document["tubes"]:
+        box = ParameterBox(loop.box.names, loop.box.units, tuple(row["lower"]), tuple(row["upper"]))
+        whole = reacher.tube(box)
+        for number, start in enumerate([*box.corners(), *box.sample(20, rng)]):
+            run = simulate(reacher, loop.state(box, start), pushes(loop, rng, "ends" if number % 2 else "random"))
+            assert first_outside(whole, run) is None
+            compared += len(run.states)
+    assert compared > 500
+
+
+def test_where_runs_go_wrong(edge: Course, finished: Path) -> None:
+    """The edge of the funnel's reach lies in the box: both verdicts, and stored runs that leave the funnel again."""
+    document = json.loads((finished / "report.json").read_text())
+    assert document["verdict"] == "falsified" and document["state"] == "done"
+    shares = document["questions"]["safe"]
+    assert shares["certified"] > 0.1 and shares["falsified"] > 0.1 and shares["unknown"] < 0.1
+    # no more than runs show, of which there are 200
+    assert abs(shares["certified"] - shares["simulated"]["went_well"]) < 0.15
+    job = edge.job
+    files = sorted((finished / "counterexamples").glob("*.npz"))
+    broken = [row for row in cells(finished) if row[3] == "falsified"]
+    assert len(files) == len(broken) > 0
+    for file in files[:5]:
+        stored = np.load(file)
+        again = simulate(job.reacher(), stored["states"][0], stored["disturbances"])
+        assert (again.states == stored["states"]).all() and again.margin(job.loop, "safe") <= 0.0
+
+
+def test_a_planted_bad_controller_is_falsified(course: Course, tmp_path: Path) -> None:
+    """It steers away from the axis."""
+    control = json.loads(course.loop.read_text())["control"] | {"gain": [[1.2, 0.0], [0.0, -1.2]]}
+    bad = course.changed("bad.json", control=control, initial=PART | {"across": [0.1, 0.15]})
+    document = bad.run(tmp_path / "out")
+    assert document["verdict"] == "falsified"
+    assert document["questions"]["reaches"]["falsified"] == 1.0 == document["questions"]["safe"]["falsified"]
+
+
+def test_scene_margin(course: Course, tmp_path: Path) -> None:
+    """Runs in scenes at the ends of the certified radius stay in the tubes and go well; stored ones fail."""
+    small = {"along": 0.0, "across": [0.3, 0.302], "up": 0.0, "v_across": 0.0, "v_up": 0.0}
+    part = course.changed("margin.json", "goal", initial=small, steps=10)
+    document = part.run(tmp_path / "out", scene_margin=True)
+    assert document["verdict"] == "safe" and document["scene_margin"]["question"] == "safe"
+    job, rng = part.job, np.random.default_rng(8)
+    loop, box = job.loop, job.loop.box
+    kinds = {entry["kind"]: entry for entry in document["scene_margin"]["kinds"]}
+    assert list(kinds) == ["mean", "opacity", "color", "brightness", "white_balance", "gamma", "registration"]
+    compared = 0
+    for name, entry in kinds.items():
+        radius = entry["radius"]
+        if name == "registration":
+            reacher = replace(job.reacher(), registration=radius)
+            scenes = [(None, radius * rng.choice([-1.0, 1.0], 3)) for _ in range(24)]
+        elif (of_camera := {kind.name: kind.response for kind in CAMERA_KINDS}.get(name)) is not None:
+            view = Pictures(job.job.method, job.job.pose_sets[0], Response(of_camera, radius))
+            reacher = replace(job.reacher(), view=view)
+            scenes = [(member, None) for member in itertools.islice(view.members(1), 24)]
+        else:
+            ends: dict[str, Any] = {name: (-radius, radius)}
+            reacher = job.around(SceneVariation(Selection(), **ends)).reacher()
+            scenes = [(member, None) for member in itertools.islice(reacher.view.members(1), 24)]
+        tube = reacher.tube(box)
+        for number, (member, shift) in enumerate(scenes):
+            start = box.corners()[number % 2] if number % 2 else box.sample(1, rng)[0]
+            push = pushes(loop, rng, "ends" if number % 3 else "random")
+            run = simulate(reacher, loop.state(box, start), push, member, shift)
+            assert run.margin(loop, "safe") > 0.0
+            assert first_outside(tube, run) is None
+            compared += len(run.states)
+        assert (
+            entry["state"] == "done"
+            and entry["not_certified"]
+            and 0.0 < radius < entry["not_certified"]["radius"] <= 1.2 * radius
+        )
+        broken: Any = entry["falsified"]
+        assert not broken or broken["radius"] > radius
+        files = list((tmp_path / "out" / "counterexamples").glob(f"scene_margin_{name}.npz"))
+        assert bool(files) == bool(broken)
+        for file in files:
+            with np.load(file) as stored:
+                run = Run(stored["states"], stored["controls"], stored["disturbances"])
+                assert (
+                    run.margin(loop, "safe") <= 0.0
+                    and broken is not None
+                    and float(stored["radius"]) == broken["radius"]
+                )
+    assert compared == len(kinds) * 24 * 11 and any(entry["falsified"] for entry in kinds.values())
+    assert "How wrong the scene may be" in (tmp_path / "out" / "report.html").read_text()
+
+
+# ---------------------------------------------------------------- the command
+
+
+def start(options: list[str]) -> subprocess.Popen[str]:
+    return subprocess.Popen(
+        [sys.executable, "-m", MODULE, *options], text=True, env=environment(), stderr=subprocess.PIPE
+    )
+
+
+def test_interrupted_and_resumed(edge: Course, finished: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "out"
+    process = start(edge.options(folder))
+    until(lambda: stored(folder) >= 3, process)
+    process.send_signal(signal.SIGINT)
+    _, said = process.communicate(timeout=LONG)
+    assert process.returncode == 3 and "Traceback" not in said, said
+    document = json.loads((folder / "report.json").read_text())
+    assert document["state"] == "interrupted" and document["verdict"] != "reaches"
+    # by another number of processes
+    edge.run(folder, resume=True, workers=2)
+    assert cells(folder) == cells(finished)
+    one, other = (json.loads((f / "report.json").read_text())["questions"] for f in (folder, finished))
+    for name, entry in one.items():
+        assert entry["certified"] == other[name]["certified"] and entry["falsified"] == other[name]["falsified"]
+
+
+@pytest.mark.parametrize(
+    "place",
+    [
+        "ns_abstract.api.reaching:open_loop",
+        "ns_abstract.api.compiling:compile_beside",
+        "ns_abstract.api.reaching:simulate",
+        "ns_abstract.api.reaching:examine_here",
+    ],
+)
+def test_interrupted_before_the_first_block(
+    place: str, edge: Course, finished: Path, tmp_path: Path, in_process: InProcess, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = tmp_path / "out"
+    with monkeypatch.context() as patched:
+        interrupted_at(place, patched)
+        check_interrupted(in_process, reach_command.main, edge.options(folder), folder)
+    assert folder.exists() == ("open_loop" not in place)
+    if "examine" in place:
+        edge.run(folder, resume=True)
+        assert cells(folder) == cells(finished)
+
+
+def test_ended_while_kernels_are_compiled(edge: Course, tmp_path: Path) -> None:
+    folder = tmp_path / "out"
+    check_ended_in_a_library_call(MODULE, "ns_abstract.api.compiling.compile_beside", edge.options(folder), folder)
+
+
+@pytest.mark.skipif(importlib.util.find_spec("distributed") is None, reason="dask is not installed")
+def test_two_dask_workers_equal_one_process(edge: Course, finished: Path, tmp_path: Path) -> None:
+    process = start(edge.options(tmp_path / "out", workers=2, engine="dask"))
+    _, said = process.communicate(timeout=LONG)
+    assert process.returncode == 0, said
+    assert cells(tmp_path / "out") == cells(finished)
+
+
+def test_resume_refuses_another_loop(course: Course, finished: Path, call: Callable[..., tuple[int, str]]) -> None:
+    code, said = call(course.options(finished, resume=True))
+    assert code == 2 and said.count("\n") == 1 and "--resume" in said
+
+
+@pytest.fixture
+def call(in_process: InProcess) -> Callable[[list[str]], tuple[int, str]]:
+    def run(options: list[str]) -> tuple[int, str]:
+        code, _, err = in_process(reach_command.main, options)
+        return code, err
+
+    return run
+
+
+MISTAKES: dict[str, tuple[dict[str, Any], tuple[str, ...]]] = {
+    "budget": ({"time_budget": -1}, ("--time-budget",)),
+    "workers": ({"workers": 0}, ("--workers",)),
+    "address": ({"scheduler_address": "h:1"}, ("--scheduler-address", "--engine dask")),
+    "no loop": ({"loop": Path("none.json")}, ("none.json", "loop file")),
+    "no run": ({"load_config": Path("none.yml")}, ("none.yml",)),
+}
+
+
+@pytest.mark.parametrize("name", MISTAKES)
+def test_mistake_is_one_line(name: str, course: Course, call: Callable[..., tuple[int, str]], tmp_path: Path) -> None:
+    changes, fragments = MISTAKES[name]
+    code, said = call(course.options(tmp_path / "out", **changes))
+    assert code == 2 and said.count("\n") == 1 and said.startswith("error: ") and "; " in said, said
+    for fragment in fragments:
+        assert fragment in said
+
+
+def test_a_gain_that_does_not_fit(course: Course, call: Callable[..., tuple[int, str]], tmp_path: Path) -> None:
+    wrong = course.changed("wrong.json", control={"gain": [[1.0], [1.0]]})
+    code, said = call(wrong.options(tmp_path / "out"))
+    assert code == 2 and said.count("\n") == 1 and "wrong.json: control.gain" in said

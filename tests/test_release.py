@@ -1,0 +1,40 @@
+"""What is said of the package elsewhere is what it is: the method page, the list entry, versions."""
+
+from __future__ import annotations
+
+import re
+from importlib.metadata import entry_points
+from pathlib import Path
+
+import pytest
+
+import ns_abstract
+
+ROOT = Path(__file__).resolve().parents[1]
+pytestmark = pytest.mark.skipif(not (ROOT / "docs").is_dir(), reason="the documentation is not beside the tests")
+
+
+def test_method_page_names_what_is_registered() -> None:
+    pytest.importorskip("nerfstudio")
+    from nerfstudio.configs import external_methods
+
+    page = (ROOT / "docs" / "method.md").read_text(encoding="utf-8")
+    text = next(block for block in re.findall(r"```python\n(.*?)```", page, re.S) if "external_methods" in block)
+    known: list[external_methods.ExternalMethod] = []
+    # the entry as nerfstudio's own file would hold it
+    exec(text, {"external_methods": known, "ExternalMethod": external_methods.ExternalMethod})
+    (entry,) = known
+    points = {point.name: point.load() for point in entry_points(group="nerfstudio.method_configs")}
+    registered = {name: method.description for name, method in points.items() if name.startswith("abstract-")}
+    assert dict(entry.configurations) == registered
+    assert {name: method.config.method_name for name, method in points.items() if name in registered} == {
+        name: name for name in registered
+    }
+    for name, description in registered.items():
+        assert f"| `{name}` | {description} |" in page
+
+
+def test_versions_agree() -> None:
+    version = re.escape(ns_abstract.__version__)
+    assert re.search(rf"^version: {version}$", (ROOT / "CITATION.cff").read_text(encoding="utf-8"), re.M)
+    assert re.search(rf"^## \[?({version}|Unreleased)", (ROOT / "CHANGELOG.md").read_text(encoding="utf-8"), re.M)
