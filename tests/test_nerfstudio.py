@@ -641,6 +641,7 @@ def test_a_nerf_in_the_viewer(nerfstudio: SimpleNamespace, folder: Path, monkeyp
     model, camera = pipeline.model, cameras(nerfstudio, height=96, width=128)
     draws: list[int] = []
     monkeypatch.setattr(model.abstract.control, "draw", lambda: draws.append(1))
+    monkeypatch.setattr(nerfstudio.panel.Attached, "watched", False)
     model.abstract.control._present.set()
     model._speed = 1000.0
     model.abstract._sliders["x"].value = 1.0

@@ -213,6 +213,15 @@ def test_asking_never_waits(background: Callable[..., Background]) -> None:
     assert answer(one, view(x=0.1)).final
 
 
+def test_who_looks_may_be_gone(background: Callable[..., Background], capfd: pytest.CaptureFixture[str]) -> None:
+    def gone() -> None:
+        raise KeyError("client")
+
+    one = background(changed=gone)
+    assert answer(one, view()).final
+    assert "the viewer was not told of new bounds: KeyError" in capfd.readouterr().err
+
+
 def test_close_ends_the_workers(background: Callable[..., Background]) -> None:
     one = background()
     processes = [worker.process for worker in one._workers]

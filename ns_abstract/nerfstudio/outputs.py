@@ -143,7 +143,10 @@ class AbstractOutputs(_Base):
             refine=lambda seconds: (model := here()) and model._background.more(seconds),
         )
         self._background = Background(lambda: (model := here()) and model._news())
-        self._redraw = Insistent(self.abstract.control.draw, lambda: (model := here()) is None or model._current())
+        self._redraw = Insistent(
+            lambda: (model := here()) and model.abstract.control.draw(),
+            lambda: (model := here()) is None or model._current(),
+        )
         self._source: Source | None = None
         self._evaluating = False
         self._problems: list[str] | None = None

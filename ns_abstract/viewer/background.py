@@ -248,7 +248,11 @@ class Background:
                 self._lost(worker)
             else:
                 self._heard(worker, *message)
-        self.changed()
+        try:
+            self.changed()
+        except Exception as error:
+            # whoever looks may be gone: what is known stays, and the worker is heard on
+            print(f"the viewer was not told of new bounds: {type(error).__name__}: {error}", file=sys.stderr)
 
     def _lost(self, worker: _Process) -> None:
         was_first = worker is self._workers[0]
