@@ -202,7 +202,7 @@ CERTIFICATES = (
     ),
     Fault(
         "search: a swallowed error proves",
-        _SEARCH, "Search._bound", "reasons.update(dict.fromkeys(kept, _told(error)))",
+        _SEARCH, "Search._bound", "reasons.update(dict.fromkeys(kept, failure_text(error)))",
         "bounded.update(dict.fromkeys(kept, 1.0))", _NETWORKS + "[exception]",
     ),
     Fault(
