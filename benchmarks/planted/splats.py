@@ -158,7 +158,7 @@ SPLATS = (
         _LINE_PROJECTION,
         "project_line",
         "n00 = _lowered(_rotated(r0, b0, b1, b2, still, 0.0, 0.0), u, deep)",
-        "n00 = _lowered(_rotated(r0, b0, b1, b2, still, 0.0, 0.0), (u[0], -u[1], u[2], u[3]), deep)",
+        "n00 = _lowered(_rotated(r0, b0, b1, b2, still, 0.0, 0.0), u._replace(slope=-u.slope), deep)",
         "test_bounds.py::test_needle[2]",
     ),
     Fault(
@@ -166,7 +166,7 @@ SPLATS = (
         _LINE_PROJECTION,
         "project_line",
         "n10 = _lowered(_rotated(r1, b0, b1, b2, still, 0.0, 0.0), v, deep)",
-        "n10 = _lowered(_rotated(r1, b0, b1, b2, still, 0.0, 0.0), (v[0], -v[1], v[2], v[3]), deep)",
+        "n10 = _lowered(_rotated(r1, b0, b1, b2, still, 0.0, 0.0), v._replace(slope=-v.slope), deep)",
         "test_bounds.py::test_needle[2]",
     ),
     Fault(
