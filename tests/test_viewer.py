@@ -207,8 +207,8 @@ def test_asking_never_waits(background: Callable[..., Background]) -> None:
     start = time.perf_counter()
     for k in range(100):
         one.best(view(x=0.001 * (k + 1)), 1.0)
-    # a cell takes longer than all of these
-    assert time.perf_counter() - start < 2.0
+    # the worker sleeps ten times as long
+    assert time.perf_counter() - start < 60.0
     assert one.best(view(x=0.1), 1.0) is None
     assert answer(one, view(x=0.1)).final
 
