@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from numba import get_num_threads, njit, prange
+from numba import njit
 from test_bounds import TURN, camera, moves, scene
 
 from ns_abstract.arithmetic.rounding import REAL
 from ns_abstract.arithmetic.simd.intrinsics import pointer, taken
+from ns_abstract.execution.threads import side_by_side
 from ns_abstract.geometry.poses import PoseSet
 from ns_abstract.methods.splat.constants import GSPLAT_1_4_0
 from ns_abstract.methods.splat.frame import SplatFrame
@@ -59,19 +60,19 @@ def test_longest_lists_first():
     assert longest_first(wanted, offsets).tolist() == [2, 3, 0, 1]
 
 
-@njit(parallel=True)
-def _take(counter, owners, threads):
-    for thread in prange(threads):
-        while True:
-            number = taken(pointer(counter))
-            if number >= owners.size:
-                break
-            owners[number] += 1 + 1000 * thread
+@njit(nogil=True)
+def _take(thread, counter, owners):
+    while True:
+        number = taken(pointer(counter))
+        if number >= owners.size:
+            break
+        owners[number] += 1 + 1000 * thread
 
 
 def test_every_number_is_taken_once():
-    owners = np.zeros(20_000, np.int64)
-    _take(np.zeros(1, np.int64), owners, get_num_threads())
+    owners, counter = np.zeros(200_000, np.int64), np.zeros(1, np.int64)
+    # what is not taken at once can be taken twice: three more start than there may be cores
+    side_by_side(lambda thread: _take(thread, counter, owners), 4)
     assert (owners % 1000 == 1).all()
 
 
