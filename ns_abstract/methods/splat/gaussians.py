@@ -13,7 +13,7 @@ import numpy as np
 from numba import njit
 
 from ns_abstract.arithmetic.rounding import SUM_ROUNDING, Charges
-from ns_abstract.arithmetic.simd.intrinsics import borrowed, pointer, taken
+from ns_abstract.arithmetic.simd.intrinsics import borrowed, pointer, signed, taken
 from ns_abstract.arithmetic.simd.lanes import bits, load8, scatter_columns, store, where
 from ns_abstract.arithmetic.simd.wide_forms import bounds, magnitude, size
 from ns_abstract.geometry.camera_path import Intrinsics
@@ -123,7 +123,8 @@ def _stage_worker(counter_, candidates_, scene, poses, camera, rules, charges, s
         stop = min(candidates.shape[0], start + CHUNK)
         for k in range(stop - start):
             everyone[k] = start + k
-        count = 0
+        # not as a literal, for which what is called would be compiled once more
+        count = signed(0)
         for first in range(0, stop - start, LANES):
             block = everyone[first : first + min(LANES, stop - start - first)]
             count = _cull_block(candidates, block, inputs, scratch, state, alive, count)
