@@ -18,11 +18,11 @@ from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 from typing import Any
 
-import numba
 import numpy as np
 
 from ns_abstract.bench.sets import open_jobs, pose_set, splat_of
 from ns_abstract.bench.tables import markdown, write
+from ns_abstract.execution.threads import threads
 from ns_abstract.geometry.camera_path import Camera
 from ns_abstract.methods.splat.frame import SplatFrame
 from ns_abstract.methods.splat.ply import write_ply
@@ -113,7 +113,7 @@ def main() -> None:
         with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as pool:
             rows.append(pool.submit(compare, options.config, size, options.repeats, options.output_dir).result())
         print(markdown(rows), flush=True)
-    write(rows, options.output_dir, "open3d", f"Beside Open3D, {numba.get_num_threads()} threads")
+    write(rows, options.output_dir, "open3d", f"Beside Open3D, {threads()} threads")
 
 
 if __name__ == "__main__":

@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import time
+
+import numba
 import numpy as np
 import pytest
-from numba import get_num_threads, njit, prange
+from numba import njit
 from test_bounds import TURN, camera, moves, scene
 
 from ns_abstract.arithmetic.rounding import REAL
 from ns_abstract.arithmetic.simd.intrinsics import pointer, taken
+from ns_abstract.execution.threads import side_by_side, threads, use_threads
 from ns_abstract.geometry.poses import PoseSet
 from ns_abstract.methods.splat.constants import GSPLAT_1_4_0
 from ns_abstract.methods.splat.frame import SplatFrame
@@ -59,20 +63,46 @@ def test_longest_lists_first():
     assert longest_first(wanted, offsets).tolist() == [2, 3, 0, 1]
 
 
-@njit(parallel=True)
-def _take(counter, owners, threads):
-    for thread in prange(threads):
-        while True:
-            number = taken(pointer(counter))
-            if number >= owners.size:
-                break
-            owners[number] += 1 + 1000 * thread
+@njit(nogil=True)
+def _take(thread, counter, owners):
+    while True:
+        number = taken(pointer(counter))
+        if number >= owners.size:
+            break
+        owners[number] += 1 + 1000 * thread
 
 
 def test_every_number_is_taken_once():
-    owners = np.zeros(20_000, np.int64)
-    _take(np.zeros(1, np.int64), owners, get_num_threads())
+    owners, counter = np.zeros(200_000, np.int64), np.zeros(1, np.int64)
+    # what is not taken at once can be taken twice: three more start than there may be cores
+    side_by_side(lambda thread: _take(thread, counter, owners), 4)
     assert (owners % 1000 == 1).all()
+
+
+def test_threads_are_waited_for_and_their_errors_heard():
+    done: list[int] = []
+
+    def work(number: int) -> None:
+        if number == 2:
+            raise ZeroDivisionError
+        time.sleep(0.05 * number)
+        done.append(number)
+
+    side_by_side(work, 2)
+    assert sorted(done) == [0, 1]
+    with pytest.raises(ZeroDivisionError):
+        side_by_side(work, 3)
+
+
+def test_number_of_threads(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(numba.config, "NUMBA_NUM_THREADS", 3)
+    try:
+        for asked, there in ((2, 2), (0, 1), (7, 3)):
+            use_threads(asked)
+            assert threads() == there
+    finally:
+        monkeypatch.undo()
+        use_threads(threads())
 
 
 def test_partial_pictures_are_parts_of_the_whole():

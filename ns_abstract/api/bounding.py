@@ -20,6 +20,7 @@ from ns_abstract.execution.engines import Engine, Here
 from ns_abstract.execution.opening import Recipe, opened
 from ns_abstract.execution.scheduler import Task, work
 from ns_abstract.execution.stopping import StopRequest, interruptible
+from ns_abstract.execution.threads import use_threads
 from ns_abstract.geometry.box import ParameterBox
 from ns_abstract.io.errors import InputError
 from ns_abstract.refine.engine import Goal, groups, shared_goal
@@ -93,10 +94,7 @@ def bound_part(
     Raises:
         InputError: The worker reads other files under the same names than the command did.
     """
-    import numba
-
-    most: int = numba.config.NUMBA_NUM_THREADS  # pyright: ignore[reportPrivateImportUsage, reportAttributeAccessIssue]
-    numba.set_num_threads(max(1, min(len(os.sched_getaffinity(0)) // neighbours, most)))
+    use_threads(len(os.sched_getaffinity(0)) // neighbours)
     job = opened(recipe)
     job.warm_up(part.index)
     try:

@@ -22,6 +22,7 @@ from ns_abstract.api.job import Job, warm_up
 from ns_abstract.api.scenes import platform_problems
 from ns_abstract.execution.ending import abandoning
 from ns_abstract.execution.opening import Recipe, opened
+from ns_abstract.execution.threads import use_threads
 from ns_abstract.geometry.box import ParameterBox
 from ns_abstract.geometry.camera_path import load_camera_path
 from ns_abstract.geometry.poses import PoseSet
@@ -501,10 +502,8 @@ def examine_block(recipe: Recipe[Certification], index: int, grid: Grid, cells: 
 
 def examine_here(job: Certification, index: int, grid: Grid, cells: tuple[Cell, ...]) -> Findings:
     """Examine one block in this process."""
-    import numba
-
     # as many workers as cores; more threads would only wait for each other
-    numba.set_num_threads(1)
+    use_threads(1)
     torch.set_num_threads(1)
     return job.search(index, grid).examine(cells)
 

@@ -28,6 +28,7 @@ from ns_abstract.execution.ending import AbandonedError, abandoning
 from ns_abstract.execution.engines import Engine, EngineName, started
 from ns_abstract.execution.opening import Recipe, opened
 from ns_abstract.execution.stopping import StopRequest, interruptible
+from ns_abstract.execution.threads import use_threads
 from ns_abstract.geometry.box import ParameterBox
 from ns_abstract.io.errors import InputError
 from ns_abstract.perturbation.specification import TRANSLATIONS
@@ -205,10 +206,9 @@ def examine_cells(recipe: Recipe[LoopJob], number: int, grid: Grid, cells: tuple
 
 def examine_here(job: LoopJob, number: int, grid: Grid, cells: tuple[Cell, ...]) -> LoopFindings:
     """Examine cells in this process."""
-    import numba
     import torch
 
-    numba.set_num_threads(1)
+    use_threads(1)
     torch.set_num_threads(1)
     return job.search.examine(number, grid, cells)
 

@@ -8,9 +8,9 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 
 import numpy as np
-from numba import get_num_threads
 
 from ns_abstract.arithmetic.rounding import FRAGMENT_ROUNDING, REGION, UNIT64, Arithmetic, Charges, charges
+from ns_abstract.execution.threads import threads
 from ns_abstract.geometry.camera_path import Camera
 from ns_abstract.geometry.poses import PoseForms
 from ns_abstract.geometry.tiles import tile_grid
@@ -205,7 +205,7 @@ class SplatBounds:
             linear=np.zeros((wanted.size if keep_linear else 0, *pixels[1:], m + 1)),
             layers=np.zeros((wanted.size if layers else 0, self.side, self.side, 4)),
             slopes=np.zeros((wanted.size, d)),
-            statistics=np.zeros((get_num_threads(), 5), np.int64),
+            statistics=np.zeros((threads(), 5), np.int64),
             marks=np.zeros(n, np.uint8),
         )
         common = np.zeros(m + 1)
@@ -222,7 +222,6 @@ class SplatBounds:
             self.charges,
             self._cutoffs(floor),
             shape,
-            get_num_threads(),
             found,
         )
         return CellBounds(

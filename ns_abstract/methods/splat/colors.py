@@ -6,17 +6,17 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit, prange
+from numba import njit
 
 from ns_abstract.arithmetic.forms import bounds, clamp_below, set_norms
-from ns_abstract.arithmetic.rounding import SUM_ROUNDING, UP
-from ns_abstract.arithmetic.simd.intrinsics import advanced, borrowed, pointer
+from ns_abstract.arithmetic.rounding import SUM_ROUNDING, UP, Charges
+from ns_abstract.arithmetic.simd.intrinsics import advanced, borrowed, pointer, taken
 from ns_abstract.arithmetic.simd.wide_forms import size
 from ns_abstract.methods.splat.form_colors import WORKSPACE, form_colors
 from ns_abstract.methods.splat.line_colors import accumulate_line, basis_line, directions_line
 from ns_abstract.methods.splat.records import LANES
-
-_CHUNK = 1024
+from ns_abstract.methods.splat.sharing import CHUNK, chunked
+from ns_abstract.methods.splat.stage_data import FormShape, SceneColors
 
 #: Largest change of each basis function per unit change of the direction, rounded up.
 _SLOPE = np.array(
@@ -128,24 +128,20 @@ def _direction_error(length, position_error, means, mean_radius, i, charges):
     return min(error, 2.0)
 
 
-@njit(cache=True, parallel=True, error_model="numpy")
-def fixed_colors(scene, position, position_error, charges, colors):
-    """Colours [N, 6] seen from one camera position: centre and radius by channel (design.md, C1, C3, S4).
-
-    Args:
-        scene: `SceneColors`.
-        position: [3] world; ``position_error`` bounds what float evaluation and the set add to it.
-        charges: `Charges` for the program's rounding.
-        colors: The output.
-    """
-    count = scene.means.shape[0]
-    for chunk in prange((count + _CHUNK - 1) // _CHUNK):
-        means, mean_radius, magnitudes = borrowed(scene.means), borrowed(scene.mean_radius), borrowed(scene.magnitudes)
-        color_low, color_high, sh = borrowed(scene.low), borrowed(scene.high), borrowed(scene.sh)
-        basis = np.empty(16)
-        color = np.empty(3)
-        direction = np.empty(3)
-        for i in range(chunk * _CHUNK, min(count, (chunk + 1) * _CHUNK)):
+@njit(cache=True, error_model="numpy", nogil=True)
+def _fixed_worker(counter_, scene, position, position_error, charges, colors):
+    """One thread's Gaussians: the next chunk that none has taken yet; see `fixed_colors`."""
+    counter, count = pointer(counter_), scene.means.shape[0]
+    means, mean_radius, magnitudes = borrowed(scene.means), borrowed(scene.mean_radius), borrowed(scene.magnitudes)
+    color_low, color_high, sh = borrowed(scene.low), borrowed(scene.high), borrowed(scene.sh)
+    basis = np.empty(16)
+    color = np.empty(3)
+    direction = np.empty(3)
+    while True:
+        start = taken(counter) * CHUNK
+        if start >= count:
+            break
+        for i in range(start, min(count, start + CHUNK)):
             for k in range(3):
                 direction[k] = means[i, k] - position[k]
             length = math.sqrt(direction[0] ** 2 + direction[1] ** 2 + direction[2] ** 2)
@@ -162,6 +158,20 @@ def fixed_colors(scene, position, position_error, charges, colors):
                     radius = 0.5 * (high - low) * UP + SUM_ROUNDING * high
                 colors[i, 2 * c] = color[c]
                 colors[i, 2 * c + 1] = radius
+
+
+def fixed_colors(
+    scene: SceneColors, position: np.ndarray, position_error: float, charges: Charges, colors: np.ndarray
+) -> None:
+    """Colours [N, 6] seen from one camera position: centre and radius by channel (design.md, C1, C3, S4).
+
+    Args:
+        scene: The Gaussians.
+        position: [3] world; ``position_error`` bounds what float evaluation and the set add to it.
+        charges: For the program's rounding.
+        colors: The output.
+    """
+    chunked(_fixed_worker, scene.means.shape[0], scene, position, position_error, charges, colors)
 
 
 @njit(cache=True, error_model="numpy")
@@ -262,10 +272,10 @@ def _clamp_channel(form, channel, numbers, filled, scratch, scene, charges, shap
     _clamp_at_zero(form, low, high, shape)
 
 
-@njit(cache=True, error_model="numpy")
-def _color_chunk(chunk, indices, scene, position, origin, position_error, charges, shape, colors):
-    """One chunk of Gaussians; see `moving_colors`."""
-    n, m = indices.shape[0], shape.monomials
+@njit(cache=True, error_model="numpy", nogil=True)
+def _moving_worker(counter_, indices, scene, position, origin, position_error, charges, shape, colors):
+    """One thread's Gaussians: the next chunk that none has taken yet; see `moving_colors`."""
+    counter, n, m = pointer(counter_), indices.shape[0], shape.monomials
     # 0-2 direction, 16-18 channels; in between what `line_colors` keeps
     work_ = np.empty((19, m + 3, LANES))
     ends_ = np.empty((4, LANES))
@@ -277,37 +287,42 @@ def _color_chunk(chunk, indices, scene, position, origin, position_error, charge
         borrowed(ends_[3]),
     )  # fmt: skip
     means, mean_radius, low = borrowed(scene.means), borrowed(scene.mean_radius), scratch.low
-    for first in range(chunk * _CHUNK, min(n, (chunk + 1) * _CHUNK), LANES):
-        filled = min(LANES, min(n, (chunk + 1) * _CHUNK) - first)
-        for q in range(LANES):
-            numbers[q] = indices[first + min(q, filled - 1), 1]
-        _set_directions(work, numbers, scene, position, origin, m)
-        _set_bands(work, numbers, filled, scratch, scene, shape)
-        for q in range(filled):
-            distance = math.sqrt(low[q]) * (1.0 - SUM_ROUNDING) if low[q] > 0.0 else 0.0
-            scratch.angle[q] = _direction_error(distance, position_error, means, mean_radius, numbers[q], charges)
-        for channel in range(3):
-            form = work[16 + channel]
-            _clamp_channel(form, channel, numbers, filled, scratch, scene, charges, shape)
+    while True:
+        start = taken(counter) * CHUNK
+        if start >= n:
+            break
+        for first in range(start, min(n, start + CHUNK), LANES):
+            filled = min(LANES, min(n, start + CHUNK) - first)
+            for q in range(LANES):
+                numbers[q] = indices[first + min(q, filled - 1), 1]
+            _set_directions(work, numbers, scene, position, origin, m)
+            _set_bands(work, numbers, filled, scratch, scene, shape)
             for q in range(filled):
-                for k in range(m + 1):
-                    colors[indices[first + q, 0], channel * (m + 1) + k] = form[k, q]
+                distance = math.sqrt(low[q]) * (1.0 - SUM_ROUNDING) if low[q] > 0.0 else 0.0
+                scratch.angle[q] = _direction_error(distance, position_error, means, mean_radius, numbers[q], charges)
+            for channel in range(3):
+                form = work[16 + channel]
+                _clamp_channel(form, channel, numbers, filled, scratch, scene, charges, shape)
+                for q in range(filled):
+                    for k in range(m + 1):
+                        colors[indices[first + q, 0], channel * (m + 1) + k] = form[k, q]
     # the owners of the borrowed arrays live to here
     return work_.size + ends_.size + wide_.size + numbers_.size
 
 
-@njit(cache=True, parallel=True, error_model="numpy")
-def moving_colors(indices, scene, position, origin, position_error, charges, shape, colors):
+def moving_colors(
+    indices: np.ndarray, scene: SceneColors, position: np.ndarray, origin: np.ndarray, position_error: float,
+    charges: Charges, shape: FormShape, colors: np.ndarray,
+) -> None:  # fmt: skip
     """Colours over a cell in which the camera moves, as forms (design.md, C2, C3, S4).
 
     Args:
         indices: [n, 2] row of ``colors`` and number of the Gaussian in the scene.
-        scene: `SceneColors`.
+        scene: The Gaussians.
         position: [rows, 3] forms of the camera position, world, centred at ``origin`` [3].
         position_error: Bound of the float error of the camera position, world units.
-        charges: `Charges` for the program's rounding.
-        shape: `FormShape` of ``position``.
+        charges: For the program's rounding.
+        shape: Of the forms of ``position``.
         colors: [., 3 (m + 1)] output: coefficients and radius by channel.
     """
-    for chunk in prange((indices.shape[0] + _CHUNK - 1) // _CHUNK):
-        _color_chunk(chunk, indices, scene, position, origin, position_error, charges, shape, colors)
+    chunked(_moving_worker, indices.shape[0], indices, scene, position, origin, position_error, charges, shape, colors)

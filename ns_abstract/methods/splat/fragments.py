@@ -588,9 +588,10 @@ def collect_fragments(numbers, place, inputs, block, marks_):
     window = _start(numbers, inputs, block)
     if not window.room > 0.0:
         return GIVE_UP, 0
-    pairs, slots, moved, used = 0, 0, 1, 0
+    # not as literals, for which what is called would be compiled once more
+    pairs, slots, moved, used = signed(0), signed(0), signed(1), signed(0)
     # pixels that take light, and those that take none, or too little, behind the fragments whose place is still open
-    live, dim = -1, 0
+    live, dim = signed(-1), signed(0)
     missing = length
     for start in range(0, length, BATCH):
         some = min(BATCH, length - start)

@@ -10,13 +10,15 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit, prange
+from numba import njit
 
 from ns_abstract.arithmetic.rounding import SUM_ROUNDING, Charges
-from ns_abstract.arithmetic.simd.intrinsics import borrowed, pointer
+from ns_abstract.arithmetic.simd.intrinsics import borrowed, pointer, signed, taken
 from ns_abstract.arithmetic.simd.lanes import bits, load8, scatter_columns, store, where
 from ns_abstract.arithmetic.simd.wide_forms import bounds, magnitude, size
+from ns_abstract.geometry.camera_path import Intrinsics
 from ns_abstract.methods.splat import records as row
+from ns_abstract.methods.splat.constants import RasterRules
 from ns_abstract.methods.splat.form_projection import WORKSPACE, project_forms, rotate
 from ns_abstract.methods.splat.line_projection import compensate_line, project_line
 from ns_abstract.methods.splat.records import (
@@ -30,9 +32,14 @@ from ns_abstract.methods.splat.records import (
     projected_stretch,
     regions,
 )
-from ns_abstract.methods.splat.stage_data import CellPoses, ProjectedGaussians, ProjectionInputs, SceneGaussians
-
-_CHUNK = 1024
+from ns_abstract.methods.splat.sharing import CHUNK, chunked
+from ns_abstract.methods.splat.stage_data import (
+    CellPoses,
+    FormShape,
+    ProjectedGaussians,
+    ProjectionInputs,
+    SceneGaussians,
+)
 
 
 def covariance_noise(axes: np.ndarray, charges: Charges) -> np.ndarray:
@@ -91,10 +98,11 @@ def _borrowed_inputs(scene, poses, camera, rules, charges, shape):
     return ProjectionInputs(scene, poses, camera, rules, charges, shape)
 
 
-@njit(cache=True, error_model="numpy")
-def _stage_chunk(chunk, candidates_, inputs, out, state_):
-    """One chunk of candidates; see `gaussian_stage`."""
-    candidates, state = borrowed(candidates_), borrowed(state_)
+@njit(cache=True, error_model="numpy", nogil=True)
+def _stage_worker(counter_, candidates_, scene, poses, camera, rules, charges, shape, out, state_):
+    """One thread's candidates: the next chunk that none has taken yet; see `gaussian_stage`."""
+    counter, candidates, state = pointer(counter_), borrowed(candidates_), borrowed(state_)
+    inputs = _borrowed_inputs(scene, poses, camera, rules, charges, shape)
     out = ProjectedGaussians(
         borrowed(out.record), borrowed(out.box), borrowed(out.tiles), borrowed(out.depth), borrowed(out.delta),
         borrowed(out.depth_error),
@@ -106,40 +114,45 @@ def _stage_chunk(chunk, candidates_, inputs, out, state_):
         np.empty(LANES, np.int64),
     )
     scratch = _Scratch(borrowed(owned.work), borrowed(owned.rows), borrowed(owned.logarithms), borrowed(owned.places))
-    start = chunk * _CHUNK
-    stop = min(candidates.shape[0], start + _CHUNK)
-    alive_ = np.empty(_CHUNK, np.int64)
-    everyone_ = np.arange(start, stop)
+    alive_, everyone_ = np.empty(CHUNK, np.int64), np.empty(CHUNK, np.int64)
     alive, everyone = borrowed(alive_), borrowed(everyone_)
-    count = 0
-    for first in range(start, stop, LANES):
-        filled = min(LANES, stop - first)
-        block = everyone[first - start : first - start + filled]
-        count = _cull_block(candidates, block, inputs, scratch, state, alive, count)
-    for first in range(0, count, LANES):
-        filled = min(LANES, count - first)
-        _project_block(candidates, alive[first : first + filled], inputs, scratch, out, state)
+    while True:
+        start = taken(counter) * CHUNK
+        if start >= candidates.shape[0]:
+            break
+        stop = min(candidates.shape[0], start + CHUNK)
+        for k in range(stop - start):
+            everyone[k] = start + k
+        # not as a literal, for which what is called would be compiled once more
+        count = signed(0)
+        for first in range(0, stop - start, LANES):
+            block = everyone[first : first + min(LANES, stop - start - first)]
+            count = _cull_block(candidates, block, inputs, scratch, state, alive, count)
+        for first in range(0, count, LANES):
+            filled = min(LANES, count - first)
+            _project_block(candidates, alive[first : first + filled], inputs, scratch, out, state)
     # the owners of the borrowed arrays live to here
     return len(owned) + alive_.size + everyone_.size
 
 
-@njit(cache=True, parallel=True, error_model="numpy")
-def gaussian_stage(candidates, scene, poses, camera, rules, charges, shape, out, state):
+def gaussian_stage(
+    candidates: np.ndarray, scene: SceneGaussians, poses: CellPoses, camera: Intrinsics, rules: RasterRules,
+    charges: Charges, shape: FormShape, out: ProjectedGaussians, state: np.ndarray,
+) -> None:  # fmt: skip
     """Project the ``candidates`` over a cell (design.md, G).
 
     Args:
         candidates: [n] int32 indices into the scene's arrays.
-        scene: `SceneGaussians`.
-        poses: `CellPoses`.
-        camera: `Intrinsics`.
-        rules: `RasterRules`.
-        charges: `Charges` for the program's rounding.
-        shape: `FormShape` of the poses' forms.
-        out: `ProjectedGaussians`, the output; ``out.record`` has `records.columns`.
+        scene: The Gaussians.
+        poses: The cell's.
+        camera: Intrinsics.
+        rules: The rasteriser's.
+        charges: For the program's rounding.
+        shape: Of the poses' forms.
+        out: The output; ``out.record`` has `records.columns`.
         state: [n] uint8 output: 1 if visible; else the candidate's row of ``out`` is not set.
     """
-    for chunk in prange((candidates.shape[0] + _CHUNK - 1) // _CHUNK):
-        _stage_chunk(chunk, candidates, _borrowed_inputs(scene, poses, camera, rules, charges, shape), out, state)
+    chunked(_stage_worker, candidates.shape[0], candidates, scene, poses, camera, rules, charges, shape, out, state)
 
 
 @njit(cache=True, error_model="numpy")

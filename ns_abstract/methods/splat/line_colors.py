@@ -52,20 +52,20 @@ def directions_line(s, n, degree, low):
             store(combined(multiplied(x, s1), 1.0, multiplied(y, c1), 1.0), s, _S2, LANES, q)
 
 
-@njit(cache=True, error_model="numpy", inline="always")
+@njit(cache=True, error_model="numpy", forceinline=True)
 def _multiple(s, n, source, factor):
     for q in range(n):
         store(scaled(load(s, source, LANES, q), factor), s, _BASIS, LANES, q)
 
 
-@njit(cache=True, error_model="numpy", inline="always")
+@njit(cache=True, error_model="numpy", forceinline=True)
 def _product(s, n, left, right, factor):
     for q in range(n):
         product = multiplied(load(s, left, LANES, q), load(s, right, LANES, q))
         store(scaled(product, factor), s, _BASIS, LANES, q)
 
 
-@njit(cache=True, error_model="numpy", inline="always")
+@njit(cache=True, error_model="numpy", forceinline=True)
 def _shifted_square(s, n, left, factor, shift):
     """``left (factor z^2 + shift)``."""
     for q in range(n):
@@ -122,7 +122,7 @@ def accumulate_line(s, n, weights, channel):
         _accumulated(s, n, weights, _RED + 2 * _SLOT)
 
 
-@njit(cache=True, error_model="numpy", inline="always")
+@njit(cache=True, error_model="numpy", forceinline=True)
 def _accumulated(s, n, weights, target):
     for q in range(n):
         w = abs(weights[q])

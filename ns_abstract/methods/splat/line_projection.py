@@ -37,13 +37,13 @@ class _RotationRow(NamedTuple):
     magnitude_z: float
 
 
-@njit(cache=True, error_model="numpy", inline="always")
+@njit(cache=True, error_model="numpy", forceinline=True)
 def _column(forms, k):
     """Column ``k`` of forms [6, n]."""
     return LineForm(forms[0, k], forms[1, k], forms[2, k], forms[3, k])
 
 
-@njit(cache=True, error_model="numpy", inline="always")
+@njit(cache=True, error_model="numpy", forceinline=True)
 def _rotation_row(rotation, k):
     """Row ``k`` of the rotation [6, 9]."""
     a, b, c = 3 * k, 3 * k + 1, 3 * k + 2
@@ -55,7 +55,7 @@ def _rotation_row(rotation, k):
     )  # fmt: skip
 
 
-@njit(cache=True, error_model="numpy", inline="always")
+@njit(cache=True, error_model="numpy", forceinline=True)
 def _rotated(r, x, y, z, shift, shift_size, spread):
     """``r . (x, y, z) + shift`` for exact x, y, z and a form ``shift``, widened (`form_projection.rotate`)."""
     a, b, c = abs(x), abs(y), abs(z)
@@ -69,12 +69,12 @@ def _rotated(r, x, y, z, shift, shift_size, spread):
     )
 
 
-@njit(cache=True, error_model="numpy", inline="always")
+@njit(cache=True, error_model="numpy", forceinline=True)
 def _negated(a):
     return LineForm(-a.center, -a.slope, -a.bend, a.radius)
 
 
-@njit(cache=True, error_model="numpy", inline="always")
+@njit(cache=True, error_model="numpy", forceinline=True)
 def _clamped(a, low, high, limit_low, limit_high):
     """``min(limit_high, max(-limit_low, a))`` given bounds of ``a`` (`wide_forms.clamp`)."""
     a = raised(a, -limit_low, low, high)
@@ -82,7 +82,7 @@ def _clamped(a, low, high, limit_low, limit_high):
     return _negated(raised(_negated(a), -limit_high, -high, -low))
 
 
-@njit(cache=True, error_model="numpy", inline="always")
+@njit(cache=True, error_model="numpy", forceinline=True)
 def _pixels(a, z, ratio, focal):
     """``focal a - (focal ratio) z``, which vanishes at the middle of the cell: a pixel offset times depth."""
     # the pixel offset used later is exactly focal * ratio in float64
@@ -95,18 +95,18 @@ def _pixels(a, z, ratio, focal):
     )  # fmt: skip
 
 
-@njit(cache=True, error_model="numpy", inline="always")
+@njit(cache=True, error_model="numpy", forceinline=True)
 def _lowered(c, a, b):
     """``c - a b``."""
     return combined(c, 1.0, multiplied(a, b), -1.0)
 
 
-@njit(cache=True, error_model="numpy", inline="always")
+@njit(cache=True, error_model="numpy", forceinline=True)
 def _sum_of_products(a0, b0, a1, b1, a2, b2):
     return combined(combined(multiplied(a0, b0), 1.0, multiplied(a1, b1), 1.0), 1.0, multiplied(a2, b2), 1.0)
 
 
-@njit(cache=True, error_model="numpy", inline="always")
+@njit(cache=True, error_model="numpy", forceinline=True)
 def _crossed(a, b, c, d):
     """``(a d - b c)^2``."""
     found = combined(multiplied(a, d), 1.0, multiplied(b, c), -1.0)

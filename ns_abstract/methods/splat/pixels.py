@@ -9,15 +9,27 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit, prange
+from numba import njit
 
+from ns_abstract.arithmetic.rounding import Charges
 from ns_abstract.arithmetic.simd.intrinsics import borrowed, pointer, taken
+from ns_abstract.execution.threads import side_by_side
+from ns_abstract.geometry.camera_path import Intrinsics
 from ns_abstract.methods.splat.blend import shade, swap_bounds
 from ns_abstract.methods.splat.block import Place, block_of, longest_list, new_buffers, resized
+from ns_abstract.methods.splat.constants import RasterRules
 from ns_abstract.methods.splat.depths import ACCUMULATION_HIGH, ACCUMULATION_LOW, DEPTH_HIGH, DEPTH_LOW, shade_layers
 from ns_abstract.methods.splat.fragments import GIVE_UP, GROW, apply_stops, collect_fragments, number_groups
-from ns_abstract.methods.splat.lists import BLOCK, PIXELS, block_lists, longest_first
-from ns_abstract.methods.splat.stage_data import Colors, PixelBounds, PixelInputs, ProjectedGaussians, ViewingAxes
+from ns_abstract.methods.splat.lists import BLOCK, PIXELS, TileLists, block_lists, longest_first
+from ns_abstract.methods.splat.stage_data import (
+    Colors,
+    Cutoffs,
+    FormShape,
+    PixelBounds,
+    PixelInputs,
+    ProjectedGaussians,
+    ViewingAxes,
+)
 
 
 @njit(cache=True, error_model="numpy")
@@ -99,10 +111,13 @@ def _tile_bounds(bounds, number, thread):
     )  # fmt: skip
 
 
-@njit(cache=True, error_model="numpy")
-def _pixel_worker(thread, sequence_, counter_, lists, inputs, bounds):
+@njit(cache=True, error_model="numpy", nogil=True)
+def _pixel_worker(
+    thread, sequence_, counter_, lists, gaussians, axes, intrinsics, colors, rules, charges, cutoffs, shape, bounds
+):
     """One thread's tiles: the next of ``sequence_`` that none has taken yet; see `pixel_stage`."""
     sequence, counter = borrowed(sequence_), pointer(counter_)
+    inputs = _borrowed_inputs(gaussians, axes, intrinsics, colors, rules, charges, cutoffs, shape)
     camera, m = inputs.intrinsics, inputs.shape.monomials
     side = bounds.lower.shape[1]
     tiles_x = int(math.ceil(camera.width / side))
@@ -140,27 +155,27 @@ def _pixel_worker(thread, sequence_, counter_, lists, inputs, bounds):
     return len(buffers)
 
 
-@njit(cache=True, parallel=True, error_model="numpy")
-def pixel_stage(lists, gaussians, axes, intrinsics, colors, rules, charges, cutoffs, shape, threads, bounds):
+def pixel_stage(
+    lists: TileLists, gaussians: ProjectedGaussians, axes: ViewingAxes, intrinsics: Intrinsics, colors: Colors,
+    rules: RasterRules, charges: Charges, cutoffs: Cutoffs, shape: FormShape, bounds: PixelBounds,
+) -> None:  # fmt: skip
     """Bounds of the pixels of the tiles ``lists.wanted`` (design.md, B).
 
     Args:
-        lists: `TileLists` of all tiles of the image.
-        gaussians: `ProjectedGaussians`.
-        axes: `ViewingAxes`.
-        intrinsics: `Intrinsics`.
-        colors: `Colors`.
-        rules: `RasterRules`.
-        charges: `Charges` for the program's rounding.
-        cutoffs: `Cutoffs`.
-        shape: `FormShape` of the Gaussians' forms.
-        threads: How many work side by side.
-        bounds: `PixelBounds`, the output.
+        lists: Of all tiles of the image.
+        gaussians: Projected.
+        axes: What decides their order.
+        intrinsics: The camera's.
+        colors: Of the Gaussians.
+        rules: The rasteriser's.
+        charges: For the program's rounding.
+        cutoffs: What is left out.
+        shape: Of the Gaussians' forms.
+        bounds: The output; one row of its statistics for each thread.
     """
     sequence = longest_first(lists.wanted, lists.offsets)
     counter = np.zeros(1, np.int64)
-    for thread in prange(threads):
-        _pixel_worker(
-            thread, sequence, counter, lists,
-            _borrowed_inputs(gaussians, axes, intrinsics, colors, rules, charges, cutoffs, shape), bounds,
-        )  # fmt: skip
+    inputs = gaussians, axes, intrinsics, colors, rules, charges, cutoffs, shape
+    side_by_side(
+        lambda thread: _pixel_worker(thread, sequence, counter, lists, *inputs, bounds), bounds.statistics.shape[0]
+    )

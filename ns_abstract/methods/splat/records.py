@@ -141,19 +141,19 @@ def coordinate_errors(s, n, poses, charges):
             s[spread + q] = (r0 * s[R0 + q] + r1 * s[R1 + q] + r2 * s[R2 + q]) * UP
 
 
-@njit(cache=True, error_model="numpy", inline="always")
+@njit(cache=True, error_model="numpy", forceinline=True)
 def _rotation_row(magnitude, k):
     """Upper bounds of the absolute entries of row ``k`` of the rotation."""
     return magnitude[3 * k], magnitude[3 * k + 1], magnitude[3 * k + 2]
 
 
-@njit(cache=True, error_model="numpy", inline="always")
+@njit(cache=True, error_model="numpy", forceinline=True)
 def _scaled_row(j, ratio, r, r2):
     """Upper bounds of the absolute entries of a row of J R, from those of the rotation's row ``r`` and third row."""
     return j * (r[0] + ratio * r2[0]), j * (r[1] + ratio * r2[1]), j * (r[2] + ratio * r2[2])
 
 
-@njit(cache=True, error_model="numpy", inline="always")
+@njit(cache=True, error_model="numpy", forceinline=True)
 def _applied(f00, f11, f22, f01, f02, f12, g):
     """A symmetric matrix times a vector."""
     return (
@@ -163,12 +163,12 @@ def _applied(f00, f11, f22, f01, f02, f12, g):
     )
 
 
-@njit(cache=True, error_model="numpy", inline="always")
+@njit(cache=True, error_model="numpy", forceinline=True)
 def _dot(a, b):
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
-@njit(cache=True, error_model="numpy", inline="always")
+@njit(cache=True, error_model="numpy", forceinline=True)
 def view_limits(rules, camera):
     """Largest absolute ratios x/z and y/z that the Jacobian is evaluated at; infinite without a margin."""
     fx, fy, cx, cy, width, height = camera
@@ -180,7 +180,7 @@ def view_limits(rules, camera):
     return limit_x, limit_y
 
 
-@njit(cache=True, error_model="numpy", inline="always")
+@njit(cache=True, error_model="numpy", forceinline=True)
 def _axis_sizes(s, k, q):
     """Absolute entries of principal axis ``k``."""
     at = B00 + 3 * k * LANES + q
@@ -429,12 +429,12 @@ def exponent_limits(opacity_high: np.ndarray, alpha_min: float, charges: Charges
     return exponent * REGION + 2.0**-30
 
 
-@njit(cache=True, error_model="numpy", inline="always")
+@njit(cache=True, error_model="numpy", forceinline=True)
 def _within(x, most):
     return min(max(x, 0.0), most)
 
 
-@njit(cache=True, error_model="numpy", inline="always")
+@njit(cache=True, error_model="numpy", forceinline=True)
 def ellipse_is_met(sharpness, widest, thinnest, eta, span, charges):
     """Whether a Gaussian shows hardly anything in tiles that rounding may miss (design.md, G12), by its covariance.
 
@@ -446,7 +446,7 @@ def ellipse_is_met(sharpness, widest, thinnest, eta, span, charges):
     return steep & tips & (eta < 2.0**-9) & (span < 4096.0)
 
 
-@njit(cache=True, error_model="numpy", inline="always")
+@njit(cache=True, error_model="numpy", forceinline=True)
 def largest_extent(s, q):
     """Upper bound of the largest standard deviation of one lane's Gaussian, up to rounding."""
     total = 0.0
@@ -456,7 +456,7 @@ def largest_extent(s, q):
     return np.sqrt(total)
 
 
-@njit(cache=True, error_model="numpy", inline="always")
+@njit(cache=True, error_model="numpy", forceinline=True)
 def projected_stretch(rules, camera):
     """Upper bound of the norm of z J, up to rounding; 0 where no float32 program is modelled (the paper's rules)."""
     if rules.view_margin < 0.0:
@@ -478,7 +478,7 @@ def regions(s, n, rules, camera, charges):
     _pixel_boxes(s, n, rules, camera)
 
 
-@njit(cache=True, error_model="numpy", inline="always")
+@njit(cache=True, error_model="numpy", forceinline=True)
 def _tile_side(rules):
     """Side of a tile, pixels: the program's, or that of the work's division where it has none."""
     return rules.tile_size if rules.tile_size > 0.0 else float(rules.work_tile)

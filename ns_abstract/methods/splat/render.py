@@ -10,11 +10,12 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numba import get_num_threads, njit, prange
+from numba import njit
 
 from ns_abstract.arithmetic.elementary import exp_kernel
 from ns_abstract.arithmetic.rounding import REGION
 from ns_abstract.arithmetic.simd.intrinsics import borrowed, pointer, taken
+from ns_abstract.execution.threads import side_by_side, threads
 from ns_abstract.geometry.camera_path import Camera
 from ns_abstract.geometry.tiles import assemble, tile_grid
 from ns_abstract.methods.splat.activate import Splats
@@ -31,8 +32,8 @@ from ns_abstract.methods.splat.lists import (
     tile_mask,
     touching,
 )
+from ns_abstract.methods.splat.sharing import CHUNK, chunked
 
-_CHUNK = 1024
 _EXPONENT_LIMIT = 60.0
 
 # columns of a projected Gaussian
@@ -145,9 +146,21 @@ def _set_color(scene, i, direction, basis, color):
             color[channel] = min(scene.color_max, max(0.0, color[channel] + shift[i, channel]))
 
 
-@njit(cache=True, error_model="numpy")
-def _project_chunk(chunk, scene, rotation, position, eye, camera, rules, out):
-    """Project one chunk of Gaussians; see `ns_abstract.methods.splat.constants` for the rules' sources."""
+@njit(cache=True, error_model="numpy", nogil=True)
+def _project_worker(counter_, scene, rotation, position, eye, camera, rules, out):
+    """One thread's Gaussians; see `ns_abstract.methods.splat.constants` for the rules' sources.
+
+    Args:
+        counter_: See `chunked`.
+        scene: `_Scene`.
+        rotation: [3, 3] world to camera, OpenCV axes.
+        position: [3] camera, world.
+        eye: [3] where colours are seen from, world.
+        camera: `Intrinsics`.
+        rules: `RasterRules`.
+        out: `_Projected`, the output.
+    """
+    counter = pointer(counter_)
     means, axes, opacity = borrowed(scene.means), borrowed(scene.axes), borrowed(scene.opacity)
     records, box, tiles = borrowed(out.record), borrowed(out.box), borrowed(out.tiles)
     depth, visible = borrowed(out.depth), borrowed(out.visible)
@@ -166,67 +179,54 @@ def _project_chunk(chunk, scene, rotation, position, eye, camera, rules, out):
     r2 = rotation[2, 0], rotation[2, 1], rotation[2, 2]
     basis = np.empty(16)
     direction = np.empty(3)
-    for i in range(chunk * _CHUNK, min(means.shape[0], (chunk + 1) * _CHUNK)):
-        visible[i] = 0
-        d0 = means[i, 0] - position[0]
-        d1 = means[i, 1] - position[1]
-        d2 = means[i, 2] - position[2]
-        z = r2[0] * d0 + r2[1] * d1 + r2[2] * d2
-        alpha = opacity[i]
-        if not (rules.near <= z and z <= rules.far) or alpha < alpha_min:
-            continue
-        inverse = 1.0 / z
-        u = (r0[0] * d0 + r0[1] * d1 + r0[2] * d2) * inverse
-        v = (r1[0] * d0 + r1[1] * d1 + r1[2] * d2) * inverse
-        mean_x = fx * u + cx
-        mean_y = fy * v + cy
-        u = min(right, max(-left, u))
-        v = min(bottom, max(-top, v))
-        a, b, c, sharp = _covariance(fx * inverse, fy * inverse, u, v, r0, r1, r2, axes[i])
-        det = sharp + eps2d * (a + c) + eps2d * eps2d
-        a += eps2d
-        c += eps2d
-        if not det > 0.0:
-            continue
-        if rules.antialiased:
-            alpha *= max(rules.compensation_min, math.sqrt(sharp / det))
-        if alpha < alpha_min or alpha == 0.0:
-            continue
-        x0, x1, y0, y1, shown = _region(mean_x, mean_y, a, b, c, alpha, camera, rules)
-        if not shown:
-            continue
-        tiles[i, 0] = int(max(0.0, np.floor(x0 / tile)))
-        tiles[i, 1] = int(min(float(tiles_x), np.floor(x1 / tile) + 1.0))
-        tiles[i, 2] = int(max(0.0, np.floor(y0 / tile)))
-        tiles[i, 3] = int(min(float(tiles_y), np.floor(y1 / tile) + 1.0))
-        box[i, 0], box[i, 1], box[i, 2], box[i, 3] = x0, x1, y0, y1
-        p = math.sqrt(c / det)
-        record = records[i]
-        record[_MEAN_X], record[_MEAN_Y] = mean_x, mean_y
-        record[_P], record[_Q], record[_S] = p, p * (b / c), 1.0 / math.sqrt(c)
-        record[_OPACITY] = alpha
-        for k in range(3):
-            direction[k] = means[i, k] - eye[k]
-        _set_color(scene, i, direction, basis, record[_RED:])
-        depth[i] = z
-        visible[i] = 1
-
-
-@njit(cache=True, parallel=True, error_model="numpy")
-def _project(scene, rotation, position, eye, camera, rules, out):
-    """Project every Gaussian.
-
-    Args:
-        scene: `_Scene`.
-        rotation: [3, 3] world to camera, OpenCV axes.
-        position: [3] camera, world.
-        eye: [3] where colours are seen from, world.
-        camera: `Intrinsics`.
-        rules: `RasterRules`.
-        out: `_Projected`, the output.
-    """
-    for chunk in prange((scene.means.shape[0] + _CHUNK - 1) // _CHUNK):
-        _project_chunk(chunk, scene, rotation, position, eye, camera, rules, out)
+    while True:
+        start = taken(counter) * CHUNK
+        if start >= means.shape[0]:
+            break
+        for i in range(start, min(means.shape[0], start + CHUNK)):
+            visible[i] = 0
+            d0 = means[i, 0] - position[0]
+            d1 = means[i, 1] - position[1]
+            d2 = means[i, 2] - position[2]
+            z = r2[0] * d0 + r2[1] * d1 + r2[2] * d2
+            alpha = opacity[i]
+            if not (rules.near <= z and z <= rules.far) or alpha < alpha_min:
+                continue
+            inverse = 1.0 / z
+            u = (r0[0] * d0 + r0[1] * d1 + r0[2] * d2) * inverse
+            v = (r1[0] * d0 + r1[1] * d1 + r1[2] * d2) * inverse
+            mean_x = fx * u + cx
+            mean_y = fy * v + cy
+            u = min(right, max(-left, u))
+            v = min(bottom, max(-top, v))
+            a, b, c, sharp = _covariance(fx * inverse, fy * inverse, u, v, r0, r1, r2, axes[i])
+            det = sharp + eps2d * (a + c) + eps2d * eps2d
+            a += eps2d
+            c += eps2d
+            if not det > 0.0:
+                continue
+            if rules.antialiased:
+                alpha *= max(rules.compensation_min, math.sqrt(sharp / det))
+            if alpha < alpha_min or alpha == 0.0:
+                continue
+            x0, x1, y0, y1, shown = _region(mean_x, mean_y, a, b, c, alpha, camera, rules)
+            if not shown:
+                continue
+            tiles[i, 0] = int(max(0.0, np.floor(x0 / tile)))
+            tiles[i, 1] = int(min(float(tiles_x), np.floor(x1 / tile) + 1.0))
+            tiles[i, 2] = int(max(0.0, np.floor(y0 / tile)))
+            tiles[i, 3] = int(min(float(tiles_y), np.floor(y1 / tile) + 1.0))
+            box[i, 0], box[i, 1], box[i, 2], box[i, 3] = x0, x1, y0, y1
+            p = math.sqrt(c / det)
+            record = records[i]
+            record[_MEAN_X], record[_MEAN_Y] = mean_x, mean_y
+            record[_P], record[_Q], record[_S] = p, p * (b / c), 1.0 / math.sqrt(c)
+            record[_OPACITY] = alpha
+            for k in range(3):
+                direction[k] = means[i, k] - eye[k]
+            _set_color(scene, i, direction, basis, record[_RED:])
+            depth[i] = z
+            visible[i] = 1
 
 
 # rows of a block's state: transmittance, colours, whether the pixel still takes light
@@ -287,9 +287,20 @@ def _blend_block(numbers, x0, y0, record, box, rules, state):
                 break
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", nogil=True)
 def _rasterise_worker(sequence_, counter_, lists, record_, box_, camera, rules, background, image_):
-    """One thread's tiles: the next of ``sequence_`` that none has taken yet; see `_rasterise`."""
+    """Blend one thread's tiles of ``lists.wanted``: the next of ``sequence_`` that none has taken yet.
+
+    Args:
+        sequence_: [t] numbers of tiles, those with most to do first.
+        counter_: [1] int64, how many are taken.
+        lists: `TileLists`.
+        record_, box_: Of `_Projected`.
+        camera: `Intrinsics`.
+        rules: `RasterRules`.
+        background: [3].
+        image_: [t, side, side, 3] output, in [0, 1].
+    """
     sequence, counter = borrowed(sequence_), pointer(counter_)
     record, box, image = borrowed(record_), borrowed(box_), borrowed(image_)
     tile = image.shape[1]
@@ -323,25 +334,6 @@ def _rasterise_worker(sequence_, counter_, lists, record_, box_, camera, rules, 
                     image[number, row, column, channel] = min(1.0, max(0.0, value))
     # the owner of the borrowed state lives to here
     return state_.size
-
-
-@njit(cache=True, parallel=True, error_model="numpy")
-def _rasterise(lists, record, box, camera, rules, background, threads, image):
-    """Blend the tiles ``lists.wanted``.
-
-    Args:
-        lists: `TileLists`.
-        record, box: Of `_Projected`.
-        camera: `Intrinsics`.
-        rules: `RasterRules`.
-        background: [3].
-        threads: How many work side by side.
-        image: [t, side, side, 3] output, in [0, 1].
-    """
-    sequence = longest_first(lists.wanted, lists.offsets)
-    counter = np.zeros(1, np.int64)
-    for _ in prange(threads):
-        _rasterise_worker(sequence, counter, lists, record, box, camera, rules, background, image)
 
 
 class Renderer:
@@ -399,7 +391,9 @@ class Renderer:
         found = self._projected
         rotation = np.ascontiguousarray(rotation, np.float64)
         position = np.ascontiguousarray(position, np.float64)
-        _project(
+        chunked(
+            _project_worker,
+            splats.count,
             scene,
             rotation,
             position,
@@ -419,7 +413,9 @@ class Renderer:
     def _blend(self, camera: Camera, lists: TileLists, record: np.ndarray, background: np.ndarray) -> np.ndarray:
         image = np.zeros((lists.wanted.size, self.side, self.side, 3))
         box = self._projected.box
-        _rasterise(lists, record, box, camera.intrinsics, self.rules, background, get_num_threads(), image)
+        sequence, counter = longest_first(lists.wanted, lists.offsets), np.zeros(1, np.int64)
+        inputs = lists, record, box, camera.intrinsics, self.rules, background
+        side_by_side(lambda _: _rasterise_worker(sequence, counter, *inputs, image), threads())
         return image
 
     def image(

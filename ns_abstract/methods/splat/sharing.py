@@ -1,0 +1,24 @@
+"""How the threads of a process share a kernel's work: each takes the next piece that none has taken yet."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from ns_abstract.execution.threads import side_by_side, threads
+
+#: Gaussians that are taken at once.
+CHUNK = 1024
+
+
+def chunked(kernel: Callable[..., object], count: int, *arguments: object) -> None:
+    """Run ``kernel(counter, *arguments)`` in as many threads as there is work for.
+
+    Args:
+        kernel: Takes chunks of `CHUNK` Gaussians by the number that it takes from the counter, an int64 [1].
+        count: Gaussians.
+        arguments: The kernel's other ones.
+    """
+    counter = np.zeros(1, np.int64)
+    side_by_side(lambda _: kernel(counter, *arguments), max(1, min(threads(), -(-count // CHUNK))))
