@@ -95,7 +95,7 @@ def test_threads_are_waited_for_and_their_errors_heard():
 
 
 def test_number_of_threads(monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(numba.config, "NUMBA_NUM_THREADS", 3)
+    monkeypatch.setattr("numba.config.NUMBA_NUM_THREADS", 3)
     try:
         for asked, there in ((2, 2), (0, 1), (7, 3)):
             use_threads(asked)
