@@ -32,6 +32,7 @@ from ns_abstract.geometry.box import ParameterBox
 from ns_abstract.io.errors import InputError
 from ns_abstract.perturbation.specification import TRANSLATIONS
 from ns_abstract.perturbation.variations import SceneVariation
+from ns_abstract.reach.learned import LearnedDynamics
 from ns_abstract.reach.loop import Loop, load_loop, parse_loop
 from ns_abstract.reach.page import loop_page
 from ns_abstract.reach.search import QUESTIONS, LoopFindings, LoopSearch, Question, Run, pushes, simulate
@@ -177,8 +178,11 @@ class LoopJob:
     @cached_property
     def _fingerprint(self) -> dict[str, Any]:
         text = json.dumps(self.loop.value, sort_keys=True)
+        law = self.loop.dynamics
+        learned = {"dynamics": file_stamp(law.file)["sha256"]} if isinstance(law, LearnedDynamics) else {}
         return {
             **self.job.fingerprint,
+            **learned,
             "network": file_stamp(self.loop.network)["sha256"],
             "loop": hashlib.sha256(text.encode()).hexdigest(),
             "network_arithmetic": self.model.arithmetic,
@@ -413,6 +417,10 @@ class ReachRun:
         self.rows = {tally.frame: store.leaves(tally.frame) for tally in store.tallies()}
         entries = {QUESTIONS[tally.frame]: self._entry(tally) for tally in store.tallies()}
         program = job.job.method.program
+        learned: dict[str, Any] = {}
+        if isinstance(loop.dynamics, LearnedDynamics):
+            law = loop.dynamics
+            learned = {"dynamics_model": file_stamp(law.file), "dynamics_guarantee": law.network.guarantee()}
         return plain(
             {
                 "version": 1,
@@ -427,6 +435,7 @@ class ReachRun:
                 "model": file_stamp(loop.network),
                 "loop": loop.value,
                 "dynamics": loop.dynamics.about,
+                **learned,
                 "parameters": [
                     {"name": n, "unit": u, "lower": a, "upper": b}
                     for n, u, a, b in zip(loop.box.names, loop.box.units, loop.box.lower, loop.box.upper, strict=True)
