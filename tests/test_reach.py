@@ -16,6 +16,7 @@ from onnx_files import OnnxFile
 
 from ns_abstract.demo.approach import write_network
 from ns_abstract.geometry.box import ParameterBox
+from ns_abstract.geometry.poses import SCENE_TURNS
 from ns_abstract.io.errors import InputError
 from ns_abstract.reach.dynamics import Dynamics, Floats, affine, double_integrator, fixed_wing, quadrotor, unicycle
 from ns_abstract.reach.learned import LearnedDynamics
@@ -315,11 +316,31 @@ def test_tubes_hold_runs_in_a_scene_that_stands_elsewhere(tmp_path: Path) -> Non
     spread = set()
     for number, start in enumerate([*box.corners()[:20], *box.sample(20, rng)]):
         shift = found.shift * (rng.choice([-1.0, 1.0], 4) if number % 3 else rng.uniform(-1.0, 1.0, 4))
-        run = simulate(found, loop.state(box, start), pushes(loop, rng, "ends"), shift=shift)
+        run = simulate(found, loop.state(box, start), pushes(loop, rng, "ends"), off=shift)
         assert first_outside(tube, run) is None
         still = simulate(found, loop.state(box, start), run.disturbances)
         spread.add(bool((run.states != still.states).any()))
     assert spread == {True}
+
+
+def test_tubes_hold_runs_in_a_scene_whose_place_the_view_tells(tmp_path: Path) -> None:
+    base = reacher(tmp_path, specification("affine"))
+    view, rng = Wall(base.loop), np.random.default_rng(3)
+    view.slopes = np.concatenate([view.slopes, 0.2 * rng.normal(size=(SIDE, SIDE, 3, 3))], axis=-1)
+    view.pose_set = view.pose_set.registered(SCENE_TURNS, 0.05)
+    found = replace(base, view=view)
+    loop, box = found.loop, found.loop.box
+    tube, still = found.tube(box, whole=True), base.tube(box, whole=True)
+    assert len(tube.sets) > 10 and found.place.tolist() == [0.05] * 3 and not base.place.size
+    wide = [np.subtract(*entry.sets[5].hull()[::-1]) for entry in (tube, still)]
+    assert (wide[0] > wide[1])[:2].all()
+    spread = set()
+    for number, start in enumerate([*box.corners()[:20], *box.sample(20, rng)]):
+        off = found.place * (rng.choice([-1.0, 1.0], 3) if number % 3 else rng.uniform(-1.0, 1.0, 3))
+        run = simulate(found, loop.state(box, start), pushes(loop, rng, "ends"), off=off)
+        assert first_outside(tube, run) is None
+        spread.add(first_outside(still, run) is None)
+    assert False in spread
 
 
 def examined(search: LoopSearch, number: int, most: int = 60) -> list[Any]:

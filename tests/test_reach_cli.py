@@ -26,6 +26,7 @@ from ns_abstract.cli import reach as reach_command
 from ns_abstract.demo.gate import gate
 from ns_abstract.demo.writing import write_loop_demo
 from ns_abstract.geometry.box import ParameterBox
+from ns_abstract.geometry.poses import SCENE_TURNS
 from ns_abstract.perturbation.variations import SceneVariation, Selection
 from ns_abstract.reach.search import Run, first_outside, pushes, simulate
 from ns_abstract.reach.tubes import Pictures
@@ -159,14 +160,19 @@ def test_scene_margin(course: Course, tmp_path: Path) -> None:
     job, rng = part.job, np.random.default_rng(8)
     loop, box = job.loop, job.loop.box
     kinds = {entry["kind"]: entry for entry in document["scene_margin"]["kinds"]}
-    assert list(kinds) == ["mean", "opacity", "color", "brightness", "white_balance", "gamma", "registration"]
+    assert list(kinds) == ["mean", "opacity", "color", "brightness", "white_balance", "gamma", "registration", "turn"]
+    responses = {kind.name: kind.response for kind in CAMERA_KINDS}
     compared = 0
     for name, entry in kinds.items():
         radius = entry["radius"]
         if name == "registration":
             reacher = replace(job.reacher(), registration=radius)
             scenes = [(None, radius * rng.choice([-1.0, 1.0], 3)) for _ in range(24)]
-        elif (of_camera := {kind.name: kind.response for kind in CAMERA_KINDS}.get(name)) is not None:
+        elif name == "turn":
+            view = Pictures(job.job.method, job.job.pose_sets[0].registered(SCENE_TURNS, radius))
+            reacher = replace(job.reacher(), view=view)
+            scenes = [(None, radius * rng.choice([-1.0, 1.0], 3)) for _ in range(24)]
+        elif (of_camera := responses.get(name)) is not None:
             view = Pictures(job.job.method, job.job.pose_sets[0], Response(of_camera, radius))
             reacher = replace(job.reacher(), view=view)
             scenes = [(member, None) for member in itertools.islice(view.members(1), 24)]

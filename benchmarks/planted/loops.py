@@ -30,6 +30,14 @@ LOOPS = (
         "test_reach.py::test_tubes_hold_runs_in_a_scene_that_stands_elsewhere",
     ),
     Fault(
+        "loops: places of the scene that the view tells are not charged",
+        _TUBES,
+        "Reacher._advanced",
+        "AffineSet(np.zeros(place.size), none, place, pose.first)",
+        "AffineSet(np.zeros(place.size), none, 0.0 * place, pose.first)",
+        "test_reach.py::test_tubes_hold_runs_in_a_scene_whose_place_the_view_tells",
+    ),
+    Fault(
         "scene margin: runs see the stored scene",
         _SEARCH,
         "simulate",

@@ -11,7 +11,7 @@ import numpy as np
 
 from ns_abstract.execution.stopping import StopRequest
 from ns_abstract.geometry.box import ParameterBox
-from ns_abstract.verify.scene_margin import CAMERA_KINDS, KINDS, Certified, Kind, SceneMargin, Settle, widest
+from ns_abstract.verify.scene_margin import Certified, Kind, SceneMargin, Settle, widest
 from ns_abstract.verify.store import Store
 
 #: Part of the time that is kept for margins where they are asked for.
@@ -38,7 +38,7 @@ class Margins:
         self.cells, self._settle, self._told = cells, settle, told
         self.found: list[SceneMargin] = []
 
-    def find(self, deadline: float, stop: StopRequest, kinds: Sequence[Kind] = (*KINDS, *CAMERA_KINDS)) -> None:
+    def find(self, deadline: float, stop: StopRequest, kinds: Sequence[Kind]) -> None:
         """Look for them; every kind has the same part of the time that is left then.
 
         Args:

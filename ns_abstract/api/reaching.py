@@ -24,6 +24,7 @@ from ns_abstract.api.job import Job
 from ns_abstract.api.margins import NOT_ASKED, SHARE, Margins, certified_cells
 from ns_abstract.api.scenes import Scene, platform_problems
 from ns_abstract.api.searching import paced, search_blocks
+from ns_abstract.arithmetic.forms import MAX_DIMENSIONS
 from ns_abstract.execution.ending import AbandonedError, abandoning
 from ns_abstract.execution.engines import Engine, EngineName, started
 from ns_abstract.execution.opening import Recipe, opened
@@ -43,7 +44,16 @@ from ns_abstract.verify.cells import Cell, Grid
 from ns_abstract.verify.model import NetworkModel
 from ns_abstract.verify.network import NetworkArithmetic, load_network
 from ns_abstract.verify.response import Response
-from ns_abstract.verify.scene_margin import CAMERA_KINDS, KINDS, REGISTRATION, Kind, SceneMargin, Settle, Settled
+from ns_abstract.verify.scene_margin import (
+    CAMERA_KINDS,
+    KINDS,
+    PLACES,
+    REGISTRATION,
+    Kind,
+    SceneMargin,
+    Settle,
+    Settled,
+)
 from ns_abstract.verify.store import Block, Store, Tally, fractions
 
 #: Of the search's rules: results of different ones are not mixed.
@@ -133,6 +143,16 @@ class LoopJob:
         other.job = self.job.around(extra)
         return other
 
+    @property
+    def _moves(self) -> bool:
+        # a place that does not depend on the state is no parameter that could be off
+        return set(TRANSLATIONS) <= set(self.loop.camera.names)
+
+    def places(self, kind: Kind) -> bool:
+        """Whether the scene's place can be bounded beside the pose: within it, or as more parameters."""
+        fits = len(self.loop.camera.names) + len(kind.place) <= MAX_DIMENSIONS
+        return fits or (kind is REGISTRATION and self._moves)
+
     def settle(self, kind: Kind) -> Settle:
         """Bounds and attacks cells for all scenes around the stored one (V13)."""
         kept: dict[float, LoopSearch] = {}
@@ -141,8 +161,11 @@ class LoopJob:
             if radius not in kept:
                 # radii come one after the other
                 kept.clear()
-                if kind is REGISTRATION:
+                if kind is REGISTRATION and self._moves:
                     kept[radius] = LoopSearch(replace(self.reacher(), registration=radius))
+                elif kind.place:
+                    view = Pictures(self.job.method, self.job.pose_sets[0].registered(kind.place, radius))
+                    kept[radius] = LoopSearch(replace(self.reacher(), view=view))
                 elif kind.response is not None:
                     view = Pictures(self.job.method, self.job.pose_sets[0], Response(kind.response, radius))
                     kept[radius] = LoopSearch(replace(self.reacher(), view=view))
@@ -404,9 +427,8 @@ class ReachRun:
         )
         margins = Margins(cells, self.job.settle, told)
         try:
-            # a place that does not depend on the state is no parameter that could be off
-            moves = set(TRANSLATIONS) <= set(self.job.loop.camera.names)
-            margins.find(deadline, stop, (*KINDS, *CAMERA_KINDS, *([REGISTRATION] if moves else [])))
+            places = [kind for kind in PLACES if self.job.places(kind)]
+            margins.find(deadline, stop, (*KINDS, *CAMERA_KINDS, *places))
         finally:
             margins.keep(store)
             self.scene_margin = {"question": QUESTIONS[number], **margins.entry}

@@ -355,7 +355,8 @@ class Reacher:
         pilot: Its network and control.
         dependence: What is kept from step to step.
         registration: How far the scene may stand from its place along every world axis, all of a run through; needs a
-            camera that moves along all of them.
+            camera that moves along all of them. Otherwise the view's set may tell where the scene stands
+            (`PoseSet.registered`).
     """
 
     loop: Loop
@@ -373,6 +374,18 @@ class Reacher:
     def shift(self) -> Float64:
         """[d] how far pose parameters may be off, as seen from the scene."""
         return np.array([self.registration if name in TRANSLATIONS else 0.0 for name in self.loop.camera.names])
+
+    @property
+    def place(self) -> Float64:
+        """[3] how far the scene may stand from its place, where the view's set tells; else [0]."""
+        return self._limits[1][len(self.loop.camera.names) :]
+
+    def seen_from(self, x: Float64, off: Float64 | None = None) -> Float64:
+        """Parameters of the view at a state [n], in a scene that is ``off`` by as much as `place` or `shift` say."""
+        values = self.loop.camera.values(x)
+        if self.place.size:
+            return np.concatenate([values, np.zeros(self.place.size) if off is None else off])
+        return values if off is None else values + off
 
     def tube(self, cell: ParameterBox, *, whole: bool = False) -> Tube:
         """The tube of a cell of the initial box; it ends early where an unsafe set cannot be ruled out.
@@ -420,8 +433,12 @@ class Reacher:
         # a scene elsewhere is a camera elsewhere (V13)
         pose = state.mapped(camera.factors, camera.offset, self.shift + rounding * size)
         low, high = pose.hull()
-        if not ((low >= self._limits[0]) & (high <= self._limits[1])).all():
+        if not ((low >= self._limits[0][: len(low)]) & (high <= self._limits[1][: len(high)])).all():
             return "the camera may leave the range of poses"
+        if (place := self.place).size:
+            low, high = np.concatenate([low, -place]), np.concatenate([high, place])
+            none = np.zeros((place.size, pose.generators.shape[1]))
+            pose = pose.beside(AffineSet(np.zeros(place.size), none, place, pose.first))
         names, units = self.view.pose_set.box.names, self.view.pose_set.box.units
         linear, lower, upper, slopes = self.view.sets(
             ParameterBox(names, units, tuple(low.tolist()), tuple(high.tolist()))
@@ -431,9 +448,9 @@ class Reacher:
         controls = self.pilot.bound(linear, lower, upper)
         if controls is None:
             return "the network's bounds are not finite"
-        place = _scaled(pose, *middle_half(low, high))
-        moved = np.abs(np.asarray(slopes, np.float64)) @ np.abs(place.generators)
-        control = place.mapped(controls.slopes, controls.center, controls.radius)
+        scaled = _scaled(pose, *middle_half(low, high))
+        moved = np.abs(np.asarray(slopes, np.float64)) @ np.abs(scaled.generators)
+        control = scaled.mapped(controls.slopes, controls.center, controls.radius)
         ends = control.hull()
         ends = np.maximum(ends[0], controls.lower), np.minimum(ends[1], controls.upper)
         if not (np.isfinite(ends[0]).all() and np.isfinite(ends[1]).all() and (ends[0] <= ends[1]).all()):
