@@ -35,6 +35,12 @@ CERTIFICATES = (
         "test_certify_cli.py::test_scene_margin", True,
     ),
     Fault(
+        "scene margin: what is known of one radius is taken for all",
+        _STORE, "Store.settled", '"kind = ? AND radius = ? AND frame = ? AND lower = ? AND upper = ?"',
+        '"kind = ? AND 0.0 < ? AND frame = ? AND lower = ? AND upper = ?"',
+        "test_scene_margin.py::test_a_resumed_command_settles_nothing_twice",
+    ),
+    Fault(
         "registration: the worst place of the scene is not taken",
         _REGISTRATION, "RegisteredModel.bound",
         "found.b - lost - 2.0**-48 * (np.abs(found.b) + lost)", "found.b", _PLACES,

@@ -253,12 +253,12 @@ class CertificateRun:
                         substitution = self.compare(store)
                 if scene_margin and not stop():
                     rows = {tally.frame: store.leaves(tally.frame, "certified") for tally in store.tallies()}
-                    margins = Margins(certified_cells(rows, self._box), self.job.settle, on_margin)
+                    margins = Margins(certified_cells(rows, self._box), self.job.settle, store, on_margin)
                     try:
                         places = [kind for kind in PLACES if self.job.places(kind)]
                         margins.find(deadline + SHARE * budget, stop, (*KINDS, *CAMERA_KINDS, *places))
                     finally:
-                        margins.keep(store)
+                        margins.keep()
                         self.scene_margin = margins.entry
             finally:
                 # also after a failure: what is finished is written

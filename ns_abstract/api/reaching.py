@@ -425,12 +425,12 @@ class ReachRun:
             {number: rows.get(number, [])},
             lambda _, row: ParameterBox(box.names, box.units, tuple(row["lower"]), tuple(row["upper"])),
         )
-        margins = Margins(cells, self.job.settle, told)
+        margins = Margins(cells, self.job.settle, store, told)
         try:
             places = [kind for kind in PLACES if self.job.places(kind)]
             margins.find(deadline, stop, (*KINDS, *CAMERA_KINDS, *places))
         finally:
-            margins.keep(store)
+            margins.keep()
             self.scene_margin = {"question": QUESTIONS[number], **margins.entry}
 
     def document(self, store: Store, state: str) -> dict[str, Any]:
