@@ -58,9 +58,10 @@ def __getattr__(name: str) -> object:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     from importlib import import_module
 
-    found = getattr(import_module(f"{__name__}.{_HOME[name]}"), name)
-    globals()[name] = found
-    return found
+    home = import_module(f"{__name__}.{_HOME[name]}")
+    # all of them: importing a folder of the same name (reach) has put that there
+    globals().update({entry: getattr(home, entry) for entry in _HOMES[_HOME[name]]})
+    return globals()[name]
 
 
 def __dir__() -> list[str]:

@@ -329,6 +329,11 @@ def test_import_is_light() -> None:
         nsa.nothing  # noqa: B018
 
 
+def test_a_function_is_not_hidden_by_the_folder_of_its_name() -> None:
+    code = "from ns_abstract import ReachResult; from ns_abstract import reach; reach.__call__"
+    subprocess.run([sys.executable, "-c", code], check=True, timeout=120)
+
+
 def test_version_is_that_of_the_package() -> None:
     import importlib.metadata
 

@@ -45,8 +45,9 @@ from ns_abstract.perturbation.variations import SceneVariation, Selection
 from ns_abstract.verify import model
 from ns_abstract.verify.eight_bit import rounded
 from ns_abstract.verify.network import OutputBounds
+from ns_abstract.verify.registration import RegisteredScene
 from ns_abstract.verify.response import Response
-from ns_abstract.verify.scene_margin import CAMERA_KINDS, KINDS
+from ns_abstract.verify.scene_margin import CAMERA_KINDS, KINDS, PLACES
 
 MODULE = "ns_abstract.cli.certify"
 SIZE = 16
@@ -857,25 +858,29 @@ def test_a_variation_of_the_scene_breaks_what_poses_do_not(
         assert not np.array_equal(stored["image"], case.job.pictures(0).image(np.zeros(0)))
 
 
-KINDS_BY_NAME = {kind.name: kind for kind in (*KINDS, *CAMERA_KINDS)}
+KINDS_BY_NAME = {kind.name: kind for kind in (*KINDS, *CAMERA_KINDS, *PLACES)}
 
 
 def test_scene_margin(blobs: Inputs, bright: tuple[Path, float, float], tmp_path: Path) -> None:
     """Scenes at the ends of the certified radius break nothing, whatever varies; scenes that do lie farther off."""
     spec = {"version": 1, "translation": {"x": [0.1, 0.11]}}
     case = Case(tmp_path / "case", blobs, bright[0], {"type": "classification", "label": 0, "preprocess": PRE}, spec)
-    found = case.run(tmp_path / "out", time_budget=240.0, scene_margin=True)
+    found = case.run(tmp_path / "out", time_budget=600.0, scene_margin=True)
     assert found["verdict"] == "certified" and found["scene_margin"]["skipped"] is None
     job, rng = case.job, np.random.default_rng(4)
     kinds = {entry["kind"]: entry for entry in found["scene_margin"]["kinds"]}
-    assert list(kinds) == ["mean", "opacity", "color", "brightness", "white_balance", "gamma"]
+    assert list(kinds) == ["mean", "opacity", "color", "brightness", "white_balance", "gamma", "registration", "turn"]
     for name, entry in kinds.items():
         radius, broken = entry["radius"], entry["falsified"]
         assert entry["state"] == "done" and radius > 0.0 and entry["runs"] >= entry["cells"]
         # it was bisected to the end, and what was found to break the property lies beyond
         assert radius < entry["not_certified"]["radius"] <= 1.2 * radius or radius == KINDS_BY_NAME[name].most
         assert broken is None or broken["radius"] > radius
-        if (response := KINDS_BY_NAME[name].response) is not None:
+        pictures: FramePictures | RegisteredScene
+        if place := KINDS_BY_NAME[name].place:
+            shown = FramePictures(job.job.method, job.job.pose_sets[0].registered(place, radius))
+            pictures = RegisteredScene(shown, shown.frame)
+        elif (response := KINDS_BY_NAME[name].response) is not None:
             set_ = Response(response, radius)
             pictures = FramePictures(job.job.method, job.job.pose_sets[0], "float", set_)
         else:
@@ -896,6 +901,8 @@ def test_scene_margin(blobs: Inputs, bright: tuple[Path, float, float], tmp_path
                 > 0
             )
     assert any(entry["falsified"] for entry in kinds.values())
+    # the means of all Gaussians together are less than each by itself
+    assert kinds["registration"]["radius"] > kinds["mean"]["radius"]
     # factors of the channels are one factor, too
     assert kinds["white_balance"]["radius"] <= kinds["brightness"]["radius"]
     for name, entry in kinds.items():
@@ -905,8 +912,13 @@ def test_scene_margin(blobs: Inputs, bright: tuple[Path, float, float], tmp_path
             with np.load(file) as stored:
                 assert float(stored["radius"]) == entry["falsified"]["radius"]
                 assert not np.subtract(*job.model.outputs(stored["image"][None])[0]) > 0.0
-                of_camera = KINDS_BY_NAME[name].response is not None
-                assert stored["scene_response" if of_camera else f"scene_{name}"].shape[0] > 0
+                kind = KINDS_BY_NAME[name]
+                told = "place" if kind.place else "response" if kind.response is not None else name
+                assert stored[f"scene_{told}"].shape[0] > 0
+                if kind.place:
+                    shown = FramePictures(job.job.method, job.job.pose_sets[0].registered(kind.place, 1.0))
+                    seen = np.concatenate([stored["values"], stored["scene_place"]])
+                    assert (shown.image(seen) == stored["image"]).all()
     page = (tmp_path / "out" / "report.html").read_text()
     assert "How wrong the scene may be" in page
 

@@ -7,13 +7,23 @@ import math
 import mpmath
 import numpy as np
 import pytest
+import torch
 from flint import fmpq
 from oracle import BITS, big, inside, rational, rational_of
 
 from ns_abstract.arithmetic.rounding import UNIT64
 from ns_abstract.geometry.box import ParameterBox
 from ns_abstract.geometry.camera_path import Camera
-from ns_abstract.geometry.poses import PoseSet, axis_angle, orthonormal, rotation_about, translation_only
+from ns_abstract.geometry.differentiable_pose import differentiable_pose
+from ns_abstract.geometry.poses import (
+    SCENE_SHIFTS,
+    SCENE_TURNS,
+    PoseSet,
+    axis_angle,
+    orthonormal,
+    rotation_about,
+    translation_only,
+)
 from ns_abstract.io.errors import InputError
 from ns_abstract.perturbation.specification import Orbit, Perturbation
 
@@ -52,7 +62,8 @@ def exact_matrix(array: np.ndarray) -> Matrix:
 
 def reference(poses: PoseSet, values: dict[str, fmpq]) -> tuple[Matrix, Matrix]:
     """Camera-to-world rotation and position by definition, from parameter values (missing ones are 0)."""
-    p = {name: big(values.get(name, fmpq(0))) for name in ("x", "y", "z", "yaw", "pitch", "roll", "segment", "azimuth")}
+    names = ("x", "y", "z", "yaw", "pitch", "roll", "segment", "azimuth", *SCENE_SHIFTS, *SCENE_TURNS)
+    p = {name: big(values.get(name, fmpq(0))) for name in names}
     start = exact_matrix(poses.camera.camera_to_world)
     rotation, position = start[:, :3], start[:, 3]
     if poses.target_camera is not None:
@@ -74,7 +85,10 @@ def reference(poses: PoseSet, values: dict[str, fmpq]) -> tuple[Matrix, Matrix]:
     position = position + (rotation * shift if poses.perturbation.frame == "camera" else shift)
     for name in ("yaw", "pitch", "roll"):
         rotation = rotation * elementary(name, p[name])
-    return rotation, position
+    # the scene is turned about z, then y, then x, then shifted
+    x, y, z = (elementary(kind, p[name]) for kind, name in zip(("pitch", "yaw", "roll"), SCENE_TURNS, strict=True))
+    scene, shift = x * y * z, Matrix([p[name] for name in SCENE_SHIFTS])
+    return scene.T * rotation, scene.T * (position - shift)
 
 
 def random_rotation(seed: int) -> np.ndarray:
@@ -178,6 +192,32 @@ SETS = {
 def test_enclosure(name, order):
     poses = PoseSet.around(camera(random_rotation(1)), SETS[name])
     assert escapes(poses, poses.box, order) == []
+
+
+@pytest.mark.parametrize("order", [1, 2])
+@pytest.mark.parametrize(("names", "radius"), [(SCENE_SHIFTS, 0.03), (SCENE_TURNS, 0.2), (SCENE_TURNS, 1e-9)])
+@pytest.mark.parametrize("name", ["nothing", "world", "orbit", "rotation"])
+def test_enclosure_of_a_scene_elsewhere(name, names, radius, order):
+    poses = PoseSet.around(camera(random_rotation(6)), SETS[name]).registered(names, radius)
+    assert poses.box.names[-3:] == names and poses.box.upper[-3:] == (radius,) * 3
+    assert escapes(poses, poses.box, order) == []
+    point = ParameterBox(poses.box.names, poses.box.units, poses.box.upper, poses.box.upper)
+    assert escapes(poses, point, order, 1) == []
+    pose = differentiable_pose(poses)
+    for values in poses.box.sample(5, np.random.default_rng(0)):
+        assert np.allclose(pose(torch.from_numpy(values)).numpy(), poses.pose(values), rtol=0.0, atol=1e-13)
+
+
+def test_a_scene_elsewhere_is_seen_as_it_would_be():
+    """Points of a scene that is turned and shifted, and of the stored one by the pose that stands for it."""
+    poses, rng = PoseSet.around(camera(random_rotation(7)), SETS["six"]), np.random.default_rng(1)
+    points, turns, shifts = rng.normal(size=(20, 3)), rng.uniform(-0.5, 0.5, 3), rng.uniform(-0.5, 0.5, 3)
+    values = poses.box.sample(1, rng)[0]
+    pose = poses.pose(values)
+    scene = np.linalg.multi_dot([rotation_about(axis, turn) for axis, turn in zip(np.eye(3), turns, strict=True)])
+    for names, off, moved in ((SCENE_TURNS, turns, points @ scene.T), (SCENE_SHIFTS, shifts, points + shifts)):
+        seen = poses.registered(names, 0.5).pose(np.concatenate([values, off]))
+        assert np.allclose((moved - pose[:, 3]) @ pose[:, :3], (points - seen[:, 3]) @ seen[:, :3], atol=1e-12)
 
 
 @pytest.mark.parametrize("order", [1, 2])

@@ -18,6 +18,7 @@ import numpy as np
 import pytest
 from conftest import InProcess, environment
 from interrupting import LONG, check_ended_in_a_library_call, check_interrupted, interrupted_at, stored, until
+from onnx_files import OnnxFile
 
 from ns_abstract.api.reaching import LoopJob, open_loop, reach
 from ns_abstract.api.scenes import load_scene
@@ -25,6 +26,7 @@ from ns_abstract.cli import reach as reach_command
 from ns_abstract.demo.gate import gate
 from ns_abstract.demo.writing import write_loop_demo
 from ns_abstract.geometry.box import ParameterBox
+from ns_abstract.geometry.poses import SCENE_TURNS
 from ns_abstract.perturbation.variations import SceneVariation, Selection
 from ns_abstract.reach.search import Run, first_outside, pushes, simulate
 from ns_abstract.reach.tubes import Pictures
@@ -158,14 +160,19 @@ def test_scene_margin(course: Course, tmp_path: Path) -> None:
     job, rng = part.job, np.random.default_rng(8)
     loop, box = job.loop, job.loop.box
     kinds = {entry["kind"]: entry for entry in document["scene_margin"]["kinds"]}
-    assert list(kinds) == ["mean", "opacity", "color", "brightness", "white_balance", "gamma", "registration"]
+    assert list(kinds) == ["mean", "opacity", "color", "brightness", "white_balance", "gamma", "registration", "turn"]
+    responses = {kind.name: kind.response for kind in CAMERA_KINDS}
     compared = 0
     for name, entry in kinds.items():
         radius = entry["radius"]
         if name == "registration":
             reacher = replace(job.reacher(), registration=radius)
             scenes = [(None, radius * rng.choice([-1.0, 1.0], 3)) for _ in range(24)]
-        elif (of_camera := {kind.name: kind.response for kind in CAMERA_KINDS}.get(name)) is not None:
+        elif name == "turn":
+            view = Pictures(job.job.method, job.job.pose_sets[0].registered(SCENE_TURNS, radius))
+            reacher = replace(job.reacher(), view=view)
+            scenes = [(None, radius * rng.choice([-1.0, 1.0], 3)) for _ in range(24)]
+        elif (of_camera := responses.get(name)) is not None:
             view = Pictures(job.job.method, job.job.pose_sets[0], Response(of_camera, radius))
             reacher = replace(job.reacher(), view=view)
             scenes = [(member, None) for member in itertools.islice(view.members(1), 24)]
@@ -290,6 +297,55 @@ MISTAKES: dict[str, tuple[dict[str, Any], tuple[str, ...]]] = {
 def test_mistake_is_one_line(name: str, course: Course, call: Callable[..., tuple[int, str]], tmp_path: Path) -> None:
     changes, fragments = MISTAKES[name]
     code, said = call(course.options(tmp_path / "out", **changes))
+    assert code == 2 and said.count("\n") == 1 and said.startswith("error: ") and "; " in said, said
+    for fragment in fragments:
+        assert fragment in said
+
+
+def learned(course: Course, name: str = "law.onnx") -> Path:
+    """The demo's dynamics as a file beside LOOP.json."""
+    law = json.loads(course.loop.read_text())["dynamics"]
+    f = OnnxFile((7,), batch=1)
+    both = np.concatenate([np.array(law["A"]), np.array(law["B"])], axis=1)
+    f.node("Gemm", "image", f.constant(both), f.constant(law["c"]), transB=1)
+    return f.write(course.loop.with_name(name))
+
+
+def test_dynamics_in_a_file(course: Course, call: Callable[..., tuple[int, str]], tmp_path: Path) -> None:
+    """The demo's law as a file is certified by two processes, and another file is not mixed in."""
+    file = learned(course)
+    small = {"along": [0.0, 0.01], "across": [0.0, 0.01], "up": 0.0, "v_across": 0.0, "v_up": 0.0}
+    part = course.changed("learned.json", "goal", initial=small, steps=8, dynamics={"type": "onnx", "file": file.name})
+    document = part.run(tmp_path / "out", workers=2)
+    assert document["verdict"] == "safe" and document["questions"]["safe"]["simulated"]["went_well"] == 1.0
+    assert document["dynamics_model"]["name"] == file.name and document["dynamics_guarantee"]
+    assert "law.onnx(x, u)" in (tmp_path / "out" / "report.html").read_text()
+    job, rng = part.job, np.random.default_rng(4)
+    for row in document["tubes"]:
+        box = ParameterBox(job.loop.box.names, job.loop.box.units, tuple(row["lower"]), tuple(row["upper"]))
+        tube = job.reacher().tube(box)
+        for start in [*box.corners(), *box.sample(10, rng)]:
+            run = simulate(job.reacher(), job.loop.state(box, start), pushes(job.loop, rng, "ends"))
+            assert first_outside(tube, run) is None
+    file.write_bytes(file.read_bytes().replace(b"network", b"another"))
+    code, said = call(part.options(tmp_path / "out", resume=True))
+    assert code == 2 and said.count("\n") == 1 and "--resume" in said, said
+
+
+@pytest.mark.parametrize(
+    ("node", "fragments"),
+    [(None, ("none.onnx: no such network",)), ("Sin", ("bad.onnx: node Sin_v0 (Sin): operator is not supported",))],
+)
+def test_bad_files_of_dynamics(
+    node: str | None, fragments: tuple[str, ...], course: Course, call: Callable[..., tuple[int, str]], tmp_path: Path
+) -> None:
+    name = "none.onnx"
+    if node is not None:
+        f, name = OnnxFile((7,), batch=1), "bad.onnx"
+        f.node(node)
+        f.write(course.loop.with_name(name))
+    wrong = course.changed("wrong.json", dynamics={"type": "onnx", "file": name})
+    code, said = call(wrong.options(tmp_path / "out"))
     assert code == 2 and said.count("\n") == 1 and said.startswith("error: ") and "; " in said, said
     for fragment in fragments:
         assert fragment in said

@@ -2,13 +2,21 @@
 
 from __future__ import annotations
 
+import sqlite3
+import time
+from contextlib import closing
+from pathlib import Path
+from typing import Any, cast
+
 import numpy as np
 import pytest
 
+from ns_abstract.api.margins import Margins
 from ns_abstract.execution.ending import AbandonedError, checkpoint
 from ns_abstract.geometry.box import ParameterBox
 from ns_abstract.io.errors import InputError
 from ns_abstract.verify.scene_margin import Certified, Kind, Settled, check_scenes, widest
+from ns_abstract.verify.store import Store
 
 KIND = Kind("color", "every colour", "of 1", 0.01, 1.0)
 #: What may vary at x: less where x is large. Bounds lose a quarter of a cell's width.
@@ -96,6 +104,47 @@ def test_nothing_is_swallowed() -> None:
 
     found = widest(KIND, cells(), given_up, lambda: False)
     assert found.radius == 0.0 and found.state == "ended" and not found.trials
+
+
+def test_a_resumed_command_settles_nothing_twice(tmp_path: Path) -> None:
+    """Interrupted after any number of cells, a margin is what it is in one go."""
+
+    def begun(resume: bool) -> Store:
+        fixed: dict[int, dict[str, float]] = {k: {} for k in range(3)}
+        return Store(tmp_path, {"scene": 1}, [("x", "m")], fixed, resume=resume)
+
+    whole, asked = widest(KIND, cells(), settle, lambda: False), []
+
+    def counted(radius: float, frame: int, box: ParameterBox) -> Settled:
+        found = settle(radius, frame, box)
+        asked.append((radius, frame, box, found.outcome))
+        return found
+
+    for stops in (1, 9, 1000):
+        store, left = begun(bool(asked)), stops
+
+        def stop() -> bool:
+            nonlocal left
+            left -= 1
+            return left < 0
+
+        margins = Margins(cells(), lambda kind: counted, store)
+        margins.find(time.perf_counter() + 1e6, cast("Any", stop), [KIND])
+        assert margins.found[0].state == ("done" if stops == 1000 else "ended")
+        store.close()
+    (found,) = margins.found
+    assert found.radius == whole.radius and found.example == whole.example
+    assert [(t.cell, t.radius, t.outcome, t.parts) for t in found.trials] == [
+        (t.cell, t.radius, t.outcome, t.parts) for t in whole.trials
+    ]
+    # scenes that break what is certified are found again, for they are not stored with the rest
+    kept = [entry[:3] for entry in asked if entry[3] != "falsified"]
+    assert len(kept) == len(set(kept)) > 10
+    # what others put there is noticed
+    with closing(sqlite3.connect(tmp_path / "cells.sqlite")) as base, base:
+        assert base.execute("UPDATE search_settled SET outcome = 'holds' WHERE outcome = 'unknown'").rowcount > 0
+    with pytest.raises(InputError, match="changed since it was written"):
+        begun(True)
 
 
 @pytest.mark.parametrize(("varied", "rays"), [(True, False), (False, True)])

@@ -21,6 +21,8 @@ _SCENES = "test_certify_search.py::test_scenes_of_a_set"
 _IMPOSSIBLE = "test_certify_search.py::test_impossible_leaves_are_refused_and_nothing_is_stored"
 _RESUMED = "test_certify_search.py::test_resumed_store_equals_an_uninterrupted_one"
 
+_REGISTRATION = "verify/registration.py"
+_PLACES = "test_registration.py::test_bounds_hold_for_every_place_of_the_scene"
 _ROUNDED = "verify/eight_bit.py"
 _BOXES = "verify/boxes.py"
 _EITHER = "test_vnnlib_runner.py::test_proofs_alone_never_decide_unsafe_instances"
@@ -29,8 +31,24 @@ _LEVELS = "test_eight_bit.py::test_sets_hold_rounded_pictures"
 CERTIFICATES = (
     Fault(
         "scene margin: scenes of a tenth of the radius",
-        "api/certification.py", "Certification.settle.settle", "kind.variation(radius)", "kind.variation(0.1 * radius)",
+        "api/certification.py", "Certification._varied", "kind.variation(radius)", "kind.variation(0.1 * radius)",
         "test_certify_cli.py::test_scene_margin", True,
+    ),
+    Fault(
+        "scene margin: what is known of one radius is taken for all",
+        _STORE, "Store.settled", '"kind = ? AND radius = ? AND frame = ? AND lower = ? AND upper = ?"',
+        '"kind = ? AND 0.0 < ? AND frame = ? AND lower = ? AND upper = ?"',
+        "test_scene_margin.py::test_a_resumed_command_settles_nothing_twice",
+    ),
+    Fault(
+        "registration: the worst place of the scene is not taken",
+        _REGISTRATION, "RegisteredModel.bound",
+        "found.b - lost - 2.0**-48 * (np.abs(found.b) + lost)", "found.b", _PLACES,
+    ),
+    Fault(
+        "registration: pictures of one corner of the places",
+        _REGISTRATION, "RegisteredScene.widened",
+        "(*box.upper, *whole.upper[-PLACE:])", "(*box.upper, *whole.lower[-PLACE:])", _PLACES,
     ),
     Fault(
         "scene margin: parts that are not proved are passed over",

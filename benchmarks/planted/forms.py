@@ -207,6 +207,14 @@ FORMS = (
         "test_poses.py::test_enclosure[orbit_six-2]",
     ),
     Fault(
+        "a scene that is shifted takes its camera along",
+        _POSES,
+        "PoseSet._enclosed",
+        "position - parameter(name) * np.eye(3)[k]",
+        "position + parameter(name) * np.eye(3)[k]",
+        "test_poses.py::test_enclosure_of_a_scene_elsewhere",
+    ),
+    Fault(
         "slanted box loses its ends",
         _POSES,
         "PoseSet.sheared",

@@ -3,6 +3,8 @@
 from planted.fault import Fault
 
 _DYNAMICS, _TUBES, _SEARCH, _LOOP = "reach/dynamics.py", "reach/tubes.py", "reach/search.py", "reach/loop.py"
+_LEARNED = "reach/learned.py"
+_FILE = "test_reach.py::test_a_step_of_a_file_is_enclosed"
 _STEP = "test_reach.py::test_a_step_is_enclosed"
 _SETS = "test_reach.py::test_affine_sets_hold_their_images"
 _CLIP = "test_reach.py::test_a_clip_is_enclosed"
@@ -28,6 +30,14 @@ LOOPS = (
         "test_reach.py::test_tubes_hold_runs_in_a_scene_that_stands_elsewhere",
     ),
     Fault(
+        "loops: places of the scene that the view tells are not charged",
+        _TUBES,
+        "Reacher._advanced",
+        "AffineSet(np.zeros(place.size), none, place, pose.first)",
+        "AffineSet(np.zeros(place.size), none, 0.0 * place, pose.first)",
+        "test_reach.py::test_tubes_hold_runs_in_a_scene_whose_place_the_view_tells",
+    ),
+    Fault(
         "scene margin: runs see the stored scene",
         _SEARCH,
         "simulate",
@@ -50,6 +60,38 @@ LOOPS = (
         "np.where(low > 0.0, 1.0, -1.0)",
         "np.where(low > 0.0, 1.0, 1.0)",
         _STEP,
+    ),
+    Fault(
+        "loops: states that a file is given are not rounded to float32",
+        _LEARNED,
+        "LearnedDynamics.bound",
+        "_ROUNDED * size + _FLUSHED",
+        "0.0 * size",
+        f"{_FILE}[selection]",
+    ),
+    Fault(
+        "loops: the remainder of states and controls does not pass a file",
+        _LEARNED,
+        "LearnedDynamics.bound",
+        "(radius + room) * (1.0 + 2.0**-50)",
+        "room",
+        f"{_FILE}[tanh]",
+    ),
+    Fault(
+        "loops: what lies between planes is one of them",
+        _TUBES,
+        "between",
+        "half + wide",
+        "wide",
+        f"{_FILE}[relu]",
+    ),
+    Fault(
+        "loops: the remainder of a file's step is left out",
+        _TUBES,
+        "Reacher._driven",
+        "AffineSet(lines.center, lines.slopes, lines.radius, both.first)",
+        "AffineSet(lines.center, lines.slopes, 0.0 * lines.radius, both.first)",
+        f"{_RUNS}[onnx]",
     ),
     Fault(
         "loops: a map forgets the remainder",
@@ -78,9 +120,9 @@ LOOPS = (
     Fault(
         "loops: disturbances are left out",
         _TUBES,
-        "Reacher._advanced",
-        "law.radius + wide + added",
-        "law.radius + added",
+        "Reacher._driven",
+        "step.radius + wide + added",
+        "step.radius + added",
         _RUNS,
     ),
     Fault(

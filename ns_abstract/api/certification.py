@@ -20,6 +20,7 @@ import torch
 from ns_abstract.api.files import Settings, path_sets, resized
 from ns_abstract.api.job import Job, warm_up
 from ns_abstract.api.scenes import platform_problems
+from ns_abstract.arithmetic.forms import MAX_DIMENSIONS
 from ns_abstract.execution.ending import abandoning
 from ns_abstract.execution.opening import Recipe, opened
 from ns_abstract.execution.threads import use_threads
@@ -39,9 +40,12 @@ from ns_abstract.verify.model import NetworkModel, parametric
 from ns_abstract.verify.network import NetworkArithmetic, load_network
 from ns_abstract.verify.pixel_costs import pixel_costs
 from ns_abstract.verify.properties import Claim, LinearClaim, Property, parse_property
+from ns_abstract.verify.registration import RegisteredModel, RegisteredScene
 from ns_abstract.verify.response import Response, shown_sets
 from ns_abstract.verify.scene_margin import Kind, Settle, Settled
 from ns_abstract.verify.search import BLOCK, ContradictionError, Findings, Search
+from ns_abstract.verify.search import Model as SearchedModel
+from ns_abstract.verify.search import Scene as SearchedScene
 
 if TYPE_CHECKING:
     from ns_abstract.verify.interop import Form
@@ -369,31 +373,43 @@ class Certification:
         other.job, other._searches = self.job.around(extra), {}
         return other
 
+    def places(self, kind: Kind) -> bool:
+        """Whether a kind's parameters can be bounded beside those of every set."""
+        return all(poses.box.dimensions + len(kind.place) <= MAX_DIMENSIONS for poses in self.job.pose_sets)
+
+    def _varied(self, kind: Kind, radius: float, frame: int) -> tuple[FramePictures, SearchedScene, SearchedModel]:
+        """Pictures of a frame for all that may vary, as the search sees them, and the network behind them (V13)."""
+        method, poses, model = self.job.method, self.job.pose_sets[frame], self.model
+        if kind.place:
+            pictures = FramePictures(method, poses.registered(kind.place, radius), self.picture)
+            return pictures, RegisteredScene(pictures, pictures.frame), RegisteredModel(model)
+        if kind.response is not None:
+            pictures = FramePictures(method, poses, self.picture, Response(kind.response, radius))
+        else:
+            pictures = self.around(kind.variation(radius)).pictures(frame)
+        return pictures, pictures, model
+
     def settle(self, kind: Kind) -> Settle:
         """Bounds and attacks cells for all scenes around the stored one (V13)."""
-        kept: dict[tuple[float, int], tuple[FramePictures, Claim]] = {}
+        kept: dict[tuple[float, int], tuple[FramePictures, SearchedScene, SearchedModel, Claim]] = {}
 
         def settle(radius: float, frame: int, box: ParameterBox) -> Settled:
             key = radius, frame
             if key not in kept:
                 # radii come one after the other
                 kept.clear()
-                if kind.response is not None:
-                    response = Response(kind.response, radius)
-                    pictures = FramePictures(self.job.method, self.job.pose_sets[frame], self.picture, response)
-                else:
-                    pictures = self.around(kind.variation(radius)).pictures(frame)
                 # what is claimed does not depend on the scenes
-                kept[key] = pictures, self.claim(self.pictures(frame))
-            pictures, claim = kept[key]
-            search = Search(pictures, self.model, claim, Grid.adaptive(box, [1] * box.dimensions), cuts=False)
+                kept[key] = *self._varied(kind, radius, frame), self.claim(self.pictures(frame))
+            pictures, scene, model, claim = kept[key]
+            search = Search(scene, model, claim, Grid.adaptive(box, [1] * box.dimensions), cuts=False)
             (leaf,) = search.examine(search.grid.roots()).leaves
             if leaf.verdict == "certified":
                 return Settled("holds", "", np.zeros(box.dimensions))
             if leaf.verdict == "unknown":
                 # the network's bounds are there, and not above 0
                 reason = leaf.reason if leaf.margin is None else "the margin's bound is not above 0"
-                return Settled("unknown", reason, pictures.frame.motion(box))
+                whole = scene.widened(box) if isinstance(scene, RegisteredScene) else box
+                return Settled("unknown", reason, pictures.frame.motion(whole)[: box.dimensions])
             if leaf.scene is None:
                 raise ContradictionError(
                     f"internal error: the stored scene breaks at {leaf.counterexample} what was proved there"

@@ -35,7 +35,7 @@ from ns_abstract.report.record import file_stamp
 from ns_abstract.verify.cells import Grid
 from ns_abstract.verify.eight_bit import Picture
 from ns_abstract.verify.network import NetworkArithmetic
-from ns_abstract.verify.scene_margin import SceneMargin, check_scenes
+from ns_abstract.verify.scene_margin import CAMERA_KINDS, KINDS, PLACES, SceneMargin, check_scenes
 from ns_abstract.verify.search import Findings
 from ns_abstract.verify.store import IMAGES, Block, Store, fractions
 from ns_abstract.verify.substitution import MODES, STEP, Comparison, compare, gains, spread_by_volume
@@ -253,11 +253,12 @@ class CertificateRun:
                         substitution = self.compare(store)
                 if scene_margin and not stop():
                     rows = {tally.frame: store.leaves(tally.frame, "certified") for tally in store.tallies()}
-                    margins = Margins(certified_cells(rows, self._box), self.job.settle, on_margin)
+                    margins = Margins(certified_cells(rows, self._box), self.job.settle, store, on_margin)
                     try:
-                        margins.find(deadline + SHARE * budget, stop)
+                        places = [kind for kind in PLACES if self.job.places(kind)]
+                        margins.find(deadline + SHARE * budget, stop, (*KINDS, *CAMERA_KINDS, *places))
                     finally:
-                        margins.keep(store)
+                        margins.keep()
                         self.scene_margin = margins.entry
             finally:
                 # also after a failure: what is finished is written

@@ -11,7 +11,7 @@ import numpy as np
 
 from ns_abstract.execution.stopping import StopRequest
 from ns_abstract.geometry.box import ParameterBox
-from ns_abstract.verify.scene_margin import CAMERA_KINDS, KINDS, Certified, Kind, SceneMargin, Settle, widest
+from ns_abstract.verify.scene_margin import Certified, Kind, SceneMargin, Settle, Settled, widest
 from ns_abstract.verify.store import Store
 
 #: Part of the time that is kept for margins where they are asked for.
@@ -26,6 +26,7 @@ class Margins:
     Args:
         cells: What is certified.
         settle: Bounds and attacks cells for scenes of a kind.
+        store: Keeps what is settled, for a command that goes on; what it holds is not settled again.
         told: Told every margin as it is found.
     """
 
@@ -33,12 +34,13 @@ class Margins:
         self,
         cells: Sequence[Certified],
         settle: Callable[[Kind], Settle],
+        store: Store,
         told: Callable[[SceneMargin], object] = lambda found: None,
     ) -> None:
-        self.cells, self._settle, self._told = cells, settle, told
+        self.cells, self._settle, self._store, self._told = cells, settle, store, told
         self.found: list[SceneMargin] = []
 
-    def find(self, deadline: float, stop: StopRequest, kinds: Sequence[Kind] = (*KINDS, *CAMERA_KINDS)) -> None:
+    def find(self, deadline: float, stop: StopRequest, kinds: Sequence[Kind]) -> None:
         """Look for them; every kind has the same part of the time that is left then.
 
         Args:
@@ -53,17 +55,30 @@ class Margins:
             def over(end: float = end) -> bool:
                 return stop() or time.perf_counter() >= end
 
-            self.found.append(widest(kind, self.cells, self._settle(kind), over))
+            self.found.append(widest(kind, self.cells, self._remembered(kind), over))
             self._told(self.found[-1])
 
-    def keep(self, store: Store) -> None:
+    def _remembered(self, kind: Kind) -> Settle:
+        """Settles what the store does not hold yet."""
+        settle = self._settle(kind)
+
+        def remembered(radius: float, frame: int, box: ParameterBox) -> Settled:
+            found = self._store.settled(kind.name, radius, frame, box)
+            if found is None:
+                found = settle(radius, frame, box)
+                self._store.keep_settled(kind.name, radius, frame, box, found)
+            return found
+
+        return remembered
+
+    def keep(self) -> None:
         """Store the scenes that break what is certified."""
         for found in self.found:
             if found.example is not None:
                 buffer = io.BytesIO()
                 arrays: dict[str, Any] = dict(found.example)
                 np.savez(buffer, **arrays)
-                store.keep_image(f"scene_margin_{found.kind.name}", buffer.getvalue())
+                self._store.keep_image(f"scene_margin_{found.kind.name}", buffer.getvalue())
 
     @property
     def entry(self) -> dict[str, Any]:

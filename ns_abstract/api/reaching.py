@@ -24,6 +24,7 @@ from ns_abstract.api.job import Job
 from ns_abstract.api.margins import NOT_ASKED, SHARE, Margins, certified_cells
 from ns_abstract.api.scenes import Scene, platform_problems
 from ns_abstract.api.searching import paced, search_blocks
+from ns_abstract.arithmetic.forms import MAX_DIMENSIONS
 from ns_abstract.execution.ending import AbandonedError, abandoning
 from ns_abstract.execution.engines import Engine, EngineName, started
 from ns_abstract.execution.opening import Recipe, opened
@@ -33,6 +34,7 @@ from ns_abstract.geometry.box import ParameterBox
 from ns_abstract.io.errors import InputError
 from ns_abstract.perturbation.specification import TRANSLATIONS
 from ns_abstract.perturbation.variations import SceneVariation
+from ns_abstract.reach.learned import LearnedDynamics
 from ns_abstract.reach.loop import Loop, load_loop, parse_loop
 from ns_abstract.reach.page import loop_page
 from ns_abstract.reach.search import QUESTIONS, LoopFindings, LoopSearch, Question, Run, pushes, simulate
@@ -43,7 +45,16 @@ from ns_abstract.verify.cells import Cell, Grid
 from ns_abstract.verify.model import NetworkModel
 from ns_abstract.verify.network import NetworkArithmetic, load_network
 from ns_abstract.verify.response import Response
-from ns_abstract.verify.scene_margin import CAMERA_KINDS, KINDS, REGISTRATION, Kind, SceneMargin, Settle, Settled
+from ns_abstract.verify.scene_margin import (
+    CAMERA_KINDS,
+    KINDS,
+    PLACES,
+    REGISTRATION,
+    Kind,
+    SceneMargin,
+    Settle,
+    Settled,
+)
 from ns_abstract.verify.store import Block, Store, Tally, fractions
 
 #: Of the search's rules: results of different ones are not mixed.
@@ -133,6 +144,16 @@ class LoopJob:
         other.job = self.job.around(extra)
         return other
 
+    @property
+    def _moves(self) -> bool:
+        # a place that does not depend on the state is no parameter that could be off
+        return set(TRANSLATIONS) <= set(self.loop.camera.names)
+
+    def places(self, kind: Kind) -> bool:
+        """Whether the scene's place can be bounded beside the pose: within it, or as more parameters."""
+        fits = len(self.loop.camera.names) + len(kind.place) <= MAX_DIMENSIONS
+        return fits or (kind is REGISTRATION and self._moves)
+
     def settle(self, kind: Kind) -> Settle:
         """Bounds and attacks cells for all scenes around the stored one (V13)."""
         kept: dict[float, LoopSearch] = {}
@@ -141,8 +162,11 @@ class LoopJob:
             if radius not in kept:
                 # radii come one after the other
                 kept.clear()
-                if kind is REGISTRATION:
+                if kind is REGISTRATION and self._moves:
                     kept[radius] = LoopSearch(replace(self.reacher(), registration=radius))
+                elif kind.place:
+                    view = Pictures(self.job.method, self.job.pose_sets[0].registered(kind.place, radius))
+                    kept[radius] = LoopSearch(replace(self.reacher(), view=view))
                 elif kind.response is not None:
                     view = Pictures(self.job.method, self.job.pose_sets[0], Response(kind.response, radius))
                     kept[radius] = LoopSearch(replace(self.reacher(), view=view))
@@ -178,8 +202,11 @@ class LoopJob:
     @cached_property
     def _fingerprint(self) -> dict[str, Any]:
         text = json.dumps(self.loop.value, sort_keys=True)
+        law = self.loop.dynamics
+        learned = {"dynamics": file_stamp(law.file)["sha256"]} if isinstance(law, LearnedDynamics) else {}
         return {
             **self.job.fingerprint,
+            **learned,
             "network": file_stamp(self.loop.network)["sha256"],
             "loop": hashlib.sha256(text.encode()).hexdigest(),
             "network_arithmetic": self.model.arithmetic,
@@ -398,13 +425,12 @@ class ReachRun:
             {number: rows.get(number, [])},
             lambda _, row: ParameterBox(box.names, box.units, tuple(row["lower"]), tuple(row["upper"])),
         )
-        margins = Margins(cells, self.job.settle, told)
+        margins = Margins(cells, self.job.settle, store, told)
         try:
-            # a place that does not depend on the state is no parameter that could be off
-            moves = set(TRANSLATIONS) <= set(self.job.loop.camera.names)
-            margins.find(deadline, stop, (*KINDS, *CAMERA_KINDS, *([REGISTRATION] if moves else [])))
+            places = [kind for kind in PLACES if self.job.places(kind)]
+            margins.find(deadline, stop, (*KINDS, *CAMERA_KINDS, *places))
         finally:
-            margins.keep(store)
+            margins.keep()
             self.scene_margin = {"question": QUESTIONS[number], **margins.entry}
 
     def document(self, store: Store, state: str) -> dict[str, Any]:
@@ -413,6 +439,10 @@ class ReachRun:
         self.rows = {tally.frame: store.leaves(tally.frame) for tally in store.tallies()}
         entries = {QUESTIONS[tally.frame]: self._entry(tally) for tally in store.tallies()}
         program = job.job.method.program
+        learned: dict[str, Any] = {}
+        if isinstance(loop.dynamics, LearnedDynamics):
+            law = loop.dynamics
+            learned = {"dynamics_model": file_stamp(law.file), "dynamics_guarantee": law.network.guarantee()}
         return plain(
             {
                 "version": 1,
@@ -427,6 +457,7 @@ class ReachRun:
                 "model": file_stamp(loop.network),
                 "loop": loop.value,
                 "dynamics": loop.dynamics.about,
+                **learned,
                 "parameters": [
                     {"name": n, "unit": u, "lower": a, "upper": b}
                     for n, u, a, b in zip(loop.box.names, loop.box.units, loop.box.lower, loop.box.upper, strict=True)

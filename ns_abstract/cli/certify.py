@@ -83,8 +83,8 @@ class Certify:
     resume: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
     """Go on with the cells that an interrupted run with the same inputs has stored."""
     scene_margin: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
-    """Splats: in half of the time, look for the largest variation of all Gaussians' means, opacities and colours for
-    which everything that is certified holds."""
+    """Splats: in half of the time, look for the largest variation of all Gaussians' means, opacities and colours, of
+    the camera's response and of the place of the whole scene for which everything that is certified holds."""
     memory_limit: float | None = None
     """GiB that may be used. Default: 80 % of what is free."""
 

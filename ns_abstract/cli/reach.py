@@ -50,8 +50,8 @@ class Reach:
     workers: int = 1
     """Processes on this machine; 1 works in this process."""
     scene_margin: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
-    """In half of the time, look for the largest variation of all Gaussians' means, opacities and colours for which
-    everything that is certified holds."""
+    """In half of the time, look for the largest variation of all Gaussians' means, opacities and colours, of the
+    camera's response and of the place of the whole scene for which everything that is certified holds."""
     resume: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
     """Go on with the cells that an interrupted run with the same inputs has stored."""
 

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ns_abstract.geometry.poses import PoseSet, axis_angle, orthonormal
+from ns_abstract.geometry.poses import SCENE_SHIFTS, SCENE_TURNS, PoseSet, axis_angle, orthonormal
 from ns_abstract.perturbation.specification import ROTATIONS, TRANSLATIONS
 
 #: Elementary rotation axes of yaw, pitch and roll in camera axes.
@@ -33,7 +33,8 @@ def differentiable_pose(pose_set: PoseSet) -> Callable[[Tensor], Tensor]:
     """The function from parameter values [d] to camera-to-world [3, 4], both float64.
 
     Values are in physical units and in the order of ``pose_set.box``, as for `PoseSet.pose`; the rules
-    are those of the perturbation file: segment, then orbit, then translation, then yaw, pitch and roll.
+    are those of the perturbation file: segment, then orbit, then translation, then yaw, pitch and roll; then those of
+    `PoseSet.registered`.
     """
     perturbation = pose_set.perturbation
     start = torch.from_numpy(np.array(pose_set.camera.camera_to_world))
@@ -62,6 +63,14 @@ def differentiable_pose(pose_set: PoseSet) -> Callable[[Tensor], Tensor]:
         position = position + (rotation @ shift if perturbation.frame == "camera" else shift)
         for name in ROTATIONS:
             rotation = rotation @ _turn(torch.tensor(_AXES[name], dtype=torch.float64), p[name])
+        unit = torch.eye(3, dtype=torch.float64)
+        for k, name in enumerate(SCENE_TURNS):
+            if name in p:
+                turn = _turn(unit[k], -p[name])
+                rotation, position = turn @ rotation, turn @ position
+        for k, name in enumerate(SCENE_SHIFTS):
+            if name in p:
+                position = position - p[name] * unit[k]
         return torch.cat([rotation, position[:, None]], dim=1)
 
     return pose

@@ -26,6 +26,11 @@ from ns_abstract.perturbation.specification import ROTATIONS, TRANSLATIONS, Pert
 _CAMERA_AXES = {"yaw": (0.0, 1.0, 0.0), "pitch": (1.0, 0.0, 0.0), "roll": (0.0, 0.0, 1.0)}
 #: Parameters that shift the colours of a NeRF's points and leave the pose alone.
 COLOR_SHIFTS = ("hue", "saturation")
+#: Where the scene as a whole stands: shifts along the world axes, or turns (radians) about those through the origin.
+SCENE_SHIFTS = ("scene_x", "scene_y", "scene_z")
+SCENE_TURNS = ("scene_turn_x", "scene_turn_y", "scene_turn_z")
+#: What three more turns make of the rounding of a rotation and of a position.
+_TURNED_ROTATION, _TURNED_POSITION = 4.0, 8.0
 #: OpenGL to OpenCV camera axes.
 _FLIP = np.array([1.0, -1.0, -1.0])
 
@@ -108,7 +113,8 @@ class PoseSet:
     Attributes:
         camera: Intrinsics and image size; the pose of the first keyframe.
         perturbation: What may vary.
-        box: Parameters of positive width, in the order x, y, z, yaw, pitch, roll, segment, azimuth, hue, saturation.
+        box: Parameters of positive width, in the order x, y, z, yaw, pitch, roll, segment, azimuth, hue, saturation;
+            behind them where the scene stands (`registered`).
         fixed: Values of the parameters of zero width.
         target_camera: End of the segment, where the sweep is over segments.
         shear: [name][other] factors: ``box`` counts the rotation ``name`` from the sum of factor * other, so that its
@@ -163,6 +169,23 @@ class PoseSet:
     def geometry(self) -> PoseSet:
         """The same poses without the parameters that shift colours."""
         return replace(self, box=self.box.without(COLOR_SHIFTS))
+
+    def registered(self, names: tuple[str, ...], radius: float) -> PoseSet:
+        """The same poses as seen from a scene that stands elsewhere as a whole (design.md, P3).
+
+        Args:
+            names: `SCENE_SHIFTS`, normalised units; or `SCENE_TURNS`, radians: the scene is turned about the world
+                axes through the origin, z first and x last.
+            radius: Each is from its negative to it; above 0.
+
+        Returns:
+            The set with these parameters behind its own.
+        """
+        box, unit = self.box, "normalised units" if names == SCENE_SHIFTS else "rad"
+        count = len(names)
+        more = names, (unit,) * count, (-radius,) * count, (radius,) * count
+        parts = box.names, box.units, box.lower, box.upper
+        return replace(self, box=ParameterBox(*(a + b for a, b in zip(parts, more, strict=True))))  # pyright: ignore[reportArgumentType]
 
     def sheared(self, shear: dict[str, dict[str, float]]) -> PoseSet:
         """The same poses in slanted parameters: rotation = own + sum of factor * other (design.md, P2).
@@ -237,6 +260,12 @@ class PoseSet:
         for name in ROTATIONS:
             if p[name] != 0.0:
                 rotation = rotation @ rotation_about(np.array(_CAMERA_AXES[name]), p[name])
+        # a scene elsewhere is a camera elsewhere
+        for k, name in enumerate(SCENE_TURNS):
+            if name in p:
+                turn = rotation_about(np.eye(3)[k], -p[name])
+                rotation, position = turn @ rotation, turn @ position
+        position = position - np.array([p.get(name, 0.0) for name in SCENE_SHIFTS])
         return np.concatenate([rotation, position[:, None]], axis=1)
 
     def enclosure(self, box: ParameterBox, order: int = 1) -> PoseForms:
@@ -262,10 +291,14 @@ class PoseSet:
     def _rounding(self) -> tuple[float, float]:
         """What the concrete pose's float64 evaluation may add to a rotation's and a position's entry."""
         start, displacement = self._base[1], self._base[4]
-        farthest = sum(max(map(abs, limits)) for limits in self.perturbation.translation.values())
+        limits = dict(zip(self.box.names, zip(self.box.lower, self.box.upper, strict=True), strict=True))
+        shifts = [*self.perturbation.translation.values(), *(limits[n] for n in SCENE_SHIFTS if n in limits)]
+        farthest = sum(max(map(abs, ends)) for ends in shifts)
         shift = POSE_ROUNDING * (1.0 + farthest + np.abs(start).max() + np.abs(displacement).max())
         if self.perturbation.orbit is not None:
             shift += POSE_ROUNDING * (1.0 + 2.0 * np.abs(self.perturbation.orbit.target).max())
+        if any(name in limits for name in SCENE_TURNS):
+            return _TURNED_ROTATION * POSE_ROUNDING, _TURNED_POSITION * shift
         return POSE_ROUNDING, shift
 
     def _enclosed(self, box: ParameterBox, basis: Any, kind: Any, trigonometry: Callable[[Any], tuple]) -> tuple:
@@ -313,6 +346,13 @@ class PoseSet:
         for name in ROTATIONS:
             if name in box.names or self.fixed[name] != 0.0:
                 rotation = rotation @ turned(np.array(_CAMERA_AXES[name]), parameter(name))
+        for k, name in enumerate(SCENE_TURNS):
+            if name in box.names:
+                turn = turned(np.eye(3)[k], parameter(name) * -1.0)
+                rotation, position = turn @ rotation, turn @ position
+        for k, name in enumerate(SCENE_SHIFTS):
+            if name in box.names:
+                position = position - parameter(name) * np.eye(3)[k]
         return rotation, position
 
     def world_to_camera(self, values: Float64Array) -> tuple[Float64Array, Float64Array]:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -18,7 +19,8 @@ from ns_abstract.arithmetic.rounding import UNDERFLOW64, UNIT64, gamma
 from ns_abstract.arithmetic.trigonometry import cos_sin
 from ns_abstract.io.errors import InputError
 from ns_abstract.io.fields import Fail, known
-from ns_abstract.io.jsonio import FIX_MODERATE, is_moderate, show
+from ns_abstract.io.jsonio import FIX_MODERATE, file_beside, is_moderate, show
+from ns_abstract.reach.learned import LearnedDynamics
 
 Float64 = NDArray[np.float64]
 
@@ -263,6 +265,7 @@ _KEYS = {
     "double integrator": ("type", "axes", "drag", "quadratic_drag"),
     "fixed wing": ("type", "speed"),
     "quadrotor": ("type", "lag", "gravity"),
+    "onnx": ("type", "file"),
 }
 
 
@@ -306,13 +309,28 @@ def number(value: Any, name: str, fail: Fail, *, positive: bool = False) -> floa
     return float(value)
 
 
-def parse_dynamics(value: Any, states: int, dt: float, fail: Fail) -> Dynamics:
+def named_file(value: Any, name: str, folder: Path, endings: str, fail: Fail) -> Path:
+    """The file beside LOOP.json that a field names.
+
+    Raises:
+        InputError: Of ``fail``; or the name leads out of the folder.
+    """
+    if not isinstance(value, str) or not value:
+        raise fail(name, f"found {show(value)}", f"name {endings} file beside this one")
+    try:
+        return file_beside(folder, value)
+    except InputError as error:
+        raise InputError(error.problem, fix=error.fix, field=name) from None
+
+
+def parse_dynamics(value: Any, states: int, dt: float, folder: Path, fail: Fail) -> Dynamics | LearnedDynamics:
     """The object under the key ``dynamics``.
 
     Args:
         value: The object.
         states: Number of states.
         dt: Sampling time, seconds.
+        folder: Where files lie.
         fail: Makes errors.
 
     Raises:
@@ -325,7 +343,10 @@ def parse_dynamics(value: Any, states: int, dt: float, fail: Fail) -> Dynamics:
     if not isinstance(kind, str) or kind not in _KEYS:
         raise fail("dynamics.type", f"found {show(kind)}", f"write one of {kinds}")
     known(value, _KEYS[kind], "dynamics.", fail)
-    if kind == "affine":
+    found: Dynamics | LearnedDynamics
+    if kind == "onnx":
+        found = LearnedDynamics(named_file(value.get("file"), "dynamics.file", folder, "an .onnx", fail), states)
+    elif kind == "affine":
         a = matrix(value.get("A"), "dynamics.A", states, states, fail)
         b = matrix(value.get("B"), "dynamics.B", states, None, fail)
         c = numbers(value.get("c", [0.0] * states), "dynamics.c", states, fail)

@@ -16,9 +16,19 @@ from ns_abstract.geometry.camera_path import Camera, checked_pose, focal_length
 from ns_abstract.geometry.poses import PoseSet
 from ns_abstract.io.errors import InputError
 from ns_abstract.io.fields import Fail, interval, known
-from ns_abstract.io.jsonio import file_beside, is_moderate, is_number, load_json, show
+from ns_abstract.io.jsonio import is_moderate, is_number, load_json, show
 from ns_abstract.perturbation.specification import ROTATIONS, TRANSLATIONS, Perturbation
-from ns_abstract.reach.dynamics import MOST, Dynamics, matrix, number, numbers, parse_dynamics, unusable
+from ns_abstract.reach.dynamics import (
+    MOST,
+    Dynamics,
+    matrix,
+    named_file,
+    number,
+    numbers,
+    parse_dynamics,
+    unusable,
+)
+from ns_abstract.reach.learned import LearnedDynamics
 from ns_abstract.verify.preprocess import Preprocess, parse_preprocess
 
 Float64 = NDArray[np.float64]
@@ -147,7 +157,7 @@ class Loop:
     upper: Float64
     steps: int
     dt: float
-    dynamics: Dynamics
+    dynamics: Dynamics | LearnedDynamics
     disturbance: Float64
     camera: CameraMount
     network: Path
@@ -184,7 +194,7 @@ class Loop:
 
 
 def load_loop(path: str | Path) -> Loop:
-    """Read LOOP.json; the network's file is looked for beside it.
+    """Read LOOP.json; the files that it names are looked for beside it.
 
     Raises:
         InputError: The file or a field in it cannot be used.
@@ -202,7 +212,7 @@ def parse_loop(value: Any, folder: Path) -> Loop:
 
     Args:
         value: The content.
-        folder: Where the network's file lies.
+        folder: Where the files that it names lie.
 
     Raises:
         InputError: A key is unknown, or a value cannot be used.
@@ -226,15 +236,9 @@ def parse_loop(value: Any, folder: Path) -> Loop:
     if type(steps) is not int or not 1 <= steps <= MOST_STEPS:
         raise fail("steps", f"found {show(steps)}", f"write a whole number from 1 to {MOST_STEPS}")
     dt = number(value.get("sampling_time"), "sampling_time", fail, positive=True)
-    dynamics = parse_dynamics(value.get("dynamics"), n, dt, fail)
+    dynamics = parse_dynamics(value.get("dynamics"), n, dt, folder, fail)
     disturbance = np.stack(_ranges(value.get("disturbance", {}), "disturbance", names, fail))
-    file = value.get("network")
-    if not isinstance(file, str) or not file:
-        raise fail("network", f"found {show(file)}", "name an .onnx or .pt2 file beside this one")
-    try:
-        network = file_beside(folder, file)
-    except InputError as error:
-        raise InputError(error.problem, fix=error.fix, field="network") from None
+    network = named_file(value.get("network"), "network", folder, "an .onnx or .pt2", fail)
     unsafe = value.get("unsafe", [])
     if not isinstance(unsafe, list) or len(unsafe) > _MOST_SETS:
         raise fail("unsafe", f"found {show(unsafe)}", f"write a list of at most {_MOST_SETS} sets")

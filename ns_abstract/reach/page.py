@@ -179,6 +179,8 @@ def _guarantee(document: Mapping[str, Any]) -> str:
         f"Pictures: <b>{escape(document['guarantee'])}</b>, each bound {escape(document['guarantee_text'])}.",
         "Network: " + escape("; ".join(document["network_guarantee"])) + ".",
     ]
+    if "dynamics_guarantee" in document:
+        lines.append("f, a network of its own: " + escape("; ".join(document["dynamics_guarantee"])) + ".")
     reasons = "".join(f"<li>{escape(text)}: {count}</li>" for text, count in document["unknown_because"].items())
     plan = "".join(f"<li>{escape(line)}</li>" for line in document["plan"])
     terms = "".join(f"<dt>{escape(key)}</dt><dd>{escape(text)}</dd>" for key, text in document["metrics"].items())

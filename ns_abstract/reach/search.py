@@ -79,7 +79,7 @@ def simulate(
     start: Float64,
     disturbances: Float64,
     member: Member | None = None,
-    shift: Float64 | None = None,
+    off: Float64 | None = None,
 ) -> Run:
     """One run with the real renderer and the deployed network, in float64 but for these.
 
@@ -88,7 +88,7 @@ def simulate(
         start: [n] initial state.
         disturbances: [steps, n], added to every next state.
         member: The scene that is seen throughout; None: the stored one.
-        shift: [d] added to the pose's parameters throughout, for a scene that stands elsewhere; None: nothing.
+        off: Where the scene stands throughout, as `Reacher.seen_from` has it; None: at its place.
     """
     loop = reacher.loop
     more = () if member is None else (member,)
@@ -98,7 +98,7 @@ def simulate(
             x = states[-1]
             if not np.isfinite(x).all():
                 break
-            pose = loop.camera.values(x) if shift is None else loop.camera.values(x) + shift
+            pose = reacher.seen_from(x, off)
             u = reacher.pilot.concrete(reacher.view.image(pose, *more))
             controls.append(u)
             states.append(loop.dynamics.step(x, u) + push)
@@ -199,7 +199,7 @@ class LoopSearch:
 
     def _scenes(self, generator: np.random.Generator) -> Iterator[tuple[Member | None, Float64 | None]]:
         """Scenes of the set, without end: other Gaussians, or the stored ones elsewhere, corners first."""
-        reach = self.reacher.shift
+        reach = self.reacher.place if self.reacher.place.size else self.reacher.shift
         if not reach.any():
             yield from ((member, None) for member in self.reacher.view.members(0))
             return
@@ -224,10 +224,10 @@ class LoopSearch:
         starts = [box.middle, np.array(box.lower), np.array(box.upper)]
         first = int(generator.integers(_SCENES)) if proved else 0
         scenes = itertools.islice(self._scenes(generator), first, first + 1 if proved else _SCENES)
-        for number, (member, shift) in enumerate(scenes):
+        for number, (member, off) in enumerate(scenes):
             state = self.loop.state(box, starts[number % len(starts)])
             push = pushes(self.loop, generator, "ends" if number % 2 else "middle")
-            run = simulate(self.reacher, state, push, member, shift)
+            run = simulate(self.reacher, state, push, member, off)
             outside = first_outside(tube, run) if known else None
             margin = run.margin(self.loop, question)
             if outside is not None or (proved and margin <= 0.0):
@@ -237,12 +237,12 @@ class LoopSearch:
                 )
             if math.isnan(margin):
                 return Settled("unknown", "the states of a run are no finite numbers", width)
-            if margin <= 0.0 and simulate(self.reacher, state, push, member, shift).margin(self.loop, question) <= 0.0:
+            if margin <= 0.0 and simulate(self.reacher, state, push, member, off).margin(self.loop, question) <= 0.0:
                 arrays = {"states": run.states, "controls": run.controls, "disturbances": run.disturbances}
                 arrays |= {"names": np.array(self.loop.names, str)}
                 varied = {} if member is None else member.arrays
                 arrays |= {f"scene_{name}": array for name, array in varied.items()}
-                arrays |= {} if shift is None else {"shift": shift}
+                arrays |= {} if off is None else {"place" if self.reacher.place.size else "shift": off}
                 return Settled("falsified", "a run goes wrong", width, arrays)
         if proved:
             return Settled("holds", "", width)

@@ -16,9 +16,11 @@ from ns_abstract.geometry.poses import PoseSet
 from ns_abstract.geometry.tiles import assemble
 from ns_abstract.perturbation.specification import TRANSLATIONS
 from ns_abstract.reach.dynamics import middle_half
+from ns_abstract.reach.learned import LearnedDynamics
 from ns_abstract.reach.loop import Control, Face, Loop
 from ns_abstract.refine.protocol import Frame, Member, Method
 from ns_abstract.verify.model import NetworkModel
+from ns_abstract.verify.network import OutputBounds
 from ns_abstract.verify.properties import Query
 from ns_abstract.verify.response import Response, shown_sets
 
@@ -188,8 +190,8 @@ class Pictures:
 
 
 @dataclass(frozen=True)
-class Controls:
-    """``u = slopes q + center + e`` with |e| <= radius, and ``lower <= u <= upper``, of poses at q in [-1, 1]^d.
+class Linear:
+    """``y = slopes q + center + e`` with |e| <= radius, and ``lower <= y <= upper``, at places q in [-1, 1]^d.
 
     Attributes:
         slopes: [m, d].
@@ -203,7 +205,7 @@ class Controls:
     upper: Float64
 
 
-def clipped(raw: Controls, lower: Float64, upper: Float64) -> Controls:
+def clipped(raw: Linear, lower: Float64, upper: Float64) -> Linear:
     """``clip(z, lower, upper)`` for z given by ``raw`` (L3).
 
     ``clip(z) - lambda z`` is largest and smallest at the ends of z's range or where the clip begins, for any lambda.
@@ -227,7 +229,7 @@ def clipped(raw: Controls, lower: Float64, upper: Float64) -> Controls:
         shape = (-1, *[1] * (same.ndim - 1))
         return np.where(inside.reshape(shape), same, np.where(flat.reshape(shape), level, steep))
 
-    return Controls(
+    return Linear(
         chosen(raw.slopes, slope[:, None] * raw.slopes, 0.0),
         chosen(raw.center, slope * raw.center + middle, center),
         chosen(raw.radius, radius, spread),
@@ -255,42 +257,59 @@ class Pilot:
         """[m] the control for a picture, as the deployed network computes it."""
         return self.control.of(self.model.outputs(image[None])[0].astype(np.float64))
 
-    def bound(self, linear: Sequence[np.ndarray], lower: np.ndarray, upper: np.ndarray) -> Controls | None:
+    def bound(self, linear: Sequence[np.ndarray], lower: np.ndarray, upper: np.ndarray) -> Linear | None:
         """The controls for a set of pictures, and float64 evaluations of K (y - goal); None: nothing is known (L3)."""
         control = self.control
         m, o = control.gain.shape
         images = self.model.input_sets(tuple(part[None] for part in linear), lower[None], upper[None])
         found = self.model.bound(images, self._query)
-        least = found.lower[0]
-        if not np.isfinite(least).all():
-            # what is not known to be finite need not be a number either, which no clip mends
-            return None
-        usable = np.isfinite(found.b[0])
-        a, b = np.where(usable[:, None], found.a[0], 0.0), np.where(usable, found.b[0], least)
         with np.errstate(all="ignore"):
-            shift = control.gain @ control.goal
-            steep, outputs = np.abs(control.gain), np.maximum(-least[2 * m : 2 * m + o], -least[2 * m + o :])
-            # K (y - goal) in float64, K goal above, and the sums below
+            least = found.lower[0]
+            outputs = np.maximum(-least[2 * m : 2 * m + o], -least[2 * m + o :])
+            # K (y - goal) in float64, and K goal
+            steep = np.abs(control.gain)
             room = 2.0 * gamma(2 * o + _FEW) * (steep @ (np.abs(outputs) + np.abs(control.goal)))
-            slopes = 0.5 * (a[:m] - a[m : 2 * m])
-            apart = 0.5 * np.abs(a[:m] + a[m : 2 * m]).sum(axis=1)
-            bottom, top = b[:m] - apart, -b[m : 2 * m] + apart
-            size = np.abs(a[: 2 * m]).sum(axis=1).reshape(2, m).sum(axis=0) + np.abs(bottom) + np.abs(top)
-            center, half = middle_half(bottom, top)
-            low, high = least[:m], -least[m : 2 * m]
-            # the float64 evaluation errs beside the exact function
-            wide = room + 2.0 * gamma(a.shape[1] + _FEW) * (size + np.abs(shift))
-            raw = Controls(slopes, center - shift, half + wide, low - shift - wide, high - shift + wide)
-            poor = ~(raw.radius < 0.5 * (raw.upper - raw.lower))
-            middle, spread = middle_half(raw.lower, raw.upper)
-            raw = Controls(
-                np.where(poor[:, None], 0.0, raw.slopes),
-                np.where(poor, middle, raw.center),
-                np.where(poor, spread, raw.radius),
-                raw.lower,
-                raw.upper,
-            )
-            return clipped(raw, control.lower, control.upper)
+            raw = between(found, m, control.gain @ control.goal, room)
+            return None if raw is None else clipped(raw, control.lower, control.upper)
+
+
+def between(found: OutputBounds, count: int, shift: Float64, room: Float64) -> Linear | None:
+    """What lies between planes: the first ``count`` rows of one cell, the next as many their negatives (L3).
+
+    Args:
+        found: Lower bounds [1, 2 count or more]; places are the parameters.
+        count: How many.
+        shift: [count] what is taken off.
+        room: [count] how far values may be off beside that.
+
+    Returns:
+        None where a bound is not finite: what is not known to be finite need not be a number either.
+    """
+    least = found.lower[0]
+    if not np.isfinite(least).all():
+        return None
+    usable = np.isfinite(found.b[0])
+    a, b = np.where(usable[:, None], found.a[0], 0.0), np.where(usable, found.b[0], least)
+    a, b, least = a[: 2 * count], b[: 2 * count], least[: 2 * count]
+    with np.errstate(all="ignore"):
+        slopes = 0.5 * (a[:count] - a[count:])
+        apart = 0.5 * np.abs(a[:count] + a[count:]).sum(axis=1)
+        bottom, top = b[:count] - apart, -b[count:] + apart
+        size = np.abs(a).sum(axis=1).reshape(2, count).sum(axis=0) + np.abs(bottom) + np.abs(top)
+        center, half = middle_half(bottom, top)
+        low, high = least[:count], -least[count:]
+        # the sums above, and the shift
+        wide = room + 2.0 * gamma(a.shape[1] + _FEW) * (size + np.abs(shift))
+        raw = Linear(slopes, center - shift, half + wide, low - shift - wide, high - shift + wide)
+        poor = ~(raw.radius < 0.5 * (raw.upper - raw.lower))
+        middle, spread = middle_half(raw.lower, raw.upper)
+    return Linear(
+        np.where(poor[:, None], 0.0, raw.slopes),
+        np.where(poor, middle, raw.center),
+        np.where(poor, spread, raw.radius),
+        raw.lower,
+        raw.upper,
+    )
 
 
 # ---------------------------------------------------------------- the tube
@@ -336,7 +355,8 @@ class Reacher:
         pilot: Its network and control.
         dependence: What is kept from step to step.
         registration: How far the scene may stand from its place along every world axis, all of a run through; needs a
-            camera that moves along all of them.
+            camera that moves along all of them. Otherwise the view's set may tell where the scene stands
+            (`PoseSet.registered`).
     """
 
     loop: Loop
@@ -354,6 +374,18 @@ class Reacher:
     def shift(self) -> Float64:
         """[d] how far pose parameters may be off, as seen from the scene."""
         return np.array([self.registration if name in TRANSLATIONS else 0.0 for name in self.loop.camera.names])
+
+    @property
+    def place(self) -> Float64:
+        """[3] how far the scene may stand from its place, where the view's set tells; else [0]."""
+        return self._limits[1][len(self.loop.camera.names) :]
+
+    def seen_from(self, x: Float64, off: Float64 | None = None) -> Float64:
+        """Parameters of the view at a state [n], in a scene that is ``off`` by as much as `place` or `shift` say."""
+        values = self.loop.camera.values(x)
+        if self.place.size:
+            return np.concatenate([values, np.zeros(self.place.size) if off is None else off])
+        return values if off is None else values + off
 
     def tube(self, cell: ParameterBox, *, whole: bool = False) -> Tube:
         """The tube of a cell of the initial box; it ends early where an unsafe set cannot be ruled out.
@@ -401,8 +433,12 @@ class Reacher:
         # a scene elsewhere is a camera elsewhere (V13)
         pose = state.mapped(camera.factors, camera.offset, self.shift + rounding * size)
         low, high = pose.hull()
-        if not ((low >= self._limits[0]) & (high <= self._limits[1])).all():
+        if not ((low >= self._limits[0][: len(low)]) & (high <= self._limits[1][: len(high)])).all():
             return "the camera may leave the range of poses"
+        if (place := self.place).size:
+            low, high = np.concatenate([low, -place]), np.concatenate([high, place])
+            none = np.zeros((place.size, pose.generators.shape[1]))
+            pose = pose.beside(AffineSet(np.zeros(place.size), none, place, pose.first))
         names, units = self.view.pose_set.box.names, self.view.pose_set.box.units
         linear, lower, upper, slopes = self.view.sets(
             ParameterBox(names, units, tuple(low.tolist()), tuple(high.tolist()))
@@ -412,9 +448,9 @@ class Reacher:
         controls = self.pilot.bound(linear, lower, upper)
         if controls is None:
             return "the network's bounds are not finite"
-        place = _scaled(pose, *middle_half(low, high))
-        moved = np.abs(np.asarray(slopes, np.float64)) @ np.abs(place.generators)
-        control = place.mapped(controls.slopes, controls.center, controls.radius)
+        scaled = _scaled(pose, *middle_half(low, high))
+        moved = np.abs(np.asarray(slopes, np.float64)) @ np.abs(scaled.generators)
+        control = scaled.mapped(controls.slopes, controls.center, controls.radius)
         ends = control.hull()
         ends = np.maximum(ends[0], controls.lower), np.minimum(ends[1], controls.upper)
         if not (np.isfinite(ends[0]).all() and np.isfinite(ends[1]).all() and (ends[0] <= ends[1]).all()):
@@ -423,10 +459,24 @@ class Reacher:
             middle, half = middle_half(*ends)
             control = AffineSet(middle, np.zeros_like(control.generators), half, control.first)
         hull = state.hull()
-        law = loop.dynamics.enclose(np.concatenate([hull[0], ends[0]]), np.concatenate([hull[1], ends[1]]))
-        both = _scaled(state.beside(control), law.middle, law.half)
+        follow = self._driven(state.beside(control), np.concatenate([hull, ends], axis=1))
+        return follow if isinstance(follow, str) else (follow, np.stack(ends), moved)
+
+    def _driven(self, both: AffineSet, ends: Float64) -> AffineSet | str:
+        """The next states, of states and controls in a set and between ``ends`` [2, n + m] (L4, L6)."""
+        loop, law = self.loop, self.loop.dynamics
         push, wide = middle_half(*loop.disturbance)
-        # the sum with the disturbance is rounded where a run is simulated, too
-        added = 4.0 * UNIT64 * (np.abs(law.center + push) + np.abs(loop.disturbance).max(axis=0))
-        follow = both.mapped(law.slopes, law.center + push, law.radius + wide + added)
-        return follow, np.stack(ends), moved
+        most = np.abs(loop.disturbance).max(axis=0)
+        if isinstance(law, LearnedDynamics):
+            found = law.bound(both.center, both.generators, both.radius, *ends)
+            none = np.zeros(law.states)
+            lines = None if found is None else between(found, law.states, none, none)
+            if lines is None:
+                return "the dynamics' bounds are not finite"
+            moved = AffineSet(lines.center, lines.slopes, lines.radius, both.first)
+            # the sum with the disturbance is rounded where a run is simulated, too
+            return moved.mapped(np.eye(law.states), push, wide + 4.0 * UNIT64 * (moved.size + most))
+        step = law.enclose(*ends)
+        place = _scaled(both, step.middle, step.half)
+        added = 4.0 * UNIT64 * (np.abs(step.center + push) + most)
+        return place.mapped(step.slopes, step.center + push, step.radius + wide + added)

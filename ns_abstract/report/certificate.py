@@ -18,7 +18,7 @@ VERSION = 1
 #: What the key ``scene_margin`` of report.json tells.
 SCENE_MARGIN = (
     "by what varies, of every Gaussian by itself, (brightness, white_balance, gamma) of the camera "
-    "or (registration) of the scene as a whole: radius of the largest "
+    "or (registration, turn) of the scene as a whole: radius of the largest "
     "variation for which every certified cell is certified again; not_certified: the smallest radius that was "
     "tried in vain, and why; falsified: the smallest for which a scene, stored under counterexamples/, breaks "
     "what is certified; reached: radius at which the part of the certified volume holds that was looked at before "

@@ -32,7 +32,7 @@ def scene_margin(entry: Mapping[str, Any]) -> str:
     lines = "".join(f"<li>{escape(kind['text'])}.</li>" for kind in entry["kinds"])
     return (
         f"{title}<p>Every certified cell was bounded again for all scenes that are off by no more than a radius, every "
-        f"Gaussian by itself, the camera, or (registration) the scene as a whole; it is certified again "
+        f"Gaussian by itself, the camera, or (registration, turn) the scene as a whole; it is certified again "
         f"for the radius in the table, and so for every smaller one."
         f'</p><ul>{lines}</ul><div class="wide"><table><thead><tr><th class="left">what varies</th>'
         '<th>radius, certified</th><th class="left">smallest not certified</th><th class="left">smallest broken</th>'

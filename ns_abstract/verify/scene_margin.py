@@ -16,6 +16,7 @@ import numpy as np
 
 from ns_abstract.execution.ending import AbandonedError, abandoning, checkpoint
 from ns_abstract.geometry.box import ParameterBox
+from ns_abstract.geometry.poses import SCENE_SHIFTS, SCENE_TURNS
 from ns_abstract.io.errors import InputError
 from ns_abstract.perturbation.variations import SceneVariation, Selection
 from ns_abstract.verify.cells import Cell, Grid
@@ -37,7 +38,7 @@ _LISTED = 200
 
 @dataclass(frozen=True)
 class Kind:
-    """What varies; of `KINDS`, of every Gaussian independently; of `CAMERA_KINDS`, of the camera.
+    """What varies; of `KINDS`, of every Gaussian independently; of `CAMERA_KINDS`, of the camera; of `PLACES`, all.
 
     Attributes:
         name: Key of a scene variation, of `KINDS`.
@@ -45,6 +46,7 @@ class Kind:
         first: Radius that is tried first.
         most: Radius beyond which none is tried.
         response: What of the camera varies, if it is not the scene.
+        place: Parameters of where the scene as a whole stands, if these vary (`PoseSet.registered`).
     """
 
     name: str
@@ -53,6 +55,7 @@ class Kind:
     first: float
     most: float
     response: ResponseName | None = None
+    place: tuple[str, ...] = ()
 
     def variation(self, radius: float) -> SceneVariation:
         """All scenes around the stored one."""
@@ -73,10 +76,19 @@ CAMERA_KINDS: tuple[Kind, ...] = (
     Kind("gamma", "the power of the camera's response", "of 1", 1e-2, 0.9, "gamma"),
 )
 
-#: Not of single Gaussians: the scene as a whole, the same for a whole run of a loop.
+#: The scene as a whole, the same for a whole run of a loop.
 REGISTRATION = Kind(
-    "registration", "the place of the whole scene along every world axis", "normalised units", 1e-3, 10.0
+    "registration",
+    "the place of the whole scene along every world axis",
+    "normalised units",
+    1e-3,
+    10.0,
+    place=SCENE_SHIFTS,
 )
+TURN = Kind(
+    "turn", "the turn of the whole scene about every world axis through the origin", "rad", 1e-3, 1.5, place=SCENE_TURNS
+)
+PLACES = (REGISTRATION, TURN)
 
 
 @dataclass(frozen=True)

@@ -25,16 +25,19 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import quote
 
+import numpy as np
+
 from ns_abstract.geometry.box import ParameterBox
 from ns_abstract.io.atomic import write_atomic
 from ns_abstract.io.errors import InputError, first_line
 from ns_abstract.io.folder import claim, remove_parts, unwritable
 from ns_abstract.io.jsonio import load_json
 from ns_abstract.verify.cells import Cell, Grid
+from ns_abstract.verify.scene_margin import Settled
 from ns_abstract.verify.search import RANK_FIRST, Findings, Leaf, Verdict
 
 NAME = "cells.sqlite"
-VERSION = 4
+VERSION = 5
 #: One open block of so many is the one with the largest cells, all others are those nearest to a proof.
 _LARGEST_EVERY = 4
 #: Folder of the images of counterexamples.
@@ -52,6 +55,8 @@ CREATE INDEX search_large ON search_blocks(volume DESC, id);
 CREATE TABLE search_reasons(reason TEXT PRIMARY KEY, cells INTEGER);
 CREATE TABLE search_trace(seconds REAL, cells INTEGER, certified REAL, falsified REAL, unknown REAL);
 CREATE TABLE search_images(name TEXT PRIMARY KEY, sha256 TEXT);
+CREATE TABLE search_settled(kind TEXT, radius REAL, frame INTEGER, lower TEXT, upper TEXT, outcome TEXT, reason TEXT,
+  slopes TEXT, PRIMARY KEY(kind, radius, frame, lower, upper));
 """
 _REPORT_LIMIT = 2**30
 #: What a file that others have changed may raise when it is read.
@@ -65,6 +70,7 @@ _PASSING = ("locked", "full", "disk I/O", "readonly", "unable to open")
 _CELL = "frame, lower, upper, verdict, margin, seconds, counterexample"
 _FRAME = "frame, units, coarse, lower, upper, total, certified, falsified, unknown, undecided, poses, holding"
 _BLOCK = "id, frame, volume, rank, depth, cells"
+_SETTLED = "kind, radius, frame, lower, upper, outcome, reason, slopes"
 
 
 @dataclass
@@ -91,11 +97,12 @@ class Seal:
 
 @dataclass
 class _Seals:
-    """Of the cells that have a verdict, the open blocks and the frames."""
+    """Of the cells that have a verdict, the open blocks, the frames, and what is known of margins."""
 
     cells: Seal = field(default_factory=Seal)
     blocks: Seal = field(default_factory=Seal)
     frames: Seal = field(default_factory=Seal)
+    settled: Seal = field(default_factory=Seal)
 
     def plain(self) -> dict[str, Any]:
         return {name: [seal.rows, seal.text] for name, seal in vars(self).items()}
@@ -295,6 +302,8 @@ class Store:
             found.blocks.add(row)
         for row in self._base.execute(f"SELECT {_FRAME} FROM search_frames"):
             found.frames.add(row)
+        for row in self._base.execute(f"SELECT {_SETTLED} FROM search_settled"):
+            found.settled.add(row)
         if found.plain() != self._get("seals"):
             raise self._damaged("its content was changed since it was written")
         self._seals = found
@@ -517,6 +526,24 @@ class Store:
         self._base.execute("INSERT INTO cells VALUES (?, ?, ?, ?, ?, ?, ?)", row)
         self._seals.cells.add(row)
 
+    def settled(self, kind: str, radius: float, frame: int, box: ParameterBox) -> Settled | None:
+        """What `keep_settled` was told of a cell, or None."""
+        query = "kind = ? AND radius = ? AND frame = ? AND lower = ? AND upper = ?"
+        row = self._base.execute(
+            f"SELECT outcome, reason, slopes FROM search_settled WHERE {query}", _settled_key(kind, radius, frame, box)
+        ).fetchone()
+        return None if row is None else Settled(row[0], row[1], np.array(json.loads(row[2]), np.float64))
+
+    def keep_settled(self, kind: str, radius: float, frame: int, box: ParameterBox, found: Settled) -> None:
+        """Note what is known of a cell for all scenes of a radius; scenes that break it are found again."""
+        if found.outcome == "falsified":
+            return
+        with self._transaction():
+            slopes = np.nan_to_num(np.asarray(found.slopes, np.float64)).tolist()
+            row = (*_settled_key(kind, radius, frame, box), found.outcome, found.reason, json.dumps(slopes))
+            self._base.execute(f"INSERT INTO search_settled VALUES ({', '.join('?' * len(row))})", row)
+            self._seals.settled.add(row)
+
     def finish(self, grids: Mapping[int, Grid]) -> None:
         """List what is still open as unknown, so that the cells cover the set; `Store` takes it back on resuming."""
         with self._transaction():
@@ -594,6 +621,10 @@ class Store:
             if verdict in (None, kind)
         ]
         return sorted(found, key=lambda row: row["lower"])
+
+
+def _settled_key(kind: str, radius: float, frame: int, box: ParameterBox) -> tuple[str, float, int, str, str]:
+    return kind, float(radius), int(frame), json.dumps(box.lower), json.dumps(box.upper)
 
 
 def _parts_of(base: sqlite3.Connection) -> set[tuple[str, str, str]]:

@@ -20,8 +20,12 @@ _DIFFERENCE = 2.0**-10
 _IMAGES = 3
 
 
-def load_network(path: Path) -> Network:
+def load_network(path: Path, *, vector: bool = False) -> Network:
     """The network in an .onnx or a .pt2 file, compared with the program that usually runs such a file.
+
+    Args:
+        path: The file.
+        vector: Whether an .onnx file's input may be a vector [n], without a batch.
 
     Raises:
         InputError: The file cannot be read, uses what is not supported, or computes something else elsewhere.
@@ -29,7 +33,7 @@ def load_network(path: Path) -> Network:
     path = Path(path)
     file_size(path, "network")
     if path.suffix == ".onnx":
-        network = read_onnx(path)
+        network = read_onnx(path, vector=vector)
         run = onnx_runner(path)
     elif path.suffix == ".pt2":
         network, run = read_exported(path)
@@ -60,7 +64,9 @@ def load_network(path: Path) -> Network:
 
 
 def onnx_runner(path: Path) -> Callable[[np.ndarray], np.ndarray]:
-    """Runs the model in onnxruntime on one image [1, ...]; all outputs one after another.
+    """Runs the model in onnxruntime on one image [1, ...] in the type that it wants; all outputs one after another.
+
+    A model of vectors [n] is given one.
 
     Raises:
         InputError: onnxruntime refuses the file.
@@ -70,13 +76,15 @@ def onnx_runner(path: Path) -> Callable[[np.ndarray], np.ndarray]:
     options.intra_op_num_threads = options.inter_op_num_threads = 1
     try:
         session = onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
-        name = session.get_inputs()[0].name
+        wanted = session.get_inputs()[0]
     except Exception as error:
         raise InputError(f"onnxruntime refuses it: {error}", file=path, fix="export the network again") from None
-    double = session.get_inputs()[0].type == "tensor(double)"
+    kind = np.float64 if wanted.type == "tensor(double)" else np.float32
+    vector = len(wanted.shape) == 1
 
     def run(image: np.ndarray) -> np.ndarray:
-        found = session.run(None, {name: image.astype(np.float64) if double else image})
+        image = (image.reshape(-1) if vector else image).astype(kind)
+        found = session.run(None, {wanted.name: image})
         return np.concatenate([np.asarray(output).reshape(-1) for output in found])
 
     return run

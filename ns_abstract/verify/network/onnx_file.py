@@ -10,11 +10,11 @@ from ns_abstract.verify.network.onnx_rules import RULES
 from ns_abstract.verify.network.onnx_tensors import parse_model
 
 
-def read_onnx(path: Path) -> Network:
-    """The network in an ONNX file.
+def read_onnx(path: Path, *, vector: bool = False) -> Network:
+    """The network in an ONNX file; its input may be a vector without a batch where ``vector`` is.
 
     Raises:
         InputError: The file cannot be read, or uses what is not supported; names node, operator and attribute.
     """
     model = parse_model(path)
-    return Reader(path, model.graph, operator_set(model, path), RULES).network()
+    return Reader(path, model.graph, operator_set(model, path), RULES, vector).network()

@@ -81,7 +81,9 @@ class Value(NamedTuple):
 class Reader:
     """Turns one graph's nodes into layers."""
 
-    def __init__(self, path: Path, graph: onnx.GraphProto, opset: int, rules: dict[str, Rule]) -> None:
+    def __init__(
+        self, path: Path, graph: onnx.GraphProto, opset: int, rules: dict[str, Rule], vector: bool = False
+    ) -> None:
         self.path, self.graph, self.opset, self.rules = path, graph, opset, rules
         self.stored = StoredTensors(path)
         self.constants: dict[str, np.ndarray] = {}
@@ -89,9 +91,9 @@ class Reader:
             self.constants[tensor.name] = self.stored.array(tensor, f"initializer {tensor.name}")
         if graph.sparse_initializer:
             raise InputError("sparse constants are not supported", file=path, fix="store them as dense tensors")
-        self.input_name, shape = self._input()
-        self.builder = Composer(path, shape)
-        self.values: dict[str, Value] = {self.input_name: Value(0, (1, *shape))}
+        self.input_name, image = self._input(vector)
+        self.builder = Composer(path, image.item)
+        self.values: dict[str, Value] = {self.input_name: image}
         #: whether a value is above a number: what the exporter makes of softplus
         self.above: dict[str, tuple[Value, float]] = {}
 
@@ -99,7 +101,7 @@ class Reader:
         name = node.name or (node.output[0] if node.output else "")
         return InputError(problem, file=self.path, field=f"node {name} ({node.op_type})", fix=fix)
 
-    def _input(self) -> tuple[str, tuple[int, ...]]:
+    def _input(self, vector: bool) -> tuple[str, Value]:
         inputs = [value for value in self.graph.input if value.name not in self.constants]
         if len(inputs) != 1:
             raise InputError(f"has {len(inputs)} inputs", file=self.path, field="graph.input", fix="one image expected")
@@ -109,6 +111,8 @@ class Reader:
         if kind.elem_type not in (onnx.TensorProto.FLOAT, onnx.TensorProto.DOUBLE):
             raise InputError("is not a float32 tensor", file=self.path, field=field, fix="export with a float input")
         sizes = [d.dim_value if d.HasField("dim_value") else 0 for d in kind.shape.dim]
+        if vector and len(sizes) == 1 and sizes[0] > 0:
+            return value.name, Value(0, tuple(sizes))
         if len(sizes) < 2 or sizes[0] not in (0, 1) or min(sizes[1:]) < 1:
             shown = [d.dim_value if d.HasField("dim_value") else d.dim_param or "?" for d in kind.shape.dim]
             raise InputError(
@@ -117,7 +121,7 @@ class Reader:
                 field=field,
                 fix="export with a free batch or a batch of 1 and all other sizes fixed",
             )
-        return value.name, tuple(sizes[1:])
+        return value.name, Value(0, (1, *sizes[1:]))
 
     def network(self) -> Network:
         """All outputs that depend on the image, one after the other if they are several."""

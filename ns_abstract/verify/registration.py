@@ -1,0 +1,130 @@
+"""Pictures of a scene that may stand elsewhere as a whole, and a network behind them (docs/design.md, V13, P3).
+
+Where the scene stands is three parameters more, which the sets of pictures and the network's bounds keep; only what is
+left of them at the end is taken at its worst.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+
+from ns_abstract.geometry.box import ParameterBox
+from ns_abstract.refine.protocol import Frame, Member, Score
+from ns_abstract.verify.network import ImageSets, OutputBounds, Substitution
+from ns_abstract.verify.properties import Query
+
+if TYPE_CHECKING:
+    from ns_abstract.verify.search import Model, Scene
+
+#: Parameters of where a scene stands.
+PLACE = 3
+
+
+class RegisteredScene:
+    """Pictures of poses, each for all places of the scene; see `ns_abstract.verify.search.Scene`.
+
+    Args:
+        scene: Pictures of a set of `PoseSet.registered`: its last parameters tell where the scene stands.
+        frame: The frame behind them.
+    """
+
+    def __init__(self, scene: Scene, frame: Frame) -> None:
+        self.scene, self.frame = scene, frame
+        box = scene.box
+        self.box = box.without(box.names[-PLACE:])
+        #: [3] how far each may be off
+        self.reach = np.array(box.upper[-PLACE:])
+
+    def image(self, values: np.ndarray, member: Member | None = None) -> np.ndarray:
+        assert member is None or isinstance(member, RegisteredMember)
+        return self.scene.image(np.concatenate([values, np.zeros(PLACE) if member is None else member.offset]))
+
+    def members(self, seed: int) -> Iterator[RegisteredMember]:
+        """Places of the scene, without end, corners first."""
+        for signs in itertools.product((-1.0, 1.0), repeat=PLACE):
+            yield RegisteredMember(self, self.reach * signs)
+        generator = np.random.default_rng(seed)
+        while True:
+            yield RegisteredMember(self, self.reach * generator.uniform(-1.0, 1.0, PLACE))
+
+    def widened(self, box: ParameterBox) -> ParameterBox:
+        """A box of poses with all places of the scene."""
+        whole = self.scene.box
+        lower, upper = (*box.lower, *whole.lower[-PLACE:]), (*box.upper, *whole.upper[-PLACE:])
+        return ParameterBox(whole.names, whole.units, lower, upper)
+
+    def sets(self, box: ParameterBox) -> tuple[tuple[np.ndarray, ...], np.ndarray, np.ndarray, np.ndarray]:
+        """As a scene's, but the linear sets have `PLACE` parameters more."""
+        linear, lower, upper, slopes = self.scene.sets(self.widened(box))
+        return linear, lower, upper, slopes[:-PLACE]
+
+    def differentiable(self, values: torch.Tensor) -> torch.Tensor:
+        return self.scene.differentiable(torch.cat([values, torch.zeros(PLACE, dtype=values.dtype)]))
+
+
+@dataclass(frozen=True)
+class RegisteredMember:
+    """One place of a scene; see `ns_abstract.refine.protocol.Member`.
+
+    Attributes:
+        scene: The pictures.
+        offset: [3] where the scene stands.
+    """
+
+    scene: RegisteredScene = field(repr=False)
+    offset: np.ndarray
+
+    def __call__(self, values: np.ndarray, tiles: np.ndarray | None = None) -> np.ndarray:
+        return self.scene.frame.render(np.concatenate([values, self.offset]), tiles)
+
+    def pushed(
+        self, box: ParameterBox, values: np.ndarray, score: Score, size: float
+    ) -> tuple[np.ndarray, RegisteredMember]:
+        pose, offset = (torch.tensor(part, dtype=torch.float64, requires_grad=True) for part in (values, self.offset))
+        found = score(self.scene.scene.differentiable(torch.cat([pose, offset])), pose)
+        if found.requires_grad:
+            found.backward()
+        low, high, reach = np.array(box.lower), np.array(box.upper), self.scene.reach
+        values = np.clip(values + 0.5 * size * _sign(pose) * (high - low), low, high)
+        return values, RegisteredMember(self.scene, np.clip(self.offset + size * _sign(offset) * reach, -reach, reach))
+
+    @property
+    def nearest(self) -> RegisteredMember:
+        return RegisteredMember(self.scene, np.zeros(PLACE))
+
+    @property
+    def arrays(self) -> dict[str, np.ndarray]:
+        """Where the scene stands."""
+        return {"place": self.offset}
+
+
+def _sign(leaf: torch.Tensor) -> np.ndarray:
+    """The gradient's signs; 0 where there is none."""
+    return np.zeros(len(leaf)) if leaf.grad is None else np.sign(np.nan_to_num(leaf.grad.numpy()))
+
+
+class RegisteredModel:
+    """A network behind such pictures; see `ns_abstract.verify.search.Model`.
+
+    Args:
+        model: The network.
+    """
+
+    def __init__(self, model: Model) -> None:
+        self.model = model
+        self.outputs, self.differentiable, self.input_sets = model.outputs, model.differentiable, model.input_sets
+
+    def bound(self, images: ImageSets, query: Query, substitution: Substitution = "everywhere") -> OutputBounds:
+        """Bounds in the poses' parameters, for all places of the scene."""
+        found = self.model.bound(images, query, substitution)
+        kept = images.dimensions - PLACE
+        lost = np.abs(found.a[..., kept:]).sum(axis=-1)
+        with np.errstate(invalid="ignore"):
+            b = found.b - lost - 2.0**-48 * (np.abs(found.b) + lost)
+        return OutputBounds(found.lower, found.a[..., :kept], b)

@@ -1,0 +1,103 @@
+"""A scene that stands elsewhere as a whole: sets, the network's bounds and members, on pictures with a formula."""
+
+from __future__ import annotations
+
+import itertools
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from onnx_files import OnnxFile
+
+from ns_abstract.geometry.box import ParameterBox
+from ns_abstract.verify.model import NetworkModel
+from ns_abstract.verify.network import load_network
+from ns_abstract.verify.preprocess import Preprocess
+from ns_abstract.verify.properties import Query
+from ns_abstract.verify.registration import RegisteredModel, RegisteredScene
+
+SIDE = 2
+
+
+class Wall:
+    """Pictures ``0.5 + 0.3 a . sin(v)`` of d parameters and three of the scene's place, bounded by Taylor's formula."""
+
+    def __init__(self, d: int, radius: float) -> None:
+        self.box = ParameterBox(
+            (*"abcde"[:d], "sx", "sy", "sz"),
+            ("",) * (d + 3),
+            (0.1,) * d + (-radius,) * 3,
+            (0.2,) * d + (radius,) * 3,
+        )
+        self.slopes = 0.2 * np.random.default_rng(0).normal(size=(SIDE, SIDE, 3, d + 3))
+
+    def image(self, values: np.ndarray, member: Any = None) -> np.ndarray:
+        return (0.5 + 0.3 * self.slopes @ np.sin(values)).astype(np.float32)
+
+    def render(self, values: np.ndarray, tiles: Any = None) -> np.ndarray:
+        return self.image(values)
+
+    def sets(self, box: ParameterBox) -> tuple[tuple[np.ndarray, ...], np.ndarray, np.ndarray, np.ndarray]:
+        middle, half = box.middle, 0.5 * (np.array(box.upper) - np.array(box.lower))
+        a = 0.3 * self.slopes * (np.cos(middle) * half)
+        b = 0.5 + 0.3 * self.slopes @ np.sin(middle)
+        room = 0.3 * np.abs(self.slopes) @ (0.5 * half**2) * 1.0001 + 1e-6
+        spread = np.abs(a).sum(axis=-1) + room
+        return (a, b - room, a, b + room), b - spread, b + spread, np.abs(a).mean(axis=(0, 1, 2))
+
+    def differentiable(self, values: torch.Tensor) -> torch.Tensor:
+        return 0.5 + 0.3 * torch.from_numpy(self.slopes) @ torch.sin(values)
+
+    def members(self, seed: int) -> Any:
+        return iter(())
+
+
+@pytest.mark.parametrize("d", [0, 1, 2])
+def test_bounds_hold_for_every_place_of_the_scene(tmp_path: Path, d: int) -> None:
+    """Planes in the poses' parameters and constants, below outputs of pictures from all places, without a tolerance."""
+    f = OnnxFile((3, SIDE, SIDE))
+    f.node("Flatten")
+    f.gemm(12, 8)
+    f.node("Relu")
+    f.gemm(8, 3)
+    wall = Wall(d, 0.1)
+    scene: Any = RegisteredScene(wall, wall)  # type: ignore[arg-type]
+    plain = NetworkModel(load_network(f.write(tmp_path / "net.onnx")), Preprocess(), 1 << 28)
+    model = RegisteredModel(plain)
+    assert scene.box.dimensions == d
+    box, rng = scene.box, np.random.default_rng(1)
+    linear, lower, upper, slopes = scene.sets(box)
+    assert slopes.shape == (d,)
+    rows = np.concatenate([np.eye(3), -np.eye(3)])
+    images = model.input_sets(tuple(part[None] for part in linear), lower[None], upper[None])
+    found = model.bound(images, Query(rows, np.zeros(6)))
+    assert found.a.shape == (1, 6, d) and np.isfinite(found.b).all()
+    nearest, reached = np.inf, 0.0
+    for member in itertools.islice(scene.members(2), 300):
+        p = rng.choice([-1.0, 1.0], d) if rng.random() < 0.5 else rng.uniform(-1.0, 1.0, d)
+        outputs = model.outputs(scene.image(box.at(p), member)[None])[0].astype(np.float64)
+        room = rows @ outputs - (found.a[0] @ p + found.b[0])
+        assert (room >= 0.0).all() and (rows @ outputs >= found.lower[0]).all()
+        nearest, reached = min(nearest, float(room.min())), max(reached, float(np.abs(member.offset).max()))
+    # and are reached, but for what curves
+    assert nearest < 0.01 and reached == 0.1
+
+
+def test_steps_go_uphill_and_stay_in_the_set() -> None:
+    wall = Wall(2, 0.1)
+    scene: Any = RegisteredScene(wall, wall)  # type: ignore[arg-type]
+    values, member = scene.box.middle, next(scene.members(0)).nearest
+    assert (member.offset == 0.0).all() and (scene.image(values) == scene.image(values, member)).all()
+
+    def score(picture: torch.Tensor, pose: torch.Tensor) -> torch.Tensor:
+        return picture.sum()
+
+    moved, other = member.pushed(scene.box, values, score, 2.0)
+    assert scene.box.contains(moved) and (np.abs(other.offset) == 0.1).all()
+    assert other(moved).sum() > scene.image(values).sum()
+    assert float(scene.image(moved, other).sum()) >= max(
+        float(scene.image(pose, m).sum()) for m in itertools.islice(scene.members(0), 8) for pose in scene.box.corners()
+    )
+    assert (other.arrays["place"] == other.offset).all()
