@@ -195,6 +195,39 @@ def attack(case: Case, folder: Path, frame: int = 0, poses: int = 6) -> tuple[in
 # ---------------------------------------------------------------- verdicts
 
 
+def test_given_set_is_that_of_a_file(
+    blobs: Inputs, net: Path, tmp_path: Path, in_process: InProcess, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """--translation and --rotation, as ns-abstract-render has them; without a set, the path's poses alone."""
+    orders: list[Any] = []
+    monkeypatch.setattr("ns_abstract.cli.certifying.certify_path", lambda order, stop: orders.append(order) or True)
+    prop = {"type": "classification", "label": 0, "preprocess": PRE}
+    for more, spec in (
+        ({"translation": 0.05, "rotation": (2, 1, 0), "angle_units": "degrees"},
+         {"version": 1, "angle_units": "degrees", "translation": dict.fromkeys("xyz", 0.05),
+          "rotation": {"yaw": 2, "pitch": 1}}),
+        ({"translation": (0.1, 0, 0.2), "units": "dataset"},
+         {"version": 1, "units": "dataset", "translation": {"x": 0.1, "z": 0.2}}),
+        ({}, None),
+    ):  # fmt: skip
+        case = Case(tmp_path / "case", blobs, net, prop, spec)
+        options = case.options(tmp_path / "out", perturbation_filename=None, **more)
+        code, _, said = in_process(certify_command.main, options)
+        assert code == 0, said
+        job = open_certification(orders[-1].settings)
+        assert [poses.box for poses in job.job.pose_sets] == [poses.box for poses in case.job.job.pose_sets]
+    case = Case(tmp_path / "case", blobs, net, prop)
+    code, _, said = in_process(certify_command.main, case.options(tmp_path / "out", rotation=0.1))
+    assert code == 2 and said.count("\n") == 1 and "--rotation: given beside --perturbation-filename" in said
+    wrong = case.options(tmp_path / "out", perturbation_filename=None, translation=(0.1, 0.2))
+    code, _, said = in_process(certify_command.main, wrong)
+    assert code == 2 and said.count("\n") == 1 and "--translation: found 2 numbers" in said
+    job = CertifySettings(blobs.config, blobs.path, net, case.prop, given_set={"version": 1, "rotation": {"yaw": -1.0}})
+    with pytest.raises(InputError, match="not negative") as caught:
+        open_certification(job)
+    assert caught.value.field == "--rotation.yaw" and caught.value.file is None
+
+
 def test_planted_violation(planted: Case, finished: Path, bright: tuple[Path, float, float]) -> None:
     """The set holds poses whose images break the property: they are found, and no cell with one is certified."""
     document = report(finished)

@@ -17,8 +17,10 @@ from test_gsplat_kernels import BUILDS, SETS, camera, kernels, scene_of
 import ns_abstract as nsa
 from ns_abstract.arithmetic.rounding import arithmetic as arithmetic_named
 from ns_abstract.cli.render import Render, render
+from ns_abstract.geometry.camera_path import Camera
 from ns_abstract.geometry.poses import PoseSet
 from ns_abstract.geometry.tiles import assemble
+from ns_abstract.geometry.views import look_at
 from ns_abstract.io.errors import InputError
 from ns_abstract.methods.splat.activate import activate
 from ns_abstract.methods.splat.bounds import SplatBounds
@@ -121,6 +123,49 @@ def test_kernels_leave_bounds_without_rounding() -> None:
     assert sum(
         outside(bounds, program(around.pose(np.zeros(0)))) for program in programs(scene, around, "1.4.0", False)
     )
+
+
+def plane(count: int, middle: tuple[float, float, float]) -> SplatScene:
+    """Faint Gaussians that share their mean, and so their depth."""
+    scene, rng = blob_scene(count), np.random.default_rng(4)
+    return replace(
+        scene,
+        means=np.tile(np.float32(middle), (count, 1)),
+        log_scales=np.full((count, 3), -1.0, np.float32),
+        quats=np.tile(np.float32([1.0, 0.0, 0.0, 0.0]), (count, 1)),
+        opacity_logits=rng.uniform(-5.0, -3.0, count).astype(np.float32),
+    )
+
+
+def depth_bounds(scene: SplatScene, pose: np.ndarray, **charges: float) -> tuple[np.ndarray, list[np.ndarray]]:
+    """[8, 8, 4] bounds of one pose [3, 4] with some ``charges`` replaced, and what programs draw there."""
+    around = PoseSet.around(Camera(pose, 8.0, 8.0, 4.0, 4.0, 8, 8), parse_perturbation({}))
+    rules = VERSIONS["1.4.0"]
+    bounds = SplatBounds(activate(scene, rules), rules, arithmetic_named("float32"))
+    bounds.charges = bounds.charges._replace(**charges)
+    found = bounds.cell(around.camera, around.enclosure(around.box, 1), layers=True)
+    assert found.layers is not None
+    drawn = [program(pose) for program in programs(scene, around, "1.4.0", exact=False)[1:]]
+    return assemble(found.layers, around.camera), drawn
+
+
+def test_sums_of_weights_are_rounded() -> None:
+    """Many faint Gaussians at one depth that is a float32: nothing but the sums rounds."""
+    bounds, pictures = depth_bounds(plane(400, (0.0, 0.0, -1.1)), np.eye(3, 4), camera_coordinate=0.0)
+    for drawn in pictures:
+        assert (drawn[..., 0] > 0.0).mean() > 0.5 and outside(bounds, drawn) == 0
+
+
+def test_coordinates_far_from_the_origin_are_rounded() -> None:
+    """One Gaussian, one weight: nothing but its coordinate rounds."""
+    rng = np.random.default_rng(8)
+    for _ in range(4):
+        pose = np.asarray(look_at(tuple(rng.normal(size=3)), (0.0, 0.0, 0.0)))[:3].copy()
+        pose[:, 3] = rng.uniform(-4000.0, 4000.0, 3)
+        middle = pose[:, 3] - 1.1 * pose[:, 2]
+        bounds, pictures = depth_bounds(plane(1, (float(middle[0]), float(middle[1]), float(middle[2]))), pose)
+        for drawn in pictures:
+            assert (drawn[..., 0] > 0.0).mean() > 0.5 and outside(bounds, drawn) == 0
 
 
 @pytest.mark.parametrize("floor", [-1.0, 0.01])

@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib.util
 import itertools
 import json
+import re
 import signal
 import sqlite3
 import subprocess
@@ -28,6 +29,7 @@ from ns_abstract.demo.writing import write_loop_demo
 from ns_abstract.geometry.box import ParameterBox
 from ns_abstract.geometry.poses import SCENE_TURNS
 from ns_abstract.perturbation.variations import SceneVariation, Selection
+from ns_abstract.reach.film import along
 from ns_abstract.reach.search import Run, first_outside, pushes, simulate
 from ns_abstract.reach.tubes import Pictures
 from ns_abstract.verify.response import Response
@@ -36,6 +38,8 @@ from ns_abstract.verify.scene_margin import CAMERA_KINDS
 MODULE = "ns_abstract.cli.reach"
 #: A part of the demo's box that takes seconds.
 PART = {"along": [0.0, 0.03], "across": [-0.04, 0.04], "up": [0.0, 0.03], "v_across": 0.0, "v_up": 0.0}
+#: A smaller one.
+SMALL = {"along": 0.0, "across": [0.3, 0.302], "up": 0.0, "v_across": 0.0, "v_up": 0.0}
 #: Starts on both sides of where the funnel is left, which is asked alone.
 EDGE: dict[str, Any] = {
     "initial": {"along": 0.0, "across": [0.40, 0.44], "up": 0.02, "v_across": 0.0, "v_up": 0.0},
@@ -102,8 +106,9 @@ def test_no_two_gaussians_are_equally_deep() -> None:
 def test_a_part_of_the_box_is_certified(course: Course, tmp_path: Path) -> None:
     """Three dimensions, 24 steps, all of it; then hundreds of runs stay inside the tubes of its cells."""
     part = course.changed("part.json", initial=PART)
-    document = part.run(tmp_path / "out")
+    document = part.run(tmp_path / "out", film=True)
     assert document["verdict"] == "reaches"
+    check_film(tmp_path / "out", document, 24)
     for entry in document["questions"].values():
         assert entry["certified"] == 1.0 and entry["simulated"]["went_well"] == 1.0
     tube = document["tubes"][0]
@@ -122,6 +127,69 @@ def test_a_part_of_the_box_is_certified(course: Course, tmp_path: Path) -> None:
             assert first_outside(whole, run) is None
             compared += len(run.states)
     assert compared > 500
+
+
+def check_film(folder: Path, document: dict[str, Any], last: int) -> None:
+    """The film shows every step of a certified cell, the widest; the page some of them, and the scene behind tubes."""
+    film, page = document["film"], (folder / "report.html").read_text()
+    assert film["verdict"] == "certified" and film["steps"] == list(range(last + 1))
+    assert all(0.0 < mean < most <= 3.0**0.5 for mean, most in zip(film["mean_gap"], film["largest_gap"], strict=True))
+    shares = [np.prod(np.subtract(json.loads(upper), json.loads(lower))) for _, lower, upper, *_ in cells(folder)]
+    assert np.prod(np.subtract(film["upper"], film["lower"])) == max(shares)
+    content = (folder / film["file"]).read_bytes()
+    assert content[4:8] == b"ftyp" if film["file"].endswith(".mp4") else content[:3] == b"GIF"
+    images = re.findall('"data:image/png;base64,([^"]+)"', page)
+    # the scene from above and from the side, and ten steps
+    assert len(images) == 12 and sum(map(len, images[:2])) < 300_000
+    assert "default-src 'none'; img-src data:" in page and "<script" not in page
+    assert "Seen from above" in page and "Seen from the side" in page and f'href="{film["file"]}"' in page
+    for tube in document["tubes"]:
+        # this camera stands where the first three states say
+        for box, (low, high) in zip(tube["tube"], tube["camera"], strict=True):
+            assert np.allclose(box[0][:3], low) and np.allclose(box[1][:3], high)
+            assert (np.array(low) <= box[0][:3]).all() and (np.array(high) >= box[1][:3]).all()
+
+
+def test_a_film_encloses_what_runs_see(course: Course) -> None:
+    part = course.changed("film.json", initial=SMALL, steps=10).job
+    loop, box, reacher, rng = part.loop, part.loop.box, part.reacher(), np.random.default_rng(4)
+    steps = list(along(reacher, part.job.method, (24, 16), reacher.tube(box, whole=True)))
+    assert [step.index for step in steps] == list(range(11)) and steps[0].image.shape == (24, 16, 3)
+    view = Pictures(part.job.method, loop.camera.poses((24, 16)))
+    for number, start in enumerate([*box.corners(), *box.sample(4, rng)]):
+        run = simulate(reacher, loop.state(box, start), pushes(loop, rng, "ends" if number % 2 else "random"))
+        for step, x in zip(steps, run.states, strict=True):
+            seen = view.image(loop.camera.values(x))
+            assert (step.lower <= seen).all() and (seen <= step.upper).all()
+
+
+def test_interrupted_in_a_film(
+    course: Course, tmp_path: Path, in_process: InProcess, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    part = course.changed("cut.json", "goal", initial=SMALL, steps=10)
+    with monkeypatch.context() as patched:
+        interrupted_at("ns_abstract.api.reaching:along", patched)
+        code, _, said = in_process(reach_command.main, part.options(tmp_path / "out", film=True))
+    assert code == 3 and "Traceback" not in said
+    document = json.loads((tmp_path / "out" / "report.json").read_text())
+    assert document["film"] == {"skipped": "the work was interrupted"} and document["verdict"] == "safe"
+    assert "No film: the work was interrupted" in (tmp_path / "out" / "report.html").read_text()
+    assert not list((tmp_path / "out").glob("film*"))
+    again = part.run(tmp_path / "out", resume=True, film=True)
+    assert (tmp_path / "out" / again["film"]["file"]).exists()
+
+
+def test_without_video_a_film_is_a_gif(course: Course, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("ns_abstract.report.export.has_video", lambda: False)
+    document = course.changed("gif.json", "goal", initial=SMALL, steps=10).run(tmp_path / "out", film=True)
+    assert document["film"]["file"] == "film.gif" and (tmp_path / "out" / "film.gif").read_bytes()[:3] == b"GIF"
+
+
+def test_without_elements_tubes_are_alone(course: Course, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("ns_abstract.methods.splat.method.SplatMethod.elements", lambda self: None)
+    course.changed("bare.json", "goal", initial=SMALL, steps=10).run(tmp_path / "out")
+    page = (tmp_path / "out" / "report.html").read_text()
+    assert "tubes alone" in page and "<image" not in page and 'class="tube"' in page and "Along a tube" not in page
 
 
 def test_where_runs_go_wrong(edge: Course, finished: Path) -> None:
@@ -153,8 +221,7 @@ def test_a_planted_bad_controller_is_falsified(course: Course, tmp_path: Path) -
 
 def test_scene_margin(course: Course, tmp_path: Path) -> None:
     """Runs in scenes at the ends of the certified radius stay in the tubes and go well; stored ones fail."""
-    small = {"along": 0.0, "across": [0.3, 0.302], "up": 0.0, "v_across": 0.0, "v_up": 0.0}
-    part = course.changed("margin.json", "goal", initial=small, steps=10)
+    part = course.changed("margin.json", "goal", initial=SMALL, steps=10)
     document = part.run(tmp_path / "out", scene_margin=True)
     assert document["verdict"] == "safe" and document["scene_margin"]["question"] == "safe"
     job, rng = part.job, np.random.default_rng(8)

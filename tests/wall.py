@@ -155,6 +155,9 @@ class WallMethod:
     def holders(self, frame: Any, box: ParameterBox, tile: int, count: int) -> list[tuple[int, float]]:
         return []
 
+    def elements(self) -> None:
+        return None
+
     def prepare(self, perturbations: Sequence[Perturbation]) -> None:
         for perturbation in perturbations:
             if perturbation.rotation or perturbation.scene:

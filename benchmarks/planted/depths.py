@@ -11,13 +11,13 @@ DEPTHS = (
     Fault(
         "depth: rounding of the sums is not charged",
         _DEPTHS, "shade_layers", "(rounding * total_high + rounding) * all_of_it", "0.0 * all_of_it",
-        _ATTACK + "[one pose-classic-1.4.0]", compiled=True,
+        "test_depths.py::test_sums_of_weights_are_rounded",
     ),
     Fault(
         "depth: the coordinate's own rounding is not charged",
         _BOUNDS, "SplatBounds._depths",
         "self.charges.camera_coordinate * ((sizes + spread + poses.camera_magnitude) @ most) + spread @ most",
-        "spread @ most", _ATTACK + "[one pose-classic-1.4.0]", compiled=True,
+        "spread @ most", "test_depths.py::test_coordinates_far_from_the_origin_are_rounded",
     ),
     Fault(
         "depth: what all depths have in common is forgotten",

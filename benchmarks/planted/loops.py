@@ -24,7 +24,7 @@ LOOPS = (
     Fault(
         "loops: a scene that stands elsewhere is not charged",
         _TUBES,
-        "Reacher._advanced",
+        "Reacher.poses",
         "self.shift + rounding * size",
         "rounding * size",
         "test_reach.py::test_tubes_hold_runs_in_a_scene_that_stands_elsewhere",
@@ -124,6 +124,15 @@ LOOPS = (
         "step.radius + wide + added",
         "step.radius + added",
         _RUNS,
+    ),
+    Fault(
+        "loops: a film shows the first step's bounds throughout",
+        "reach/film.py",
+        "along",
+        "reacher.poses(tube.sets[step])",
+        "reacher.poses(tube.sets[0])",
+        "test_reach_cli.py::test_a_film_encloses_what_runs_see",
+        compiled=True,
     ),
     Fault(
         "loops: a run's margin has the wrong side",

@@ -543,6 +543,7 @@ class CertifySettings:
         network_arithmetic: The same of the network.
         picture: Whether the network is shown floats or pictures of 8 bits.
         memory: Bytes for the bounds of one process.
+        given_set: The content of a perturbation file, in place of one; errors name its keys as options.
     """
 
     load_config: Path
@@ -561,6 +562,7 @@ class CertifySettings:
     near_plane: float | None = None
     occupancy_grid: Path | None = None
     workers: int = 1
+    given_set: Mapping[str, Any] | None = None
 
 
 def open_certification(settings: CertifySettings) -> Certification:
@@ -581,6 +583,7 @@ def open_certification(settings: CertifySettings) -> Certification:
         num_samples=settings.num_samples,
         near_plane=settings.near_plane,
         occupancy_grid=settings.occupancy_grid,
+        given_set=settings.given_set,
     )
     path = load_camera_path(files.camera_path_filename)
     scene = files.scene.open()

@@ -34,12 +34,14 @@ from ns_abstract.geometry.box import ParameterBox
 from ns_abstract.io.errors import InputError
 from ns_abstract.perturbation.specification import TRANSLATIONS
 from ns_abstract.perturbation.variations import SceneVariation
+from ns_abstract.reach.film import along, film_size, made
 from ns_abstract.reach.learned import LearnedDynamics
 from ns_abstract.reach.loop import Loop, load_loop, parse_loop
 from ns_abstract.reach.page import loop_page
 from ns_abstract.reach.search import QUESTIONS, LoopFindings, LoopSearch, Question, Run, pushes, simulate
 from ns_abstract.reach.tubes import Dependence, Pictures, Pilot, Reacher, Tube
 from ns_abstract.report.certificate import SCENE_MARGIN, now, write_certificate
+from ns_abstract.report.outside import Outside
 from ns_abstract.report.record import file_stamp, guarantee_text, plain, versions
 from ns_abstract.verify.cells import Cell, Grid
 from ns_abstract.verify.model import NetworkModel
@@ -55,6 +57,7 @@ from ns_abstract.verify.scene_margin import (
     Settle,
     Settled,
 )
+from ns_abstract.verify.search import Verdict
 from ns_abstract.verify.store import Block, Store, Tally, fractions
 
 #: Of the search's rules: results of different ones are not mixed.
@@ -62,6 +65,8 @@ _RULES = 1
 #: Random runs for the report, and part of the time for them; runs from a cell whose tube is shown; cells shown, and
 #: part of the time for them.
 _RUNS, _RUNS_SHARE, _CELL_RUNS, _SHOWN, _SHOWN_SHARE = 200, 0.1, 20, 2, 0.1
+#: Part of the time for a film.
+_FILM_SHARE = 0.1
 #: Falsifying runs in report.json.
 _EXAMPLES = 5
 #: What is said in the report of every question.
@@ -78,6 +83,9 @@ METRICS = {
     "about others",
     "width": "mean over the states of the width of the tube by step, and of the hull of simulated runs from the same "
     "cell",
+    "camera": "of a tube, by step: least and largest x, y, z of the camera's position, normalised units",
+    "film": "of the widest certified cell (or the first one), by step: mean and largest gap of the abstract image of "
+    "all poses of the tube, in a picture of the given height and width; null: not asked for",
     "scene_margin": SCENE_MARGIN,
 }
 
@@ -276,6 +284,10 @@ class ReachRun:
         self.tubes: list[dict[str, Any]] = []
         self.examples: list[dict[str, Any]] = []
         self.scene_margin: dict[str, Any] = {"skipped": NOT_ASKED, "kinds": []}
+        self.film: dict[str, Any] | None = None
+        self._strips: list[tuple[int, bytes]] = []
+        elements = job.job.method.elements()
+        self._outside = None if elements is None else Outside(elements)
         #: Content of the last report.json.
         self.written: dict[str, Any] = {}
 
@@ -290,6 +302,7 @@ class ReachRun:
         on_progress: Callable[[ReachProgress], object] = lambda progress: None,
         scene_margin: bool = False,
         on_margin: Callable[[SceneMargin], object] = lambda found: None,
+        film: bool = False,
     ) -> dict[str, Any]:
         """Search, and write the results as they come; returns the content of report.json.
 
@@ -303,12 +316,14 @@ class ReachRun:
             scene_margin: Whether to look for the largest variation of the scene for which what is certified holds, in
                 half of the time.
             on_margin: Told what it is, kind by kind.
+            film: Whether to make a film along the tube of a certified cell.
 
         Raises:
             InputError: The folder cannot be used.
         """
         searching = (1.0 - SHARE) * budget if scene_margin else budget
         job, box = self.job, self.job.loop.box
+        filming = _FILM_SHARE * searching if film else 0.0
         parameters = list(zip(box.names, box.units, strict=True))
         with ExitStack() as stack:
             fixed: dict[int, dict[str, float]] = {number: {} for number in job.questions}
@@ -325,10 +340,13 @@ class ReachRun:
                     on_open()
                     job.job.warm_up(0)
                 begin = time.perf_counter()
+                searched = begin + (1.0 - _SHOWN_SHARE) * searching - filming
                 self._simulate(begin + _RUNS_SHARE * searching, stop)
                 with ExitStack() as engines:
-                    self._search(store, engine(engines), begin + (1.0 - _SHOWN_SHARE) * searching, stop, on_progress)
-                self._show(store, begin + searching, stop)
+                    self._search(store, engine(engines), searched, stop, on_progress)
+                self._show(store, begin + searching - filming, stop)
+                if film:
+                    self._film(store, begin + searching, stop)
                 if scene_margin and not stop():
                     self._margins(store, begin + budget, stop, on_margin)
             finally:
@@ -416,6 +434,37 @@ class ReachRun:
             except AbandonedError:
                 return
 
+    def _film(self, store: Store, deadline: float, stop: StopRequest) -> None:
+        """Abstract images along the tube of the widest certified cell of the strongest question, or of the first."""
+        job, steps, box = self.job, [], self.job.loop.box
+
+        def strongest(kind: Verdict | None) -> list[dict[str, Any]]:
+            return next((found for n in reversed(job.questions) if (found := store.leaves(n, kind))), [])
+
+        def volume(row: dict[str, Any]) -> float:
+            return float(np.prod(np.subtract(row["upper"], row["lower"])))
+
+        row = max(strongest("certified"), key=volume, default=None) or next(iter(strongest(None)), None)
+        if row is None:
+            self.film = {"skipped": "no cell has a verdict"}
+            return
+        cell = ParameterBox(box.names, box.units, tuple(row["lower"]), tuple(row["upper"]))
+        try:
+            with abandoning(lambda: stop() or time.perf_counter() >= deadline):
+                tube = job.search.reacher.tube(cell, whole=True)
+                size = film_size(job.loop.preprocess.size(job.network.input_shape))
+                for step in along(job.search.reacher, job.job.method, size, tube):
+                    steps.append(step)
+        except AbandonedError:
+            pass
+        if not steps:
+            self.film = {"skipped": "the work was interrupted" if stop() else "the time ended first"}
+            return
+        found = made(steps, cell.lower, cell.upper, row["verdict"])
+        ending, content = found.encoded()
+        self.film = {"file": store.keep(f"film.{ending}", content).name, **found.about}
+        self._strips = found.strips()
+
     def _margins(self, store: Store, deadline: float, stop: StopRequest, told: Callable[[SceneMargin], object]) -> None:
         """How far the scene may vary, for the strongest question of which anything is certified."""
         box = self.job.loop.box
@@ -464,6 +513,7 @@ class ReachRun:
                 ],
                 "simulated_states": [run.states for run in self.simulated[:40]],
                 "tubes": self.tubes,
+                "film": self.film,
                 "scene_margin": self.scene_margin,
                 "falsifying": self.examples,
                 "trace": store.points,
@@ -514,7 +564,8 @@ class ReachRun:
             self._write()
 
     def _write(self) -> None:
-        write_certificate(self.folder, self.written, loop_page(self.written, self.rows, self.job.loop))
+        page = loop_page(self.written, self.rows, self.job.loop, self._outside, self._strips)
+        write_certificate(self.folder, self.written, page)
 
 
 def verdict(entries: Mapping[str, Mapping[str, Any]]) -> str:
@@ -546,6 +597,7 @@ def shown_tube(job: LoopJob, lower: list[float], upper: list[float], runs: int) 
         "lower": list(box.lower),
         "upper": list(box.upper),
         "tube": [[low.tolist(), high.tolist()] for low, high in hulls],
+        "camera": [[end.tolist() for end in kept.places(entry)] for entry in tube.sets],
         "runs": len(found),
         "hull": [
             [low.tolist(), high.tolist()] for low, high in zip(states.min(axis=0), states.max(axis=0), strict=True)
@@ -622,6 +674,7 @@ def reach(
     engine: EngineName = "local",
     scheduler_address: str | None = None,
     scene_margin: bool = False,
+    film: bool = False,
 ) -> ReachResult:
     """Prove of a network in the loop that no run from a box of initial states goes wrong, or find one that does.
 
@@ -641,6 +694,8 @@ def reach(
         scheduler_address: HOST:PORT of its scheduler; None: a cluster on this machine.
         scene_margin: Whether to look, in half of the time, for the largest variation of the Gaussians for which what is
             certified holds; see the report's key ``scene_margin``.
+        film: Whether to write, in a tenth of the time, film.mp4 (film.gif without the package av) into ``output_dir``:
+            the abstract image along the tube of the widest certified cell; see the report's key ``film``.
 
     Raises:
         InputError: An argument cannot be used.
@@ -666,6 +721,7 @@ def reach(
             resume=resume,
             on_progress=listener(stop, on_progress),
             scene_margin=scene_margin,
+            film=film,
         )
     return result(run, document)
 

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import os
 import sys
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Annotated, Literal
 
 import tyro
 
 from ns_abstract.cli.common import DONE, INTERRUPTED, Stop, run
+from ns_abstract.cli.sets import GivenSet, given_set
 from ns_abstract.io.errors import InputError
 
 #: Seconds where no time budget is given.
@@ -18,7 +19,7 @@ _SECONDS = 1800.0
 
 
 @dataclass
-class Certify:
+class Certify(GivenSet):
     """Prove, or break, a property of a network on every image that a scene shows over a set of poses.
 
     Splits the set into cells until each is certified, falsified or too small. Writes cells.sqlite,
@@ -38,7 +39,7 @@ class Certify:
     """What is to hold (JSON): classification, regression, detection or vnnlib, with the preprocessing."""
     output_dir: Path
     """Folder for the results; made if missing."""
-    perturbation_filename: Path | None = None
+    perturbation_filename: Path | None = field(default=None, kw_only=True)
     """Set of poses (JSON). Default: the key "perturbation" of the camera path, or its poses alone."""
     time_budget: float | None = None
     """Seconds for all frames together. Default: 1800."""
@@ -114,6 +115,7 @@ def certify(options: Certify) -> int:
         given = {name: value for name, value in vars(options).items() if name in names}
         if options.workers is None:
             given["workers"] = 1 if options.engine == "dask" else len(os.sched_getaffinity(0))
+        given["given_set"] = given_set(options)
         tls = Tls.of(options.tls_ca_file, options.tls_cert, options.tls_key, options.scheduler_address)
         order = Order(
             CertifySettings(**given), options.frames, options.output_dir, options.time_budget or _SECONDS,

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import json
 import sys
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Annotated, Literal
 
 import tyro
 
 from ns_abstract.cli.common import DONE, run
+from ns_abstract.cli.sets import GivenSet, given_set
 from ns_abstract.io.errors import InputError, visible
 
 #: Along each axis of an occupancy grid.
@@ -67,7 +68,7 @@ class Ply:
 
 
 @dataclass
-class VnnLib:
+class VnnLib(GivenSet):
     """Abstract images, a network and a property as ONNX and VNN-LIB, for other verifiers.
 
     Cuts the set of poses of a frame into boxes and writes for each NAME.onnx, whose input is the box's parameters in
@@ -85,7 +86,7 @@ class VnnLib:
     """What is to hold (JSON): classification or vnnlib, with the preprocessing."""
     output_dir: Path
     """Folder for the files; made if missing."""
-    perturbation_filename: Path | None = None
+    perturbation_filename: Path | None = field(default=None, kw_only=True)
     """Set of poses (JSON). Default: the key "perturbation" of the camera path, or its poses alone."""
     frames: tuple[int, ...] | None = None
     """Entries of the camera path, counted from 0. Default: all."""
@@ -208,7 +209,8 @@ def _vnnlib(options: VnnLib) -> list[str]:
     if any(n < 1 for n in options.parts):
         raise InputError(f"found {min(options.parts)}", field="--parts", fix="give numbers of at least 1")
     names = {entry.name for entry in fields(CertifySettings)} & {entry.name for entry in fields(VnnLib)}
-    job = open_certification(CertifySettings(**{name: getattr(options, name) for name in names}))
+    given = {name: getattr(options, name) for name in names}
+    job = open_certification(CertifySettings(**given, given_set=given_set(options)))
     options.output_dir.mkdir(parents=True, exist_ok=True)
     lines, boxes = [], {}
     for frame in check_frames(options.frames, job.job.frame_count):

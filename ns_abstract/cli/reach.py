@@ -52,6 +52,9 @@ class Reach:
     scene_margin: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
     """In half of the time, look for the largest variation of all Gaussians' means, opacities and colours, of the
     camera's response and of the place of the whole scene for which everything that is certified holds."""
+    film: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    """In a tenth of the time, write film.mp4 (film.gif without the extra "video"): bounds, gap and a render at every
+    step of the tube of the widest certified cell."""
     resume: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
     """Go on with the cells that an interrupted run with the same inputs has stored."""
 
@@ -102,6 +105,7 @@ def reach(options: Reach) -> int:
             on_open=lambda: compile_beside(job.job, 0) if options.engine == "local" else None,
             on_progress=told,
             scene_margin=options.scene_margin,
+            film=options.film,
             on_margin=lambda found: console.print(f"scene margin: {found.sentence}", markup=False, soft_wrap=True),
         )
         for question, entry in document["questions"].items():

@@ -6,11 +6,12 @@ import os
 import sys
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
 from ns_abstract.cli.common import DONE, INTERRUPTED, Stop, run
+from ns_abstract.cli.sets import GivenSet, given_set
 from ns_abstract.io.errors import InputError
 
 if TYPE_CHECKING:
@@ -19,12 +20,10 @@ if TYPE_CHECKING:
 
 #: Seconds by frame where --explain is given none.
 _EXPLAINED_S = 30.0
-#: Keys of a perturbation file, in the order of the options' numbers; their own module needs numpy, --help must not.
-_AXES = {"translation": ("x", "y", "z"), "rotation": ("yaw", "pitch", "roll")}
 
 
 @dataclass
-class Render:
+class Render(GivenSet):
     """Bound every image that Nerfstudio would show, for every pose in a set around each keyframe.
 
     Writes frame_00000.npz and .png by keyframe, report.json and report.html. Exit codes: 0 done;
@@ -37,16 +36,6 @@ class Render:
     """Camera path as Nerfstudio's viewer writes it."""
     output_dir: Path
     """Folder for the results; made if missing."""
-    perturbation_filename: Path | None = None
-    """Set of poses (JSON). Default: the key "perturbation" of the camera path."""
-    translation: tuple[float, ...] | None = None
-    """A set without a file: radius of the shift along x, y and z of the camera, or three radii."""
-    rotation: tuple[float, ...] | None = None
-    """A set without a file: radius of yaw, pitch and roll, or three radii."""
-    units: Literal["normalised", "dataset"] = "normalised"
-    """Of --translation: the run's normalised frame, or transforms.json."""
-    angle_units: Literal["radians", "degrees"] = "radians"
-    """Of --rotation."""
     time_budget: float | None = None
     """Seconds for all frames together. Default: 60 per frame."""
     target_ratio: float = 1.05
@@ -118,29 +107,6 @@ class Explain(Render):
 
     output_dir: Path = Path()
     """Not used."""
-
-
-def given_set(options: Render) -> dict[str, Any] | None:
-    """The set of --translation and --rotation as the content of a perturbation file, or None.
-
-    Raises:
-        InputError: They do not go together, or with other options.
-    """
-    if options.translation is None and options.rotation is None:
-        return None
-    if options.perturbation_filename is not None:
-        field = "--translation" if options.translation is not None else "--rotation"
-        raise InputError("given beside --perturbation-filename", field=field, fix="give one of them")
-    found: dict[str, Any] = {"version": 1, "units": options.units, "angle_units": options.angle_units}
-    for name, axes in _AXES.items():
-        radii = getattr(options, name)
-        if radii is None:
-            continue
-        if len(radii) not in (1, 3):
-            fix = f"give one radius, or three for {', '.join(axes)}"
-            raise InputError(f"found {len(radii)} numbers", field=f"--{name}", fix=fix)
-        found[name] = dict(zip(axes, radii if len(radii) == 3 else radii * 3, strict=True))
-    return found
 
 
 def opened(options: Render, default: Perturbation | None = None) -> PathJob:

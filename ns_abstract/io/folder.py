@@ -19,8 +19,10 @@ MARK = ".ns-abstract.lock"
 _RESULT = re.compile(r"frame_\d{5,}\.(npz|png)|report\.(json|html)|cells\.sqlite(-wal|-shm)?")
 #: The same of images of counterexamples, in a folder below.
 _IMAGE = re.compile(r"frame_\d{5,}_(pose|\d[\d_-]*)(_\d+)?\.npz")
+#: The film of a loop.
+_FILM = re.compile(r"film(_\d+)?\.(mp4|gif)")
 #: What a killed command may leave of a result; see `ns_abstract.io.atomic`.
-_PART = re.compile(rf"\.({_RESULT.pattern}|{_IMAGE.pattern})\.[0-9a-f]{{8}}\.part")
+_PART = re.compile(rf"\.({_RESULT.pattern}|{_IMAGE.pattern}|{_FILM.pattern})\.[0-9a-f]{{8}}\.part")
 #: Keys that report.json of every command has.
 _REPORT_KEYS = {"version", "guarantee", "fingerprint", "command"}
 _REPORT_LIMIT = 2**30

@@ -106,6 +106,18 @@ class CameraMount:
         chosen = [{n: ranges[n] for n in group if n in ranges} for group in (TRANSLATIONS, ROTATIONS)]
         return PoseSet.around(camera, Perturbation(frame="world", translation=chosen[0], rotation=chosen[1]))
 
+    @property
+    def place(self) -> tuple[Float64, Float64]:
+        """[3, n] and [3]: the camera's position is ``matrix x + offset`` (world axes, normalised units)."""
+        matrix, offset = np.zeros((3, self.factors.shape[1])), np.zeros(3)
+        for axis, name in enumerate(TRANSLATIONS):
+            if name in self.names:
+                k = self.names.index(name)
+                matrix[axis], offset[axis] = self.factors[k], self.offset[k]
+            else:
+                offset[axis] = self.fixed[name]
+        return matrix, offset
+
     def values(self, x: Float64) -> Float64:
         """[d] parameters of the pose at a state [n], in float64."""
         return self.offset + self.factors @ x

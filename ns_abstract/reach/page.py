@@ -8,17 +8,26 @@ from typing import Any
 
 import numpy as np
 
+from ns_abstract.reach.film import SHOWN
 from ns_abstract.reach.loop import Loop
+from ns_abstract.reach.planes import Marks, View, plane_marks, region, views
 from ns_abstract.reach.search import QUESTIONS
 from ns_abstract.report.certificate_page import percent
 from ns_abstract.report.figures import interval, number
 from ns_abstract.report.margins import scene_margin
-from ns_abstract.report.page import Axis, draw_legend, draw_line, draw_plot, reproduce, whole_page
+from ns_abstract.report.outside import Outside
+from ns_abstract.report.page import Axis, draw_legend, draw_line, draw_plot, reproduce, uri, whole_page
 
 _STYLE = """
 svg rect.certified { fill: var(--good); fill-opacity: .45; } svg rect.falsified { fill: var(--bad); fill-opacity: .45; }
-svg rect.unknown { fill: #9aa0a6; fill-opacity: .3; } svg rect.tube { fill: none; stroke: var(--good); }
-svg path.run { fill: none; stroke: #5f6368; stroke-width: 1; } svg path.bad { stroke: var(--bad); stroke-width: 2; }
+svg rect.unknown { fill: #9aa0a6; fill-opacity: .3; } svg rect.tube { fill: none; stroke: #0b57d0; stroke-width: 1.3; }
+svg polygon.unsafe { fill: var(--bad); fill-opacity: .13; stroke: var(--bad); stroke-dasharray: 5 3; }
+svg polygon.goal { fill: none; stroke: #00695c; stroke-width: 1.5; stroke-dasharray: 5 3; }
+.film { display: flex; gap: .4rem; } .film figure { flex: none; } .film figcaption { text-align: center; }
+.film img { width: 5.2rem; image-rendering: pixelated; } .film .names { display: flex; flex-direction: column;
+  justify-content: space-around; font-size: .82rem; color: var(--soft); padding-bottom: 1.4rem; }
+svg path.run { fill: none; stroke: #5f6368; stroke-width: 1; stroke-opacity: .6; }
+svg path.bad { stroke: var(--bad); stroke-width: 2; }
 svg path.kept { fill: none; stroke: var(--good); stroke-width: 2; }
 svg path.step { fill: none; stroke: #b06000; stroke-width: 2; }
 svg path.none { fill: none; stroke: var(--bad); stroke-width: 2; }
@@ -26,8 +35,9 @@ svg text.kept, svg text.step, svg text.none, svg text.run { stroke: none; }
 svg text.kept { fill: var(--good); } svg text.step { fill: #b06000; } svg text.none { fill: var(--bad); }
 """
 _SIZE = 560, 320
-#: Falsifying runs and cells drawn at most.
-_MOST_CELLS = 4000
+#: Width of the plots with the scene, and room beside their windows: left, right, above, below.
+_SCENE_WIDTH, _ROOM = 820, (52, 12, 20, 34)
+_FILM_NAMES = {"lower": "lower", "upper": "upper", "gap": "gap", "image": "render"}
 _TITLES = {
     "reaches": ("good", "Every run stays safe and reaches the goal"),
     "safe": ("good", "Every run stays safe"),
@@ -36,13 +46,21 @@ _TITLES = {
 }
 
 
-def loop_page(document: Mapping[str, Any], rows: Mapping[int, Sequence[Mapping[str, Any]]], loop: Loop) -> str:
+def loop_page(
+    document: Mapping[str, Any],
+    rows: Mapping[int, Sequence[Mapping[str, Any]]],
+    loop: Loop,
+    outside: Outside | None = None,
+    strips: Sequence[tuple[int, bytes]] = (),
+) -> str:
     """The page.
 
     Args:
         document: Content of report.json.
         rows: By number of the question, the cells: lower, upper, verdict.
         loop: The loop.
+        outside: Draws the scene behind the tubes; None: it has no elements with a place of their own.
+        strips: Steps of the film and their PNGs.
 
     Returns:
         HTML, self-contained; every text of the document is escaped.
@@ -64,7 +82,8 @@ def loop_page(document: Mapping[str, Any], rows: Mapping[int, Sequence[Mapping[s
         f'<p class="soft">A network in the loop on {escape(name)}</p><div class="verdict {kind}"><h1>{title}</h1>'
         + "".join(f"<p>{line}</p>" for line in lines)
         + "</div>",
-        *_pictures(document, rows, loop),
+        *_pictures(document, rows, loop, outside),
+        _film(document, strips),
         _widths(document),
         scene_margin(document["scene_margin"]),
         _guarantee(document),
@@ -77,70 +96,107 @@ def _side(parameter: Mapping[str, Any]) -> str:
     return interval(parameter["name"], parameter["unit"], parameter["lower"], parameter["upper"])
 
 
-def _pictures(document: Mapping[str, Any], rows: Mapping[int, Sequence[Mapping[str, Any]]], loop: Loop) -> list[str]:
-    """Planes of states: from above and from the side where the camera's position moves with them."""
-    # the states that move the camera along the world's axes most
-    moved = {
-        name: int(np.argmax(np.abs(row)))
-        for name, row in zip(loop.camera.names, loop.camera.factors, strict=True)
-        if name in "xyz"
-    }
-    planes = [(a, b, text) for a, b, text in (("x", "y", "from above"), ("x", "z", "from the side"))]
-    found = []
-    for one, two, text in planes:
-        if one in moved and two in moved and moved[one] != moved[two]:
-            found.append(_plane(document, rows, loop, (moved[one], moved[two]), text))
-    if not found and len(loop.names) > 1:
-        found.append(_plane(document, rows, loop, (0, 1), "by its first two states"))
-    return found
-
-
-def _plane(
+def _pictures(
     document: Mapping[str, Any],
     rows: Mapping[int, Sequence[Mapping[str, Any]]],
     loop: Loop,
-    axes: tuple[int, int],
-    text: str,
-) -> str:
-    one, two = axes
-    boxes: list[tuple[str, float, float, float, float]] = []
-    names = [p["name"] for p in document["parameters"]]
+    outside: Outside | None,
+) -> list[str]:
+    """The loop from above and from the side; where the camera only turns, in the plane of two states."""
     last = max(rows, default=None)
-    for row in [] if last is None else rows[last][:_MOST_CELLS]:
-        lower, upper = loop.lower.copy(), loop.upper.copy()
-        for name, low, high in zip(names, row["lower"], row["upper"], strict=True):
-            lower[loop.names.index(name)], upper[loop.names.index(name)] = low, high
-        boxes.append((row["verdict"], lower[one], upper[one], lower[two], upper[two]))
-    for tube in document["tubes"]:
-        boxes += [("tube", low[one], high[one], low[two], high[two]) for low, high in tube["tube"]]
-    lines = [("run", states) for states in document["simulated_states"]]
-    lines += [("run bad", entry["states"]) for entry in document["falsifying"]]
-    points = [
-        (kind, [(x[one], x[two]) for x in states if x[one] is not None and x[two] is not None])
-        for kind, states in lines
+    cells = [] if last is None else rows[last]
+    asked = (
+        ""
+        if last is None
+        else f" Cells by the verdict on “{QUESTIONS[last]}”: green certified, red falsified, grey undecided."
+    )
+    left, right, above, below = _ROOM
+    found = [
+        _seen(view, document, loop, outside, asked)
+        for view in views(document, cells, loop, outside, _SCENE_WIDTH - left - right)
     ]
-    across = [v for box in boxes for v in box[1:3]] + [x for _, line in points for x, _ in line]
-    down = [v for box in boxes for v in box[3:5]] + [y for _, line in points for _, y in line]
-    if not across:
-        return ""
+    if found or len(loop.names) < 2:
+        return found
+    marks = plane_marks(document, cells, loop, np.eye(2, len(loop.names)), np.zeros(2))
+    ends = marks.ends
+    if ends is None:
+        return []
     width, height = _SIZE
-    x = Axis(min(across), max(across), 52, width - 12, log=False)
-    y = Axis(min(down), max(down), height - 34, 20, log=False)
-    marks = "".join(
-        f'<rect class="{kind}" x="{x(a):.1f}" y="{y(d):.1f}" width="{max(1.0, x(b) - x(a)):.1f}" '
-        f'height="{max(1.0, y(c) - y(d)):.1f}"/>'
-        for kind, a, b, c, d in boxes
+    x = Axis(ends[0][0], ends[1][0], left, width - right, log=False)
+    y = Axis(ends[0][1], ends[1][1], height - below, above, log=False)
+    one, two = (escape(f"{name} {unit}".strip()) for name, unit in list(zip(loop.names, loop.units, strict=True))[:2])
+    title = "Seen by its first two states"
+    plot = draw_plot(x, y, (one, two), _drawn(marks, x, y), size=_SIZE, title=title)
+    return [f"<h2>{title}</h2><p>{_MARKS_TEXT} tubes of a few certified cells.{asked}</p>{plot}"]
+
+
+_MARKS_TEXT = "Grey: simulated runs; red: stored runs that go wrong; blue outlines:"
+
+
+def _drawn(marks: Marks, x: Axis, y: Axis) -> str:
+    text = "".join(
+        f'<rect class="{kind}" x="{x(low[0]):.1f}" y="{y(high[1]):.1f}" '
+        f'width="{max(1.0, x(high[0]) - x(low[0])):.1f}" height="{max(1.0, y(low[1]) - y(high[1])):.1f}"/>'
+        for kind, low, high in marks.boxes
     )
-    marks += "".join(draw_line([(x(a), y(b)) for a, b in line], kind, False) for kind, line in points)
-    title = f"Seen {text}"
-    asked = "" if last is None else f" Cells by the verdict on “{QUESTIONS[last]}”: green certified, red falsified."
-    labels = (
-        escape(f"{loop.names[one]} {loop.units[one]}".strip()),
-        escape(f"{loop.names[two]} {loop.units[two]}".strip()),
-    )
+    return text + "".join(draw_line([(x(a), y(b)) for a, b in line], kind, False) for kind, line in marks.lines)
+
+
+def _seen(view: View, document: Mapping[str, Any], loop: Loop, outside: Outside | None, asked: str) -> str:
+    window, (left, right, above, below) = view.window, _ROOM
+    size = window.size[0] + left + right, window.size[1] + above + below
+    x = Axis(window.low[0], window.high[0], left, size[0] - right, log=False)
+    y = Axis(window.low[1], window.high[1], size[1] - below, above, log=False)
+    marks = scene = ""
+    if outside is None:
+        scene = "The scene has no elements with a place of their own (a NeRF's field has none): tubes alone."
+    else:
+        scene = "Behind them the opaque Gaussians of the scene, as ellipses of one standard deviation"
+        scene += ", without those above the cameras." if np.isfinite(view.nearest) else "."
+        marks += (
+            f'<image x="{left}" y="{above}" width="{window.size[0]}" height="{window.size[1]}" '
+            f'preserveAspectRatio="none" href="{uri(outside.picture(window, view.nearest))}"/>'
+        )
+    sets = [("unsafe", faces, -1.0) for faces in loop.unsafe]
+    sets += [] if loop.goal is None else [("goal", loop.goal.faces, 1.0)]
+    shown = set()
+    for kind, faces, sign in sets:
+        corners = region(faces, loop, view.axes, window, sign)
+        if corners:
+            shown.add(kind)
+            points = " ".join(f"{x(a):.1f},{y(b):.1f}" for a, b in corners)
+            marks += f'<polygon class="{kind}" points="{points}"/>'
+    dashed = {"unsafe": "red, dashed: unsafe sets", "goal": "green, dashed: the goal"}
+    extra = "".join(f"; {text}" for kind, text in dashed.items() if kind in shown)
+    one, two = (f"{'xyz'[axis]} units" for axis in view.axes)
+    title = f"Seen {view.title}"
+    plot = draw_plot(x, y, (one, two), marks + _drawn(view.marks, x, y), size=size, title=title)
     return (
-        f"<h2>{title}</h2><p>Grey: simulated runs; red: stored runs that go wrong; outlines: tubes of a few certified "
-        f"cells.{asked}</p>" + draw_plot(x, y, labels, marks, size=_SIZE, title=title)
+        f"<h2>{title}</h2><p>Where the camera is, in the run's normalised frame. {_MARKS_TEXT} boxes of all positions "
+        f"at a step, for a few certified cells{extra}.{asked} {scene}</p>{plot}"
+    )
+
+
+def _film(document: Mapping[str, Any], strips: Sequence[tuple[int, bytes]]) -> str:
+    """Some steps of the film, side by side."""
+    film = document["film"]
+    if film is None:
+        return ""
+    if "skipped" in film:
+        return f"<h2>Along a tube</h2><p>No film: {escape(film['skipped'])}.</p>"
+    height, width = film["size"]
+    names = "".join(f"<span>{_FILM_NAMES[name]}</span>" for name in SHOWN)
+    figures = "".join(
+        f'<figure><img src="{uri(data)}" alt="step {step}"><figcaption>{step}</figcaption></figure>'
+        for step, data in strips
+    )
+    file = escape(film["file"])
+    return (
+        f"<h2>Along a tube</h2><p>What the camera may see at a step of the tube of {escape(_cell(document, film))}, "
+        f"{film['verdict']}, in {width} × {height} pixels: lower and upper bound of every pixel over all poses of the "
+        f"tube, their gap (brightest: {number(max(film['largest_gap']))}), and the picture from the tube's middle. All "
+        f'steps: <a href="{file}">{file}</a>.</p><div class="wide"><div class="film"><div class="names">{names}</div>'
+        f"{figures}</div></div>"
     )
 
 
@@ -162,13 +218,17 @@ def _widths(document: Mapping[str, Any]) -> str:
             for kind, _, line in curves
         )
         marks += draw_legend([(kind, label) for kind, label, _ in curves], width - 12)
-        pairs = zip(document["parameters"], tube["lower"], tube["upper"], strict=True)
-        cell = " · ".join(interval(p["name"], p["unit"], a, b) for p, a, b in pairs)
         found.append(
-            f"<p>Cell {escape(cell)}: mean width of the states by step, and of {tube['runs']} simulated runs.</p>"
-            + draw_plot(x, y, ("step", "width"), marks, size=_SIZE, title="Width by step")
+            f"<p>Cell {escape(_cell(document, tube))}: mean width of the states by step, and of {tube['runs']} "
+            "simulated runs.</p>" + draw_plot(x, y, ("step", "width"), marks, size=_SIZE, title="Width by step")
         )
     return "<h2>Width of the tubes</h2>" + "".join(found) if found else ""
+
+
+def _cell(document: Mapping[str, Any], entry: Mapping[str, Any]) -> str:
+    """The cell that an entry of the report is about."""
+    pairs = zip(document["parameters"], entry["lower"], entry["upper"], strict=True)
+    return " · ".join(interval(p["name"], p["unit"], a, b) for p, a, b in pairs) or "one state"
 
 
 def _guarantee(document: Mapping[str, Any]) -> str:

@@ -425,13 +425,28 @@ class Reacher:
             slopes[:] = np.array(cell.upper) - np.array(cell.lower)
         return Tube(tuple(sets), np.array(controls), slopes, reason)
 
-    def _advanced(self, state: AffineSet) -> tuple[AffineSet, Float64, Float64] | str:
-        """One step (L4): the next set, least and most controls [2, m], and how much the picture moves by symbol."""
+    def poses(self, state: AffineSet) -> AffineSet:
+        """Parameters [d] of the camera's poses at the states of a set, and their float64 evaluations."""
         loop, camera = self.loop, self.loop.camera
         rounding = 2.0 * gamma(len(loop.names) + _FEW)
         size = np.abs(camera.factors) @ state.size + np.abs(camera.offset) + self.shift
         # a scene elsewhere is a camera elsewhere (V13)
-        pose = state.mapped(camera.factors, camera.offset, self.shift + rounding * size)
+        return state.mapped(camera.factors, camera.offset, self.shift + rounding * size)
+
+    def places(self, state: AffineSet) -> tuple[Float64, Float64]:
+        """[3], [3] ends of a box of the camera's positions at the states of a set (world axes, normalised units)."""
+        low, high = self.poses(state).hull()
+        ends = [
+            (low[names.index(axis)], high[names.index(axis)])
+            if axis in (names := self.loop.camera.names)
+            else (self.loop.camera.fixed[axis],) * 2
+            for axis in TRANSLATIONS
+        ]
+        return np.array(ends)[:, 0], np.array(ends)[:, 1]
+
+    def _advanced(self, state: AffineSet) -> tuple[AffineSet, Float64, Float64] | str:
+        """One step (L4): the next set, least and most controls [2, m], and how much the picture moves by symbol."""
+        loop, pose = self.loop, self.poses(state)
         low, high = pose.hull()
         if not ((low >= self._limits[0][: len(low)]) & (high <= self._limits[1][: len(high)])).all():
             return "the camera may leave the range of poses"

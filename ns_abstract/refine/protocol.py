@@ -7,7 +7,7 @@ every set of poses. Nothing above `ns_abstract.methods.load` asks which one it i
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
 import numpy as np
 
@@ -27,6 +27,22 @@ COLORS, ACCUMULATION, DEPTH = 3, 3, 4
 Render = Callable[[np.ndarray, "np.ndarray | None"], np.ndarray]
 #: Picture [H, W, 3] and parameter values [d] to a number, differentiable.
 Score = Callable[["torch.Tensor", "torch.Tensor"], "torch.Tensor"]
+
+
+class Elements(NamedTuple):
+    """Scene elements that have a place, for drawings of the scene as it is seen from outside.
+
+    Attributes:
+        places: [n, 3] normalised frame.
+        spreads: [n, 3, 3] columns are the principal axes scaled by their standard deviations, the same.
+        colors: [n, 3] in [0, 1], without what depends on the view.
+        opacities: [n] in [0, 1].
+    """
+
+    places: np.ndarray
+    spreads: np.ndarray
+    colors: np.ndarray
+    opacities: np.ndarray
 
 
 class Member(Protocol):
@@ -315,6 +331,10 @@ class Method(Protocol):
 
     def holders(self, frame: Frame, box: ParameterBox, tile: int, count: int) -> list[tuple[int, float]]:
         """Scene elements without which the mean gap of a tile over a cell is less, and by how much, in that order."""
+        ...
+
+    def elements(self) -> Elements | None:
+        """What can be drawn of the scene as it is seen from outside; None: nothing has a place of its own."""
         ...
 
     def differentiable(self, poses: PoseSet) -> Callable[[torch.Tensor], torch.Tensor] | None:

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import importlib.util
+import io
 import json
 import math
 import zipfile
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from fractions import Fraction
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -93,15 +96,20 @@ class Results:
 
     def picture(self, result: FrameResult, name: str) -> np.ndarray:
         """[H, W, 3] uint8 of one of `PICTURES`; bounds are rounded outward, gaps share one scale."""
-        if name == "lower":
-            return np.floor(result.lower.astype(np.float64) * 255.0).astype(np.uint8)
-        if name == "upper":
-            return np.ceil(result.upper.astype(np.float64) * 255.0).astype(np.uint8)
-        if name == "gap":
-            return heat(gap(result.lower, result.upper), self.largest)
-        if name == "witness":
-            return heat(gap(result.witness_lower, result.witness_upper), self.largest)
-        return to_bytes(result.image)
+        return picture(result, name, self.largest)
+
+
+def picture(result: FrameResult, name: str, largest: float) -> np.ndarray:
+    """[H, W, 3] uint8 of one of `PICTURES`; bounds are rounded outward, gaps are on a scale up to ``largest``."""
+    if name == "lower":
+        return np.floor(result.lower.astype(np.float64) * 255.0).astype(np.uint8)
+    if name == "upper":
+        return np.ceil(result.upper.astype(np.float64) * 255.0).astype(np.uint8)
+    if name == "gap":
+        return heat(gap(result.lower, result.upper), largest)
+    if name == "witness":
+        return heat(gap(result.witness_lower, result.witness_upper), largest)
+    return to_bytes(result.image)
 
 
 def write_archive(results: Results, file: Path) -> None:
@@ -148,30 +156,35 @@ def write_pictures(results: Results, folder: Path, names: Sequence[str]) -> list
     return written
 
 
-def panels(results: Results, result: FrameResult, names: Sequence[str]) -> np.ndarray:
-    """[h, w, 3] uint8: the pictures ``names`` side by side, each under its label, and the frame's figures below.
+def panels(result: FrameResult, names: Sequence[str], largest: float, text: str) -> np.ndarray:
+    """[h, w, 3] uint8: the pictures ``names`` side by side, each under its label, and ``text`` below.
 
     Small pictures are shown with several screen pixels for each of theirs.
     """
     from PIL import Image, ImageDraw
 
-    times = max(1, -(-_PANEL_WIDTH // results.size[1]))
-    pictures = [results.picture(result, name).repeat(times, axis=0).repeat(times, axis=1) for name in names]
+    times = max(1, -(-_PANEL_WIDTH // result.image.shape[1]))
+    pictures = [picture(result, name, largest).repeat(times, axis=0).repeat(times, axis=1) for name in names]
     height, width = pictures[0].shape[:2]
     step = width + _PANEL_GAP
     whole = Image.new("RGB", (step * len(names) - _PANEL_GAP, height + 2 * _PANEL_TEXT), "white")
     pen = ImageDraw.Draw(whole)
-    for k, (name, picture) in enumerate(zip(names, pictures, strict=True)):
-        whole.paste(Image.fromarray(picture), (k * step, _PANEL_TEXT))
+    for k, (name, shown) in enumerate(zip(names, pictures, strict=True)):
+        whole.paste(Image.fromarray(shown), (k * step, _PANEL_TEXT))
         pen.text((k * step + 4, 4), _LABELS[name], fill="black")
-    figures = metrics(result)
-    text = f"frame {result.index}   mean gap {number(figures['mpg'])}   ratio {number(figures['ratio'])}"
-    if not result.bounded:
-        text = f"frame {result.index}   no bound but [0, 1]"
-    elif "gap" in names or "witness" in names:
-        text += f"   brightest gap {number(results.largest)}"
     pen.text((4, height + _PANEL_TEXT + 4), text, fill="black")
     return np.asarray(whole)
+
+
+def _figures(results: Results, result: FrameResult, names: Sequence[str]) -> str:
+    """The text below a frame's panels."""
+    if not result.bounded:
+        return f"frame {result.index}   no bound but [0, 1]"
+    figures = metrics(result)
+    text = f"frame {result.index}   mean gap {number(figures['mpg'])}   ratio {number(figures['ratio'])}"
+    if "gap" in names or "witness" in names:
+        text += f"   brightest gap {number(results.largest)}"
+    return text
 
 
 def write_video(results: Results, file: Path, names: Sequence[str], fps: float, labelled: bool = False) -> None:
@@ -182,31 +195,57 @@ def write_video(results: Results, file: Path, names: Sequence[str], fps: float, 
     Raises:
         InputError: PyAV is missing.
     """
-    try:
-        import av
-    except ImportError:
-        raise InputError("needs the package av", field="mp4", fix="pip install 'ns-abstract[video]'") from None
-    from fractions import Fraction
-
-    def row(result: FrameResult) -> np.ndarray:
-        if labelled:
-            return panels(results, result, names)
-        return np.concatenate([results.picture(result, name) for name in names], axis=1)
-
-    height, width = row(next(iter(results))).shape[:2]  # pyright: ignore[reportCallIssue, reportArgumentType]
-    # the colour planes have half the size
-    even = height + height % 2, width + width % 2
-
-    def write(stream: BinaryIO) -> None:
-        with av.open(stream, "w", format="mp4") as container:
-            video: Any = container.add_stream("libx264", rate=Fraction(fps).limit_denominator(1001))
-            video.height, video.width = even
-            video.pix_fmt, video.options = "yuv420p", {"crf": "18"}
-            for result in results:  # pyright: ignore[reportGeneralTypeIssues]
-                padded = np.pad(row(result), ((0, even[0] - height), (0, even[1] - width), (0, 0)))
-                container.mux(video.encode(av.VideoFrame.from_ndarray(padded, "rgb24")))
-            container.mux(video.encode())
-
     if not (math.isfinite(fps) and 0.1 <= fps <= 1000.0):
         raise InputError(f"found {fps}", field="--fps", fix="give a number from 0.1 to 1000")
-    write_atomic(file, write)
+    if not has_video():
+        raise InputError("needs the package av", field="mp4", fix="pip install 'ns-abstract[video]'")
+
+    def rows() -> Iterator[np.ndarray]:
+        for result in results:  # pyright: ignore[reportGeneralTypeIssues]
+            if labelled:
+                yield panels(result, names, results.largest, _figures(results, result, names))
+            else:
+                yield np.concatenate([results.picture(result, name) for name in names], axis=1)
+
+    write_atomic(file, lambda stream: encode_mp4(stream, rows(), fps))
+
+
+def has_video() -> bool:
+    """Whether PyAV is installed, which encodes videos."""
+    return importlib.util.find_spec("av") is not None
+
+
+def encode_mp4(stream: BinaryIO, frames: Iterable[np.ndarray], fps: float) -> None:
+    """Write ``frames`` [h, w, 3] uint8, all of one size, as an H.264 video; odd sides get a black line more."""
+    import av
+
+    with av.open(stream, "w", format="mp4") as container:
+        video: Any = container.add_stream("libx264", rate=Fraction(fps).limit_denominator(1001))
+        video.pix_fmt, video.options = "yuv420p", {"crf": "18"}
+        for k, frame in enumerate(frames):
+            height, width = frame.shape[:2]
+            # the colour planes have half the size
+            even = height + height % 2, width + width % 2
+            if k == 0:
+                video.height, video.width = even
+            padded = np.pad(frame, ((0, even[0] - height), (0, even[1] - width), (0, 0)))
+            container.mux(video.encode(av.VideoFrame.from_ndarray(padded, "rgb24")))
+        container.mux(video.encode())
+
+
+def encode_gif(stream: BinaryIO, frames: Iterable[np.ndarray], fps: float) -> None:
+    """Write ``frames`` [h, w, 3] uint8 as an animation without end, in 256 colours each."""
+    from PIL import Image
+
+    first, *others = (Image.fromarray(frame) for frame in frames)
+    first.save(stream, "gif", save_all=True, append_images=others, duration=round(1000.0 / fps), loop=0)
+
+
+def encoded(frames: Iterable[np.ndarray], fps: float) -> tuple[str, bytes]:
+    """A film: the ending of its name and its content, mp4, or gif where PyAV is missing."""
+    buffer = io.BytesIO()
+    if has_video():
+        encode_mp4(buffer, frames, fps)
+        return "mp4", buffer.getvalue()
+    encode_gif(buffer, frames, fps)
+    return "gif", buffer.getvalue()

@@ -20,6 +20,7 @@ from ns_abstract.report.figures import interval, metrics, number
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
+    from PIL.Image import Image
 
     from ns_abstract.geometry.box import ParameterBox
 
@@ -253,6 +254,13 @@ def color_table() -> str:
     return heat(np.arange(256)[None] / 255.0, 1.0).tobytes().hex()
 
 
+def png(image: Image) -> bytes:
+    """The file of a picture."""
+    buffer = io.BytesIO()
+    image.save(buffer, "png", optimize=True)
+    return buffer.getvalue()
+
+
 def preview(image: NDArray[np.uint8], side: int) -> bytes:
     """PNG of ``image`` [H, W, 3], made smaller (area average) where a side exceeds ``side`` pixels."""
     from PIL import Image
@@ -260,9 +268,7 @@ def preview(image: NDArray[np.uint8], side: int) -> bytes:
     picture = Image.fromarray(image)
     if max(picture.size) > side:
         picture.thumbnail((side, side), Image.Resampling.BOX)
-    buffer = io.BytesIO()
-    picture.save(buffer, "png", optimize=True)
-    return buffer.getvalue()
+    return png(picture)
 
 
 def previews(result: FrameResult, side: int) -> Mapping[str, bytes]:

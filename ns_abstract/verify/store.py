@@ -331,36 +331,53 @@ class Store:
         except sqlite3.Error:
             return
         for name, digest in known.items():
-            file = self.folder / IMAGES / Path(name).name
+            file = self._place(name)
             if _digest(file) == digest:
                 file.unlink(missing_ok=True)
         with suppress(OSError):
             (self.folder / IMAGES).rmdir()
 
+    def _place(self, name: str) -> Path:
+        """Images of counterexamples have a folder of their own."""
+        file = self.folder / Path(name).name
+        return file.parent / IMAGES / file.name if file.suffix == ".npz" else file
+
     def keep_image(self, name: str, data: bytes) -> None:
-        """Write the image of a counterexample; a file of that name that is not ours stays, and ours gets another.
+        """Write the image of a counterexample, as `keep` does.
 
         Raises:
             InputError: It cannot be written.
         """
-        folder = self.folder / IMAGES
-        file, number = folder / f"{name}.npz", 1
+        self.keep(f"{name}.npz", data)
+
+    def keep(self, name: str, data: bytes) -> Path:
+        """Write a file; one of that name that is not ours stays, and ours gets another name.
+
+        Returns:
+            The file.
+
+        Raises:
+            InputError: It cannot be written.
+        """
+        file, number = self._place(name), 1
+        wanted = file
 
         def ours() -> bool:
             row = self._base.execute("SELECT sha256 FROM search_images WHERE name = ?", (file.name,)).fetchone()
             return row is not None and row[0] == _digest(file)
 
         try:
-            folder.mkdir(exist_ok=True)
+            file.parent.mkdir(exist_ok=True)
             while os.path.lexists(file) and not ours():
                 number += 1
-                file = folder / f"{name}_{number}.npz"
+                file = wanted.with_stem(f"{wanted.stem}_{number}")
             with self._transaction():
                 row = file.name, hashlib.sha256(data).hexdigest()
                 self._base.execute("INSERT OR REPLACE INTO search_images VALUES (?, ?)", row)
             write_atomic(file, lambda stream: stream.write(data))
         except OSError as error:
-            raise unwritable(folder, error) from None
+            raise unwritable(file.parent, error) from None
+        return file
 
     def _check(self, fingerprint: Mapping[str, Any]) -> None:
         if self._get("version") != VERSION:

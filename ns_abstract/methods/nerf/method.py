@@ -148,6 +148,9 @@ class NerfMethod:
         """A field has no elements."""
         return []
 
+    def elements(self) -> None:
+        """A field has none."""
+
     def prepare(self, perturbations: Sequence[Perturbation]) -> None:
         """Refuse what needs Gaussians.
 

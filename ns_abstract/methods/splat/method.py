@@ -16,7 +16,7 @@ from ns_abstract.geometry.poses import COLOR_SHIFTS, PoseSet
 from ns_abstract.io.errors import InputError
 from ns_abstract.methods.representation import ProgramOptions, Representation
 from ns_abstract.methods.runs import RunConfig
-from ns_abstract.methods.splat.activate import Splats, activate
+from ns_abstract.methods.splat.activate import SH_C0, Splats, activate
 from ns_abstract.methods.splat.constants import VERSIONS, Rasteriser, rasteriser_named
 from ns_abstract.methods.splat.frame import SplatFrame
 from ns_abstract.methods.splat.load import load_scene
@@ -24,7 +24,7 @@ from ns_abstract.methods.splat.scene import SplatScene
 from ns_abstract.methods.splat.variations import VariedSplats, vary
 from ns_abstract.perturbation.specification import Perturbation
 from ns_abstract.perturbation.variations import SceneVariation
-from ns_abstract.refine.protocol import Frame
+from ns_abstract.refine.protocol import Elements, Frame
 
 if TYPE_CHECKING:
     import torch
@@ -188,6 +188,12 @@ class SplatMethod:
             "background": [float(v) for v in scene.background],
             "notes": list(scene.notes),
         }
+
+    def elements(self) -> Elements:
+        """The Gaussians, in the colours of band 0."""
+        splats, base = self.splats, self.splats.sh[:, 0]
+        colors = base if splats.degree == 0 else SH_C0 * base + 0.5
+        return Elements(splats.means, splats.axes, np.clip(colors, 0.0, 1.0), splats.opacity)
 
     def differentiable(self, poses: PoseSet) -> Callable[[torch.Tensor], torch.Tensor]:
         """Parameter values [d] to the picture [H, W, 3], by the reference renderer."""

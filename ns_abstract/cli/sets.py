@@ -1,0 +1,51 @@
+"""Sets of poses that a command line gives without a file; importing it needs no numpy, as --help must not."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+from ns_abstract.io.errors import InputError
+
+#: Keys of a perturbation file, in the order of the options' numbers.
+_AXES = {"translation": ("x", "y", "z"), "rotation": ("yaw", "pitch", "roll")}
+
+
+@dataclass(kw_only=True)
+class GivenSet:
+    """Options of commands that take a set of poses."""
+
+    perturbation_filename: Path | None = None
+    """Set of poses (JSON). Default: the key "perturbation" of the camera path."""
+    translation: tuple[float, ...] | None = None
+    """A set without a file: radius of the shift along x, y and z of the camera, or three radii."""
+    rotation: tuple[float, ...] | None = None
+    """A set without a file: radius of yaw, pitch and roll, or three radii."""
+    units: Literal["normalised", "dataset"] = "normalised"
+    """Of --translation: the run's normalised frame, or transforms.json."""
+    angle_units: Literal["radians", "degrees"] = "radians"
+    """Of --rotation."""
+
+
+def given_set(options: GivenSet) -> dict[str, Any] | None:
+    """The set of --translation and --rotation as the content of a perturbation file, or None.
+
+    Raises:
+        InputError: They do not go together, or with other options.
+    """
+    if options.translation is None and options.rotation is None:
+        return None
+    if options.perturbation_filename is not None:
+        field = "--translation" if options.translation is not None else "--rotation"
+        raise InputError("given beside --perturbation-filename", field=field, fix="give one of them")
+    found: dict[str, Any] = {"version": 1, "units": options.units, "angle_units": options.angle_units}
+    for name, axes in _AXES.items():
+        radii = getattr(options, name)
+        if radii is None:
+            continue
+        if len(radii) not in (1, 3):
+            fix = f"give one radius, or three for {', '.join(axes)}"
+            raise InputError(f"found {len(radii)} numbers", field=f"--{name}", fix=fix)
+        found[name] = dict(zip(axes, radii if len(radii) == 3 else radii * 3, strict=True))
+    return found

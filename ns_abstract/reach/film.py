@@ -1,0 +1,125 @@
+"""The abstract image along a tube, step by step: what a certificate of a loop is made of, for people to look at."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from ns_abstract.execution.ending import checkpoint
+from ns_abstract.geometry.box import ParameterBox
+from ns_abstract.reach.tubes import Pictures, Reacher, Tube
+from ns_abstract.refine.protocol import Method
+from ns_abstract.refine.result import FrameResult
+from ns_abstract.report.export import encoded, panels, picture
+from ns_abstract.report.figures import metrics, number
+from ns_abstract.report.picture import preview
+
+#: Steps of a film and of the page at most; pictures a second.
+_MOST_STEPS, _MOST_SHOWN, _FPS = 100, 10, 4.0
+#: Pixels along the longer side below which the camera of the film has more of them than the network's.
+_LEAST_SIDE = 64
+#: Pixels along the longer side of a picture in the page.
+_SMALL = 64
+SHOWN = ("lower", "upper", "gap", "image")
+
+
+@dataclass(frozen=True)
+class Film:
+    """Abstract images along a tube.
+
+    Attributes:
+        about: For report.json: the cell, its verdict, the pictures' height and width, and of every step its mean and
+            largest gap and the box of the camera's parameters.
+        steps: The images, ``index`` is the step.
+    """
+
+    about: dict[str, Any]
+    steps: tuple[FrameResult, ...]
+
+    @property
+    def largest(self) -> float:
+        """The largest gap, where all scales end."""
+        return max(self.about["largest_gap"], default=0.0)
+
+    def encoded(self) -> tuple[str, bytes]:
+        """The ending of the file's name and its content; see `ns_abstract.report.export.encoded`."""
+
+        def frames() -> Iterator[np.ndarray]:
+            for result in self.steps:
+                mean = number(metrics(result)["mpg"])
+                text = f"step {result.index}   mean gap {mean}   brightest gap {number(self.largest)}"
+                yield panels(result, SHOWN, self.largest, text)
+
+        return encoded(frames(), _FPS)
+
+    def strips(self) -> list[tuple[int, bytes]]:
+        """Some steps and PNGs of their pictures, one below the other."""
+        found = []
+        for k in _some(len(self.steps), _MOST_SHOWN):
+            result = self.steps[k]
+            side = _SMALL * max(1, round(max(result.image.shape[:2]) / _SMALL))
+            pictures = [picture(result, name, self.largest) for name in SHOWN]
+            found.append((result.index, preview(np.concatenate(pictures), side * len(SHOWN))))
+        return found
+
+
+def _some(count: int, most: int) -> list[int]:
+    """At most ``most`` of the first ``count`` numbers, with both ends."""
+    return np.unique(np.linspace(0, count - 1, min(count, most)).round().astype(int)).tolist() if count else []
+
+
+def film_size(size: tuple[int, int]) -> tuple[int, int]:
+    """Height and width of the film's pictures for a network of pictures of ``size``: a whole multiple."""
+    times = -(-_LEAST_SIDE // max(size))
+    return size[0] * max(1, times), size[1] * max(1, times)
+
+
+def along(reacher: Reacher, method: Method, size: tuple[int, int], tube: Tube) -> Iterator[FrameResult]:
+    """Bounds of all pictures that the camera may take at a step of a tube, and the one at its middle, step by step.
+
+    The bounds are those of one cell, as tubes have them.
+
+    Args:
+        reacher: The loop.
+        method: The scene and its program.
+        size: Height and width of the pictures.
+        tube: Of the loop.
+
+    Raises:
+        AbandonedError: There is no time for more.
+    """
+    camera = reacher.loop.camera
+    poses = camera.poses(size)
+    view, begin = Pictures(method, poses), time.perf_counter()
+    for step in _some(len(tube.sets), _MOST_STEPS):
+        checkpoint()
+        pose = reacher.poses(tube.sets[step])
+        low, high = pose.hull()
+        outer = poses.box
+        if not pose.finite or not ((low >= outer.lower) & (high <= outer.upper)).all():
+            return
+        box = ParameterBox(outer.names, outer.units, tuple(low.tolist()), tuple(high.tolist()))
+        _, lower, upper, _ = view.sets(box)
+        image = view.image(np.clip(camera.values(tube.sets[step].center), low, high))
+        seconds = time.perf_counter() - begin
+        yield FrameResult(step, box, lower, upper, image, image, image, seconds, 1)
+
+
+def made(steps: Sequence[FrameResult], lower: Sequence[float], upper: Sequence[float], verdict: str) -> Film:
+    """The film of a cell [m] from its steps."""
+    figures = [metrics(result) for result in steps]
+    about = {
+        "lower": list(lower),
+        "upper": list(upper),
+        "verdict": verdict,
+        "size": list(steps[0].image.shape[:2]) if steps else None,
+        "steps": [result.index for result in steps],
+        "mean_gap": [entry["mpg"] for entry in figures],
+        "largest_gap": [entry["xpg"] for entry in figures],
+        "camera": [[list(result.box.lower), list(result.box.upper)] for result in steps],
+    }
+    return Film(about, tuple(steps))

@@ -1,0 +1,183 @@
+"""A loop seen from outside: cells, tubes, runs and sets in planes of camera positions, for pages and figures."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ns_abstract.reach.loop import Face, Loop
+from ns_abstract.report.outside import Outside, Window, framed
+
+Float64 = NDArray[np.float64]
+
+#: Cells drawn at most.
+_MOST_CELLS = 4000
+
+
+@dataclass(frozen=True)
+class Marks:
+    """What is drawn in a plane, in the plane's coordinates.
+
+    Attributes:
+        boxes: Class of the style sheet, and ends [2], [2].
+        lines: Class, and points.
+    """
+
+    boxes: list[tuple[str, Float64, Float64]]
+    lines: list[tuple[str, Float64]]
+
+    @property
+    def ends(self) -> tuple[Float64, Float64] | None:
+        """[2], [2] ends of a box around everything; None: there is nothing."""
+        points = [p for _, low, high in self.boxes for p in (low, high)] + [p for _, line in self.lines for p in line]
+        return (np.min(points, axis=0), np.max(points, axis=0)) if points else None
+
+
+def plane_marks(
+    document: Mapping[str, Any],
+    rows: Sequence[Mapping[str, Any]],
+    loop: Loop,
+    matrix: Float64,
+    offset: Float64,
+    axes: tuple[int, int] | None = None,
+) -> Marks:
+    """Cells, tubes and runs of a report in a plane.
+
+    Args:
+        document: Content of report.json.
+        rows: Cells: lower, upper, verdict.
+        loop: The loop.
+        matrix, offset: [2, n], [2]: states to the plane.
+        axes: The world's axes that the plane has, for tubes of camera positions; None: others.
+    """
+    names = [p["name"] for p in document["parameters"]]
+    boxes = []
+
+    def box(kind: str, lower: Float64, upper: Float64) -> None:
+        middle, half = matrix @ (0.5 * (lower + upper)) + offset, np.abs(matrix) @ (0.5 * (upper - lower))
+        boxes.append((kind, middle - half, middle + half))
+
+    for row in rows[:_MOST_CELLS]:
+        lower, upper = loop.lower.copy(), loop.upper.copy()
+        for name, low, high in zip(names, row["lower"], row["upper"], strict=True):
+            lower[loop.names.index(name)], upper[loop.names.index(name)] = low, high
+        box(row["verdict"], lower, upper)
+    for tube in document["tubes"]:
+        for low, high in tube["tube"] if axes is None else tube["camera"]:
+            if axes is None:
+                box("tube", np.array(low, np.float64), np.array(high, np.float64))
+            else:
+                ends = (np.array(end, np.float64)[list(axes)] for end in (low, high))
+                boxes.append(("tube", *ends))
+    runs = [("run", states) for states in document["simulated_states"]]
+    runs += [("run bad", entry["states"]) for entry in document["falsifying"]]
+    lines = []
+    for kind, states in runs:
+        # a state that is no number is null there
+        points = np.array([x for x in states if None not in list(x)], np.float64).reshape(-1, len(loop.names))
+        lines.append((kind, points @ matrix.T + offset))
+    boxes = [entry for entry in boxes if np.isfinite(entry[1]).all() and np.isfinite(entry[2]).all()]
+    return Marks(boxes, [(kind, line) for kind, line in lines if len(line)])
+
+
+def region(
+    faces: Sequence[Face], loop: Loop, axes: tuple[int, int], window: Window, sign: float
+) -> list[tuple[float, float]]:
+    """Corners of the part of a window where all faces are on one side, seen by where the camera is.
+
+    Empty where the set is not one of the two coordinates alone: a face that speaks of other states cannot be drawn. Of
+    a box, ends along the axis that is looked along are left out.
+
+    Args:
+        faces: Of the set.
+        loop: The loop.
+        axes: The plane's axes of the world.
+        window: The plane.
+        sign: 1: inside where all faces are above 0; -1: where all are below.
+    """
+    matrix, offset = loop.camera.place
+    moved = [np.flatnonzero(row) for row in matrix]
+    if any(len(moved[axis]) != 1 for axis in axes) or moved[axes[0]][0] == moved[axes[1]][0]:
+        return []
+    states = [int(moved[axis][0]) for axis in axes]
+    third = moved[3 - sum(axes)]
+    (left, bottom), (right, top) = window.low, window.high
+    corners = [(left, bottom), (right, bottom), (right, top), (left, top)]
+    used = 0
+    for face in faces:
+        of = set(np.flatnonzero(face.normal).tolist())
+        if len(third) == 1 and of == {int(third[0])}:
+            continue
+        if not of <= set(states):
+            return []
+        used += 1
+        slopes = [face.normal[k] / matrix[axis, k] for axis, k in zip(axes, states, strict=True)]
+        level = face.offset + sum(s * offset[axis] for s, axis in zip(slopes, axes, strict=True))
+        corners = _clipped(corners, sign * slopes[0], sign * slopes[1], sign * level)
+    return corners if used else []
+
+
+def _clipped(corners: list[tuple[float, float]], a: float, b: float, level: float) -> list[tuple[float, float]]:
+    """The part of a convex polygon where ``a x + b y >= level``."""
+    found = []
+    for (x, y), (u, v) in zip(corners, [*corners[1:], *corners[:1]], strict=True):
+        here, there = a * x + b * y - level, a * u + b * v - level
+        if here >= 0.0:
+            found.append((x, y))
+        if (here < 0.0) != (there < 0.0) and here != there:
+            part = here / (here - there)
+            found.append((x + part * (u - x), y + part * (v - y)))
+    return found
+
+
+@dataclass(frozen=True)
+class View:
+    """A loop seen from outside.
+
+    Attributes:
+        title: In words.
+        axes: The world's axes to the right and up.
+        nearest: As `ns_abstract.report.outside.Outside.picture` has it.
+        marks: What is drawn over the scene.
+        window: What is shown.
+    """
+
+    title: str
+    axes: tuple[int, int]
+    nearest: float
+    marks: Marks
+    window: Window
+
+
+def views(
+    document: Mapping[str, Any], rows: Sequence[Mapping[str, Any]], loop: Loop, outside: Outside | None, width: int
+) -> list[View]:
+    """From above and from the side, where the camera's position moves; pictures are ``width`` pixels wide."""
+    matrix, offset = loop.camera.place
+    if not matrix.any():
+        return []
+    whole = plane_marks(document, rows, loop, matrix[:2], offset[:2], (0, 1)).ends
+    if whole is None:
+        return []
+    # along the longer horizontal side of what is there
+    side = (0, 2) if whole[1][0] - whole[0][0] >= whole[1][1] - whole[0][1] else (1, 2)
+    found = []
+    for axes, title in (((0, 1), "from above"), (side, "from the side")):
+        marks = plane_marks(document, rows, loop, matrix[list(axes)], offset[list(axes)], axes)
+        ends, nearest = marks.ends, np.inf
+        assert ends is not None
+        if axes == (0, 1):
+            # a ceiling would hide everything
+            up = plane_marks(document, rows, loop, matrix[[0, 2]], offset[[0, 2]], (0, 2)).ends
+            assert up is not None
+            nearest = float(up[1][1])
+        if outside is None:
+            window = framed(axes, *ends, width)
+        else:
+            window = outside.window(axes, *ends, nearest, width)
+        found.append(View(title, axes, nearest, marks, window))
+    return found

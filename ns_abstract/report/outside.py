@@ -1,0 +1,178 @@
+"""A scene as it is seen from outside: its elements from above and from the side, as one small picture."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ns_abstract.refine.protocol import Elements
+from ns_abstract.report.picture import png
+
+Float64 = NDArray[np.float64]
+K = TypeVar("K")
+V = TypeVar("V")
+
+#: Elements drawn at most, the numbers that are tried until a picture is small enough, and bytes of one.
+_COUNTS, _MOST_BYTES = (4000, 2000, 1000, 400), 90_000
+#: Opacity from which an element is drawn, and its strength; part of the paper's colour that is mixed in.
+_OPAQUE, _STRENGTH, _FADED = 0.3, 0.9, 0.2
+_PAPER = np.array([246.0, 246.0, 243.0])
+#: Colours of a picture; corners of an ellipse; least half-axis, pixels; drawn pixels by side of one that is shown.
+_COLORS, _CORNERS, _LEAST, _FINE = 64, 32, 0.75, 2
+#: How much of the scene, and of how many elements at least, a window should hold, and how much wider than what it is
+#: about it may get.
+_SHARE, _ENOUGH, _WIDER = 0.1, 10, 2.5
+#: Elements larger than this many windows are not drawn: they would cover everything.
+_HUGE = 1.0
+#: Windows and pictures that are remembered.
+_KEPT = 4
+
+
+@dataclass(frozen=True)
+class Window:
+    """What part of a plane is shown, at one scale.
+
+    Attributes:
+        axes: The world's axes to the right and up.
+        low, high: [2] ends along them, normalised units.
+        size: Width and height in pixels.
+    """
+
+    axes: tuple[int, int]
+    low: tuple[float, float]
+    high: tuple[float, float]
+    size: tuple[int, int]
+
+
+def _remembered(kept: dict[K, V], key: K, find: Callable[[], V]) -> V:
+    """What was found for a key, as long as it is among the latest few."""
+    if key not in kept:
+        while len(kept) >= _KEPT:
+            kept.pop(next(iter(kept)))
+        kept[key] = find()
+    return kept[key]
+
+
+@dataclass
+class Outside:
+    """Draws a scene from outside.
+
+    Args:
+        elements: What is drawn.
+    """
+
+    elements: Elements
+    # reports are written again and again, mostly of the same windows
+    _windows: dict[tuple[Any, ...], Window] = field(default_factory=dict)
+    _pictures: dict[tuple[Window, float], bytes] = field(default_factory=dict)
+
+    @staticmethod
+    def sight(axes: tuple[int, int]) -> tuple[int, float]:
+        """The axis that is looked along, and the sign of the side from which."""
+        third = 3 - sum(axes)
+        return third, float(np.cross(np.eye(3)[axes[0]], np.eye(3)[axes[1]])[third])
+
+    def _drawn(self, axes: tuple[int, int], nearest: float) -> NDArray[np.intp]:
+        """Numbers of the opaque elements that are not nearer to who looks than ``nearest``, the farthest first."""
+        third, sign = self.sight(axes)
+        depth = sign * self.elements.places[:, third]
+        good = np.isfinite(self.elements.places).all(axis=1) & (self.elements.opacities >= _OPAQUE)
+        found = np.flatnonzero(good & (depth <= nearest))
+        return found[np.argsort(depth[found], kind="stable")]
+
+    def window(self, axes: tuple[int, int], low: Float64, high: Float64, nearest: float, width: int) -> Window:
+        """A window about the box [2] to [2] that shows some of the scene about it.
+
+        Args:
+            axes: The world's axes to the right and up.
+            low, high: The box, normalised units.
+            nearest: As `picture` has it.
+            width: Of the picture, pixels.
+        """
+        key = axes, *low.tolist(), *high.tolist(), nearest, width
+        return _remembered(self._windows, key, lambda: self._window(axes, low, high, nearest, width))
+
+    def _window(self, axes: tuple[int, int], low: Float64, high: Float64, nearest: float, width: int) -> Window:
+        span = max(float((high - low).max()), 1e-6)
+        places = self.elements.places[self._drawn(axes, nearest)][:, list(axes)]
+        if len(places):
+            away = np.linalg.norm(np.maximum(np.maximum(low - places, places - high), 0.0), axis=1)
+            count = min(len(places), max(_ENOUGH, int(_SHARE * len(places))))
+            near = places[np.argsort(away, kind="stable")[:count]]
+            room = _WIDER * span
+            low = np.minimum(low, np.maximum(near.min(axis=0), low - room))
+            high = np.maximum(high, np.minimum(near.max(axis=0), high + room))
+        return framed(axes, low, high, width)
+
+    def picture(self, window: Window, nearest: float = np.inf) -> bytes:
+        """PNG of the elements in a window.
+
+        Args:
+            window: The window.
+            nearest: Coordinate towards who looks beyond which elements are left out: those in front.
+        """
+        return _remembered(self._pictures, (window, nearest), lambda: self._picture(window, nearest))
+
+    def _picture(self, window: Window, nearest: float) -> bytes:
+        low, high = np.array(window.low), np.array(window.high)
+        axes = list(window.axes)
+        numbers = self._drawn(window.axes, nearest)
+        scale = _FINE * window.size[0] / (high[0] - low[0])
+        flat = self.elements.spreads[numbers][:, axes]
+        half = np.sqrt((flat**2).sum(axis=2))
+        places = self.elements.places[numbers][:, axes]
+        seen = ((places + half >= low) & (places - half <= high)).all(axis=1)
+        seen &= half.max(axis=1) <= _HUGE * float((high - low).max())
+        numbers, flat, places = numbers[seen], flat[seen], places[seen]
+        # corners of ellipses of one standard deviation, in pixels
+        values, vectors = np.linalg.eigh(flat @ flat.swapaxes(1, 2)) if len(flat) else (np.ones((0, 2)), flat[..., :2])
+        axis = np.maximum(scale * np.sqrt(np.maximum(values, 0.0)), _FINE * _LEAST)
+        angles = 2.0 * np.pi * np.arange(_CORNERS) / _CORNERS
+        circle = np.stack([np.cos(angles), np.sin(angles)])
+        around = (vectors * axis[:, None]) @ circle
+        middle = scale * (places - low)
+        corners = (middle[..., None] + around).swapaxes(1, 2)
+        corners[..., 1] = _FINE * window.size[1] - corners[..., 1]
+        fill = np.concatenate(
+            [255.0 * self.elements.colors[numbers], 255.0 * _STRENGTH * self.elements.opacities[numbers, None]], axis=1
+        )
+        fill = np.clip(fill, 0.0, 255.0).astype(np.uint8)
+        data = b""
+        for count in _COUNTS:
+            kept = np.arange(len(numbers))
+            if len(kept) > count:
+                kept = np.sort(np.random.default_rng(0).choice(len(kept), count, replace=False))
+            data = _ellipses(window.size, corners[kept], fill[kept])
+            if len(data) <= _MOST_BYTES:
+                break
+        return data
+
+
+def framed(axes: tuple[int, int], low: Float64, high: Float64, width: int) -> Window:
+    """A window of one scale around the box, with a margin, neither flat nor tall."""
+    margin = 0.06 * max(float((high - low).max()), 1e-6)
+    low, high = low - margin, high + margin
+    across, up = high - low
+    shape = min(max(up / across, 0.25), 0.8)
+    across, up = max(across, up / shape), max(up, across * shape)
+    middle, half = 0.5 * (low + high), 0.5 * np.array([across, up])
+    low, high = (middle - half).tolist(), (middle + half).tolist()
+    return Window(axes, (low[0], low[1]), (high[0], high[1]), (width, max(1, round(width * shape))))
+
+
+def _ellipses(size: tuple[int, int], corners: Float64, fill: NDArray[np.uint8]) -> bytes:
+    """PNG of polygons [n, c, 2] in colours [n, 4], one over the other."""
+    from PIL import Image, ImageDraw
+
+    whole = Image.new("RGB", (_FINE * size[0], _FINE * size[1]), tuple(int(v) for v in _PAPER))
+    pen = ImageDraw.Draw(whole, "RGBA")
+    for polygon, color in zip(corners.tolist(), fill.tolist(), strict=True):
+        pen.polygon([(x, y) for x, y in polygon], fill=tuple(color))
+    image = np.asarray(whole.resize(size, Image.Resampling.BOX), np.float64)
+    # what is drawn over it is to stand out
+    faded = Image.fromarray(((1.0 - _FADED) * image + _FADED * _PAPER).astype(np.uint8))
+    return png(faded.quantize(_COLORS, dither=Image.Dither.NONE))

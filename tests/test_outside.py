@@ -1,0 +1,246 @@
+"""A loop seen from outside: the scene behind tubes, sets in planes of camera positions, and films."""
+
+from __future__ import annotations
+
+import io
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+from test_reach import specification
+
+from ns_abstract.io.errors import InputError
+from ns_abstract.reach.loop import Loop, parse_loop
+from ns_abstract.reach.planes import plane_marks, region, views
+from ns_abstract.refine.protocol import Elements
+from ns_abstract.report.export import encode_gif, encode_mp4
+from ns_abstract.report.outside import Outside, Window
+from ns_abstract.verify.store import Store
+
+RED, GREEN, BLUE = np.eye(3)
+
+
+def elements(*rows: tuple[Any, Any, float, float]) -> Elements:
+    """Balls: place, colour, radius, opacity."""
+    places, colors, sizes, opacities = (np.array(column, np.float64) for column in zip(*rows, strict=True))
+    return Elements(places, sizes[:, None, None] * np.eye(3), colors, opacities)
+
+
+def read(data: bytes) -> np.ndarray:
+    return np.asarray(Image.open(io.BytesIO(data)).convert("RGB")).astype(int)
+
+
+def color_at(image: np.ndarray, window: Window, place: tuple[float, float]) -> str:
+    """The strongest channel at a place of the plane, or "none"."""
+    part = (np.array(place) - window.low) / (np.array(window.high) - window.low)
+    pixel = image[int((1.0 - part[1]) * image.shape[0]), int(part[0] * image.shape[1])]
+    return "none" if np.ptp(pixel) < 30 else "rgb"[int(np.argmax(pixel))]
+
+
+def test_elements_are_drawn_where_they_are_and_the_nearest_on_top() -> None:
+    scene = elements(
+        ((0.5, 0.5, 0.0), RED, 0.1, 0.95),
+        ((-0.5, 0.2, 0.0), BLUE, 0.1, 0.95),
+        # above and before the blue one
+        ((-0.5, -0.4, 0.5), GREEN, 0.15, 0.95),
+        ((0.0, 0.2, 0.5), GREEN, 0.1, 0.95),
+        # hardly to be seen
+        ((0.0, -0.5, 0.0), RED, 0.1, 0.1),
+    )
+    outside, low, high = Outside(scene), (-1.0, -0.8), (1.0, 0.8)
+    above = Window((0, 1), low, high, (300, 240))
+    image = read(outside.picture(above))
+    assert image.shape == (240, 300, 3)
+    found = [color_at(image, above, place) for place in ((0.5, 0.5), (-0.5, 0.2), (0.0, 0.2), (0.0, -0.5), (0.8, 0.0))]
+    assert found == ["r", "b", "g", "none", "none"]
+    # no roof
+    open_top = read(outside.picture(above, nearest=0.2))
+    assert color_at(open_top, above, (0.0, 0.2)) == "none" and color_at(open_top, above, (0.5, 0.5)) == "r"
+    # from -y, where the green ball at y = -0.4 hides nothing of the blue one at another height
+    side = Window((0, 2), low, high, (300, 240))
+    image = read(outside.picture(side))
+    assert color_at(image, side, (-0.5, 0.5)) == "g" and color_at(image, side, (-0.5, 0.0)) == "b"
+    one_behind_another = elements(((0.0, 1.0, 0.0), RED, 0.2, 0.95), ((0.0, -1.0, 0.0), BLUE, 0.2, 0.95))
+    assert color_at(read(Outside(one_behind_another).picture(side)), side, (0.0, 0.0)) == "b"
+    beside = Window((1, 2), low, high, (300, 240))
+    turned = elements(((-1.0, 0.0, 0.0), RED, 0.2, 0.95), ((1.0, 0.0, 0.0), BLUE, 0.2, 0.95))
+    assert color_at(read(Outside(turned).picture(beside)), beside, (0.0, 0.0)) == "b"
+
+
+def test_a_picture_of_many_elements_is_small_and_always_the_same() -> None:
+    rng = np.random.default_rng(2)
+    count = 30_000
+    scene = Elements(
+        rng.uniform(-1.0, 1.0, (count, 3)),
+        0.02 * rng.normal(size=(count, 3, 3)),
+        rng.random((count, 3)),
+        rng.random(count),
+    )
+    window = Window((0, 1), (-1.0, -0.7), (1.0, 0.7), (756, 529))
+    data = Outside(scene).picture(window)
+    # two of them, as text, are less than 300 kB
+    assert len(data) <= 100_000 and data == Outside(scene).picture(window)
+    assert read(data).std() > 10.0
+
+
+def test_a_window_holds_what_is_marked_and_some_of_the_scene() -> None:
+    low, high = np.array([0.0, -0.1]), np.array([1.0, 0.1])
+    scene = elements(*(((3.0, 0.1 * k, 0.0), RED, 0.1, 0.9) for k in range(-20, 21)), ((99.0, 0, 0), RED, 0.1, 0.9))
+    window = Outside(scene).window((0, 1), low, high, np.inf, 400)
+    assert window.low[0] <= 0.0 and 3.0 <= window.high[0] < 6.0
+    across, up = np.subtract(window.high, window.low)
+    assert abs(across / up - window.size[0] / window.size[1]) < 0.02
+    outside = Outside(scene)
+    # what was drawn is not drawn again
+    assert outside.picture(window) is outside.picture(outside.window((0, 1), low, high, np.inf, 400))
+    alone = Outside(elements(((0.0, 0.0, 0.0), RED, 0.1, 0.0))).window((0, 1), low, high, np.inf, 400)
+    assert alone.low[0] <= 0.0 and 1.0 <= alone.high[0] < 1.2
+
+
+# ---------------------------------------------------------------- planes
+
+
+def loop(tmp_path: Path, **changes: Any) -> Loop:
+    value = json.loads(json.dumps(specification("double integrator"))) | changes
+    value["camera"]["position"] = {
+        "offset": [1.0, 2.0, 0.5],
+        # x from the second state, backwards; y from the first; z stands
+        "matrix": [[0.0, -2.0, 0.0, 0.0], [1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 0.0]],
+    }
+    (tmp_path / "net.onnx").touch()
+    return parse_loop(value, tmp_path)
+
+
+WINDOW = Window((0, 1), (0.0, 0.0), (4.0, 4.0), (100, 100))
+
+
+def inside(corners: list[tuple[float, float]], point: tuple[float, float]) -> bool:
+    """Whether a convex polygon, corners in the order of the clock or against it, holds a point."""
+    turns = [
+        (u - x) * (point[1] - y) - (v - y) * (point[0] - x)
+        for (x, y), (u, v) in zip(corners, [*corners[1:], *corners[:1]], strict=True)
+    ]
+    return bool(corners) and (min(turns) >= 0.0 or max(turns) <= 0.0)
+
+
+def test_sets_are_drawn_where_the_camera_would_be(tmp_path: Path) -> None:
+    """Any state whose camera is in the polygon is in the set, and no other."""
+    sets = [
+        {"box": {"p": [-0.5, 0.7], "q": [None, 0.2]}},
+        {"half_space": {"normal": [1.0, 2.0, 0.0, 0.0], "at_least": 0.4}},
+        {"box": {"p": [50.0, None]}},
+    ]
+    course, rng = loop(tmp_path, unsafe=sets), np.random.default_rng(1)
+    matrix, offset = course.camera.place
+    hits = 0
+    for faces in course.unsafe:
+        corners = region(faces, course, (0, 1), WINDOW, -1.0)
+        for _ in range(800):
+            x = np.append(rng.uniform(-2.0, 2.0, 2), (0.0, 0.0))
+            place = matrix @ x + offset
+            if not (0.0 < place[0] < 4.0 and 0.0 < place[1] < 4.0):
+                continue
+            unsafe = all(face.exact(x.tolist()) <= 0 for face in faces)
+            assert inside(corners, (place[0], place[1])) == unsafe
+            hits += unsafe
+    assert hits > 100
+
+
+def test_what_is_no_set_of_places_is_not_drawn(tmp_path: Path) -> None:
+    sets = [{"box": {"p": [0.0, None], "r": [0.0, None]}}, {"half_space": {"normal": [1, 0, 1, 0], "at_least": 0}}]
+    course = loop(tmp_path, unsafe=sets)
+    assert [region(faces, course, (0, 1), WINDOW, -1.0) for faces in course.unsafe] == [[], []]
+    # z stands still
+    assert region(course.unsafe[0], course, (0, 2), WINDOW, -1.0) == []
+
+
+def document(course: Loop, camera: Any = ()) -> dict[str, Any]:
+    names = course.box.names
+    tube = {"tube": [[[0.0] * 4, [0.1] * 4]], "camera": list(camera)}
+    return {
+        "parameters": [{"name": name} for name in names],
+        "tubes": [tube],
+        "simulated_states": [np.zeros((3, 4)), [[0.1, 0.0, 0.0, 0.0], [None] * 4]],
+        "falsifying": [],
+    }
+
+
+def test_marks_are_places_of_the_camera(tmp_path: Path) -> None:
+    course = loop(tmp_path)
+    matrix, offset = course.camera.place
+    assert matrix[2].tolist() == [0.0] * 4 and offset.tolist() == [1.0, 2.0, 0.5]
+    camera = [[[0.5, 1.5, 0.5], [1.5, 2.5, 0.5]], [[None] * 3, [None] * 3]]
+    cells = [{"lower": [-0.01] * 3, "upper": [0.02] * 3, "verdict": "certified"}]
+    marks = plane_marks(document(course, camera), cells, course, matrix[:2], offset[:2], (0, 1))
+    (kind, low, high), (other, *tube) = marks.boxes
+    assert kind == "certified" and other == "tube"
+    np.testing.assert_allclose([low, high], [[0.96, 1.99], [1.02, 2.02]])
+    np.testing.assert_array_equal(tube, [[0.5, 1.5], [1.5, 2.5]])
+    assert [len(line) for _, line in marks.lines] == [3, 1]
+    np.testing.assert_allclose(marks.lines[1][1], [[1.0, 2.1]])
+    found = views(document(course, camera), cells, course, None, 300)
+    assert [view.axes for view in found] == [(0, 1), (0, 2)] and found[0].nearest == 0.5
+
+
+# ---------------------------------------------------------------- films
+
+
+def frames() -> list[np.ndarray]:
+    """A bright bar that moves on, of odd size."""
+    found = []
+    for k in range(5):
+        frame = np.zeros((31, 61, 3), np.uint8)
+        frame[:, 10 * k : 10 * k + 10, 1] = 255
+        found.append(frame)
+    return found
+
+
+def test_a_gif_shows_every_frame() -> None:
+    buffer = io.BytesIO()
+    encode_gif(buffer, iter(frames()), 4.0)
+    film = Image.open(buffer)
+    assert getattr(film, "n_frames", 1) == 5 and film.info["duration"] == 250
+    for k, frame in enumerate(frames()):
+        film.seek(k)
+        np.testing.assert_array_equal(np.asarray(film.convert("RGB")), frame)
+
+
+def test_an_mp4_shows_every_frame() -> None:
+    av = pytest.importorskip("av", reason="needs the extra video")
+    buffer = io.BytesIO()
+    encode_mp4(buffer, iter(frames()), 4.0)
+    buffer.seek(0)
+    with av.open(buffer) as container:
+        shown = [frame.to_ndarray(format="rgb24").astype(int) for frame in container.decode(video=0)]
+    assert len(shown) == 5 and shown[0].shape == (32, 62, 3)
+    for picture, frame in zip(shown, frames(), strict=True):
+        assert np.abs(picture[:31, :61] - frame).mean() < 20.0
+
+
+def test_a_film_leaves_files_of_others_alone(tmp_path: Path) -> None:
+    (tmp_path / "film.mp4").write_bytes(b"holidays")
+    names = []
+    for resume in (False, True, False):
+        store = Store(tmp_path, {"a": 1}, [("p", "")], {0: {}}, resume=resume)
+        names.append(store.keep("film.mp4", b"new").name)
+        store.close()
+    # our own is written over, and removed when a search begins anew
+    assert names == ["film_2.mp4"] * 3 and (tmp_path / "film.mp4").read_bytes() == b"holidays"
+    store = Store(tmp_path, {"a": 2}, [("p", "")], {0: {}}, resume=False)
+    store.close()
+    assert not (tmp_path / "film_2.mp4").exists() and (tmp_path / "film.mp4").exists()
+
+
+def test_a_full_disk_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    store = Store(tmp_path, {"a": 1}, [("p", "")], {0: {}}, resume=False)
+
+    def full(*_: Any) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("ns_abstract.verify.store.write_atomic", full)
+    with pytest.raises(InputError, match="No space left"):
+        store.keep("film.mp4", b"new")
+    store.close()
