@@ -446,7 +446,7 @@ class Reacher:
 
     def _advanced(self, state: AffineSet) -> tuple[AffineSet, Float64, Float64] | str:
         """One step (L4): the next set, least and most controls [2, m], and how much the picture moves by symbol."""
-        loop, pose = self.loop, self.poses(state)
+        pose = self.poses(state)
         low, high = pose.hull()
         if not ((low >= self._limits[0][: len(low)]) & (high <= self._limits[1][: len(high)])).all():
             return "the camera may leave the range of poses"
