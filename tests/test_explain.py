@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
@@ -115,3 +116,41 @@ def test_command(make_blobs: Make, call: Callable[[list[str]], tuple[int, str, s
     options[1] = str(config)
     code, _, err = call([*options, "--perturbation-filename", str(inputs.spec)])
     assert code == 2 and "--explain" in err and err.count("\n") == 1
+
+
+def test_the_report_tells_why(
+    make_blobs: Make, call: Callable[[list[str]], tuple[int, str, str]], tmp_path: Path
+) -> None:
+    balls = scene([[-0.1, 0.0, 0.0], [0.1, 0.001, 0.0]], [0.2, 0.2], plain([1.0, 0.0, 0.0], [0.0, 0.0, 1.0]))
+    inputs = make_blobs(scene=balls, views=FRONT, spec=TURN)
+    out = tmp_path / "out"
+    options = ["--load-config", str(inputs.config), "--camera-path-filename", str(inputs.path)]
+    options += ["--output-dir", str(out)]
+    options += ["--perturbation-filename", str(inputs.spec), "--time-budget", "2"]
+    code, _, said = call([*options, "--explain"])
+    entry = json.loads((out / "report.json").read_text())["frames"][0]
+    assert code == 0 and "the order of depth" in said and any("the order of depth" in s for s in entry["explanation"])
+    assert "the order of depth" in (out / "report.html").read_text()
+    # cells are worked with, and not stored unless that is asked for
+    assert not any(key.startswith("cell") for key in np.load(out / "frame_00000.npz").files)
+    # what is kept stays explained
+    assert call([*options, "--resume", "--target-ratio", "1000"])[0] == 0
+    assert json.loads((out / "report.json").read_text())["frames"][0]["explanation"] == entry["explanation"]
+    assert "the order of depth" in (out / "report.html").read_text()
+    # a report that others have changed is no longer believed
+    document = json.loads((out / "report.json").read_text())
+    document["frames"][0]["explanation"] = [{"<script>": 1}]
+    (out / "report.json").write_text(json.dumps(document))
+    assert call([*options, "--resume", "--target-ratio", "1000"])[0] == 0
+    assert "explanation" not in json.loads((out / "report.json").read_text())["frames"][0]
+
+
+def test_a_field_is_not_explained_in_a_report(
+    make_blobs: Make, call: Callable[[list[str]], tuple[int, str, str]], tmp_path: Path
+) -> None:
+    inputs = make_blobs(views=FRONT, spec=TURN)
+    config = write_nerf_run(tiny_scene(), tmp_path, timestamp=TIMESTAMP, experiment_name="nerf")
+    options = ["--load-config", str(config), "--camera-path-filename", str(inputs.path), "--explain"]
+    options += ["--perturbation-filename", str(inputs.spec), "--output-dir", str(tmp_path / "out")]
+    code, _, err = call(options)
+    assert code == 2 and "--explain" in err and err.count("\n") == 1 and not (tmp_path / "out").exists()

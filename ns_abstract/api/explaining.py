@@ -9,6 +9,7 @@ import numpy as np
 
 from ns_abstract.api.job import Job
 from ns_abstract.geometry.box import ParameterBox
+from ns_abstract.io.errors import InputError
 from ns_abstract.refine.protocol import Frame
 from ns_abstract.refine.result import FrameResult, Leaves
 
@@ -67,6 +68,16 @@ class Explanation:
             yield f"  {share:6.1%}  lies in rows {top} to {bottom - 1}, columns {left} to {right - 1}"
         for number, share in self.elements:
             yield f"  {share:6.1%}  of the gap of the widest leaf goes away without Gaussian {number}"
+
+
+def check_explained(job: Job) -> None:
+    """Refuse what is not explained.
+
+    Raises:
+        InputError: The scene is a field.
+    """
+    if job.rays:
+        raise InputError("is for splats, this run is a NeRF", field="--explain", fix="leave it out")
 
 
 def explain(job: Job, index: int, result: FrameResult, seed: int = 0) -> Explanation:

@@ -89,8 +89,8 @@ class Render(GivenSet):
     """Only tell what cameras, units and set mean, in pixels and distances, and do nothing else; needs no
     --output-dir."""
     explain: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
-    """Splats: bound the frames and tell why their bounds are wider than renders, where, and what would help; writes
-    nothing and needs no --output-dir."""
+    """Splats: also tell why bounds are wider than renders, where, and what would help, in words and in the report.
+    Without --output-dir nothing is written."""
 
 
 @dataclass
@@ -125,13 +125,13 @@ def explain(options: Explain) -> int:
         InputError: A file, a field or an option cannot be used.
     """
     from ns_abstract.api.bounding import bound_frames
+    from ns_abstract.api.explaining import check_explained
     from ns_abstract.api.explaining import explain as explained
     from ns_abstract.api.job import check_frames
     from ns_abstract.execution.engines import Here
 
     job = opened(options)
-    if job.rays:
-        raise InputError("is for splats, this run is a NeRF", field="--explain", fix="leave it out")
+    check_explained(job)
     frames = check_frames(options.frames, job.frame_count)
     stop = Stop()
     with stop.installed():
@@ -195,7 +195,8 @@ def render(options: Render) -> int:
         tls = Tls.of(options.tls_ca_file, options.tls_cert, options.tls_key, options.scheduler_address)
         order = Order(
             Settings(**given), options.frames, options.output_dir, options.time_budget, options.target_ratio,
-            options.engine, options.scheduler_address, tls, options.resume, options.save_cells, vars(options),
+            options.engine, options.scheduler_address, tls, options.resume, options.save_cells, options.explain,
+            vars(options),
         )  # fmt: skip
         complete = render_path(order, stop)
     return DONE if complete and not stop() else INTERRUPTED
@@ -205,7 +206,7 @@ def main() -> None:
     """Entry point of the console script."""
     if "--describe" in sys.argv[1:]:
         run(describe, lambda: tyro.cli(Describe, prog="ns-abstract-render"))
-    elif "--explain" in sys.argv[1:]:
+    elif "--explain" in sys.argv[1:] and not any(w.replace("_", "-").startswith("--output-dir") for w in sys.argv[1:]):
         run(explain, lambda: tyro.cli(Explain, prog="ns-abstract-render"))
     run(render, lambda: tyro.cli(Render, prog="ns-abstract-render"))
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +14,7 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
 from ns_abstract.api import bounding
 from ns_abstract.api.compiling import compile_beside
+from ns_abstract.api.explaining import check_explained, explain
 from ns_abstract.api.files import PathJob, Settings, open_job
 from ns_abstract.api.job import Job, check_frames
 from ns_abstract.api.scenes import platform_problems
@@ -41,6 +42,7 @@ class Order:
         engine, scheduler_address, tls: Where the work is done.
         resume: Whether to keep finished frames.
         save_cells: Whether to store leaf cells.
+        explain: Whether the report tells why bounds are loose.
         options: All options, for the report.
     """
 
@@ -54,6 +56,7 @@ class Order:
     tls: Tls | None
     resume: bool
     save_cells: bool
+    explain: bool
     options: Mapping[str, Any]
 
 
@@ -84,6 +87,8 @@ def render_path(order: Order, stop: Stop) -> bool:
     with stop.at_once():
         job = open_job(order.settings)
         frames = check_frames(order.frames, job.frame_count)
+        if order.explain:
+            check_explained(job)
         problems = platform_problems()
     with ExitStack() as stack:
         # before the workers: another command may be writing there
@@ -126,12 +131,18 @@ def _fill(report: Report, job: Job, order: Order, engine: Engine, stop: Stop, co
             meter = _Meter(progress, len(pending), order.target_ratio)
             results = bounding.bound_frames(
                 job, pending, engine=engine, budget=budget, target_ratio=order.target_ratio,
-                keep_leaves=order.save_cells, stop=stop, on_progress=meter.told,
+                keep_leaves=order.save_cells or order.explain, stop=stop, on_progress=meter.told,
             )  # fmt: skip
             for done, result in enumerate(results, 1):
                 # first what was asked for: drawing loads matplotlib
-                _tell(console, report.add(result, picture=False))
+                kept = result if order.save_cells else replace(result, leaves=None)
+                _tell(console, report.add(kept, picture=False))
                 report.draw(result.index)
+                if order.explain and result.bounded and not stop():
+                    with stop.at_once():
+                        lines = tuple(explain(job, result.index, result, order.settings.seed).lines())
+                    report.explain(result.index, lines)
+                    console.print("\n".join(lines[1:]), markup=False, soft_wrap=True)
                 meter.finished(done)
     finally:
         # also after a failure: what is finished is written

@@ -293,6 +293,7 @@ def _frame(entry: Mapping[str, Any], pictures: Mapping[str, bytes], *, sampled: 
         else ""
     )
     plan = "".join(f"<li>{escape(line)}</li>" for line in entry["plan"])
+    why = escape("\n".join(entry.get("explanation", ())))
     links = " · ".join(f'<a href="{escape(file)}">{escape(file)}</a>' for file in entry["files"].values())
     return (
         f'<details{" open" if opened else ""} id="frame{entry["index"]}"><summary>Frame {entry["index"]} '
@@ -304,6 +305,7 @@ def _frame(entry: Mapping[str, Any], pictures: Mapping[str, bytes], *, sampled: 
         f"{number(entry['xpg'])}</div>"
         f'<div class="below"><div class="stats">{stats}</div>{_curve(entry)}</div>'
         + (f"<p>Left out for this frame:</p><ul>{plan}</ul>" if plan else "")
+        + (f"<p>Why it is loose:</p><pre>{why}</pre>" if why else "")
         + f'<p class="soft">{links}</p></details>'
     )
 

@@ -9,7 +9,7 @@ import math
 import os
 import platform
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -138,6 +138,18 @@ def frame_digests(document: Any) -> dict[str, str]:
     """SHA-256 of the frame files by name, as report.json has them; what is damaged is left out."""
     known = document.get("sha256") if isinstance(document, dict) else None
     return {str(k): v for k, v in known.items() if isinstance(v, str)} if isinstance(known, dict) else {}
+
+
+def explanations(document: Any) -> dict[int, tuple[str, ...]]:
+    """What a report.json, which others may have written, tells of why frames are loose."""
+    frames = document.get("frames") if isinstance(document, dict) else None
+    found = {}
+    for entry in frames if isinstance(frames, list) else ():
+        if isinstance(entry, dict) and isinstance(entry.get("index"), int):
+            lines = entry.get("explanation")
+            if isinstance(lines, list) and all(isinstance(line, str) for line in lines):
+                found[entry["index"]] = tuple(lines)
+    return found
 
 
 def versions() -> dict[str, str | None]:
@@ -295,6 +307,7 @@ class Report:
         self._previews: dict[int, Mapping[str, bytes]] = {}
         self._plays: dict[int, str | None] = {}
         self._undrawn: set[int] = set()
+        self._explained: dict[int, tuple[str, ...]] = {}
         self._state = "running"
         self._started = _now()
         self._page_due = 0.0
@@ -319,6 +332,7 @@ class Report:
     def _keep(self) -> None:
         run, path = self.run, self.folder / "report.json"
         digests: dict[str, str] = {}
+        explained: dict[int, tuple[str, ...]] = {}
         if path.exists():
             try:
                 old = load_json(path, "report", limit=_JSON_LIMIT)
@@ -326,6 +340,7 @@ class Report:
                 old = None
                 self.ignored.append(f"report.json: {error.problem}")
             digests = frame_digests(old)
+            explained = explanations(old)
             prints = old.get("fingerprint") if isinstance(old, dict) else None
             if isinstance(prints, dict):
                 changed = differences(prints, run.fingerprint)
@@ -356,6 +371,7 @@ class Report:
                 self.ignored.append(f"{path.name}: has no leaf cells")
             else:
                 result = stored.result
+                self._explained[index] = explained.get(index, ())
                 self._entries[index] = self._entry(result, self._stored_status(stored))
                 self._before[index] = result.seconds, result.cells, result.trace
                 if not path.with_suffix(".png").exists():
@@ -388,6 +404,16 @@ class Report:
     def missing(self) -> list[int]:
         """Frames asked for of which no bound but [0, 1] is known."""
         return [k for k in self.run.frames if self._entries.get(k, {}).get("status", "missing") == "missing"]
+
+    def explain(self, index: int, lines: Sequence[str]) -> None:
+        """Say in words why the bounds of a frame that was added are loose.
+
+        Raises:
+            InputError: A file cannot be written.
+        """
+        self._explained[index] = tuple(lines)
+        self._entries[index]["explanation"] = list(lines)
+        self._publish(page=time.monotonic() >= self._page_due)
 
     def add(self, result: FrameResult, status: Status | None = None, *, picture: bool = True) -> dict[str, Any]:
         """Write one frame and bring the report up to date.
@@ -502,6 +528,7 @@ class Report:
                 ],
                 "seconds_to_ratio": {f"{mark:g}": seconds for mark, seconds in seconds_to(result.trace).items()},
                 "status": status,
+                **({"explanation": why} if (why := self._explained.get(result.index)) else {}),
                 "parameters": [
                     {"name": name, "unit": unit, "lower": low, "upper": high}
                     for name, unit, low, high in zip(box.names, box.units, box.lower, box.upper, strict=True)
