@@ -667,6 +667,12 @@ def test_report(planted: Case, finished: Path) -> None:
     for kind, volume in volumes.items():
         assert document["coverage"][kind] == pytest.approx(volume)
     assert document["trace"][-1]["certified"] == pytest.approx(document["coverage"]["certified"])
+    # one camera by cell, at its middle
+    places, poses = document["cameras"], planted.job.job.pose_sets[0]
+    middles = [0.5 * (json.loads(lower)[0] + json.loads(upper)[0]) for _, lower, upper, *_ in cells(finished)]
+    found = sorted(cell["position"] for cell in places["cells"])
+    assert places["left_out"] == 0 and {cell["frame"] for cell in places["cells"]} == {0}
+    np.testing.assert_allclose(found, sorted(poses.pose(np.array([x]))[:, 3].tolist() for x in middles), atol=1e-5)
 
 
 def test_substitutions_are_compared(blobs: Inputs, net: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -721,6 +727,10 @@ def test_page(finished: Path) -> None:
     ):  # fmt: skip
         assert part in page, part
     assert "https://" not in page and "http://" not in page
+    # frusta of all cells, twice, over the scene
+    kinds = [verdict for _, _, _, verdict, *_ in cells(finished)]
+    groups = re.findall(r'<image [^>]*href="data:image/png[^>]*><g class="frusta">(.*?)</g>', page)
+    assert [sorted(re.findall(r'class="(\w+)"', group)) for group in groups] == [sorted(kinds)] * 2
     # one script, which the policy names by its hash, and its data
     scripts = re.findall(r"<script([^>]*)>(.*?)</script>", page, re.DOTALL)
     (_, data), (_, code) = scripts

@@ -1,21 +1,28 @@
-"""A loop seen from outside: the scene behind tubes, sets in planes of camera positions, and films."""
+"""The scene seen from outside, behind loops' tubes and certificates' cameras; sets in planes of positions; films."""
 
 from __future__ import annotations
 
 import io
+import itertools
 import json
+import re
 from pathlib import Path
 from typing import Any
+from xml.etree import ElementTree
 
 import numpy as np
 import pytest
 from PIL import Image
 from test_reach import specification
 
+from ns_abstract.geometry.camera_path import Camera
+from ns_abstract.geometry.poses import PoseSet
 from ns_abstract.io.errors import InputError
+from ns_abstract.perturbation.specification import parse_perturbation
 from ns_abstract.reach.loop import Loop, parse_loop
 from ns_abstract.reach.planes import plane_marks, region, views
 from ns_abstract.refine.protocol import Elements
+from ns_abstract.report.cameras import MOST, Cameras, cameras_entry, cell_cameras, standing
 from ns_abstract.report.export import encode_gif, encode_mp4
 from ns_abstract.report.outside import Outside, Window
 from ns_abstract.verify.store import Store
@@ -183,6 +190,140 @@ def test_marks_are_places_of_the_camera(tmp_path: Path) -> None:
     np.testing.assert_allclose(marks.lines[1][1], [[1.0, 2.1]])
     found = views(document(course, camera), cells, course, None, 300)
     assert [view.axes for view in found] == [(0, 1), (0, 2)] and found[0].nearest == 0.5
+
+
+# ---------------------------------------------------------------- cameras of a certificate
+
+NAMES = ("x", "y", "azimuth")
+KINDS = ("certified", "falsified", "unknown")
+#: Looks along -x from (1, 0, 0.3), z up.
+AHEAD = np.array([[0.0, 0.0, 1.0, 1.0], [1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.3]])
+
+
+def poses(specification: dict[str, Any] | None = None, pose: np.ndarray = AHEAD) -> PoseSet:
+    return PoseSet.around(Camera(pose, 20.0, 30.0, 16.0, 12.0, 32, 24), parse_perturbation(specification or {}))
+
+
+def around(low: float = 0.0, high: float = 6.0) -> PoseSet:
+    return poses({"orbit": {"target": [0.0, 0.0, 0.0], "axis": [0.0, 0.0, 1.0], "azimuth": [low, high]}})
+
+
+def shifts() -> PoseSet:
+    turned = np.array([[1.0, 0.0, 0.0, 2.0], [0.0, 0.0, -1.0, -1.0], [0.0, 1.0, 0.0, 0.5]])
+    return poses({"translation": {"x": 0.3, "y": 0.2}, "rotation": {"yaw": 0.1}}, turned)
+
+
+def azimuths(ends: np.ndarray) -> list[dict[str, Any]]:
+    """Cells between angles, verdicts in turn."""
+    return [
+        {"lower": [0.0, 0.0, a], "upper": [0.0, 0.0, b], "verdict": KINDS[k % 3]}
+        for k, (a, b) in enumerate(itertools.pairwise(ends.tolist()))
+    ]
+
+
+def tick_map(plot: ElementTree.Element, along: str) -> np.ndarray:
+    """Scale and offset from a plot's coordinates to the numbers at its ticks."""
+    anchor, at = ("middle", "x") if along == "x" else ("end", "y")
+    ticks = [
+        (float(entry.get(at, "nan")) - (4.0 if along == "y" else 0.0), float(entry.text or "nan"))
+        for entry in plot.findall("text")
+        if entry.get("text-anchor") == anchor and "units" not in (entry.text or "")
+    ]
+    assert len(ticks) > 1
+    places, values = np.array(ticks).T
+    return np.polyfit(places, values, 1)
+
+
+def test_cameras_are_drawn_where_the_middles_of_their_cells_are() -> None:
+    sets = {3: around(), 7: shifts()}
+    names = ("x", "y", "yaw", "azimuth")
+    rows = {
+        3: [
+            {"lower": [0.0] * 3 + [2.0 * k], "upper": [0.0] * 3 + [2.0 * k + 2.0], "verdict": kind}
+            for k, kind in enumerate(KINDS)
+        ],
+        7: [
+            {"lower": [a, -0.2, -0.1, 0.0], "upper": [a + 0.3, 0.2, b, 0.0], "verdict": "unknown"}
+            for a, b in ((-0.3, 0.1), (0.0, 0.05))
+        ],
+    }
+    cells, left_out = cell_cameras(sets, rows, names)
+    assert left_out == 0 and [(cell.frame, cell.row) for cell in cells] == [(3, 0), (3, 1), (3, 2), (7, 0), (7, 1)]
+    angles = np.array([1.0, 3.0, 5.0])
+    places = np.stack([np.cos(angles), np.sin(angles), np.full(3, 0.3)], axis=1)
+    places = np.concatenate([places, [[1.85, -1.0, 0.5], [2.15, -1.0, 0.5]]])
+    entry = cameras_entry(cells, left_out)
+    np.testing.assert_allclose([cell["position"] for cell in entry["cells"]], places, atol=1e-5)
+    np.testing.assert_allclose(entry["cells"][0]["direction"], [-np.cos(1.0), -np.sin(1.0), 0.0], atol=1e-5)
+    np.testing.assert_allclose(entry["cells"][3]["direction"], [0.0, 1.0, 0.0], atol=1e-5)
+    assert [cell["verdict"] for cell in entry["cells"]] == [*KINDS, "unknown", "unknown"]
+    for cell in cells:
+        # through the corners of the picture
+        x, y, z = (cell.rays @ cell.pose[:, :3]).T
+        np.testing.assert_allclose(x / -z, [-0.8, 0.8, 0.8, -0.8])
+        np.testing.assert_allclose(y / -z, [0.4, 0.4, -0.4, -0.4])
+
+    page = Cameras(cells, left_out, standing(sets), None).html({(3, 1): 4})
+    assert "further" not in page and "cameras alone" in page and page.count('data-cell="4"') == 2
+    # well-formed: nothing is left open, and no text is taken for a tag
+    plots = ElementTree.fromstring(f"<part>{page}</part>").findall("figure/svg")
+    assert len(plots) == 2
+    for plot, axes in zip(plots, ((0, 1), (0, 2)), strict=True):
+        across, up = tick_map(plot, "x"), tick_map(plot, "y")
+        shapes = plot.findall("g/path")
+        assert sorted(s.get("class", "") for s in shapes) == sorted([*KINDS, "unknown", "unknown"])
+        assert [s.get("class") for s in shapes][-1] == "falsified"
+        for kind in KINDS:
+            wanted = [places[k, list(axes)] for k, cell in enumerate(cells) if cell.verdict == kind]
+            drawn = [
+                np.array([p.split(",") for p in s.get("d", "").strip("MZ").split("L")], np.float64)
+                for s in shapes
+                if s.get("class") == kind
+            ]
+            corners = [np.stack([np.polyval(across, d[:, 0]), np.polyval(up, d[:, 1])]) for d in drawn]
+            for place in wanted:
+                away = [c - place[:, None] for c in corners]
+                if axes == (0, 1):
+                    # from above a camera that looks ahead is a corner of a small shape
+                    assert any(np.abs(a).max(axis=0).min() < 0.01 and 0.02 < np.abs(a).max() < 0.3 for a in away)
+                else:
+                    # who looks at one who looks has its tip in the middle
+                    assert any((a.min(axis=1) < 0.01).all() and (a.max(axis=1) > -0.01).all() for a in away)
+
+
+def test_the_widest_cells_have_cameras_and_the_others_are_counted() -> None:
+    narrow = np.linspace(0.0, 3.0, 1001)
+    rows = azimuths(np.append(narrow, [4.0, 5.0, 6.0]))
+    cells, left_out = cell_cameras({0: around()}, {0: rows}, NAMES)
+    drawn = [cell.row for cell in cells]
+    assert len(drawn) == MOST and left_out == len(rows) - MOST and drawn[-3:] == [1000, 1001, 1002]
+    # of equal cells, some from everywhere
+    assert drawn[0] < 10 and drawn[-4] > 990 and max(np.diff(drawn[:-3])) < 10
+    assert f"{left_out} further cells" in Cameras(cells, left_out, standing({0: around()}), None).html({})
+
+
+def test_cameras_that_stand_still_are_drawn() -> None:
+    one = {"lower": [0.0] * 3, "upper": [0.0] * 3, "verdict": "certified"}
+    turned = {"lower": [-0.1], "upper": [0.1], "verdict": "unknown"}
+    for still, row, names in ((poses(), one, NAMES), (poses({"rotation": {"yaw": 0.1}}), turned, ("yaw",))):
+        cells, left_out = cell_cameras({0: still}, {0: [row]}, names)
+        np.testing.assert_array_equal(cells[0].pose, AHEAD)
+        page = Cameras(cells, left_out, standing({0: still}), None).html({})
+        assert page.count(f'<path class="{row["verdict"]}"') == 2 and "nan" not in page
+    assert Cameras([], 0, standing({0: poses()}), None).html({}) == ""
+
+
+def test_the_scene_behind_cameras_is_the_same_in_every_report() -> None:
+    rng = np.random.default_rng(5)
+    scene = elements(*[(rng.normal(size=3) * 0.3, rng.uniform(size=3), 0.03, 0.9) for _ in range(3000)])
+    outside, sets = Outside(scene), {0: around()}
+    found = []
+    for count in (1, 700):
+        cells, left_out = cell_cameras(sets, {0: azimuths(np.linspace(0.0, 6.0, count + 1))}, NAMES)
+        page = Cameras(cells, left_out, standing(sets), outside).html({})
+        assert page.count("<path") == 2 * len(cells) and len(page) < 310_000
+        found.append(re.findall(r'<image [^>]*href="data:image/png;base64,[^"]*"/>', page))
+    assert found[0] == found[1] and len(found[0]) == 2 and "Gaussians" in page
 
 
 # ---------------------------------------------------------------- films

@@ -10,6 +10,7 @@ import zipfile
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal
 
@@ -28,8 +29,10 @@ from ns_abstract.execution.stopping import StopRequest, interruptible
 from ns_abstract.geometry.box import ParameterBox
 from ns_abstract.io.errors import InputError
 from ns_abstract.io.memory import available_memory
+from ns_abstract.report.cameras import Cameras, cameras_entry, cell_cameras, standing
 from ns_abstract.report.certificate import CertifiedRun, certificate_document, coverage, verdict, write_certificate
 from ns_abstract.report.certificate_page import certificate_page
+from ns_abstract.report.outside import Outside
 from ns_abstract.report.picture import preview, to_bytes
 from ns_abstract.report.record import file_stamp
 from ns_abstract.verify.cells import Grid
@@ -102,6 +105,7 @@ class CertificateRun:
         self.shown: list[dict[str, Any]] = []
         self.seen: dict[tuple[int, int], dict[str, Any]] = {}
         self.rows: dict[int, list[dict[str, Any]]] = {}
+        self.cameras: Cameras | None = None
         #: Content of the last report.json, and its cells by frame.
         self.written: tuple[dict[str, Any], dict[int, list[dict[str, Any]]]] = {}, {}
         #: When no more pictures are rendered for the report.
@@ -348,6 +352,9 @@ class CertificateRun:
         """Content of report.json, and the cells by frame."""
         rows = {tally.frame: store.leaves(tally.frame) for tally in store.tallies()}
         entries = [self._entry(tally, rows[tally.frame]) for tally in store.tallies()]
+        sets = {frame: self.job.job.pose_sets[frame] for frame in rows}
+        cells, left_out = cell_cameras(sets, rows, [name for name, _ in self.job.parameters])
+        self.cameras = Cameras(cells, left_out, self._standing, self._outside)
         document = certificate_document(
             self.about,
             entries,
@@ -359,8 +366,19 @@ class CertificateRun:
             cells_seal={"rows": store.seal.rows, "sum": store.seal.text},
             substitution=substitution or substitution_entry([], "made when the search ends without being interrupted"),
             scene_margin=self.scene_margin,
+            cameras=cameras_entry(cells, left_out),
         )
         return document, rows
+
+    @cached_property
+    def _standing(self) -> tuple[np.ndarray, np.ndarray]:
+        """Where cameras may stand; the same for every report, so that the scene is drawn once."""
+        return standing({frame: self.job.job.pose_sets[frame] for frame in self.grids})
+
+    @cached_property
+    def _outside(self) -> Outside | None:
+        elements = self.job.job.method.elements()
+        return None if elements is None else Outside(elements)
 
     def report(
         self, store: Store, state: str, substitution: Mapping[str, Any] | None = None, *, pictures: bool = True
@@ -386,7 +404,7 @@ class CertificateRun:
 
     def _write(self) -> None:
         document, rows = self.written
-        write_certificate(self.folder, document, certificate_page(document, rows, self.shown, self.seen))
+        write_certificate(self.folder, document, certificate_page(document, rows, self.shown, self.seen, self.cameras))
 
     def _entry(self, tally: Any, rows: list[dict[str, Any]]) -> dict[str, Any]:
         shares = fractions(tally)

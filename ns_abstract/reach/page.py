@@ -15,7 +15,7 @@ from ns_abstract.reach.search import QUESTIONS
 from ns_abstract.report.certificate_page import percent
 from ns_abstract.report.figures import interval, number
 from ns_abstract.report.margins import scene_margin
-from ns_abstract.report.outside import Outside
+from ns_abstract.report.outside import PICTURE_WIDTH, Outside, behind, draw_plane, plane_axes
 from ns_abstract.report.page import Axis, draw_legend, draw_line, draw_plot, reproduce, uri, whole_page
 
 _STYLE = """
@@ -35,8 +35,6 @@ svg text.kept, svg text.step, svg text.none, svg text.run { stroke: none; }
 svg text.kept { fill: var(--good); } svg text.step { fill: #b06000; } svg text.none { fill: var(--bad); }
 """
 _SIZE = 560, 320
-#: Width of the plots with the scene, and room beside their windows: left, right, above, below.
-_SCENE_WIDTH, _ROOM = 820, (52, 12, 20, 34)
 _FILM_NAMES = {"lower": "lower", "upper": "upper", "gap": "gap", "image": "render"}
 _TITLES = {
     "reaches": ("good", "Every run stays safe and reaches the goal"),
@@ -110,10 +108,8 @@ def _pictures(
         if last is None
         else f" Cells by the verdict on “{QUESTIONS[last]}”: green certified, red falsified, grey undecided."
     )
-    left, right, above, below = _ROOM
     found = [
-        _seen(view, document, loop, outside, asked)
-        for view in views(document, cells, loop, outside, _SCENE_WIDTH - left - right)
+        _seen(view, document, loop, outside, asked) for view in views(document, cells, loop, outside, PICTURE_WIDTH)
     ]
     if found or len(loop.names) < 2:
         return found
@@ -122,8 +118,8 @@ def _pictures(
     if ends is None:
         return []
     width, height = _SIZE
-    x = Axis(ends[0][0], ends[1][0], left, width - right, log=False)
-    y = Axis(ends[0][1], ends[1][1], height - below, above, log=False)
+    x = Axis(ends[0][0], ends[1][0], 52, width - 12, log=False)
+    y = Axis(ends[0][1], ends[1][1], height - 34, 20, log=False)
     one, two = (escape(f"{name} {unit}".strip()) for name, unit in list(zip(loop.names, loop.units, strict=True))[:2])
     title = "Seen by its first two states"
     plot = draw_plot(x, y, (one, two), _drawn(marks, x, y), size=_SIZE, title=title)
@@ -143,20 +139,8 @@ def _drawn(marks: Marks, x: Axis, y: Axis) -> str:
 
 
 def _seen(view: View, document: Mapping[str, Any], loop: Loop, outside: Outside | None, asked: str) -> str:
-    window, (left, right, above, below) = view.window, _ROOM
-    size = window.size[0] + left + right, window.size[1] + above + below
-    x = Axis(window.low[0], window.high[0], left, size[0] - right, log=False)
-    y = Axis(window.low[1], window.high[1], size[1] - below, above, log=False)
-    marks = scene = ""
-    if outside is None:
-        scene = "The scene has no elements with a place of their own (a NeRF's field has none): tubes alone."
-    else:
-        scene = "Behind them the opaque Gaussians of the scene, as ellipses of one standard deviation"
-        scene += ", without those above the cameras." if np.isfinite(view.nearest) else "."
-        marks += (
-            f'<image x="{left}" y="{above}" width="{window.size[0]}" height="{window.size[1]}" '
-            f'preserveAspectRatio="none" href="{uri(outside.picture(window, view.nearest))}"/>'
-        )
+    window, marks = view.window, ""
+    x, y = plane_axes(window)
     sets = [("unsafe", faces, -1.0) for faces in loop.unsafe]
     sets += [] if loop.goal is None else [("goal", loop.goal.faces, 1.0)]
     shown = set()
@@ -168,9 +152,9 @@ def _seen(view: View, document: Mapping[str, Any], loop: Loop, outside: Outside 
             marks += f'<polygon class="{kind}" points="{points}"/>'
     dashed = {"unsafe": "red, dashed: unsafe sets", "goal": "green, dashed: the goal"}
     extra = "".join(f"; {text}" for kind, text in dashed.items() if kind in shown)
-    one, two = (f"{'xyz'[axis]} units" for axis in view.axes)
     title = f"Seen {view.title}"
-    plot = draw_plot(x, y, (one, two), marks + _drawn(view.marks, x, y), size=size, title=title)
+    plot = draw_plane(outside, window, view.nearest, marks + _drawn(view.marks, x, y), title)
+    scene = behind(outside, view.nearest, "tubes alone")
     return (
         f"<h2>{title}</h2><p>Where the camera is, in the run's normalised frame. {_MARKS_TEXT} boxes of all positions "
         f"at a step, for a few certified cells{extra}.{asked} {scene}</p>{plot}"

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ns_abstract.reach.loop import Face, Loop
-from ns_abstract.report.outside import Outside, Window, framed
+from ns_abstract.report.outside import ABOVE, Outside, Window, about, sideways
 
 Float64 = NDArray[np.float64]
 
@@ -160,24 +160,18 @@ def views(
     matrix, offset = loop.camera.place
     if not matrix.any():
         return []
-    whole = plane_marks(document, rows, loop, matrix[:2], offset[:2], (0, 1)).ends
+    whole = plane_marks(document, rows, loop, matrix[:2], offset[:2], ABOVE).ends
     if whole is None:
         return []
-    # along the longer horizontal side of what is there
-    side = (0, 2) if whole[1][0] - whole[0][0] >= whole[1][1] - whole[0][1] else (1, 2)
     found = []
-    for axes, title in (((0, 1), "from above"), (side, "from the side")):
+    for axes, title in ((ABOVE, "from above"), (sideways(*whole), "from the side")):
         marks = plane_marks(document, rows, loop, matrix[list(axes)], offset[list(axes)], axes)
         ends, nearest = marks.ends, np.inf
         assert ends is not None
-        if axes == (0, 1):
+        if axes == ABOVE:
             # a ceiling would hide everything
             up = plane_marks(document, rows, loop, matrix[[0, 2]], offset[[0, 2]], (0, 2)).ends
             assert up is not None
             nearest = float(up[1][1])
-        if outside is None:
-            window = framed(axes, *ends, width)
-        else:
-            window = outside.window(axes, *ends, nearest, width)
-        found.append(View(title, axes, nearest, marks, window))
+        found.append(View(title, axes, nearest, marks, about(outside, axes, *ends, nearest, width)))
     return found

@@ -36,6 +36,8 @@ METRICS = {
     "about its middle that each way certifies, on a ladder of steps by the given factor; says how much the shared "
     "parameters are worth, and is no part of the certificate",
     "scene_margin": SCENE_MARGIN,
+    "cameras": "where the camera of a cell's middle pose stands and where it looks, a unit vector, in the normalised "
+    "frame, for the cells that are the largest parts of their sets; left_out: number of the others",
     "cells_seal": "rows of cells that have a verdict, and the sum of their SHA-256: --resume refuses other rows",
     "PCP-S": "parts of the fixed partition where the property holds at every sample, or is proved",
     "undecided": "parts of the fixed partition with a sample that neither holds nor breaks the property: its margin is "
@@ -112,6 +114,7 @@ def certificate_document(
     cells_seal: Mapping[str, Any],
     substitution: Mapping[str, Any],
     scene_margin: Mapping[str, Any],
+    cameras: Mapping[str, Any] | None = None,
 ) -> dict[str, Any]:
     """Content of report.json.
 
@@ -127,6 +130,7 @@ def certificate_document(
         cells_seal: Number of rows of ``cells`` with a verdict, and the sum of their hashes.
         substitution: A few certified cells bounded in weaker ways, too.
         scene_margin: Largest variations of the scene for which what is certified holds.
+        cameras: Where cameras of cells stand; None: of none.
     """
     covered = coverage(frames)
     poses = sum(entry["sampled"]["poses"] for entry in frames)
@@ -165,6 +169,7 @@ def certificate_document(
             "cells_seal": cells_seal,
             "substitution": substitution,
             "scene_margin": scene_margin,
+            "cameras": cameras or {"cells": [], "left_out": 0},
             "plan": run.plan,
             "limits": run.limits,
             "state": state,

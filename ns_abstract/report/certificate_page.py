@@ -8,6 +8,7 @@ from collections.abc import Mapping, Sequence
 from html import escape
 from typing import Any
 
+from ns_abstract.report.cameras import Cameras
 from ns_abstract.report.figures import interval, number
 from ns_abstract.report.margins import scene_margin
 from ns_abstract.report.page import Axis, counted, draw_line, draw_plot, reproduce, script, uri, whole_page
@@ -22,6 +23,8 @@ svg path.c-unknown { stroke: #9aa0a6; }
 .key i { display: inline-block; width: .8em; height: .8em; margin: 0 .35em 0 1em; border-radius: 2px; }
 .certified-back { background: var(--good); } .falsified-back { background: var(--bad); }
 .unknown-back { background: #9aa0a6; } .certified-ink { color: var(--good); } .falsified-ink { color: var(--bad); }
+svg .frusta path { fill-opacity: .45; stroke-width: 1; } svg .frusta .certified { stroke: var(--good); }
+svg .frusta .falsified { stroke: var(--bad); } svg .frusta .unknown { stroke: #5f6368; }
 svg [data-cell] { cursor: pointer; } svg [data-cell].chosen { stroke: var(--ink); stroke-width: 2.5; }
 #cell { background: var(--card); border: 1px solid var(--line); border-radius: 6px; padding: .8rem 1.2rem;
   flex: 1 1 20rem; }
@@ -54,6 +57,7 @@ def certificate_page(
     cells: Mapping[int, Sequence[Mapping[str, Any]]],
     pictures: Sequence[Mapping[str, Any]],
     seen: Mapping[tuple[int, int], Mapping[str, Any]] | None = None,
+    cameras: Cameras | None = None,
 ) -> str:
     """The page of a certificate.
 
@@ -62,6 +66,7 @@ def certificate_page(
         cells: By frame, rows lower, upper, verdict in the order of ``document``'s parameters.
         pictures: ``title``, ``text`` and ``png`` of images to show, in order.
         seen: ``text`` and ``png`` of a pose in a cell, by frame and position of the cell in it.
+        cameras: Where cameras stand.
 
     Returns:
         HTML, self-contained; every text of the document is escaped.
@@ -72,6 +77,7 @@ def certificate_page(
         _verdict(document, name),
         _map(document, cells, numbers),
         _cell_data(document, cells, numbers, seen or {}) if numbers else "",
+        "" if cameras is None else cameras.html(numbers),
         _pictures(pictures),
         _counterexamples(document),
         _time(document),

@@ -1,4 +1,4 @@
-"""A scene as it is seen from outside: its elements from above and from the side, as one small picture."""
+"""A scene as it is seen from outside: its elements from above and from the side, as one small picture, and plots."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ns_abstract.refine.protocol import Elements
+from ns_abstract.report.page import Axis, draw_plot, uri
 from ns_abstract.report.picture import png
 
 Float64 = NDArray[np.float64]
@@ -30,6 +31,11 @@ _SHARE, _ENOUGH, _WIDER = 0.1, 10, 2.5
 _HUGE = 1.0
 #: Windows and pictures that are remembered.
 _KEPT = 4
+#: Room beside the window of a plot: left, right, above, below; and the window's width.
+_ROOM = 52, 12, 20, 34
+PICTURE_WIDTH = 820 - _ROOM[0] - _ROOM[1]
+#: The world's axes to the right and up, seen from above.
+ABOVE = (0, 1)
 
 
 @dataclass(frozen=True)
@@ -162,6 +168,56 @@ def framed(axes: tuple[int, int], low: Float64, high: Float64, width: int) -> Wi
     middle, half = 0.5 * (low + high), 0.5 * np.array([across, up])
     low, high = (middle - half).tolist(), (middle + half).tolist()
     return Window(axes, (low[0], low[1]), (high[0], high[1]), (width, max(1, round(width * shape))))
+
+
+def sideways(low: Float64, high: Float64) -> tuple[int, int]:
+    """The axes to the right and up from the side: along the longer horizontal side of a box, [2] at least."""
+    return (0, 2) if high[0] - low[0] >= high[1] - low[1] else (1, 2)
+
+
+def about(
+    outside: Outside | None, axes: tuple[int, int], low: Float64, high: Float64, nearest: float, width: int
+) -> Window:
+    """`Outside.window`; `framed` where there is nothing to draw of the scene."""
+    return framed(axes, low, high, width) if outside is None else outside.window(axes, low, high, nearest, width)
+
+
+def plane_axes(window: Window) -> tuple[Axis, Axis]:
+    """From the plane's coordinates to those of `draw_plane`."""
+    (left, _, above, _), (width, height) = _ROOM, window.size
+    return (
+        Axis(window.low[0], window.high[0], left, left + width, log=False),
+        Axis(window.low[1], window.high[1], above + height, above, log=False),
+    )
+
+
+def draw_plane(outside: Outside | None, window: Window, nearest: float, marks: str, title: str) -> str:
+    """SVG of a window: the scene, if it has elements, and ``marks`` over it.
+
+    Args:
+        outside: Draws the scene.
+        window: What is shown.
+        nearest: As `Outside.picture` has it.
+        marks: SVG, in the coordinates of `plane_axes`.
+        title: Of the plot.
+    """
+    (left, right, above, below), (width, height) = _ROOM, window.size
+    if outside is not None:
+        marks = (
+            f'<image x="{left}" y="{above}" width="{width}" height="{height}" preserveAspectRatio="none" '
+            f'href="{uri(outside.picture(window, nearest))}"/>{marks}'
+        )
+    labels = f"{'xyz'[window.axes[0]]} units", f"{'xyz'[window.axes[1]]} units"
+    size = width + left + right, height + above + below
+    return draw_plot(*plane_axes(window), labels, marks, size=size, title=title)
+
+
+def behind(outside: Outside | None, nearest: float, alone: str) -> str:
+    """What a plot shows of the scene, in words; ``alone``: what it shows where there is none."""
+    if outside is None:
+        return f"The scene has no elements with a place of their own (a NeRF's field has none): {alone}."
+    text = "Behind them the opaque Gaussians of the scene, as ellipses of one standard deviation"
+    return text + (", without those above the cameras." if np.isfinite(nearest) else ".")
 
 
 def _ellipses(size: tuple[int, int], corners: Float64, fill: NDArray[np.uint8]) -> bytes:

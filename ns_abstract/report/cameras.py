@@ -1,0 +1,205 @@
+"""Where the cameras of a certificate stand: frusta over the scene, from above and from the side."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ns_abstract.geometry.camera_path import Camera
+from ns_abstract.geometry.poses import PoseSet
+from ns_abstract.report.figures import number
+from ns_abstract.report.outside import ABOVE, PICTURE_WIDTH, Outside, about, behind, draw_plane, plane_axes, sideways
+from ns_abstract.report.page import counted
+
+Float64 = NDArray[np.float64]
+
+#: Cells drawn at most, and the verdicts in the order in which they are drawn.
+MOST = 400
+_ORDER = ("certified", "unknown", "falsified")
+#: Poses of all sets that are looked at for where cameras may stand, and by parameter at most.
+_POSES, _STEPS = 2000, 17
+#: Least side of what is shown, normalised units; a frustum's length as part of what is shown, and of the window.
+_LEAST, _LENGTH, _OF_WINDOW = 0.1, 0.1, 0.035
+#: Spreads the drawn ones of many equally wide cells.
+_GOLDEN = 0.6180339887498949
+
+
+@dataclass(frozen=True)
+class CellCamera:
+    """The camera at the middle of a cell.
+
+    Attributes:
+        frame: Number of the cell's set.
+        row: Position of the cell in its frame.
+        verdict: Of the cell.
+        pose: [3, 4] camera-to-world, normalised frame.
+        rays: [4, 3] unit vectors through the picture's corners, in order around it, world axes.
+    """
+
+    frame: int
+    row: int
+    verdict: str
+    pose: Float64
+    rays: Float64
+
+
+def corner_rays(camera: Camera, pose: Float64) -> Float64:
+    """[4, 3] unit vectors through the corners of the picture, in order around it, for a pose [3, 4]."""
+    left, right = ((x - camera.cx) / camera.fx for x in (0.0, float(camera.width)))
+    top, bottom = ((camera.cy - y) / camera.fy for y in (0.0, float(camera.height)))
+    rays = np.array([(left, top, -1.0), (right, top, -1.0), (right, bottom, -1.0), (left, bottom, -1.0)])
+    rays = rays @ pose[:, :3].T
+    return rays / np.linalg.norm(rays, axis=1, keepdims=True)
+
+
+def cell_cameras(
+    pose_sets: Mapping[int, PoseSet], rows: Mapping[int, Sequence[Mapping[str, Any]]], names: Sequence[str]
+) -> tuple[list[CellCamera], int]:
+    """Cameras at the middles of cells, the widest cells first.
+
+    Args:
+        pose_sets: By frame.
+        rows: By frame, cells: lower, upper, verdict.
+        names: Of all parameters, in the order of the cells' ends.
+
+    Returns:
+        At most `MOST` cameras, and the number of cells that are left out.
+    """
+    keys = [(frame, k) for frame, found in rows.items() for k in range(len(found))]
+    width = np.concatenate([np.ones(0), *(_shares(pose_sets[f].box, found, names) for f, found in rows.items())])
+    # by parts of their sets; of equal ones some from everywhere
+    order = np.lexsort(((_GOLDEN * np.arange(len(keys))) % 1.0, -width.round(12)))
+    found = []
+    for frame, k in sorted(keys[n] for n in order[:MOST]):
+        row, poses = rows[frame][k], pose_sets[frame]
+        middle = {n: 0.5 * (a + b) for n, a, b in zip(names, row["lower"], row["upper"], strict=True)}
+        pose = poses.pose(np.array([middle[name] for name in poses.box.names]))
+        found.append(CellCamera(frame, k, row["verdict"], pose, corner_rays(poses.camera, pose)))
+    return found, len(keys) - len(found)
+
+
+def _shares(box: Any, rows: Sequence[Mapping[str, Any]], names: Sequence[str]) -> Float64:
+    """[n] parts of the set that cells are."""
+    sides = np.ones((len(rows), 0))
+    if rows and box.names:
+        columns = [list(names).index(name) for name in box.names]
+        ends = [np.array([row[key] for row in rows], np.float64)[:, columns] for key in ("lower", "upper")]
+        sides = (ends[1] - ends[0]) / (np.array(box.upper) - np.array(box.lower))
+    return sides.prod(axis=1)
+
+
+def standing(pose_sets: Mapping[int, PoseSet]) -> tuple[Float64, Float64]:
+    """[3], [3] ends of a box around where cameras of the sets stand: of poses that vary one parameter each."""
+    axes = sum(poses.box.dimensions for poses in pose_sets.values())
+    steps = min(_STEPS, max(2, _POSES // max(1, axes)))
+    places = []
+    for poses in pose_sets.values():
+        middle = np.asarray(poses.box.middle, np.float64)
+        values = [middle]
+        for axis, ends in enumerate(zip(poses.box.lower, poses.box.upper, strict=True)):
+            for value in np.linspace(*ends, steps):
+                values.append(middle.copy())
+                values[-1][axis] = value
+        places += [poses.pose(v)[:, 3] for v in values]
+    return np.min(places, axis=0), np.max(places, axis=0)
+
+
+def cameras_entry(cameras: Sequence[CellCamera], left_out: int) -> dict[str, Any]:
+    """The key ``cameras`` of report.json."""
+
+    def rounded(values: Float64) -> list[float]:
+        return [float(f"{v:.6g}") for v in values]
+
+    cells = [
+        {
+            "frame": camera.frame,
+            "verdict": camera.verdict,
+            "position": rounded(camera.pose[:, 3]),
+            "direction": rounded(-camera.pose[:, 2] / np.linalg.norm(camera.pose[:, 2])),
+        }
+        for camera in cameras
+    ]
+    return {"cells": cells, "left_out": left_out}
+
+
+@dataclass(frozen=True)
+class Cameras:
+    """What the page shows of the cameras.
+
+    Attributes:
+        cells: Cameras of cells.
+        left_out: Cells without one here.
+        ends: [3], [3] ends of a box about where cameras stand, normalised units.
+        outside: Draws the scene behind them; None: it has no elements with a place of their own.
+    """
+
+    cells: Sequence[CellCamera]
+    left_out: int
+    ends: tuple[Float64, Float64]
+    outside: Outside | None
+
+    def html(self, numbers: Mapping[tuple[int, int], int]) -> str:
+        """The page's part; cells with numbers, by frame and position, can be chosen."""
+        if not self.cells:
+            return ""
+        low, high = self.ends
+        span = float((high - low).max())
+        room = _LENGTH * max(span, _LEAST)
+        around = room + 0.5 * max(0.0, _LEAST - span)
+        figures = []
+        for axes, title, nearest in (
+            # a ceiling would hide everything
+            (ABOVE, "from above", float(high[2])),
+            (sideways(low, high), "from the side", np.inf),
+        ):
+            chosen = list(axes)
+            window = about(self.outside, axes, low[chosen] - around, high[chosen] + around, nearest, PICTURE_WIDTH)
+            length = min(room, _OF_WINDOW * (window.high[0] - window.low[0]))
+            x, y = plane_axes(window)
+            shapes = []
+            for camera in sorted(self.cells, key=lambda cell: _ORDER.index(cell.verdict)):
+                place = camera.pose[:, 3]
+                points = np.concatenate([place[None], place + length * camera.rays])[:, chosen]
+                corners = "L".join(f"{a:.1f},{b:.1f}" for a, b in _hull([(x(a), y(b)) for a, b in points.tolist()]))
+                cell = numbers.get((camera.frame, camera.row))
+                data = "" if cell is None else f' data-cell="{cell}"'
+                shapes.append(f'<path class="{camera.verdict}"{data} d="M{corners}Z"/>')
+            marks = f'<g class="frusta">{"".join(shapes)}</g>'
+            plot = draw_plane(self.outside, window, nearest, marks, f"Cameras seen {title}")
+            scene = behind(self.outside, nearest, "cameras alone")
+            figures.append(f"<figure>{plot}<figcaption><b>{title}</b> {scene}</figcaption></figure>")
+        left = f" {counted(self.left_out, 'further cell')}, none of them wider, not shown." if self.left_out else ""
+        where = " · ".join(
+            f"{name} {number(a, 4)}" if a == b else f"{name} {number(a, 4)} to {number(b, 4)}"
+            for name, a, b in zip("xyz", low.tolist(), high.tolist(), strict=True)
+        )
+        return (
+            "<h2>Where the cameras stand</h2><p>One frustum for the middle pose of a cell, in the colour of the cell's "
+            f"verdict, in the run's normalised frame ({where}); its tip is the camera's position, it opens as the "
+            f"picture does, its length means nothing. Where frusta overlap, red is over grey, grey over green."
+            f"{left}</p>{''.join(figures)}"
+        )
+
+
+def _hull(points: Sequence[tuple[float, float]]) -> list[tuple[float, float]]:
+    """Corners of the convex hull (Andrew's chain)."""
+    rising = sorted(set(points))
+    if len(rising) < 3:
+        return rising
+
+    def half(along: Sequence[tuple[float, float]]) -> list[tuple[float, float]]:
+        kept: list[tuple[float, float]] = []
+        for c in along:
+            while len(kept) > 1:
+                a, b = kept[-2:]
+                if (b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0]) > 0.0:
+                    break
+                kept.pop()
+            kept.append(c)
+        return kept[:-1]
+
+    return half(rising) + half(rising[::-1])
