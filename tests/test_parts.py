@@ -261,7 +261,7 @@ class Machines:
 
 
 def options(blobs: Inputs, folder: Path, **more: Any) -> Render:
-    return Render(blobs.config, blobs.path, folder, blobs.spec, **more)
+    return Render(blobs.config, blobs.path, folder, perturbation_filename=blobs.spec, **more)
 
 
 def test_frames_are_divided_where_threads_are_many(blobs: Inputs) -> None:
