@@ -13,7 +13,6 @@ from numba import njit
 
 from ns_abstract.arithmetic.rounding import Charges
 from ns_abstract.arithmetic.simd.intrinsics import borrowed, pointer, taken
-from ns_abstract.execution.threads import side_by_side
 from ns_abstract.geometry.camera_path import Intrinsics
 from ns_abstract.methods.splat.blend import shade, swap_bounds
 from ns_abstract.methods.splat.block import Place, block_of, longest_list, new_buffers, resized
@@ -21,6 +20,7 @@ from ns_abstract.methods.splat.constants import RasterRules
 from ns_abstract.methods.splat.depths import ACCUMULATION_HIGH, ACCUMULATION_LOW, DEPTH_HIGH, DEPTH_LOW, shade_layers
 from ns_abstract.methods.splat.fragments import GIVE_UP, GROW, apply_stops, collect_fragments, number_groups
 from ns_abstract.methods.splat.lists import BLOCK, PIXELS, TileLists, block_lists, longest_first
+from ns_abstract.methods.splat.sharing import by_tiles
 from ns_abstract.methods.splat.stage_data import (
     Colors,
     Cutoffs,
@@ -112,11 +112,9 @@ def _tile_bounds(bounds, number, thread):
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def _pixel_worker(
-    thread, sequence_, counter_, lists, gaussians, axes, intrinsics, colors, rules, charges, cutoffs, shape, bounds
-):
-    """One thread's tiles: the next of ``sequence_`` that none has taken yet; see `pixel_stage`."""
-    sequence, counter = borrowed(sequence_), pointer(counter_)
+def _pixel_worker(share, lists, gaussians, axes, intrinsics, colors, rules, charges, cutoffs, shape, bounds):
+    """One thread's tiles; see `Share` and `pixel_stage`."""
+    sequence, counter = borrowed(share.sequence), pointer(share.counter)
     inputs = _borrowed_inputs(gaussians, axes, intrinsics, colors, rules, charges, cutoffs, shape)
     camera, m = inputs.intrinsics, inputs.shape.monomials
     side = bounds.lower.shape[1]
@@ -135,7 +133,7 @@ def _pixel_worker(
         tile = lists.wanted[number]
         tile_x = tile % tiles_x
         tile_y = tile // tiles_x
-        of_tile = _tile_bounds(bounds, number, thread)
+        of_tile = _tile_bounds(bounds, number, share.thread)
         block_entries = block_lists(
             lists.entries[lists.offsets[tile] : lists.offsets[tile + 1]], inputs.gaussians.box, tile_x * side,
             tile_y * side, side, block_offsets, block_entries,
@@ -173,9 +171,7 @@ def pixel_stage(
         shape: Of the Gaussians' forms.
         bounds: The output; one row of its statistics for each thread.
     """
-    sequence = longest_first(lists.wanted, lists.offsets)
-    counter = np.zeros(1, np.int64)
-    inputs = gaussians, axes, intrinsics, colors, rules, charges, cutoffs, shape
-    side_by_side(
-        lambda thread: _pixel_worker(thread, sequence, counter, lists, *inputs, bounds), bounds.statistics.shape[0]
-    )
+    by_tiles(
+        _pixel_worker, longest_first(lists.wanted, lists.offsets), bounds.statistics.shape[0],
+        lists, gaussians, axes, intrinsics, colors, rules, charges, cutoffs, shape, bounds,
+    )  # fmt: skip

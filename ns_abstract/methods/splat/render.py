@@ -15,7 +15,7 @@ from numba import njit
 from ns_abstract.arithmetic.elementary import exp_kernel
 from ns_abstract.arithmetic.rounding import REGION
 from ns_abstract.arithmetic.simd.intrinsics import borrowed, pointer, taken
-from ns_abstract.execution.threads import side_by_side, threads
+from ns_abstract.execution.threads import threads
 from ns_abstract.geometry.camera_path import Camera
 from ns_abstract.geometry.tiles import assemble, tile_grid
 from ns_abstract.methods.splat.activate import Splats
@@ -32,7 +32,7 @@ from ns_abstract.methods.splat.lists import (
     tile_mask,
     touching,
 )
-from ns_abstract.methods.splat.sharing import CHUNK, chunked
+from ns_abstract.methods.splat.sharing import CHUNK, by_tiles, chunked
 
 _EXPONENT_LIMIT = 60.0
 
@@ -288,12 +288,11 @@ def _blend_block(numbers, x0, y0, record, box, rules, state):
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def _rasterise_worker(sequence_, counter_, lists, record_, box_, camera, rules, background, image_):
-    """Blend one thread's tiles of ``lists.wanted``: the next of ``sequence_`` that none has taken yet.
+def _rasterise_worker(share, lists, record_, box_, camera, rules, background, image_):
+    """Blend one thread's tiles of ``lists.wanted``.
 
     Args:
-        sequence_: [t] numbers of tiles, those with most to do first.
-        counter_: [1] int64, how many are taken.
+        share: `Share`.
         lists: `TileLists`.
         record_, box_: Of `_Projected`.
         camera: `Intrinsics`.
@@ -301,7 +300,7 @@ def _rasterise_worker(sequence_, counter_, lists, record_, box_, camera, rules, 
         background: [3].
         image_: [t, side, side, 3] output, in [0, 1].
     """
-    sequence, counter = borrowed(sequence_), pointer(counter_)
+    sequence, counter = borrowed(share.sequence), pointer(share.counter)
     record, box, image = borrowed(record_), borrowed(box_), borrowed(image_)
     tile = image.shape[1]
     tiles_x = int(math.ceil(camera.width / tile))
@@ -413,9 +412,10 @@ class Renderer:
     def _blend(self, camera: Camera, lists: TileLists, record: np.ndarray, background: np.ndarray) -> np.ndarray:
         image = np.zeros((lists.wanted.size, self.side, self.side, 3))
         box = self._projected.box
-        sequence, counter = longest_first(lists.wanted, lists.offsets), np.zeros(1, np.int64)
-        inputs = lists, record, box, camera.intrinsics, self.rules, background
-        side_by_side(lambda _: _rasterise_worker(sequence, counter, *inputs, image), threads())
+        by_tiles(
+            _rasterise_worker, longest_first(lists.wanted, lists.offsets), threads(),
+            lists, record, box, camera.intrinsics, self.rules, background, image,
+        )  # fmt: skip
         return image
 
     def image(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import NamedTuple
 
 import numpy as np
 
@@ -10,6 +11,26 @@ from ns_abstract.execution.threads import side_by_side, threads
 
 #: Gaussians that are taken at once.
 CHUNK = 1024
+
+
+class Share(NamedTuple):
+    """One thread's part of a picture.
+
+    Attributes:
+        thread: Its number.
+        sequence: [t] numbers of all tiles, those with most to do first.
+        counter: [1] int64, how many are taken.
+    """
+
+    thread: int
+    sequence: np.ndarray
+    counter: np.ndarray
+
+
+def by_tiles(kernel: Callable[..., object], sequence: np.ndarray, count: int, *arguments: object) -> None:
+    """Run ``kernel(share, *arguments)`` in ``count`` threads; each takes the next tile of ``sequence``."""
+    counter = np.zeros(1, np.int64)
+    side_by_side(lambda thread: kernel(Share(thread, sequence, counter), *arguments), count)
 
 
 def chunked(kernel: Callable[..., object], count: int, *arguments: object) -> None:
