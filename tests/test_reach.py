@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import replace
 from fractions import Fraction
 from pathlib import Path
@@ -13,9 +13,9 @@ import mpmath
 import numpy as np
 import pytest
 from onnx_files import OnnxFile
+from waves import Waves
 
 from ns_abstract.demo.approach import write_network
-from ns_abstract.geometry.box import ParameterBox
 from ns_abstract.geometry.poses import SCENE_TURNS
 from ns_abstract.io.errors import InputError
 from ns_abstract.reach.dynamics import Dynamics, Floats, affine, double_integrator, fixed_wing, quadrotor, unicycle
@@ -187,26 +187,12 @@ def test_a_clip_is_enclosed() -> None:
 # ---------------------------------------------------------------- loops without a renderer
 
 
-class Wall:
-    """Pictures that fade with the pose: ``0.5 + 0.3 a . sin(v)``, bounded by Taylor's formula."""
+class Wall(Waves):
+    """Pictures of a loop's poses."""
 
     def __init__(self, loop: Loop) -> None:
         self.pose_set = loop.camera.poses((SIDE, SIDE))
-        self.slopes = np.random.default_rng(0).normal(size=(SIDE, SIDE, 3, len(loop.camera.names))) * 0.2
-
-    def members(self, seed: int) -> Iterator[Any]:
-        return iter(())
-
-    def image(self, values: np.ndarray, member: Any = None) -> np.ndarray:
-        return (0.5 + 0.3 * self.slopes @ np.sin(values)).astype(np.float32)
-
-    def sets(self, box: ParameterBox) -> tuple[tuple[np.ndarray, ...], np.ndarray, np.ndarray, np.ndarray]:
-        middle, half = box.middle, 0.5 * (np.array(box.upper) - np.array(box.lower))
-        a = 0.3 * self.slopes * (np.cos(middle) * half)
-        b = 0.5 + 0.3 * self.slopes @ np.sin(middle)
-        room = 0.3 * np.abs(self.slopes) @ (0.5 * half**2) * 1.0001 + 1e-6
-        spread = np.abs(a).sum(axis=-1) + room
-        return (a, b - room, a, b + room), b - spread, b + spread, np.abs(a).mean(axis=(0, 1, 2))
+        super().__init__((SIDE, SIDE), len(loop.camera.names))
 
 
 def specification(kind: str, gain: float = -2.0) -> dict[str, Any]:

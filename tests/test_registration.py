@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import torch
 from onnx_files import OnnxFile
+from waves import Waves
 
 from ns_abstract.geometry.box import ParameterBox
 from ns_abstract.verify.model import NetworkModel
@@ -21,8 +22,8 @@ from ns_abstract.verify.registration import RegisteredModel, RegisteredScene
 SIDE = 2
 
 
-class Wall:
-    """Pictures ``0.5 + 0.3 a . sin(v)`` of d parameters and three of the scene's place, bounded by Taylor's formula."""
+class Wall(Waves):
+    """Pictures of d parameters and three of the scene's place."""
 
     def __init__(self, d: int, radius: float) -> None:
         self.box = ParameterBox(
@@ -31,27 +32,13 @@ class Wall:
             (0.1,) * d + (-radius,) * 3,
             (0.2,) * d + (radius,) * 3,
         )
-        self.slopes = 0.2 * np.random.default_rng(0).normal(size=(SIDE, SIDE, 3, d + 3))
-
-    def image(self, values: np.ndarray, member: Any = None) -> np.ndarray:
-        return (0.5 + 0.3 * self.slopes @ np.sin(values)).astype(np.float32)
+        super().__init__((SIDE, SIDE), d + 3)
 
     def render(self, values: np.ndarray, tiles: Any = None) -> np.ndarray:
         return self.image(values)
 
-    def sets(self, box: ParameterBox) -> tuple[tuple[np.ndarray, ...], np.ndarray, np.ndarray, np.ndarray]:
-        middle, half = box.middle, 0.5 * (np.array(box.upper) - np.array(box.lower))
-        a = 0.3 * self.slopes * (np.cos(middle) * half)
-        b = 0.5 + 0.3 * self.slopes @ np.sin(middle)
-        room = 0.3 * np.abs(self.slopes) @ (0.5 * half**2) * 1.0001 + 1e-6
-        spread = np.abs(a).sum(axis=-1) + room
-        return (a, b - room, a, b + room), b - spread, b + spread, np.abs(a).mean(axis=(0, 1, 2))
-
     def differentiable(self, values: torch.Tensor) -> torch.Tensor:
         return 0.5 + 0.3 * torch.from_numpy(self.slopes) @ torch.sin(values)
-
-    def members(self, seed: int) -> Any:
-        return iter(())
 
 
 @pytest.mark.parametrize("d", [0, 1, 2])
