@@ -32,6 +32,7 @@ REPORT = Path(__file__).with_suffix(".md")
 _TIMEOUT_S = 600.0
 # pytest's exit codes
 _PASSED, _FAILED = 0, 1
+_LATE = -1
 
 
 @dataclass
@@ -77,9 +78,12 @@ def run_test(folder: Path, test: str, compiled: bool) -> tuple[int, str, float]:
             "--hypothesis-seed=1", f"tests/{test}",
         ]  # fmt: skip
         start = time.perf_counter()
-        done = subprocess.run(
-            command, cwd=folder, env=environment, capture_output=True, text=True, timeout=_TIMEOUT_S, check=False
-        )
+        try:
+            done = subprocess.run(
+                command, cwd=folder, env=environment, capture_output=True, text=True, timeout=_TIMEOUT_S, check=False
+            )
+        except subprocess.TimeoutExpired:
+            return _LATE, "", _TIMEOUT_S
         return done.returncode, done.stdout + done.stderr, time.perf_counter() - start
 
 
@@ -144,7 +148,7 @@ def main() -> int:
                 (folder / "ns_abstract" / mutant.file).write_text(original)
                 # an assertion that fails, not a crash
                 asserted = code == _FAILED and ("AssertionError" in output or "DID NOT RAISE" in output)
-                verdicts = {_PASSED: "survived", _FAILED: "killed" if asserted else "crashed"}
+                verdicts = {_PASSED: "survived", _FAILED: "killed" if asserted else "crashed", _LATE: "timed out"}
                 verdict = verdicts.get(code, f"pytest {code}")
             outcomes.append(Outcome(mutant, verdict, seconds))
             print(f"{verdict:10s} {seconds:6.1f} s  {mutant.name}", flush=True)

@@ -137,9 +137,11 @@ def plane(count: int, middle: tuple[float, float, float]) -> SplatScene:
     )
 
 
-def depth_bounds(scene: SplatScene, pose: np.ndarray, **charges: float) -> tuple[np.ndarray, list[np.ndarray]]:
+def depth_bounds(
+    scene: SplatScene, pose: np.ndarray, middle: float = 4.0, **charges: float
+) -> tuple[np.ndarray, list[np.ndarray]]:
     """[8, 8, 4] bounds of one pose [3, 4] with some ``charges`` replaced, and what programs draw there."""
-    around = PoseSet.around(Camera(pose, 8.0, 8.0, 4.0, 4.0, 8, 8), parse_perturbation({}))
+    around = PoseSet.around(Camera(pose, 8.0, 8.0, middle, middle, 8, 8), parse_perturbation({}))
     rules = VERSIONS["1.4.0"]
     bounds = SplatBounds(activate(scene, rules), rules, arithmetic_named("float32"))
     bounds.charges = bounds.charges._replace(**charges)
@@ -154,6 +156,14 @@ def test_sums_of_weights_are_rounded() -> None:
     bounds, pictures = depth_bounds(plane(400, (0.0, 0.0, -1.1)), np.eye(3, 4), camera_coordinate=0.0)
     for drawn in pictures:
         assert (drawn[..., 0] > 0.0).mean() > 0.5 and outside(bounds, drawn) == 0
+
+
+def test_the_accumulation_is_rounded() -> None:
+    """In the pixel at the middle of many Gaussians exponentials are exp(0): nothing but sums and products rounds."""
+    exact = dict.fromkeys(("exponential", "exponential_by_argument", "exponential_by_range", "opacity"), 0.0)
+    bounds, pictures = depth_bounds(plane(400, (0.0, 0.0, -1.0)), np.eye(3, 4), middle=4.5, **exact)
+    for drawn in pictures:
+        assert outside(bounds[4:5, 4:5], drawn[4:5, 4:5]) == 0
 
 
 def test_coordinates_far_from_the_origin_are_rounded() -> None:

@@ -41,7 +41,7 @@ DEPTHS = (
     Fault(
         "accumulation: its rounding is not charged",
         _DEPTHS, "shade_layers", "1.01 * (charges.blend_fragment * n + charges.blend_pixel)", "0.0",
-        _ATTACK + "[one pose-classic-1.4.0]", compiled=True,
+        "test_depths.py::test_the_accumulation_is_rounded",
     ),
     Fault(
         "depth: empty pixels show the depth of what might be drawn there",

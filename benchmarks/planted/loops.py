@@ -20,6 +20,7 @@ LOOPS = (
         "kind.variation(radius)",
         "kind.variation(0.1 * radius)",
         _MARGIN,
+        compiled=True,
     ),
     Fault(
         "loops: a scene that stands elsewhere is not charged",
@@ -44,6 +45,7 @@ LOOPS = (
         "reacher.view.image(pose, *more)",
         "reacher.view.image(pose)",
         _MARGIN,
+        compiled=True,
     ),
     Fault(
         "loops: the float64 step's rounding is not charged",
