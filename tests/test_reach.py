@@ -147,8 +147,10 @@ def test_affine_sets_hold_their_images() -> None:
         image, (low, high), fewer = values.mapped(matrix, offset), values.hull(), values.promoted()
         assert fewer.generators.shape[1] <= 64 and (fewer.generators[:, :2] == values.generators[:, :2]).all()
         reduced_low, reduced_high = fewer.hull()
-        for _ in range(20):
-            s, e = rng.choice([-1.0, 1.0], q), values.radius * rng.choice([-1.0, 1.0], n)
+        # where a coordinate is largest and least, and anywhere
+        ends = [(k * np.sign(row), np.full(n, k)) for row in values.generators for k in (-1.0, 1.0)]
+        for s, signs in [*ends, *((rng.choice([-1.0, 1.0], q), rng.choice([-1.0, 1.0], n)) for _ in range(20))]:
+            e = values.radius * signs
             x = [
                 Fraction(float(values.center[i]))
                 + sum(a * b for a, b in zip(exactly(values.generators[i]), exactly(s), strict=True))
