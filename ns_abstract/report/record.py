@@ -412,7 +412,6 @@ class Report:
             InputError: A file cannot be written.
         """
         self._explained[index] = tuple(lines)
-        self._entries[index]["explanation"] = list(lines)
         self._publish(page=time.monotonic() >= self._page_due)
 
     def add(self, result: FrameResult, status: Status | None = None, *, picture: bool = True) -> dict[str, Any]:
@@ -528,7 +527,6 @@ class Report:
                 ],
                 "seconds_to_ratio": {f"{mark:g}": seconds for mark, seconds in seconds_to(result.trace).items()},
                 "status": status,
-                **({"explanation": why} if (why := self._explained.get(result.index)) else {}),
                 "parameters": [
                     {"name": name, "unit": unit, "lower": low, "upper": high}
                     for name, unit, low, high in zip(box.names, box.units, box.lower, box.upper, strict=True)
@@ -556,7 +554,10 @@ class Report:
                 "renderer": run.renderer,
                 "scene": run.scene,
                 "plan": run.plan,
-                "frames": [self._entries[k] for k in sorted(self._entries)],
+                "frames": [
+                    self._entries[k] | ({"explanation": why} if (why := self._explained.get(k)) else {})
+                    for k in sorted(self._entries)
+                ],
                 "frames_asked": run.frames,
                 "missing": self.missing,
                 # a run that was killed never gets to say so
