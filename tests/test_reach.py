@@ -331,6 +331,24 @@ def test_tubes_hold_runs_in_a_scene_whose_place_the_view_tells(tmp_path: Path) -
     assert False in spread
 
 
+class Lamp(Wall):
+    """A wall by the light that a member of the scene's set tells."""
+
+    def image(self, values: np.ndarray, member: Any = None) -> np.ndarray:
+        return super().image(values) * np.float32(1.0 if member is None else member)
+
+
+def test_a_run_sees_the_scene_it_is_given(tmp_path: Path) -> None:
+    base = reacher(tmp_path, specification("affine"))
+    lit = replace(base, view=Lamp(base.loop))
+    start, push = base.loop.state(base.loop.box, np.zeros(base.loop.box.dimensions)), np.zeros((20, 3))
+    stored, dark = (simulate(lit, start, push, member) for member in (None, 0.5))
+    assert (stored.states == simulate(base, start, push).states).all()
+    for x, u in zip(dark.states, dark.controls, strict=False):
+        assert (u == lit.pilot.concrete(lit.view.image(lit.loop.camera.values(x), 0.5))).all()
+    assert (dark.controls != stored.controls).any(axis=1).all()
+
+
 def examined(search: LoopSearch, number: int, most: int = 60) -> list[Any]:
     """All leaves of a search, in the order of the cells."""
     box = search.loop.box

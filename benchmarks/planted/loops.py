@@ -44,16 +44,7 @@ LOOPS = (
         "simulate",
         "reacher.view.image(pose, *more)",
         "reacher.view.image(pose)",
-        _MARGIN,
-        compiled=True,
-    ),
-    Fault(
-        "loops: the float64 step's rounding is not charged",
-        _DYNAMICS,
-        "Dynamics.enclose",
-        "2.0 * gamma(STEP_ROUNDINGS) * size",
-        "0.0 * size",
-        _STEP,
+        "test_reach.py::test_a_run_sees_the_scene_it_is_given",
     ),
     Fault(
         "loops: quadratic drag curves one way only",
