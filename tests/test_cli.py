@@ -25,10 +25,10 @@ from ns_abstract.api.files import Settings, open_job
 from ns_abstract.cli import demo as demo_command
 from ns_abstract.cli import render as render_command
 from ns_abstract.cli.common import complaint
-from ns_abstract.cli.rendering import listed
 from ns_abstract.geometry.views import View, path_json
 from ns_abstract.io.folder import MARK
 from ns_abstract.methods.splat.scene import SplatScene
+from ns_abstract.report.figures import listed
 from ns_abstract.report.files import StoredFrame, load_frame
 
 MODULE = "ns_abstract.cli.render"

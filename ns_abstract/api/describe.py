@@ -9,7 +9,7 @@ import numpy as np
 
 from ns_abstract.api.files import PathJob
 from ns_abstract.geometry.poses import PoseSet
-from ns_abstract.report.figures import interval, number
+from ns_abstract.report.figures import interval, listed, number
 
 #: Parts of the visible scene elements that are nearer than the depths that are told.
 _QUANTILES = {"near": 0.05, "middle": 0.5, "far": 0.95}
@@ -70,7 +70,7 @@ def _sets(job: PathJob, frames: Sequence[int]) -> Iterator[str]:
     for index in frames:
         told.setdefault(tuple(_ranges(job.pose_sets[index], job.method.dataset_scale)), []).append(index)
     for lines, indices in told.items():
-        some = f"frame{'s' if indices[1:] else ''} {_counted(indices)}"
+        some = f"frame{'s' if indices[1:] else ''} {listed(indices)}"
         yield f"set        of {'every frame' if len(indices) == len(frames) else some}:"
         if not lines:
             yield "  one camera pose"
@@ -103,7 +103,3 @@ def _span(low: float, high: float) -> str:
 
 def _vector(values: np.ndarray) -> str:
     return f"({', '.join(number(float(v), 3) for v in values)})"
-
-
-def _counted(indices: Sequence[int]) -> str:
-    return ", ".join(map(str, indices[:20])) + (", …" if len(indices) > 20 else "")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -21,12 +21,11 @@ from ns_abstract.api.scenes import platform_problems
 from ns_abstract.cli.common import Stop, plain_console
 from ns_abstract.execution.engines import Engine, EngineName, Tls, started
 from ns_abstract.io.folder import claim
+from ns_abstract.report.figures import listed
 from ns_abstract.report.record import Report, Run
 
 #: Seconds by frame where no time budget is given.
 _SECONDS_BY_FRAME = 60.0
-#: Runs of numbers that a line lists.
-_RUNS = 8
 
 
 @dataclass(frozen=True)
@@ -157,18 +156,6 @@ def _introduce(console: Console, job: Job, report: Report) -> None:
         console.print(f"  {note}", markup=False, soft_wrap=True)
     if report.kept:
         console.print(f"  kept from before: frames {listed(report.kept)}", markup=False, soft_wrap=True)
-
-
-def listed(numbers: Sequence[int]) -> str:
-    """Ascending ``numbers`` in words, runs of them by their ends, and how many where there are many runs."""
-    runs: list[list[int]] = []
-    for number in numbers:
-        if runs and number == runs[-1][1] + 1:
-            runs[-1][1] = number
-        else:
-            runs.append([number, number])
-    told = [f"{a} to {b}" if b > a + 1 else ", ".join(map(str, dict.fromkeys((a, b)))) for a, b in runs[:_RUNS]]
-    return ", ".join(told) + (f" and others, {len(numbers):,} together" if len(runs) > _RUNS else "")
 
 
 def _tell(console: Console, entry: dict[str, Any]) -> None:

@@ -9,6 +9,8 @@ from ns_abstract.refine.result import FrameResult, TracePoint, max_pixel_gap, me
 
 #: Ratios whose times are told.
 MARKS = (1.5, 1.25, 1.1, 1.05)
+#: Runs of numbers that a line lists.
+_RUNS = 8
 
 
 def metrics(result: FrameResult) -> dict[str, float | None]:
@@ -71,3 +73,15 @@ def interval(name: str, unit: str, low: float, high: float) -> str:
     """One side of a box for people, a symmetric one as a radius."""
     size = f"± {number(high)}" if low == -high else f"∈ [{number(low, 6)}, {number(high, 6)}]"
     return f"{name} {size} {unit}".strip()
+
+
+def listed(numbers: Sequence[int]) -> str:
+    """Ascending ``numbers`` in words, runs of them by their ends, and how many where there are many runs."""
+    runs: list[list[int]] = []
+    for number in numbers:
+        if runs and number == runs[-1][1] + 1:
+            runs[-1][1] = number
+        else:
+            runs.append([number, number])
+    told = [f"{a} to {b}" if b > a + 1 else ", ".join(map(str, dict.fromkeys((a, b)))) for a, b in runs[:_RUNS]]
+    return ", ".join(told) + (f" and others, {len(numbers):,} together" if len(runs) > _RUNS else "")
