@@ -1,10 +1,10 @@
-"""Bounds of a network's outputs over sets of images (docs/design.md, N, N0, N1, N2, N6, N12, N13, N14)."""
+"""Bounds of a network's outputs over sets of images (docs/design.md, N, N0, N1, N2, N6, N12, N13, N14, N15)."""
 
 from __future__ import annotations
 
 import functools
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
@@ -20,7 +20,7 @@ from ns_abstract.verify.network.maxima import Candidates, MaxPool, upper_planes
 from ns_abstract.verify.network.products import Product
 from ns_abstract.verify.network.rows import Rows, charge, concretize, full, grid, join, pass_activation, pass_maximum
 from ns_abstract.verify.network.schedule import Schedule, on_threads
-from ns_abstract.verify.network.slopes import Ascent, Chosen, OpenUnits, derivatives
+from ns_abstract.verify.network.slopes import Ascent, Chosen, Held, OpenUnits, derivatives
 
 Float64 = NDArray[np.float64]
 Int64 = NDArray[np.int64]
@@ -46,6 +46,8 @@ _UNSURE = 0.25
 _CLOSES = 0.1
 #: Room for rounding of lines relative to references and sizes.
 _REFERENCES = 2.0**-46
+#: Room for rounding above zero where nothing better is looked for.
+_SURE = 1e-9
 #: Bytes of rows that are worked on at a time: they should stay in a processor's cache.
 _ROWS_AT_ONCE = 24 << 20
 
@@ -91,18 +93,26 @@ class ImageSets:
         return ImageSets(*(getattr(self, name)[cells] for name in self.__dataclass_fields__))
 
 
+#: Signs that are assumed of a node's numbers: where they are in the node [B], and 1 or -1 [B] for "not negative" or
+#: "not positive".
+Signs = tuple[Int64, Float64]
+
+
 @dataclass(frozen=True)
 class OutputBounds:
     """Lower bounds of ``rows @ y + offset``; minus infinity where nothing is known, never NaN.
 
     Attributes:
-        lower: [m, k] for every p of the cell.
+        lower: [m, k] for every p of the cell; infinite where no image has the signs that are assumed.
         a, b: [m, k, d], [m, k]: ``a p + b`` is a lower bound at p.
+        loosest: [m, k, 2] where signs are assumed: the node and the place in it of the input of an open unit that costs
+            the row most, about; -1 where no unit is open.
     """
 
     lower: Float64
     a: Float64
     b: Float64
+    loosest: Int64 | None = None
 
 
 def bound_outputs(
@@ -115,6 +125,7 @@ def bound_outputs(
     memory: int = 1 << 30,
     arithmetic: NetworkArithmetic = "float32",
     slope_steps: int = 0,
+    assumed: Sequence[Mapping[int, Signs]] | None = None,
 ) -> OutputBounds:
     """Lower bounds of ``rows @ network(x) + offset`` over every image set.
 
@@ -129,6 +140,8 @@ def bound_outputs(
         arithmetic: Whether the bounds hold for every float32 evaluation and the exact network, or for that alone.
         slope_steps: Steps towards the best slopes below open ReLUs, for every row of its own (N14); a bound never
             is worse for them, and each takes as long as two passes of the rows.
+        assumed: By cell: signs of inputs of (leaky) ReLUs, by node; bounds are of the images for which these numbers
+            have them in the evaluation that is bounded (N15). ``slope_steps`` must be positive then.
     """
     offset = np.asarray(offset, np.float64)
     if images.a_lower.shape[1] != network.input_size:
@@ -141,12 +154,14 @@ def bound_outputs(
     step = max(1, int(0.5 * memory) // by_cell)
     parts = []
     for first in range(0, images.count, step):
-        cells = _Cells(network, images[first : first + step], substitution, memory, arithmetic, slope_steps)
+        signs = None if assumed is None else assumed[first : first + step]
+        cells = _Cells(network, images[first : first + step], substitution, memory, arithmetic, slope_steps, signs)
         parts.append(cells.outputs(rows, offset))
     if not parts:
-        d = images.dimensions
-        return OutputBounds(np.zeros((0, len(offset))), np.zeros((0, len(offset), d)), np.zeros((0, len(offset))))
-    return OutputBounds(*(np.concatenate([getattr(part, name) for part in parts]) for name in ("lower", "a", "b")))
+        k, d = len(offset), images.dimensions
+        return OutputBounds(np.zeros((0, k)), np.zeros((0, k, d)), np.zeros((0, k)))
+    names = ("lower", "a", "b") if assumed is None else ("lower", "a", "b", "loosest")
+    return OutputBounds(*(np.concatenate([getattr(part, name) for part in parts]) for name in names))
 
 
 class _Interval(NamedTuple):
@@ -216,9 +231,15 @@ class _Cells:
         memory: int,
         arithmetic: NetworkArithmetic = "float32",
         slope_steps: int = 0,
+        assumed: Sequence[Mapping[int, Signs]] | None = None,
     ) -> None:
         self.network = network
         self.slope_steps = slope_steps
+        self.assumed = assumed
+        #: by cell and node: what rows take of signs that are assumed
+        self.held: list[dict[int, Held]] = [{} for _ in range(images.count)]
+        #: cells without an image that has the signs assumed
+        self.vacant = np.zeros(images.count, bool)
         #: units whose lower lines may have other slopes
         self.open: dict[int, OpenUnits] = {}
         self.count, self.d = images.count, images.dimensions
@@ -296,6 +317,11 @@ class _Cells:
         fine = (low <= high) & torch.isfinite(form.reference) & torch.isfinite(form.c) & torch.isfinite(form.r)
         fine &= torch.isfinite(form.a).all(1)
         good = fine.reshape(self.count, -1).all(1)
+        if self.assumed is not None and not bool(good.all()):
+            # bounds that hold for all images with these signs contradict each other: there are none (N15)
+            crossed = torch.isfinite(low) & torch.isfinite(high) & (low > high)
+            told = np.array([len(signs) > 0 for signs in self.assumed]) & self.good
+            self.vacant |= told & crossed.reshape(self.count, -1).any(1).numpy()
         self.good &= good.numpy()
         found = _Form(form.reference, form.c, form.a, form.r, low, high, form.active)
         if bool(good.all()):
@@ -323,8 +349,10 @@ class _Cells:
             if isinstance(node.layer, Activation):
                 # what is known better of the input is also known to its other readers
                 source = node.inputs[0]
+                inputs[0] = self._assume(source, inputs[0])
                 open_ = node.layer.open(*inputs[0].interval)
-                forms[source] = inputs[0] = self._known_better(source, inputs[0], open_, node.layer)
+                better = self._known_better(source, inputs[0], open_, node.layer)
+                forms[source] = inputs[0] = self._assume(source, better)
                 if isinstance(node.layer, LeakyRelu):
                     self.unsure = float(node.layer.open(*inputs[0].interval).double().mean())
                 forms.append(self._activate(k, source, node.layer, inputs[0]))
@@ -346,6 +374,31 @@ class _Cells:
         end = forms[last]
         assert end is not None
         return end
+
+    def _assume(self, source: int, z: _Form) -> _Form:
+        """What is known of node ``source`` where its numbers have the signs that are assumed (N15)."""
+        if self.assumed is None or not any(source in signs for signs in self.assumed):
+            return z
+        lower, upper = (v.flatten(1).clone() for v in (z.lower, z.upper))
+        least, most = (v.flatten(1).numpy() for v in z.interval)
+        reference, width = z.reference.flatten(1), z.width.flatten(1).numpy()
+        for cell, signs in enumerate(self.assumed):
+            if source not in signs or not self.good[cell]:
+                continue
+            flat, side = signs[source]
+            if bool(np.where(side > 0.0, most[cell, flat] < 0.0, least[cell, flat] > 0.0).any()):
+                self.vacant[cell] = True
+                continue
+            at, positive = torch.from_numpy(flat), torch.from_numpy(side > 0.0)
+            zero = -reference[cell, at]
+            low, high = lower[cell, at], upper[cell, at]
+            lower[cell, at] = torch.where(positive, torch.minimum(torch.maximum(low, zero), high), low)
+            upper[cell, at] = torch.where(positive, high, torch.maximum(torch.minimum(high, zero), low))
+            noise = UNIT * (_SPARE + self.network.readers[source]) * width[cell, flat]
+            if source in self.noise:
+                noise = noise + self.noise[source].flatten(1).numpy()[cell, flat]
+            self.held[cell][source] = Held(flat, side, -zero.numpy(), noise)
+        return replace(z, lower=lower.reshape(z.lower.shape), upper=upper.reshape(z.upper.shape))
 
     def _combine(self, k: int, sources: tuple[int, ...], layer: Linear, inputs: list[_Form]) -> _Form:
         """A linear layer (N1, N2)."""
@@ -845,6 +898,11 @@ class _Cells:
                     return
             here = batch.waiting.pop(at)
             node = self.network.nodes[at - 1]
+            if batch.chosen is not None and at in batch.chosen.paid:
+                flat, gained, offset = batch.chosen.paid[at]
+                here = full(here, node.layer.shape, force=True)
+                here.value.reshape(len(here.value), -1)[:, flat] += gained[batch.number]
+                batch.total[:, 0] += offset[batch.number]
             if batch.chosen is not None and not isinstance(node.layer, Linear):
                 here = full(here, node.layer.shape, force=True)
                 batch.chosen.keep(at, here.value, batch.number, len(found.lower))
@@ -890,21 +948,28 @@ class _Cells:
         box += lost
         found.improve(batch.number, plane, box)
 
-    def _climb(self, index: int, rows: Rows, cell: Int64) -> _Reached:
-        """Bounds below of rows on node ``index``, with the best slopes that were tried (N14)."""
+    def _climb(self, index: int, rows: Rows, cell: Int64, need: Float64) -> tuple[_Reached, Int64]:
+        """Bounds below of rows on node ``index``, with the best slopes and multipliers that were tried (N14, N15).
+
+        Where signs are assumed, a cell whose rows are above ``need`` [R] is done. Also returns `OutputBounds.loosest`
+        of the rows.
+        """
+        loosest = np.full((len(cell), 2), -1, np.int64)
         if not self.slope_steps:
-            return self._backward(index, rows, cell)
+            return self._backward(index, rows, cell), loosest
         start = Rows(rows.value.copy(), rows.y, rows.x)
         best = self._backward(index, rows, cell)
         for k in np.unique(cell):
             units = {at: opened.of(k) for at, opened in self.open.items()}
             units = {at: opened for at, opened in units.items() if len(opened.flat)}
-            own = np.flatnonzero(cell == k)
-            if not units or not self.good[k]:
+            own, held = np.flatnonzero(cell == k), self.held[k]
+            if not (units or held) or not self.good[k]:
                 continue
             first = {at: self.lines[at][0, k].reshape(-1)[opened.flat] for at, opened in units.items()}
-            ascent = Ascent(units, first, len(own))
+            ascent = Ascent(units, first, len(own), held)
             for _ in range(self.slope_steps + 1):
+                if self.assumed is not None and bool((best.lower[own] > need[own]).all()):
+                    break
                 chosen = ascent.lines(self.lines, k)
                 found = _Reached.unknown(len(own), self.d)
                 # rows are changed in place
@@ -913,17 +978,43 @@ class _Cells:
                 self._descend(index, index, _Batch({index: part}, cell[own], total, number, chosen), found, None)
                 better = found.lower > best.lower[own]
                 best.lower[own[better]], best.plane[own[better]] = found.lower[better], found.plane[better]
-                ascent.climb(self._derivatives(k, chosen, found, units))
-        return best
+                slopes, forces = self._derivatives(k, chosen, found, units)
+                ascent.climb(slopes, forces, {at: self._size(chosen, at) for at in held})
+            else:
+                loosest[own] = self._loosest(chosen, units, len(own))
+        return best, loosest
+
+    def _size(self, chosen: Chosen, source: int) -> float:
+        """What coefficients of rows on the readers of node ``source`` are about."""
+        found = [
+            float(np.abs(chosen.trace[k]).mean())
+            for k, node in enumerate(self.network.nodes, 1)
+            if source in node.inputs and k in chosen.trace
+        ]
+        return max(found, default=0.0)
+
+    def _loosest(self, chosen: Chosen, units: Mapping[int, OpenUnits], count: int) -> Int64:
+        """[R, 2] the node and place of the input of the open unit that costs each row most."""
+        found, most = np.full((count, 2), -1, np.int64), np.full(count, -1.0)
+        for k, opened in units.items():
+            if k not in chosen.trace:
+                continue
+            losses = opened.losses(chosen.trace[k].reshape(count, -1)[:, opened.flat])
+            at = losses.argmax(1)
+            value = losses[np.arange(count), at]
+            here = value > most
+            most[here] = value[here]
+            found[here, 0], found[here, 1] = self.network.nodes[k - 1].inputs[0], opened.flat[at[here]]
+        return found
 
     def _derivatives(
         self, cell: int, chosen: Chosen, found: _Reached, units: Mapping[int, OpenUnits]
-    ) -> dict[int, Float64]:
-        """How the bounds of a cell's rows change with slopes."""
-        planes = self.image
+    ) -> tuple[dict[int, Float64], dict[int, Float64]]:
+        """How the bounds of a cell's rows change with slopes and with multipliers."""
+        planes, held = self.image, self.held[cell]
         rows = chosen.trace.get(0)
         if rows is None:
-            return {k: np.zeros((len(found.lower), len(v.flat))) for k, v in units.items()}
+            rows = np.zeros((len(found.lower), *grid(self.network.input_shape)), np.float32)
         p = -np.sign(np.nan_to_num(found.plane[:, 0, :-1]))
         ends = np.einsum("schwd,rd->srchw", planes.slopes[cell], p) + planes.offsets[cell][:, None]
         image = np.where(rows >= 0.0, ends[0], ends[1]).astype(np.float32)
@@ -939,13 +1030,14 @@ class _Cells:
             return chosen.lines[k] if k in chosen.lines else self.lines[k][:, cell : cell + 1]
 
         shaped = torch.from_numpy(image).reshape(-1, *self.network.input_shape)
-        return derivatives(self.network, shaped, chosen.trace, lines, units, others)
+        return derivatives(self.network, shaped, chosen.trace, lines, units, others, held)
 
     def outputs(self, rows: Any, offset: Float64) -> OutputBounds:
         """Bounds of ``rows @ y + offset`` in every cell."""
         index = len(self.network.nodes)
         m, k = self.count, len(offset)
         plane, lower = np.zeros((m, k, self.d + 1)), np.zeros((m, k))
+        loosest = np.zeros((m, k, 2), np.int64)
         shape = grid(self.network.shape(index))
         dense = np.asarray(rows.toarray() if hasattr(rows, "toarray") else rows, np.float64)
         single = dense.astype(np.float32)
@@ -954,6 +1046,7 @@ class _Cells:
         missing = size @ np.abs(dense - single).T
         missing += 2.0**-52 * (dense.shape[1] + 2) * (np.abs(reference) @ np.abs(dense).T)
         offset = reference @ dense.T + offset
+        need = -offset + _SURE * (1.0 + np.abs(offset))
         for top, left, height, width, number in _windows(single.reshape(k, *shape)):
             part = single.reshape(k, *shape)[:, :, top : top + height, left : left + width]
             step = max(1, _ROWS_AT_ONCE // (4 * shape[0] * height * width))
@@ -961,16 +1054,15 @@ class _Cells:
                 which = np.arange(first, min(m * len(number), first + step))
                 cell, row = which // len(number), number[which % len(number)]
                 rows = Rows(np.ascontiguousarray(part[row]), np.full(len(which), top), np.full(len(which), left))
-                found = self._climb(index, rows, cell)
+                found, loosest[cell, row] = self._climb(index, rows, cell, need[cell, row])
                 plane[cell, row], lower[cell, row] = found.plane[:, 0], found.lower
         room = 2.0**-48 * (np.abs(plane).sum(-1) + np.abs(offset) + missing) + missing
         lower, b = lower + offset - room, plane[..., -1] + offset - room
         a = plane[..., :-1]
         known = self.good[:, None] & np.isfinite(lower)
         usable = self.good[:, None] & np.isfinite(b) & np.isfinite(a).all(-1)
-        return OutputBounds(
-            np.where(known, lower, -np.inf), np.where(usable[..., None], a, 0.0), np.where(usable, b, -np.inf)
-        )
+        lower = np.where(self.vacant[:, None], np.inf, np.where(known, lower, -np.inf))
+        return OutputBounds(lower, np.where(usable[..., None], a, 0.0), np.where(usable, b, -np.inf), loosest)
 
 
 def _open_units(layer: LeakyRelu, given: tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]) -> OpenUnits:

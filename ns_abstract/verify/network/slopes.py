@@ -1,4 +1,4 @@
-"""Lower lines of open ReLUs with slopes chosen for a row (docs/design.md, N14)."""
+"""Slopes of lower lines and multipliers of assumed signs, chosen for a row (docs/design.md, N14, N15)."""
 
 from __future__ import annotations
 
@@ -55,6 +55,12 @@ class OpenUnits:
         names = ("cell", "flat", "lower", "upper", "reference", "image", "loose", "room")
         return replace(self, **{name: getattr(self, name)[at] for name in names})
 
+    def losses(self, coefficient: Float32) -> Float64:
+        """[R, U] about what rows with ``coefficient`` on the units lose because these are open."""
+        gap = (1.0 - self.alpha) * self.upper * -self.lower / (self.upper - self.lower)
+        # a slope below was chosen for the row, the line above could not be
+        return np.where(coefficient < 0.0, 1.0, 0.5) * np.abs(coefficient) * gap
+
     def offsets(self, slope: Float32) -> tuple[Float32, Float32]:
         """Of lines with ``slope`` [R, U] between `alpha` and 1: below and above the function, as rows want them."""
         s = slope.astype(np.float64)
@@ -67,16 +73,45 @@ class OpenUnits:
         return np.nextafter(low, np.float32(-np.inf)), np.nextafter(high, np.float32(np.inf))
 
 
+@dataclass(frozen=True)
+class Held:
+    """Numbers of one node of one cell whose signs are assumed (N15).
+
+    Attributes:
+        flat: [B] where they are.
+        side: [B] 1 where they are assumed not to be negative, -1 where not positive.
+        reference: [B] their reference.
+        noise: [B] charged for every part of a coefficient: rounding of the node and of rows.
+    """
+
+    flat: Int64
+    side: Float64
+    reference: Float64
+    noise: Float64
+
+    def pay(self, multiplier: Float32) -> tuple[Float32, Float64]:
+        """What rows gain for ``multiplier`` [R, B], not negative: coefficients [R, B], and [R] the least offset.
+
+        A row is at least itself less ``multiplier * side * z``, as the latter is not negative.
+        """
+        gained = -multiplier * self.side.astype(np.float32)
+        size = np.abs(gained.astype(np.float64))
+        room = size @ (self.noise + 2.0**-48 * np.abs(self.reference)) * (1.0 + 2.0**-40)
+        return gained, gained.astype(np.float64) @ self.reference - room
+
+
 @dataclass
 class Chosen:
-    """Slopes of a cell's rows, and what rows are on the way.
+    """Slopes and multipliers of a cell's rows, and what rows are on the way.
 
     Attributes:
         lines: By node: as `pass_activation` wants them, with rows in place of cells.
+        paid: By node: where, and what `Held.pay` gives.
         trace: By node: [R, C, H, W] rows on its output, and on the image (0).
     """
 
     lines: dict[int, Float32]
+    paid: dict[int, tuple[Int64, Float32, Float64]] = field(default_factory=dict)
     trace: dict[int, Float32] = field(default_factory=dict)
 
     def keep(self, at: int, value: Float32, number: Int64, count: int) -> None:
@@ -86,21 +121,44 @@ class Chosen:
         self.trace[at][number] = value
 
 
+class _Adam:
+    """Adam's steps of one array of numbers."""
+
+    def __init__(self, shape: tuple[int, ...]) -> None:
+        self._mean, self._square, self._count = np.zeros(shape), np.zeros(shape), 0
+
+    def step(self, g: Float64) -> Float64:
+        """Directions, about one long, for derivatives ``g``."""
+        self._count += 1
+        self._mean += (1.0 - _FIRST) * (g - self._mean)
+        self._square += (1.0 - _SECOND) * (g * g - self._square)
+        size = np.sqrt(self._square / (1.0 - _SECOND**self._count)) + 1e-30
+        return self._mean / (1.0 - _FIRST**self._count) / size
+
+
 class Ascent:
-    """Adam's steps on the slopes of a cell's rows.
+    """Adam's steps on the slopes and multipliers of a cell's rows.
 
     Args:
         units: Open units of the cell by node.
         start: [U] slopes to start from, by node.
         rows: Number of rows.
+        held: Numbers of the cell whose signs are assumed, by node.
     """
 
-    def __init__(self, units: Mapping[int, OpenUnits], start: Mapping[int, Float32], rows: int) -> None:
-        self.units = units
+    def __init__(
+        self,
+        units: Mapping[int, OpenUnits],
+        start: Mapping[int, Float32],
+        rows: int,
+        held: Mapping[int, Held] | None = None,
+    ) -> None:
+        self.units, self.held = units, held or {}
         self.slopes = {k: np.repeat(start[k][None], rows, 0) for k in units}
-        self._mean = {k: np.zeros(v.shape) for k, v in self.slopes.items()}
-        self._square = {k: np.zeros(v.shape) for k, v in self.slopes.items()}
-        self._step, self._count = _STEP, 0
+        self.multipliers = {k: np.zeros((rows, len(v.flat)), np.float32) for k, v in self.held.items()}
+        self._slopes = {k: _Adam(v.shape) for k, v in self.slopes.items()}
+        self._multipliers = {k: _Adam(v.shape) for k, v in self.multipliers.items()}
+        self._step = _STEP
 
     def lines(self, known: Mapping[int, Float32], cell: int) -> Chosen:
         """Lines of every row: those of the cell, with the slopes of open units."""
@@ -112,19 +170,21 @@ class Ascent:
             flat[0][:, units.flat] = slope
             flat[1][:, units.flat], flat[2][:, units.flat] = units.offsets(slope)
             found[k] = lines
-        return Chosen(found)
+        return Chosen(found, {k: (held.flat, *held.pay(self.multipliers[k])) for k, held in self.held.items()})
 
-    def climb(self, slopes: Mapping[int, Float64]) -> None:
-        """Step along derivatives [R, U] of the bounds, within what slopes may be."""
-        self._count += 1
+    def climb(self, slopes: Mapping[int, Float64], forces: Mapping[int, Float64], size: Mapping[int, float]) -> None:
+        """Step along derivatives of the bounds, within what slopes and multipliers may be.
+
+        Args:
+            slopes, forces: Derivatives [R, U] by slopes and [R, B] by multipliers.
+            size: What coefficients of rows on a node are about.
+        """
         for k, units in self.units.items():
-            g = slopes[k]
-            mean, square = self._mean[k], self._square[k]
-            mean += (1.0 - _FIRST) * (g - mean)
-            square += (1.0 - _SECOND) * (g * g - square)
-            size = np.sqrt(square / (1.0 - _SECOND**self._count)) + 1e-30
-            step = self._step * mean / (1.0 - _FIRST**self._count) / size
-            self.slopes[k] = np.clip(self.slopes[k] + step, units.alpha, 1.0).astype(np.float32)
+            moved = self.slopes[k] + self._step * self._slopes[k].step(slopes[k])
+            self.slopes[k] = np.clip(moved, units.alpha, 1.0).astype(np.float32)
+        for k in self.held:
+            moved = self.multipliers[k] + self._step * size.get(k, 0.0) * self._multipliers[k].step(forces[k])
+            self.multipliers[k] = np.maximum(moved, 0.0).astype(np.float32)
         self._step *= _DECAY
 
 
@@ -135,11 +195,13 @@ def derivatives(
     lines: Callable[[int], Float32],
     units: Mapping[int, OpenUnits],
     others: Mapping[int, Any],
-) -> dict[int, Float64]:
-    """By node [R, U]: how bounds of rows change with the slopes of lower lines.
+    held: Mapping[int, Held],
+) -> tuple[dict[int, Float64], dict[int, Float64]]:
+    """By node: how bounds of rows change with the slopes of lower lines [R, U] and with multipliers [R, B].
 
     A row's bound is a sum of products along the lines that it took; read forwards from the image where it is least,
-    these lines give a value to every node, and a slope counts its row's coefficient times that value.
+    these lines give a value to every node. A slope counts its row's coefficient times that value, a multiplier the
+    value where it has not the sign that is assumed.
 
     Args:
         network: The network.
@@ -148,10 +210,11 @@ def derivatives(
         lines: Of an activation's node: [6, R, C, H, W].
         units: Open units of activations.
         others: Of products' and maxima's nodes: a function of rows and inputs that gives the output.
+        held: Numbers whose signs are assumed, by their node.
     """
     values: list[Tensor | None] = [image]
     left = list(network.readers)
-    count, found = image.shape[0], {}
+    count, found, forces = image.shape[0], {}, {}
     for k, node in enumerate(network.nodes, 1):
         inputs = [v for v in (values[i] for i in node.inputs) if v is not None]
         rows = trace.get(k)
@@ -166,6 +229,10 @@ def derivatives(
             own = torch.from_numpy(lines(k)).reshape(6, -1, *node.layer.shape)
             a, u = torch.from_numpy(rows).reshape(inputs[0].shape), inputs[0]
             slope, offset = torch.where(a >= 0.0, own[0], own[3]), torch.where(a >= 0.0, own[1], own[4])
+            source = node.inputs[0]
+            if source in held:
+                here = held[source]
+                forces[source] = -here.side * (u.flatten(1).numpy()[:, here.flat] + here.reference)
             values.append(slope * u + offset)
             if k in units:
                 at = units[k]
@@ -176,4 +243,7 @@ def derivatives(
             left[i] -= 1
             if not left[i]:
                 values[i] = None
-    return {k: found.get(k, np.zeros((count, len(v.flat)))) for k, v in units.items()}
+    return (
+        {k: found.get(k, np.zeros((count, len(v.flat)))) for k, v in units.items()},
+        {k: forces.get(k, np.zeros((count, len(v.flat)))) for k, v in held.items()},
+    )
