@@ -84,6 +84,9 @@ class Threshold:
         a, b = images.a_lower.mean(1)[:, None], images.b_lower.mean(1)[:, None] - self.threshold
         return OutputBounds(b - np.abs(a).sum(-1), a, b)
 
+    def branch(self, images: ImageSets, query: Query, groups: Any, most: int) -> float:
+        return -np.inf
+
 
 def drive(search: Search, limit: int = 100_000, shuffle: int | None = None) -> tuple[list[Leaf], int]:
     """Examine all blocks, in order or at random; leaves by cell, and the number of blocks."""

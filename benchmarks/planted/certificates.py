@@ -26,6 +26,8 @@ _PLACES = "test_registration.py::test_bounds_hold_for_every_place_of_the_scene"
 _ROUNDED = "verify/eight_bit.py"
 _BOXES = "verify/boxes.py"
 _EITHER = "test_vnnlib_runner.py::test_proofs_alone_never_decide_unsafe_instances"
+_BRANCHING, _SLOPES = "verify/network/branching.py", "verify/network/slopes.py"
+_BRANCHES = "test_network_branching.py::test_claims_next_to_the_exact_minimum"
 _LEVELS = "test_eight_bit.py::test_sets_hold_rounded_pictures"
 
 CERTIFICATES = (
@@ -194,7 +196,30 @@ CERTIFICATES = (
     ),
     Fault(
         "boxes: a half is dropped",
-        _BOXES, "_Search._cut", "[(lower, left), (right, upper)]", "[(lower, left)]", _EITHER,
+        _BOXES, "_cut", "[(lower, left), (right, upper)]", "[(lower, left)]", _EITHER,
+    ),
+    Fault(
+        "branching: one sign of a unit is left out",
+        _BRANCHING, "_Branch.halves", "for sign in (1.0, -1.0)", "for sign in (1.0,)", _BRANCHES,
+    ),
+    Fault(
+        "branching: multipliers of either sign",
+        _SLOPES, "Ascent.climb", "np.maximum(moved, 0.0).astype(np.float32)", "moved.astype(np.float32)", _BRANCHES,
+    ),
+    Fault(
+        "branching: multipliers forget the reference",
+        _SLOPES, "Held.pay", "gained.astype(np.float64) @ self.reference - room", "-room", _BRANCHES,
+    ),
+    Fault(
+        "branching: signs of the other side are assumed",
+        "verify/network/bounds.py", "_Cells._assume", "torch.from_numpy(side > 0.0)", "torch.from_numpy(side < 0.0)",
+        _BRANCHES,
+    ),
+    Fault(
+        "branching: what is not a number is proved",
+        _BRANCHING, "_judged", "np.where(np.isnan(found.lower[number]), -np.inf, found.lower[number])",
+        "np.where(np.isnan(found.lower[number]), np.inf, found.lower[number])",
+        "test_network_branching.py::test_an_end_comes_soon",
     ),
     Fault(
         "search: a bound below 0 is a proof",

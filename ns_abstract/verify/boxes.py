@@ -1,4 +1,4 @@
-"""Whether a network has an unsafe output for some input of a box: bounds, attacks, and boxes cut in two.
+"""Whether a network has an unsafe output for some input of a box: bounds, attacks, boxes cut in two, or branches.
 
 See docs/design.md, V11.
 """
@@ -14,6 +14,7 @@ import torch
 
 from ns_abstract.execution.ending import AbandonedError, abandoning, checkpoint
 from ns_abstract.verify.network import ImageSets, Network, NetworkArithmetic, OutputBounds, bound_outputs
+from ns_abstract.verify.network.branching import branch
 from ns_abstract.verify.vnnlib import Region
 
 #: The competitions' words: an unsafe output was found; there is none; not decided; not decided in time.
@@ -24,10 +25,8 @@ _PARAMETERS = 16
 #: Boxes bounded together: as many as have so many numbers of layers between them, and no more than the second number;
 #: and the most that wait.
 _TOGETHER, _MOST, _WAITING = 1 << 18, 256, 1 << 14
-#: Boxes of many inputs that are cut: their halves are hardly easier.
-_CUTS = 64
-#: Steps towards the best slopes of rows over such boxes; inner rows take longer.
-_SLOPE_STEPS = 12
+#: Branches of a box of many inputs, whose halves would hardly be easier.
+_BRANCHES = 1 << 14
 #: Starts and steps of the first attack on a region.
 _STARTS, _STEPS = 12, 25
 
@@ -101,23 +100,33 @@ class _Search:
             # any output is unsafe, and no input could be shown to have one
             self.undecided = True
             return False
+        if len(region.lower) > _PARAMETERS:
+            found = branch(
+                self.network,
+                self._images(region.lower[None], region.upper[None]),
+                region.unsafe.rows,
+                region.unsafe.offset,
+                region.unsafe.groups,
+                _BRANCHES,
+                memory=self.memory,
+                arithmetic=self.arithmetic,
+            )
+            self.boxes += found.branches
+            self.undecided |= not found.proved
+            return False
         waiting = [(region.lower, region.upper)]
-        n = len(region.lower)
-        most = _WAITING if n <= _PARAMETERS else _CUTS
-        done = 0
         while waiting:
             checkpoint()
             boxes, waiting = waiting[-self.together :], waiting[: -self.together]
             bounds = self._bound(region, boxes)
             proved = proves(bounds, region.unsafe.groups)
             self.boxes += len(boxes)
-            done += len(boxes)
             left = np.flatnonzero(~proved)
             if len(left) and self._probe(region, [(*boxes[k], bounds.a[k]) for k in left]):
                 return True
             for k in left:
-                halves = self._cut(region, *boxes[k], bounds.a[k])
-                if halves is None or len(waiting) > most or (n > _PARAMETERS and done > most):
+                halves = _cut(*boxes[k], bounds.a[k])
+                if halves is None or len(waiting) > _WAITING:
                     self.undecided = True
                     return False
                 waiting += halves
@@ -125,54 +134,30 @@ class _Search:
 
     # ------------------------------------------------------------ proofs
 
-    def _bound(self, region: Region, boxes: Sequence[tuple[np.ndarray, np.ndarray]]) -> OutputBounds:
-        lower, upper = (np.stack(ends) for ends in zip(*boxes, strict=True))
+    def _images(self, lower: np.ndarray, upper: np.ndarray) -> ImageSets:
+        """Boxes [m, n]: every input is a parameter, if they are few."""
         # the program rounds an input to float32, and rounding keeps the order
         lower = np.minimum(lower, lower.astype(np.float32).astype(np.float64))
         upper = np.maximum(upper, upper.astype(np.float32).astype(np.float64))
         m, n = lower.shape
-        if n <= _PARAMETERS:
-            middle = 0.5 * (lower + upper)
-            half = np.nextafter(np.maximum(upper - middle, middle - lower), np.inf)
-            a = half[:, :, None] * np.eye(n)
-            images = ImageSets(a, middle, a, middle, lower, upper)
-            steps = 0
-        else:
+        if n > _PARAMETERS:
             none = np.zeros((m, n, 1))
-            images = ImageSets(none, lower, none, upper, lower, upper)
-            steps = _SLOPE_STEPS
+            return ImageSets(none, lower, none, upper, lower, upper)
+        middle = 0.5 * (lower + upper)
+        half = np.nextafter(np.maximum(upper - middle, middle - lower), np.inf)
+        a = half[:, :, None] * np.eye(n)
+        return ImageSets(a, middle, a, middle, lower, upper)
+
+    def _bound(self, region: Region, boxes: Sequence[tuple[np.ndarray, np.ndarray]]) -> OutputBounds:
+        lower, upper = (np.stack(ends) for ends in zip(*boxes, strict=True))
         return bound_outputs(
             self.network,
-            images,
+            self._images(lower, upper),
             region.unsafe.rows,
             region.unsafe.offset,
             memory=self.memory,
             arithmetic=self.arithmetic,
-            slope_steps=steps,
         )
-
-    def _cut(
-        self, region: Region, lower: np.ndarray, upper: np.ndarray, slopes: np.ndarray
-    ) -> list[tuple[np.ndarray, np.ndarray]] | None:
-        """The box in two halves across the input that matters most; None if it is too small to be cut."""
-        width = upper - lower
-        if len(lower) <= _PARAMETERS:
-            # slopes are by half widths
-            score = np.abs(slopes).max(0) + 1e-9 * width
-        else:
-            x = torch.from_numpy(0.5 * (lower + upper)).requires_grad_()
-            value = self._value(region, x[None])[0]
-            score = np.zeros_like(width)
-            if value.requires_grad:
-                score = torch.autograd.grad(value, x)[0].abs().numpy() * width
-            score = score + 1e-9 * width
-        at = int(np.argmax(np.where(width > 0.0, score, -1.0)))
-        middle = 0.5 * (lower[at] + upper[at])
-        if not lower[at] < middle < upper[at]:
-            return None
-        left, right = upper.copy(), lower.copy()
-        left[at] = right[at] = middle
-        return [(lower, left), (right, upper)]
 
     # ------------------------------------------------------------ counterexamples
 
@@ -210,8 +195,7 @@ class _Search:
         x = []
         for lower, upper, slopes in boxes:
             x.append(0.5 * (lower + upper))
-            if slopes.shape[1] == len(lower):
-                x += [np.where(row > 0.0, lower, upper) for row in slopes]
+            x += [np.where(row > 0.0, lower, upper) for row in slopes]
         with torch.no_grad():
             tried = torch.from_numpy(np.stack(x))
             return self._any(region, tried, self._value(region, tried))
@@ -228,6 +212,20 @@ class _Search:
                 self.found = point, y
                 return True
         return False
+
+
+def _cut(lower: np.ndarray, upper: np.ndarray, slopes: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]] | None:
+    """The box in two halves across the input that matters most by ``slopes`` [k, n]; None if it is too small."""
+    width = upper - lower
+    # slopes are by half widths
+    score = np.abs(slopes).max(0) + 1e-9 * width
+    at = int(np.argmax(np.where(width > 0.0, score, -1.0)))
+    middle = 0.5 * (lower[at] + upper[at])
+    if not lower[at] < middle < upper[at]:
+        return None
+    left, right = upper.copy(), lower.copy()
+    left[at] = right[at] = middle
+    return [(lower, left), (right, upper)]
 
 
 def run_once(network: Network, run: Callable[[np.ndarray], np.ndarray], x: np.ndarray) -> np.ndarray:

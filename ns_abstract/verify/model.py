@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 from functools import cached_property
 from typing import Any
 
@@ -17,6 +18,7 @@ from ns_abstract.verify.network import (
     Substitution,
     bound_outputs,
 )
+from ns_abstract.verify.network.branching import branch
 from ns_abstract.verify.preprocess import Preprocess
 from ns_abstract.verify.properties import Query
 
@@ -82,6 +84,16 @@ class NetworkModel:
             arithmetic=self.arithmetic,
         )
         return found if d else dataclasses.replace(found, a=found.a[..., :0])
+
+    def branch(self, images: ImageSets, query: Query, groups: Sequence[Sequence[int]], most: int) -> float:
+        """A lower bound of the margin ``min over groups of max over its rows`` in the one cell of ``images``.
+
+        It is positive if ``most`` branches on the signs of units prove it (N15).
+        """
+        rows, offset = query.rows, query.offset
+        return branch(
+            self.network, parametric(images), rows, offset, groups, most, memory=self.memory, arithmetic=self.arithmetic
+        ).least
 
 
 def parametric(images: ImageSets) -> ImageSets:

@@ -119,6 +119,8 @@ class RegisteredModel:
     def __init__(self, model: Model) -> None:
         self.model = model
         self.outputs, self.differentiable, self.input_sets = model.outputs, model.differentiable, model.input_sets
+        # what holds for all parameters holds for all places
+        self.branch = model.branch
 
     def bound(self, images: ImageSets, query: Query, substitution: Substitution = "everywhere") -> OutputBounds:
         """Bounds in the poses' parameters, for all places of the scene."""

@@ -21,7 +21,7 @@ from ns_abstract.geometry.box import ParameterBox
 from ns_abstract.io.errors import InputError
 from ns_abstract.refine.protocol import Member
 from ns_abstract.verify.cells import Cell, Grid
-from ns_abstract.verify.properties import Claim, Query
+from ns_abstract.verify.properties import Claim, LinearClaim, Query
 
 if TYPE_CHECKING:
     from ns_abstract.verify.network import ImageSets, OutputBounds, Substitution
@@ -52,6 +52,9 @@ _FIRST_STEP = 0.25
 _MEMBERS = 4
 #: Why a cell is unknown where a sample's margin decides nothing.
 NO_NUMBER = "the margin of a picture is no finite number"
+#: Most branches on signs of units where a cell cannot be cut, and how many times the margin that samples show its bound
+#: may miss for these to be tried.
+_BRANCHES, _NEAR = 256, 3.0
 #: A scene among so many, in their order, attacks a proof.
 _ATTACKERS = 24
 
@@ -95,6 +98,10 @@ class Model(Protocol):
 
     def bound(self, images: ImageSets, query: Query, substitution: Substitution = "everywhere") -> OutputBounds:
         """Bounds of the query's rows over the sets."""
+        ...
+
+    def branch(self, images: ImageSets, query: Query, groups: Sequence[Sequence[int]], most: int) -> float:
+        """A lower bound of the margin of a linear claim over one set, by at most so many branches."""
         ...
 
 
@@ -433,7 +440,8 @@ class Search:
         """Lower bounds of the margin by cell; what fails leaves a reason and no bound."""
         kept: list[int] = []
         parts: list[Any] = []
-        for number, cell in zip(numbers, cells, strict=True):
+        seen = dict(zip(numbers, cells, strict=True))
+        for number, cell in seen.items():
             checkpoint()
             try:
                 linear, lower, upper, slope = self.scene.sets(cell.box)
@@ -457,13 +465,18 @@ class Search:
         try:
             query = self.claim.query(np.stack([outputs[number] for number in kept]))
             sets = self.model.input_sets(tuple(stacked[:4]), stacked[4], stacked[5])
-            found = self.claim.proved(query, self.model.bound(sets, query), boxes)
+            found = np.array(self.claim.proved(query, self.model.bound(sets, query), boxes), np.float64)
+            for place, number in enumerate(kept):
+                groups = self._branching(seen[number], float(found[place]))
+                if groups:
+                    better = self.model.branch(sets[place : place + 1], query, groups, _BRANCHES)
+                    found[place] = max(found[place], better)
         except InputError:
             raise
         except FAILURES as error:
             reasons.update(dict.fromkeys(kept, failure_text(error)))
             return
-        for number, margin in zip(kept, np.asarray(found, np.float64).tolist(), strict=True):
+        for number, margin in zip(kept, found.tolist(), strict=True):
             # infinite or NaN bounds prove nothing
             if math.isfinite(margin):
                 bounded[number] = margin
@@ -509,6 +522,13 @@ class Search:
         lost = 0.5 * np.abs(slope * width).sum() + np.abs(np.tensordot(slope, slopes, 3)).sum()
         here = float(margin.detach())
         return float(lost) / here if here > 0.0 else math.nan
+
+    def _branching(self, cell: _Seen, margin: float) -> Sequence[Sequence[int]]:
+        """The claim's groups, if branches may prove a cell that cannot be cut any more, and nothing else can (N15)."""
+        if not isinstance(self.claim, LinearClaim) or self._splittable(cell.cell) or cell.broken or cell.undecided:
+            return ()
+        near = -_NEAR * min(cell.margins, default=0.0) < margin <= 0.0
+        return self.claim.groups if near else ()
 
     def _splittable(self, cell: Cell) -> bool:
         return self.cuts and cell.volume > 1

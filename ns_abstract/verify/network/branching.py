@@ -36,7 +36,7 @@ class Branching:
 
 @dataclass(frozen=True)
 class _Branch:
-    """Signs that are assumed, with the value and the unit that `_judge` found for the branch they are of."""
+    """Signs that are assumed, by how much the claim holds or fails, and the unit to branch on (-1: none is left)."""
 
     signs: Mapping[int, Signs]
     value: float
@@ -65,8 +65,8 @@ def branch(
     """Try to prove that in every group some of ``rows @ network(x) + offset`` is positive, on one set of images.
 
     Whichever evaluation is meant, the input of a ReLU is not negative or not positive in it: where the bounds leave
-    the claim open, either is assumed, and both branches have to be proved. The weakest come first, so that a hopeless
-    claim ends soon.
+    a group open, either is assumed, and both branches have to be proved, each group for itself. The weakest come first,
+    so that a hopeless claim ends soon.
 
     Args:
         network, rows, offset, memory, arithmetic: See `bound_outputs`.
@@ -75,27 +75,31 @@ def branch(
         most: Branches after which it is given up.
         enough: Asked between batches of branches: whether to give up.
     """
-    waiting: list[_Branch] = []
-    count, least = 0, np.inf
-    assumed: list[dict[int, Signs]] = [{}]
-    while assumed:
+    dense = np.asarray(rows.toarray() if hasattr(rows, "toarray") else rows, np.float64)
+
+    def bounded(group: Sequence[int], assumed: list[dict[int, Signs]]) -> list[_Branch]:
         checkpoint()
         found = bound_outputs(
-            network, _repeated(images, len(assumed)), rows, offset,
+            network, _repeated(images, len(assumed)), dense[list(group)], offset[list(group)],
             memory=memory, arithmetic=arithmetic, slope_steps=_STEPS, assumed=assumed,
         )  # fmt: skip
-        count += len(assumed)
-        for number, signs in enumerate(assumed):
-            value, unit = _judge(found, number, groups)
-            if value > 0.0:
-                least = min(least, value)
-                continue
-            waiting.append(_Branch(signs, value, unit))
-        waiting.sort(key=lambda entry: entry.value)
-        if waiting and (waiting[0].unit[0] < 0 or count + 2 > most or enough()):
-            return Branching(False, count, waiting[0].value)
-        taken, waiting = waiting[: _TOGETHER // 2], waiting[_TOGETHER // 2 :]
-        assumed = [half for entry in taken for half in entry.halves()]
+        return [_judged(found, number, signs) for number, signs in enumerate(assumed)]
+
+    count, least = 0, np.inf
+    for group in groups:
+        if not len(group):
+            return Branching(False, count, -np.inf)
+        waiting: list[_Branch] = []
+        assumed: list[dict[int, Signs]] = [{}]
+        while assumed:
+            found = bounded(group, assumed)
+            count += len(assumed)
+            least = min([least, *(entry.value for entry in found if entry.value > 0.0)])
+            waiting = sorted([*waiting, *(entry for entry in found if not entry.value > 0.0)], key=lambda e: e.value)
+            if waiting and (waiting[0].unit[0] < 0 or count + 2 > most or enough()):
+                return Branching(False, count, waiting[0].value)
+            taken, waiting = waiting[: _TOGETHER // 2], waiting[_TOGETHER // 2 :]
+            assumed = [half for entry in taken for half in entry.halves()]
     return Branching(True, count, least)
 
 
@@ -104,15 +108,10 @@ def _repeated(images: ImageSets, count: int) -> ImageSets:
     return ImageSets(*(np.repeat(getattr(images, name), count, axis=0) for name in ImageSets.__dataclass_fields__))
 
 
-def _judge(found: OutputBounds, number: int, groups: Sequence[Sequence[int]]) -> tuple[float, tuple[int, int]]:
-    """How far a branch is from its proof (positive: proved; NaN is minus infinity), and the unit to branch on."""
-    value, unit = np.inf, (-1, -1)
+def _judged(found: OutputBounds, number: int, signs: Mapping[int, Signs]) -> _Branch:
+    """A branch by the bounds of its group's rows, of which one has to be positive; NaN is minus infinity."""
+    lower = np.where(np.isnan(found.lower[number]), -np.inf, found.lower[number])
+    best = int(lower.argmax())
     assert found.loosest is not None
-    for group in groups:
-        lower = np.where(np.isnan(found.lower[number]), -np.inf, found.lower[number])[list(group)]
-        best = int(lower.argmax()) if len(group) else -1
-        here = float(lower[best]) if len(group) else -np.inf
-        if here < value:
-            node, place = found.loosest[number, group[best]].tolist() if len(group) else (-1, -1)
-            value, unit = here, (node, place)
-    return value, unit
+    node, place = found.loosest[number, best].tolist()
+    return _Branch(signs, float(lower[best]), (node, place))
