@@ -10,7 +10,14 @@ import pytest
 from onnx_files import OnnxFile, attack, image_sets, session
 from test_network_bounds import exact_least, mlp, residual
 
-from ns_abstract.verify.network import ImageSets, NetworkArithmetic, bound_outputs, load_network
+from ns_abstract.verify.network import (
+    ImageSets,
+    NetworkArithmetic,
+    OutputBounds,
+    bound_outputs,
+    branching,
+    load_network,
+)
 from ns_abstract.verify.network.branching import branch
 
 MOST = 100
@@ -71,7 +78,7 @@ def test_behind_residuals(tmp_path: Path) -> None:
     assert branched
 
 
-def test_an_end_comes_soon(tmp_path: Path) -> None:
+def test_an_end_comes_soon(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     network, layers, _ = mlp(tmp_path, 1, 2.0)
     images, row = line(np.random.default_rng(1), 3), np.array([[1.0, 0.5]])
     least = float(exact_least(layers, images.b_lower[0], images.a_lower[0, :, 0], row[0]))
@@ -80,6 +87,10 @@ def test_an_end_comes_soon(tmp_path: Path) -> None:
     assert branch(network, images, row, np.array([-least - 1e-6]), [[0]], MOST, enough=lambda: True).branches <= 1
     assert not branch(network, images, row, np.array([np.nan]), [[0]], MOST).proved
     assert not branch(network, images, row, np.array([1e3 - least]), [[]], MOST).proved
+    # a bound that is no number proves nothing
+    nothing = OutputBounds(np.full((1, 1), np.nan), np.zeros((1, 1, 1)), np.zeros((1, 1)), np.full((1, 1, 2), -1))
+    monkeypatch.setattr(branching, "bound_outputs", lambda *_, **__: nothing)
+    assert not branch(network, images, row, np.array([1e3 - least]), [[0]], MOST).proved
 
 
 def test_a_network_without_units(tmp_path: Path) -> None:

@@ -200,7 +200,7 @@ CERTIFICATES = (
     ),
     Fault(
         "branching: one sign of a unit is left out",
-        _BRANCHING, "_Branch.halves", "for sign in (1.0, -1.0)", "for sign in (1.0,)", _BRANCHES,
+        _BRANCHING, "_Branch.halves", "(1.0, -1.0)", "(1.0,)", _BRANCHES,
     ),
     Fault(
         "branching: multipliers of either sign",
