@@ -177,7 +177,7 @@ def scene(things: Sequence[Thing], seed: int | None = 0) -> SplatScene:
 
 #: Scenes that are certified: things, seed of the lawn, distance and elevation (degrees) of the camera.
 RUNS: dict[str, tuple[list[Thing], int | None, float, float]] = {
-    "toy": ([Thing("aeroplane", (0.0, 0.0), 0.4)], None, 1.15, 25.0),
+    "toy": ([Thing("car", (0.0, 0.0), 1.3, 0, 1.3)], None, 1.15, 25.0),
     "lawn": (
         [
             Thing("aeroplane", (-0.35, 0.45), 2.2, 0, 1.05),

@@ -196,7 +196,7 @@ def photos_of_things(options: argparse.Namespace, rng: np.random.Generator) -> M
 
 
 def photos_of_run(options: argparse.Namespace, rng: np.random.Generator) -> Marked:
-    """One aeroplane, at the path's target; often outside of the picture."""
+    """One thing, at the path's target; often outside of the picture."""
     shown = nsa.load_scene(options.run, **(NERF if options.nerf else {}))
     camera, origin = load_camera_path(options.path).cameras[0], np.array(target_of(options.path))
     poses = nsa.PoseSet(
@@ -210,7 +210,7 @@ def photos_of_run(options: argparse.Namespace, rng: np.random.Generator) -> Mark
     found = [box_of(corners, drawn.pose(v), drawn.camera)[None] for v in values]
     boxes = [box[seen(box, options.side)] for box in found]
     images = list(pictures(shown.method(), drawn, values))
-    return images, boxes, [torch.zeros(len(box), dtype=torch.long) for box in boxes]
+    return images, boxes, [torch.full((len(box),), list(KINDS).index(options.kind_of_run)) for box in boxes]
 
 
 def overlaps(a: Tensor, b: Tensor) -> Tensor:
@@ -311,10 +311,11 @@ def parser() -> argparse.ArgumentParser:
     one.add_argument("--cell-axes", default="x")
     one.add_argument("--cells", type=int, default=600)
     two = kinds.add_parser("detector")
-    two.add_argument("--run", type=Path, help="of one aeroplane; left out: pictures of things")
+    two.add_argument("--run", type=Path, help="of one thing; left out: pictures of several")
+    two.add_argument("--kind-of-run", choices=list(KINDS), default="car")
     two.add_argument("--path", type=Path, help="with --run: camera path with an orbit")
     two.add_argument("--x", type=float, default=0.5)
-    two.add_argument("--extent", type=float, default=0.22, help="half a side of the cube around the aeroplane")
+    two.add_argument("--extent", type=float, default=0.22, help="half a side of the cube around the thing")
     two.add_argument("--nerf", action="store_true")
     for kind in (one, two, kinds.add_parser("classifier")):
         kind.add_argument("network", type=Path, help="where to write it")

@@ -155,9 +155,8 @@ def fit(
     model: nn.Sequential,
     images: Tensor,
     loss: Loss,
-    seconds: float,
+    seconds: float = 0.0,
     *,
-    noise: float = NOISE,
     steps: int | None = None,
     sets: Cells | None = None,
     set_loss: CellLoss | None = None,
@@ -178,7 +177,7 @@ def fit(
             group["lr"] = _RATE * (0.5 + 0.5 * math.cos(math.pi * share)) * min(1.0, (step + 1) / 30) + 1e-6
         which = torch.randint(len(images), (_BATCH,))
         shown = images[which]
-        value = loss(model(shown + noise * torch.randn_like(shown)), which)
+        value = loss(model(shown + NOISE * torch.randn_like(shown)), which)
         grown = min(1.0, max(0.0, (share - _WARM) / (_RAMP - _WARM)))
         if sets is not None and set_loss is not None and grown > 0.0:
             some = torch.randint(len(sets.middle), (_CELL_BATCH,))
