@@ -25,7 +25,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from objects import KINDS, RUNS, write_run
+from objects import KINDS, RUNS, write_nerf, write_run
 from train_views import CONFIDENCE, NERF, target_of
 from views import write_json
 
@@ -86,14 +86,14 @@ ROWS = {
     "airplane, past its edge": Row("estimator_airplane", "airplane", *estimate(0.05, x=0.55), (1000,)),
     "airfield, x": Row("estimator_airfield", "airfield", *estimate(0.05, x=0.35), (1000,)),
     "airfield, z": Row("estimator_airfield", "airfield", *estimate(0.05, z=0.2), (1000,)),
-    "toy NeRF, x": Row("estimator_toy_nerf", "toy NeRF", *estimate(0.1, x=0.2), (100,)),
+    "buoy NeRF, x": Row("estimator_buoy", "buoy", *estimate(0.05, x=0.3), (100,)),
     **{
         f"lawn, {kind}": Row("detector_things", "lawn", *detect(kind, x=0.3), (1000,))
         for kind in ("aeroplane", "car", "pottedplant")
     },
     "lawn, aeroplane, past its edge": Row("detector_things", "lawn", *detect("aeroplane", x=1.6), (1000,)),
     "lawn, car, IoU 0.5": Row("detector_things", "lawn", *detect("car", 0.5, x=0.05), (200,)),
-    "toy NeRF, car": Row("detector_toy_nerf", "toy NeRF", *detect("car", x=0.2), (100,)),
+    "buoy NeRF, boat": Row("detector_buoy", "buoy", *detect("boat", x=0.3), (100,)),
     **{f"{kind}, orbit": Row("classifier_things", kind, *turn(kind), (1000,)) for kind in KINDS},
 }
 # every Gaussian of the scene varies by itself; "airplane" is the class of the CIFAR-10 network
@@ -125,12 +125,12 @@ def scenes(options: argparse.Namespace) -> dict[str, Callable[[], tuple[nsa.Scen
         config, path = write_run(runs, name)
         return nsa.load_scene(config), path
 
-    def toy() -> tuple[nsa.Scene, Path]:
-        config = next((NETWORKS / "runs" / "toy").rglob("config.yml"))
-        return nsa.load_scene(config, **NERF), write_run(runs, "toy")[1]
+    def nerf() -> tuple[nsa.Scene, Path]:
+        config, path = write_nerf(runs)
+        return nsa.load_scene(config, **NERF), path
 
     found: dict[str, Callable[[], tuple[nsa.Scene, Path]]] = {name: partial(thing, name) for name in RUNS}
-    found["toy NeRF"] = toy
+    found["buoy"] = nerf
     if options.airplane is not None:
         found["airplane"] = lambda: (nsa.load_scene(options.airplane), options.airplane_path)
     if options.demo is not None:

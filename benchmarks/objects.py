@@ -2,8 +2,8 @@
 
     python benchmarks/objects.py OUTPUT_DIR
 
-writes runs and camera paths (OUTPUT_DIR/NAME.json, with an orbit) of those that are certified: `RUNS`. Classes have
-the numbers of VOC's, as the head of the detection property has them: `KINDS`.
+writes runs and camera paths (OUTPUT_DIR/NAME.json, with an orbit) of those that are certified: `RUNS`, and a small
+NeRF. Classes have the numbers of VOC's, as the head of the detection property has them: `KINDS`.
 """
 
 from __future__ import annotations
@@ -15,9 +15,15 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+import torch
 from numpy.typing import ArrayLike, NDArray
 
-from ns_abstract.geometry.views import around, path_json
+from ns_abstract.demo.buoy import REACH, buoy
+from ns_abstract.demo.nerf_fit import NerfNetwork, fit_field
+from ns_abstract.demo.writing import TIMESTAMP
+from ns_abstract.geometry.views import View, around, look_at, path_json
+from ns_abstract.methods.nerf.scene import NerfScene
+from ns_abstract.methods.nerf.write import write_nerf_run
 from ns_abstract.methods.splat.activate import SH_C0
 from ns_abstract.methods.splat.scene import SplatScene
 from ns_abstract.methods.splat.write import write_splatfacto_run
@@ -156,11 +162,9 @@ def _lawn(rng: np.random.Generator) -> tuple[Array, Array, Array]:
     return means, sigmas, _LAWN * rng.uniform(0.9, 1.1, (len(grid), 1))
 
 
-def scene(things: Sequence[Thing], seed: int | None = 0) -> SplatScene:
-    """Things on a lawn whose tones depend on ``seed``; None: on white."""
-    parts = [(thing.blobs(), thing.turn) for thing in things]
-    if seed is not None:
-        parts.insert(0, (_lawn(np.random.default_rng(seed)), 0.0))
+def scene(things: Sequence[Thing], seed: int = 0) -> SplatScene:
+    """Things on a lawn whose tones depend on ``seed``."""
+    parts = [(_lawn(np.random.default_rng(seed)), 0.0), *((thing.blobs(), thing.turn) for thing in things)]
     means, sigmas, colors = (np.concatenate(column) for column in zip(*(blobs for blobs, _ in parts), strict=True))
     turns = np.concatenate([np.full(len(blobs[0]), turn) for blobs, turn in parts])
     zero = np.zeros_like(turns)
@@ -170,14 +174,13 @@ def scene(things: Sequence[Thing], seed: int | None = 0) -> SplatScene:
         quats=np.stack([np.cos(0.5 * turns), zero, zero, np.sin(0.5 * turns)], axis=1).astype(np.float32),
         opacity_logits=np.full(len(means), 3.0, np.float32),
         sh=((np.clip(colors, 0.0, 1.0) - 0.5) / SH_C0)[:, None].astype(np.float32),
-        background=(np.ones(3) if seed is None else _SKY).astype(np.float32),
+        background=_SKY.astype(np.float32),
         name="things",
     )
 
 
 #: Scenes that are certified: things, seed of the lawn, distance and elevation (degrees) of the camera.
-RUNS: dict[str, tuple[list[Thing], int | None, float, float]] = {
-    "toy": ([Thing("car", (0.0, 0.0), 1.3, 0, 1.3)], None, 1.15, 25.0),
+RUNS: dict[str, tuple[list[Thing], int, float, float]] = {
     "lawn": (
         [
             Thing("aeroplane", (-0.35, 0.45), 2.2, 0, 1.05),
@@ -194,19 +197,40 @@ RUNS: dict[str, tuple[list[Thing], int | None, float, float]] = {
 _HEIGHT, _AZIMUTH, _PIXELS = 0.1, 25.0, 32
 
 
+#: The small NeRF: camera, field of view (degrees), end of the rays, and steps of its fit.
+_EYE, _FOV, _FAR, _STEPS = (2.0, -1.4, 1.0), 40.0, 4.0, 1000
+
+
+def _path(folder: Path, name: str, view: View, target: tuple[float, float, float]) -> Path:
+    orbit = {"target": list(target), "axis": [0.0, 0.0, 1.0], "azimuth": [0.0, 2.0 * np.pi]}
+    value = path_json([view], perturbation={"version": 1, "sweep": "keyframes", "orbit": orbit})
+    path = folder / f"{name}.json"
+    path.write_text(json.dumps(value, indent=1) + "\n", encoding="utf-8")
+    return path
+
+
 def write_run(folder: Path, name: str) -> tuple[Path, Path]:
     """Write a run of `RUNS` and its camera path; returns config.yml and the path."""
     things, seed, far, elevation = RUNS[name]
     target = (0.0, 0.0, _HEIGHT)
-    orbit = {"target": list(target), "axis": [0.0, 0.0, 1.0], "azimuth": [0.0, 2.0 * np.pi]}
     view = around(target, _AZIMUTH, elevation, far, height=_PIXELS, width=_PIXELS)
-    value = path_json([view], perturbation={"version": 1, "sweep": "keyframes", "orbit": orbit})
     config = write_splatfacto_run(
-        scene(things, seed), folder, timestamp="2026-01-01_120000", experiment_name=name, views=[view, view]
+        scene(things, seed), folder, timestamp=TIMESTAMP, experiment_name=name, views=[view, view]
     )  # fmt: skip
-    path = folder / f"{name}.json"
-    path.write_text(json.dumps(value, indent=1) + "\n", encoding="utf-8")
-    return config, path
+    return config, _path(folder, name, view, target)
+
+
+def write_nerf(folder: Path, steps: int = _STEPS) -> tuple[Path, Path]:
+    """Fit a small NeRF (4 x 64) to the demo's buoy, which takes seconds, and write it and a path; see `write_run`."""
+    torch.manual_seed(0)
+    network = NerfNetwork(4, 64, 2, 2, 32)
+    fit_field(network, buoy, REACH, steps, batch=1024)
+    weights = network.weights()
+    field = NerfScene(weights, weights, 0.0, _FAR, background=np.ones(3, np.float32), name="buoy")
+    target = (0.0, 0.0, _HEIGHT)
+    view = View(look_at(_EYE, target), _FOV, _PIXELS, _PIXELS)
+    config = write_nerf_run(field, folder, timestamp=TIMESTAMP, experiment_name="buoy")
+    return config, _path(folder, "buoy", view, target)
 
 
 def main() -> None:
@@ -215,6 +239,7 @@ def main() -> None:
     folder = parser.parse_args().output_dir
     for name in RUNS:
         print(*write_run(folder, name))
+    print(*write_nerf(folder))
 
 
 if __name__ == "__main__":

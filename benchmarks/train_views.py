@@ -39,7 +39,7 @@ from ns_abstract.verify.properties import ANCHORS, Truth, decode
 #: Radians by which an estimator's camera is turned in training.
 _TURN = 0.02
 #: How small NeRFs are sampled.
-NERF: dict[str, Any] = {"num_samples": 40, "near_plane": 0.4}
+NERF: dict[str, Any] = {"num_samples": 32, "near_plane": 1.2}
 #: Classes and numbers of the head of the detection property (docs/design.md, V4), and its anchors.
 _VOC, _ANCHORS = 20, 5
 #: Where detector and classifier look: distance and elevation (degrees), each from and to; height of what they look at.
@@ -305,14 +305,14 @@ def parser() -> argparse.ArgumentParser:
     one.add_argument("--y", type=float, default=0.15)
     one.add_argument("--z", type=float, default=0.2)
     one.add_argument("--tolerance", type=float, default=0.1, help="part of the distance")
-    one.add_argument("--nerf", action="store_true", help="40 samples from 0.4")
+    one.add_argument("--nerf", action="store_true", help="32 samples from 1.2")
     one.add_argument("--certified", type=float, default=0.0, help="weight of the bounds; 0: plain training")
     one.add_argument("--cell", type=float, default=0.01, help="half-width of a cell, parts of the range's")
     one.add_argument("--cell-axes", default="x")
     one.add_argument("--cells", type=int, default=600)
     two = kinds.add_parser("detector")
     two.add_argument("--run", type=Path, help="of one thing; left out: pictures of several")
-    two.add_argument("--kind-of-run", choices=list(KINDS), default="car")
+    two.add_argument("--kind-of-run", choices=list(KINDS), default="boat")
     two.add_argument("--path", type=Path, help="with --run: camera path with an orbit")
     two.add_argument("--x", type=float, default=0.5)
     two.add_argument("--extent", type=float, default=0.22, help="half a side of the cube around the thing")

@@ -47,8 +47,8 @@ def judge(name: str) -> NetworkModel:
 
 
 def moving(scripts: Any, side: int = 16) -> tuple[SplatMethod, PoseSet]:
-    """A toy on white, and a set of poses of two parameters."""
-    things, seed, far, elevation = scripts.objects.RUNS["toy"]
+    """A car on the lawn, and a set of poses of two parameters."""
+    things, seed, far, elevation = scripts.objects.RUNS["car"]
     view = scripts.train.around((0.0, 0.0, 0.1), 25.0, elevation, far)
     camera = nsa.Camera(view.camera_to_world, view.fov, side, side)
     perturbation = Perturbation(translation={"x": (-0.2, 0.2), "z": (-0.1, 0.1)})
@@ -90,7 +90,7 @@ def test_cells_hold_their_renders(scripts: Any) -> None:
 
 @pytest.mark.parametrize("certified", [0.0, 0.5])
 def test_training_learns(scripts: Any, certified: float, tmp_path: Path) -> None:
-    """A few steps on pictures of the toy, with and without cells; the file gives what the trained network gives."""
+    """A few steps on pictures of a car, with and without cells; the file gives what the trained network gives."""
     torch.manual_seed(0)
     method, poses = moving(scripts)
     values = poses.box.sample(120, np.random.default_rng(0))
