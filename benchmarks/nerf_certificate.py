@@ -20,6 +20,7 @@ import numpy as np
 import torch
 from torch import nn
 from torch.nn import functional
+from views import HELD, export, fit, pictures
 
 import ns_abstract as nsa
 from ns_abstract.geometry.camera_path import load_camera_path
@@ -32,30 +33,12 @@ from ns_abstract.verify.preprocess import Preprocess
 SECTORS = 4
 
 
-def network(side: int) -> nn.Module:
+def network(side: int) -> nn.Sequential:
     """Two strided convolutions and two linear layers."""
     return nn.Sequential(
         nn.Conv2d(3, 8, 4, 2, 1), nn.ReLU(), nn.Conv2d(8, 12, 4, 2, 1), nn.ReLU(), nn.Flatten(),
         nn.Linear(12 * (side // 4) ** 2, 24), nn.ReLU(), nn.Linear(24, SECTORS),
     )  # fmt: skip
-
-
-def train(model: nn.Module, images: torch.Tensor, labels: torch.Tensor, steps: int) -> float:
-    """Fit to pictures [n, 3, side, side] with noise; returns the accuracy on every fifth, which is held back."""
-    held = torch.arange(len(images)) % 5 == 0
-    some, right = images[~held], labels[~held]
-    optimizer = torch.optim.AdamW(model.parameters(), lr=3e-3, weight_decay=3e-2)
-    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, steps)
-    for _ in range(steps):
-        which = torch.randint(len(some), (128,))
-        noisy = some[which] + 0.05 * torch.randn_like(some[which])
-        loss = functional.cross_entropy(model(noisy), right[which], label_smoothing=0.02)
-        optimizer.zero_grad(set_to_none=True)
-        loss.backward()
-        optimizer.step()
-        schedule.step()
-    with torch.no_grad():
-        return float((model(images[held]).argmax(dim=1) == labels[held]).float().mean())
 
 
 def main() -> None:
@@ -85,13 +68,21 @@ def main() -> None:
     whole = nsa.PoseSet(camera, orbit={**orbit, "azimuth": [0.0, 2.0 * math.pi]}, translation={"x": 0.01, "y": 0.01})
     frame = scene.method().frame(whole.of(scene))
     values = frame.box.sample(options.pictures, np.random.default_rng(0))
-    images = torch.from_numpy(np.stack([frame.render(v).reshape(side, side, 3) for v in values])).permute(0, 3, 1, 2)
+    images = pictures(scene.method(), whole.of(scene), values)
     azimuth = torch.from_numpy(values[:, frame.box.names.index("azimuth")])
     labels = (azimuth / (2.0 * math.pi) * SECTORS).long().clamp(max=SECTORS - 1)
     model = network(side)
-    accuracy = train(model, images, labels, options.steps)
+    held = torch.arange(len(images)) % HELD == 0
+    right = labels[~held]
+
+    def loss(outputs: torch.Tensor, which: torch.Tensor) -> torch.Tensor:
+        return functional.cross_entropy(outputs, right[which], label_smoothing=0.02)
+
+    fit(model, images[~held], loss, steps=options.steps)
+    with torch.no_grad():
+        accuracy = float((model(images[held]).argmax(dim=1) == labels[held]).float().mean())
     file = options.output_dir / "sectors.onnx"
-    torch.onnx.export(model.eval(), (images[:1],), file, input_names=["image"], dynamo=False)
+    export(model, side, file)
     print(f"classifier: {accuracy:.3f} held back, {time.perf_counter() - begin:.0f} s", flush=True)
     middle = 1.5 * 2.0 * math.pi / SECTORS
     arc = [middle - 0.5 * options.arc, middle + 0.5 * options.arc]

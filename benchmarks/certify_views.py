@@ -1,0 +1,226 @@
+"""Certificates of the networks in `networks/`, in the shape of Tables 3 and 4 of "Abstract Rendering".
+
+    ns-abstract-demo --output-dir DEMO
+    python benchmarks/certify_views.py OUTPUT_DIR --demo DEMO [--airplane RUN/config.yml --airplane-path ORBIT.json]
+                                       [--models FOLDER] [--only NAME ...] [--minutes 20]
+
+Writes camera path, property and certificate of every row below OUTPUT_DIR (as `ns-abstract-certify` takes and leaves
+them), and prints the table. PCP-S and PCP-V are of a fixed partition (docs/certificates.md). Certified cells are then
+attacked: random poses are rendered, shown to onnxruntime, and the margin found is compared with the one proved.
+"""
+
+from __future__ import annotations
+
+import argparse
+import itertools
+import json
+import math
+import re
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from objects import KINDS, RUNS, write_nerf, write_run
+from train_views import CONFIDENCE, NERF, target_of
+from views import write_json
+
+import ns_abstract as nsa
+from ns_abstract.api.certification import FramePictures, PropertySource, Question
+from ns_abstract.geometry.camera_path import load_camera_path
+from ns_abstract.verify.model import NetworkModel
+
+NETWORKS = Path(__file__).resolve().parent / "networks"
+#: Scenes of a set that certified cells are attacked with.
+_MEMBERS = 20
+
+
+@dataclass(frozen=True)
+class Row:
+    """A certificate.
+
+    Attributes:
+        network: Name in `NETWORKS`, also of the row.
+        scene: Which run: a key of `scenes`.
+        perturbation: The set, without its version.
+        property: What is to hold; "origin" of a regression is put in from the path's orbit.
+        partitions: Of the set.
+    """
+
+    network: str
+    scene: str
+    perturbation: dict[str, Any]
+    property: dict[str, Any]
+    partitions: tuple[int, ...]
+
+
+_CIFAR = {"resize": [32, 32], "mean": [0.4914, 0.4822, 0.4465], "std": [0.2471, 0.2435, 0.2616]}
+
+
+def estimate(part: float, **translation: float) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Set and property: the target's place within ``part`` of the distance."""
+    prop = {"type": "regression", "target": "object", "tolerance": {"relative": part}}
+    return {"translation": translation}, prop
+
+
+def detect(kind: str, iou: float | None = None, **translation: float) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Set and property: a box of the kind, with the paper's threshold."""
+    prop = {"type": "detection", "class": KINDS[kind], "confidence": CONFIDENCE, "iou": iou}
+    return {"translation": translation}, prop
+
+
+def turn(kind: str) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Set and property: the right class all around the thing."""
+    prop = {"type": "classification", "label": list(KINDS).index(kind)}
+    return {"orbit": {"azimuth": [0.0, 2.0 * math.pi]}}, prop
+
+
+ROWS = {
+    "airplane, x": Row("estimator_airplane", "airplane", *estimate(0.05, x=0.4), (1000,)),
+    "airplane, z": Row("estimator_airplane", "airplane", *estimate(0.05, z=0.2), (1000,)),
+    "airplane, x and z": Row("estimator_airplane", "airplane", *estimate(0.05, x=0.4, z=0.2), (400, 50)),
+    "airplane, past its edge": Row("estimator_airplane", "airplane", *estimate(0.05, x=0.55), (1000,)),
+    "airfield, x": Row("estimator_airfield", "airfield", *estimate(0.05, x=0.35), (1000,)),
+    "airfield, z": Row("estimator_airfield", "airfield", *estimate(0.05, z=0.2), (1000,)),
+    "buoy NeRF, x": Row("estimator_buoy", "buoy", *estimate(0.05, x=0.3), (100,)),
+    **{
+        f"lawn, {kind}": Row("detector_things", "lawn", *detect(kind, x=0.3), (1000,))
+        for kind in ("aeroplane", "car", "pottedplant")
+    },
+    "lawn, aeroplane, past its edge": Row("detector_things", "lawn", *detect("aeroplane", x=1.6), (1000,)),
+    "lawn, car, IoU 0.5": Row("detector_things", "lawn", *detect("car", 0.5, x=0.05), (200,)),
+    "buoy NeRF, boat": Row("detector_buoy", "buoy", *detect("boat", x=0.3), (100,)),
+    **{f"{kind}, orbit": Row("classifier_things", kind, *turn(kind), (1000,)) for kind in KINDS},
+}
+# every Gaussian of the scene varies by itself; "airplane" is the class of the CIFAR-10 network
+ROWS |= {
+    f"airplane, orbit, {name}": Row(
+        "cifar10_resnet2b",
+        "airplane",
+        {"orbit": {"azimuth": [0.0, 2.0 * math.pi]}, **({"scene": [{"select": {}, **varied}]} if varied else {})},
+        {"type": "classification", "label": 0, "preprocess": _CIFAR},
+        (1000,),
+    )
+    for name, varied in (("poses alone", {}), ("colour 0.05", {"color": 0.05}), ("opacity 0.05", {"opacity": 0.05}))
+}
+# what certified training is for: parts so coarse that not all can be certified
+ROWS |= {
+    f"airfield, {' and '.join(translation)}, {training}, {' x '.join(map(str, parts))}": Row(
+        f"estimator_airfield{suffix}", "airfield", *estimate(0.05, **translation), parts
+    )
+    for translation, parts in (({"x": 0.35}, (80,)), ({"x": 0.35}, (160,)), ({"x": 0.35}, (320,)))
+    for training, suffix in (("plain", ""), ("certified", "_certified"))
+}
+
+
+def scenes(options: argparse.Namespace) -> dict[str, Callable[[], tuple[nsa.Scene, Path]]]:
+    """How to open the scenes of the rows, each with its camera path."""
+    runs = options.output_dir / "runs"
+
+    def thing(name: str) -> tuple[nsa.Scene, Path]:
+        config, path = write_run(runs, name)
+        return nsa.load_scene(config), path
+
+    def nerf() -> tuple[nsa.Scene, Path]:
+        config, path = write_nerf(runs)
+        return nsa.load_scene(config, **NERF), path
+
+    found: dict[str, Callable[[], tuple[nsa.Scene, Path]]] = {name: partial(thing, name) for name in RUNS}
+    found["buoy"] = nerf
+    if options.airplane is not None:
+        found["airplane"] = lambda: (nsa.load_scene(options.airplane), options.airplane_path)
+    if options.demo is not None:
+        run = next((options.demo / "airfield").rglob("config.yml"))
+        found["airfield"] = lambda: (nsa.load_scene(run), options.demo / "camera_path_orbit.json")
+    return found
+
+
+def attack(pictures: FramePictures, question: Question, found: nsa.Certificate, count: int) -> tuple[int, int]:
+    """Random poses of certified cells that were looked at, and those whose margin is below the one proved."""
+    certified = [cell for cell in found.cells if cell.verdict == "certified"]
+    if not certified:
+        return 0, 0
+    model, rng = NetworkModel(question.network, question.property.preprocess, 1 << 30), np.random.default_rng(1)
+
+    def nominal() -> np.ndarray:
+        return model.outputs(pictures.image(pictures.box.middle)[None])[0]
+
+    claim, wrong = question.property.bind(pictures.pose_set, nominal), 0
+    others = [None, *itertools.islice(pictures.members(1), _MEMBERS)]
+    for k in range(count):
+        cell = certified[rng.integers(len(certified))]
+        values = rng.uniform(cell.lower, cell.upper)
+        outputs = model.outputs(pictures.image(values, others[k % len(others)])[None]).astype(np.float64)
+        margin = float(claim.margin(torch.from_numpy(outputs), torch.from_numpy(values[None]))[0])
+        wrong += not margin >= max(cell.margin or 0.0, 0.0)
+    return count, wrong
+
+
+def certify(
+    name: str, row: Row, file: Path, scene: nsa.Scene, path: Path, folder: Path, minutes: float, attacks: int = 300
+) -> str:
+    """Certify a row with the network ``file`` and write what it takes; returns its line of the table."""
+    folder.mkdir(parents=True, exist_ok=True)
+    prop = {**row.property, "partitions": list(row.partitions)}
+    if prop["type"] == "regression":
+        prop["origin"] = target_of(path)
+    value = json.loads(path.read_text(encoding="utf-8"))
+    question = Question(file, PropertySource.of(prop))
+    value["render_height"], value["render_width"] = question.size
+    orbit = value["perturbation"]["orbit"]
+    value["perturbation"] = {"version": 1, **row.perturbation}
+    if "orbit" in row.perturbation:
+        value["perturbation"]["orbit"] = {**orbit, **row.perturbation["orbit"]}
+    camera = load_camera_path(write_json(folder / "path.json", value)).cameras[0]
+    write_json(folder / "property.json", prop)
+    poses = nsa.PoseSet.from_json(camera, value["perturbation"])
+    begin = time.process_time()
+    found = nsa.certify(
+        scene, poses, file, folder / "property.json", time_budget=60.0 * minutes, output_dir=folder / "certificate"
+    )  # fmt: skip
+    spent = (time.process_time() - begin) / 60.0
+    part = found.report["frames"][0]["partition"]
+    tried, wrong = attack(FramePictures(scene.method(), poses.of(scene)), question, found, attacks)
+    right, certified = (part[key] / part["partitions"] for key in ("right", "certified"))
+    distance = float(np.linalg.norm(camera.camera_to_world[:, 3] - np.array(orbit["target"])))
+    about = ", ".join(f"{key} {value:g}" for key, value in row.perturbation.get("translation", {"orbit": 360}).items())
+    count = " x ".join(map(str, row.partitions))
+    return (
+        f"| {name} | {scene.method().content} | {about} | {distance:.2f} | {count} | {right:.1%} | "
+        f"{certified:.1%} | {certified / right if right else math.nan:.3f} | {len(found.cells)} | {spent:.1f} | "
+        f"{found.state} | {tried} / {wrong} |"
+    )
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("output_dir", type=Path)
+    parser.add_argument("--demo", type=Path)
+    parser.add_argument("--airplane", type=Path, help="config.yml of the run that the network was trained on")
+    parser.add_argument("--airplane-path", type=Path)
+    parser.add_argument("--models", type=Path, help="folder of cifar10_resnet2b.onnx")
+    parser.add_argument("--only", nargs="*", choices=list(ROWS))
+    parser.add_argument("--minutes", type=float, default=20.0, help="by row")
+    options = parser.parse_args()
+    known = scenes(options)
+    lines, folders = [], [NETWORKS, *([options.models] if options.models else [])]
+    for name, row in ROWS.items():
+        file = next((found for found in (f / f"{row.network}.onnx" for f in folders) if found.exists()), None)
+        if file is not None and row.scene in known and (not options.only or name in options.only):
+            scene, path = known[row.scene]()
+            folder = options.output_dir / re.sub(r"[^a-zA-Z0-9.]+", "_", name)
+            lines.append(certify(name, row, file, scene, path, folder, options.minutes))
+            print(lines[-1], flush=True)
+    heads = (
+        "row", "content", "radius", "d", "parts", "PCP-S", "PCP-V", "V / S", "cells", "CPU minutes", "state",
+        "attacked / violated",
+    )  # fmt: skip
+    print("\n".join(["", f"| {' | '.join(heads)} |", "|---" * len(heads) + "|", *lines]))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,198 @@
+"""Pictures of sets of poses with what is true of them, and training of small networks, plain and certified.
+
+Shared by `train_views.py`, `certify_views.py` and `nerf_certificate.py`.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from ns_abstract.api.certification import FramePictures
+from ns_abstract.geometry.poses import PoseSet
+from ns_abstract.geometry.tiles import assemble
+from ns_abstract.refine.protocol import Method
+
+#: Every so many-th picture is held back.
+HELD = 5
+#: Standard deviation of the noise on pictures that are trained on.
+NOISE = 0.03
+_RATE, _DECAY, _BATCH, _CELL_BATCH = 3e-3, 2e-2, 64, 32
+#: Shares of the time: before cells count, and until they count in full.
+_WARM, _RAMP = 0.2, 0.6
+
+
+def pictures(method: Method, poses: PoseSet, values: np.ndarray) -> Tensor:
+    """Renders [n, 3, H, W] at parameter values [n, d]."""
+    frame = method.frame(poses)
+    found = [assemble(frame.render(v), frame.camera)[..., :3] for v in values]
+    return torch.from_numpy(np.stack(found)).permute(0, 3, 1, 2).contiguous().float()
+
+
+# ---------------------------------------------------------------- networks
+
+
+def head(side: int, outputs: int, channels: tuple[int, int, int] = (12, 16, 32)) -> nn.Sequential:
+    """A small GateNet: convolution, pool, convolution, two linear layers; pictures of a multiple of 16 pixels."""
+    first, second, hidden = channels
+    stride = side // 16
+    return nn.Sequential(
+        nn.Conv2d(3, first, stride + 2, stride, 1), nn.ReLU(), nn.AvgPool2d(2),
+        nn.Conv2d(first, second, 3, 2, 1), nn.ReLU(), nn.Flatten(),
+        nn.Linear(16 * second, hidden), nn.ReLU(), nn.Linear(hidden, outputs),
+    )  # fmt: skip
+
+
+def export(model: nn.Module, side: int, file: Path) -> None:
+    """Write a network of pictures [1, 3, side, side] with torch's exporter, weights in the file."""
+    shown = torch.zeros(1, 3, side, side)
+    program = torch.onnx.export(
+        model.eval(), (shown,), dynamo=True, input_names=["image"], output_names=["y"], verbose=False
+    )
+    assert program is not None
+    program.save(file, external_data=False)
+
+
+# ---------------------------------------------------------------- cells of poses, for certified training
+
+
+@dataclass(frozen=True)
+class Cells:
+    """Sets of pictures ``middle + sum_k slopes_k p_k`` within ``radius``, p in [-1, 1]^d, around single poses.
+
+    Attributes:
+        middle, radius: [n, 3, H, W].
+        slopes: [n, d, 3, H, W].
+        values: [n, d] the parameters at the middle.
+        half: [n, d] half-widths.
+    """
+
+    middle: Tensor
+    slopes: Tensor
+    radius: Tensor
+    values: np.ndarray
+    half: np.ndarray
+
+
+def cells(method: Method, poses: PoseSet, values: np.ndarray, half: np.ndarray) -> Cells:
+    """Bounded cells of half-widths [d] around parameter values [n, d], cut off at the ends of the set."""
+    shown = FramePictures(method, poses)
+    whole, found, boxes = shown.box, [], []
+    for v in values:
+        box = whole
+        for axis in range(whole.dimensions):
+            low, high = whole.lower[axis], whole.upper[axis]
+            box = box.replace(axis, max(low, v[axis] - half[axis]), min(high, v[axis] + half[axis]))
+        linear, lower, upper, _ = shown.sets(box)
+        a_lower, b_lower, a_upper, b_upper = (np.asarray(part, np.float64) for part in linear)
+        slopes, middle = 0.5 * (a_lower + a_upper), 0.5 * (b_lower + b_upper)
+        radius = 0.5 * (b_upper - b_lower) + 0.5 * np.abs(a_upper - a_lower).sum(axis=-1)
+        # where the interval says more, planes are flat
+        better = 0.5 * (upper - lower) < radius + np.abs(slopes).sum(axis=-1)
+        better &= 0.5 * (upper - lower) < radius
+        middle[better], radius[better] = 0.5 * (lower + upper)[better], 0.5 * (upper - lower)[better]
+        slopes[better] = 0.0
+        found.append((middle.transpose(2, 0, 1), slopes.transpose(3, 2, 0, 1), radius.transpose(2, 0, 1)))
+        boxes.append(([0.5 * (a + b) for a, b in zip(box.lower, box.upper, strict=True)], box))
+    middle, slopes, radius = (torch.from_numpy(np.stack(part)).float() for part in zip(*found, strict=True))
+    sizes = [[0.5 * (b - a) for a, b in zip(box.lower, box.upper, strict=True)] for _, box in boxes]
+    return Cells(middle, slopes, radius, np.array([centre for centre, _ in boxes]), np.array(sizes))
+
+
+def ranges(model: nn.Sequential, middle: Tensor, slopes: Tensor, radius: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """The network's outputs over cells, as sets of the same kind: [n, k], [n, d, k], [n, k]; differentiable.
+
+    Linear layers map the set exactly, but for the radius, which takes their absolute weights. ReLU: the parallel band
+    of the chord of the range (DeepZ of Singh et al., with one radius for all errors). Float64 charges are left out:
+    this is for training, not a proof.
+    """
+    count, parameters = slopes.shape[:2]
+    for layer in model:
+        if isinstance(layer, nn.ReLU):
+            reach = slopes.abs().sum(dim=1) + radius
+            low, high = middle - reach, middle + reach
+            slope = (high / (high - low).clamp(min=1e-9)).clamp(0.0, 1.0)
+            slope = torch.where(low >= 0.0, torch.ones_like(slope), torch.where(high <= 0.0, 0.0, slope))
+            half = torch.where((low < 0.0) & (high > 0.0), -0.5 * slope * low, 0.0)
+            middle, radius = slope * middle + half, slope * radius + half
+            slopes = slope[:, None] * slopes
+            continue
+        flat = slopes.reshape(count * parameters, *slopes.shape[2:])
+        if isinstance(layer, nn.Conv2d):
+            place: dict[str, Any] = {"stride": layer.stride, "padding": layer.padding}
+            middle = layer(middle)
+            flat = functional.conv2d(flat, layer.weight, None, **place)
+            radius = functional.conv2d(radius, layer.weight.abs(), None, **place)
+        elif isinstance(layer, nn.Linear):
+            middle, flat = layer(middle), functional.linear(flat, layer.weight)
+            radius = functional.linear(radius, layer.weight.abs())
+        else:
+            assert isinstance(layer, (nn.AvgPool2d, nn.Flatten)), layer
+            middle, flat, radius = layer(middle), layer(flat), layer(radius)
+        slopes = flat.reshape(count, parameters, *flat.shape[1:])
+    return middle, slopes, radius
+
+
+# ---------------------------------------------------------------- training
+
+#: Outputs [b, k] and which pictures [b] they are of, to a loss.
+Loss = Callable[[Tensor, Tensor], Tensor]
+#: Sets of outputs (see `ranges`), which cells [b] they are of, and their size now (1: the cells), to a loss.
+CellLoss = Callable[[tuple[Tensor, Tensor, Tensor], Tensor, float], Tensor]
+
+
+def fit(
+    model: nn.Sequential,
+    images: Tensor,
+    loss: Loss,
+    seconds: float = 0.0,
+    *,
+    steps: int | None = None,
+    sets: Cells | None = None,
+    set_loss: CellLoss | None = None,
+    weight: float = 1.0,
+) -> int:
+    """Train on pictures [n, 3, H, W] for so much processor time, or so many steps.
+
+    With ``sets`` the loss of bounded cells counts ``weight`` times, after a warm-up in which they grow from points.
+
+    Returns:
+        The number of steps.
+    """
+    optimizer = torch.optim.AdamW(model.parameters(), lr=_RATE, weight_decay=_DECAY)
+    started, step, share = time.process_time(), 0, 0.0
+    model.train()
+    while share < 1.0:
+        for group in optimizer.param_groups:
+            group["lr"] = _RATE * (0.5 + 0.5 * math.cos(math.pi * share)) * min(1.0, (step + 1) / 30) + 1e-6
+        which = torch.randint(len(images), (_BATCH,))
+        shown = images[which]
+        value = loss(model(shown + NOISE * torch.randn_like(shown)), which)
+        grown = min(1.0, max(0.0, (share - _WARM) / (_RAMP - _WARM)))
+        if sets is not None and set_loss is not None and grown > 0.0:
+            some = torch.randint(len(sets.middle), (_CELL_BATCH,))
+            found = ranges(model, sets.middle[some], grown * sets.slopes[some], grown * sets.radius[some])
+            value = value + weight * grown * set_loss(found, some, grown)
+        optimizer.zero_grad(set_to_none=True)
+        value.backward()
+        nn.utils.clip_grad_norm_(model.parameters(), 5.0)
+        optimizer.step()
+        step += 1
+        share = step / steps if steps is not None else (time.process_time() - started) / seconds
+    model.eval()
+    return step
+
+
+def write_json(file: Path, value: Any) -> Path:
+    file.write_text(json.dumps(value, indent=1) + "\n", encoding="utf-8")
+    return file
