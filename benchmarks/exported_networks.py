@@ -310,6 +310,19 @@ def _timm(name: str, **settings: Any) -> Callable[[], nn.Module]:
     return make
 
 
+def _timm_class(module: str, name: str, **settings: Any) -> Callable[[], nn.Module]:
+    """Made by its class: `create_model` has sizes of its own and passes none twice."""
+
+    def make() -> nn.Module:
+        import importlib
+
+        found = importlib.import_module(f"timm.models.{module}")
+        made = {k: getattr(found, v) if k.endswith("_layer") else v for k, v in settings.items()}
+        return getattr(found, name)(num_classes=10, **made)
+
+    return make
+
+
 def _features(name: str, channels: int) -> Callable[[], nn.Module]:
     """Without the classifier, which wants larger images."""
 
@@ -391,9 +404,30 @@ NETWORKS: dict[str, tuple[Callable[[], nn.Module], int]] = {
     "timm repvgg_a2": (_timm("repvgg_a2"), 32),
     "timm cspdarknet53": (_timm("cspdarknet53"), 32),
     "timm dla34": (_timm("dla34"), 32),
-    "timm vit_tiny_patch16_224": (_timm("vit_tiny_patch16_224", img_size=32, depth=2), 32),
-    "timm mixer_s32_224": (_timm("mixer_s32_224", img_size=64, num_blocks=2), 64),
-    "timm resmlp_12_224": (_timm("resmlp_12_224", img_size=32, num_blocks=2), 32),
+    "timm vit_tiny, two layers": (
+        _timm_class(
+            "vision_transformer", "VisionTransformer", img_size=32, patch_size=16, embed_dim=192, depth=2, num_heads=3
+        ),
+        32,
+    ),
+    "timm mixer_s32, two blocks": (
+        _timm_class("mlp_mixer", "MlpMixer", img_size=64, patch_size=32, num_blocks=2, embed_dim=512),
+        64,
+    ),
+    "timm resmlp_12, two blocks": (
+        _timm_class(
+            "mlp_mixer",
+            "MlpMixer",
+            img_size=32,
+            patch_size=16,
+            num_blocks=2,
+            embed_dim=384,
+            mlp_ratio=4,
+            block_layer="ResBlock",
+            norm_layer="Affine",
+        ),
+        32,
+    ),
     "timm poolformer_s12": (_timm("poolformer_s12"), 32),
     "inception_v3": (_torchvision("inception_v3", aux_logits=False, init_weights=False), 75),
 }
