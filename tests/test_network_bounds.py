@@ -157,7 +157,6 @@ def test_deep_networks_are_bounded(allowed: float, tmp_path: Path, monkeypatch: 
     plain = bound_outputs(network, images, rows, np.zeros(4))
     monkeypatch.setattr(schedule, "_DEEP", 0.0)
     monkeypatch.setattr(schedule, "_ALLOWED", allowed)
-    monkeypatch.setattr(schedule, "_GIVEN_UP", allowed)
     threads = torch.get_num_threads()
     found = []
     try:

@@ -686,6 +686,8 @@ class _Cells:
         """The form of node ``index`` with better bounds of what is open before an activation or a product (None)."""
         if self.network.depth[index] < 2:
             return form
+        if self.schedule.deep:
+            self.schedule.arrives(index)
         if apart is not None:
             form, open_ = self._bent(index, form, open_, apart)
         if self.schedule.deep:
@@ -774,9 +776,10 @@ class _Cells:
             widths = [(f.upper - f.lower).reshape(open_.shape)[at] for f in (form, found)]
             lower, upper = (v.reshape(open_.shape)[at] for v in found.interval)
             form = found
-            if self.schedule.hopeless(
+            if self.schedule.vain(
                 float((widths[1] / widths[0]).median()),
                 float(((lower < 0.0) & (upper > 0.0)).double().mean()) if decides else 0.0,
+                count / open_.numel(),
             ):
                 return form
         return self._bounded(index, form, chosen, early, decides)
