@@ -520,8 +520,10 @@ def measure(name: str, exporter: str, runs: int, width: float) -> dict[str, Any]
             least = np.minimum(least, y)
             outside += int((y < lower).sum() + (y < bounds.a[0] @ p + bounds.b[0]).sum())
         spread = (least[:k] + least[k:]) * -0.5
-        found.update(runs=done, outside=outside)
-        found["ratio"] = round(float(np.median((lower[:k] + lower[k:]) * -0.5 / np.maximum(spread, 1e-12))), 2)
+        found.update(runs=done, outside=outside, width=float(f"{-np.median(lower[:k] + lower[k:]):.3g}"))
+        moves = spread > 0.0
+        if moves.any():
+            found["ratio"] = round(float(np.median(((lower[:k] + lower[k:]) * -0.5)[moves] / spread[moves])), 2)
         return found
 
 
@@ -532,7 +534,7 @@ def main() -> None:
     parser.add_argument("--exporters", nargs="*", default=["dynamo", "17"], help="dynamo, pt2 or operator sets")
     parser.add_argument("--runs", type=int, default=2000, help="of onnxruntime; 0: networks are loaded and not bounded")
     parser.add_argument("--width", type=float, default=2e-3, help="how far an image moves with one parameter")
-    parser.add_argument("--limit", type=float, default=300.0, help="seconds a network may take")
+    parser.add_argument("--limit", type=float, default=300.0, help="processor seconds a network may take")
     parser.add_argument("--output", type=Path, default=None, help="JSON lines")
     parser.add_argument("--together", action="store_true", help="in one process: quicker, and an end ends all")
     parser.add_argument("--one", nargs=2, default=None, help=argparse.SUPPRESS)
@@ -559,10 +561,14 @@ def main() -> None:
             command = [sys.executable, __file__, "--one", name, exporter]
             command += ["--runs", str(arguments.runs), "--width", str(arguments.width)]
             try:
+                # of a busy machine a process may get a tenth
+                command = ["prlimit", f"--cpu={arguments.limit:.0f}", *command]
                 done = subprocess.run(
-                    command, capture_output=True, text=True, timeout=arguments.limit, env=os.environ, check=False
+                    command, capture_output=True, text=True, timeout=10 * arguments.limit, env=os.environ, check=False
                 )
                 text, end = done.stdout, done.stderr.strip().splitlines()[-1:] if done.returncode else []
+                if done.returncode in (-signal.SIGXCPU, -signal.SIGKILL):
+                    end = [f"more than {arguments.limit:.0f} s"]
             except subprocess.TimeoutExpired as error:
                 text = (error.stdout or b"").decode() if isinstance(error.stdout, bytes) else error.stdout or ""
                 end = [f"more than {arguments.limit:.0f} s"]

@@ -22,9 +22,9 @@ from ns_abstract.verify.network.rows import grid
 _PASSING = 40.0
 #: A network is deep if rows for all of its numbers take more products than this; about a minute of one core.
 _DEEP = 2e12
-#: Products that rows for numbers of inner nodes may take in one cell of a deep network; about three minutes of one core.
+#: Products that rows for inner nodes may take in one cell of a deep network; about three minutes of one core.
 _ALLOWED = 5e12
-#: Once such a part of them is taken, rows are given up where what has been passed so far foretells so many times more.
+#: Once such a part of them is taken, rows are given up where what was passed foretells so many times more.
 _SURE, _OVER = 0.1, 1.5
 #: Part of a node's numbers past which all of them are bounded by rows.
 _RENEW = 0.15
@@ -102,6 +102,23 @@ class Costs:
                     total += float(np.prod(self.network.shape(source))) * self.row(source)
         return total
 
+    @property
+    def deep(self) -> bool:
+        """Whether rows are rationed (N13)."""
+        return self.total > _DEEP
+
+    def foreseen(self, part: float, deep: float) -> tuple[float, bool]:
+        """Products that rows of one cell will take, and whether they are given up before the end (N13).
+
+        Args:
+            part, deep: Part of all numbers that are bounded by rows, in other networks and in deep ones.
+        """
+        if not self.deep:
+            return part * self.total, False
+        if deep * self.total > _OVER * _ALLOWED:
+            return _SURE * _ALLOWED, True
+        return min(deep * self.total, _ALLOWED), False
+
 
 class Schedule:
     """How far the work of one cell has gone."""
@@ -109,14 +126,12 @@ class Schedule:
     def __init__(self, network: Network) -> None:
         self.network = network
         self.costs = costs_of(network)
-        self.deep = self.costs.total > _DEEP
+        self.deep = self.costs.deep
         self.left = _ALLOWED
         self._taken = self._passed = 0.0
 
     def arrives(self, index: int) -> None:
-        """The work is at node ``index``; where rows would end on the way, what they are worth before is lost behind."""
-        if self._taken > _SURE * _ALLOWED and self._taken * self.costs.total > _OVER * _ALLOWED * self._passed:
-            self.left = 0.0
+        """The work is at node ``index``."""
         self._passed += float(np.prod(self.network.shape(index))) * self.costs.row(index)
 
     def renews(self, part: float) -> bool:
@@ -124,11 +139,18 @@ class Schedule:
         return part > _RENEW
 
     def takes(self, products: float) -> bool:
-        """Whether so many products are left; they are taken then."""
+        """Whether so many products are left; they are taken then.
+
+        Where rows would end on the way, what they are worth before is lost behind, so they are given up early.
+        """
+        taken = self._taken + products
         if products > self.left:
             return False
+        if taken > _SURE * _ALLOWED and taken * self.costs.total > _OVER * _ALLOWED * self._passed:
+            self.left = 0.0
+            return False
         self.left -= products
-        self._taken += products
+        self._taken = taken
         return True
 
     def vain(self, kept: float, open_: float, part: float) -> bool:
