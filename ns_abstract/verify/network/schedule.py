@@ -116,7 +116,8 @@ class Costs:
         if not self.deep:
             return part * self.total, False
         if deep * self.total > _OVER * _ALLOWED:
-            return _SURE * _ALLOWED, True
+            # hardly any are taken by then
+            return 0.0, True
         return min(deep * self.total, _ALLOWED), False
 
 
