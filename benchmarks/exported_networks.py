@@ -310,6 +310,19 @@ def _timm(name: str, **settings: Any) -> Callable[[], nn.Module]:
     return make
 
 
+def _timm_class(module: str, name: str, **settings: Any) -> Callable[[], nn.Module]:
+    """Made by its class: `create_model` has sizes of its own and passes none twice."""
+
+    def make() -> nn.Module:
+        import importlib
+
+        found = importlib.import_module(f"timm.models.{module}")
+        made = {k: getattr(found, v) if k.endswith("_layer") else v for k, v in settings.items()}
+        return getattr(found, name)(num_classes=10, **made)
+
+    return make
+
+
 def _features(name: str, channels: int) -> Callable[[], nn.Module]:
     """Without the classifier, which wants larger images."""
 
@@ -391,9 +404,30 @@ NETWORKS: dict[str, tuple[Callable[[], nn.Module], int]] = {
     "timm repvgg_a2": (_timm("repvgg_a2"), 32),
     "timm cspdarknet53": (_timm("cspdarknet53"), 32),
     "timm dla34": (_timm("dla34"), 32),
-    "timm vit_tiny_patch16_224": (_timm("vit_tiny_patch16_224", img_size=32, depth=2), 32),
-    "timm mixer_s32_224": (_timm("mixer_s32_224", img_size=64, num_blocks=2), 64),
-    "timm resmlp_12_224": (_timm("resmlp_12_224", img_size=32, num_blocks=2), 32),
+    "timm vit_tiny, two layers": (
+        _timm_class(
+            "vision_transformer", "VisionTransformer", img_size=32, patch_size=16, embed_dim=192, depth=2, num_heads=3
+        ),
+        32,
+    ),
+    "timm mixer_s32, two blocks": (
+        _timm_class("mlp_mixer", "MlpMixer", img_size=64, patch_size=32, num_blocks=2, embed_dim=512),
+        64,
+    ),
+    "timm resmlp_12, two blocks": (
+        _timm_class(
+            "mlp_mixer",
+            "MlpMixer",
+            img_size=32,
+            patch_size=16,
+            num_blocks=2,
+            embed_dim=384,
+            mlp_ratio=4,
+            block_layer="ResBlock",
+            norm_layer="Affine",
+        ),
+        32,
+    ),
     "timm poolformer_s12": (_timm("poolformer_s12"), 32),
     "inception_v3": (_torchvision("inception_v3", aux_logits=False, init_weights=False), 75),
 }
@@ -447,6 +481,8 @@ def measure(name: str, exporter: str, runs: int, width: float) -> dict[str, Any]
             return {**found, "status": "refused", "why": f"{error.field or ''}: {error.problem}; {error.fix}"[:200]}
         found.update(status="loaded", layers=len(network.nodes), load=round(time.perf_counter() - start, 2))
         print(json.dumps(found), flush=True)
+        if not runs:
+            return found
         rng = np.random.default_rng(0)
         n, d = network.input_size, 2
         c = np.repeat(np.repeat(rng.normal(size=(3, 4, 4)), -(-shape[1] // 4), 1), -(-shape[2] // 4), 2)
@@ -484,8 +520,10 @@ def measure(name: str, exporter: str, runs: int, width: float) -> dict[str, Any]
             least = np.minimum(least, y)
             outside += int((y < lower).sum() + (y < bounds.a[0] @ p + bounds.b[0]).sum())
         spread = (least[:k] + least[k:]) * -0.5
-        found.update(runs=done, outside=outside)
-        found["ratio"] = round(float(np.median((lower[:k] + lower[k:]) * -0.5 / np.maximum(spread, 1e-12))), 2)
+        found.update(runs=done, outside=outside, width=float(f"{-np.median(lower[:k] + lower[k:]):.3g}"))
+        moves = spread > 0.0
+        if moves.any():
+            found["ratio"] = round(float(np.median(((lower[:k] + lower[k:]) * -0.5)[moves] / spread[moves])), 2)
         return found
 
 
@@ -494,9 +532,9 @@ def main() -> None:
     parser.add_argument("--only", nargs="*", default=None, help="parts of names")
     parser.add_argument("--exact", nargs="*", default=None, help="whole names")
     parser.add_argument("--exporters", nargs="*", default=["dynamo", "17"], help="dynamo, pt2 or operator sets")
-    parser.add_argument("--runs", type=int, default=2000)
+    parser.add_argument("--runs", type=int, default=2000, help="of onnxruntime; 0: networks are loaded and not bounded")
     parser.add_argument("--width", type=float, default=2e-3, help="how far an image moves with one parameter")
-    parser.add_argument("--limit", type=float, default=300.0, help="seconds a network may take")
+    parser.add_argument("--limit", type=float, default=300.0, help="processor seconds a network may take")
     parser.add_argument("--output", type=Path, default=None, help="JSON lines")
     parser.add_argument("--together", action="store_true", help="in one process: quicker, and an end ends all")
     parser.add_argument("--one", nargs=2, default=None, help=argparse.SUPPRESS)
@@ -523,10 +561,14 @@ def main() -> None:
             command = [sys.executable, __file__, "--one", name, exporter]
             command += ["--runs", str(arguments.runs), "--width", str(arguments.width)]
             try:
+                # of a busy machine a process may get a tenth
+                command = ["prlimit", f"--cpu={arguments.limit:.0f}", *command]
                 done = subprocess.run(
-                    command, capture_output=True, text=True, timeout=arguments.limit, env=os.environ, check=False
+                    command, capture_output=True, text=True, timeout=10 * arguments.limit, env=os.environ, check=False
                 )
                 text, end = done.stdout, done.stderr.strip().splitlines()[-1:] if done.returncode else []
+                if done.returncode in (-signal.SIGXCPU, -signal.SIGKILL):
+                    end = [f"more than {arguments.limit:.0f} s"]
             except subprocess.TimeoutExpired as error:
                 text = (error.stdout or b"").decode() if isinstance(error.stdout, bytes) else error.stdout or ""
                 end = [f"more than {arguments.limit:.0f} s"]

@@ -157,7 +157,6 @@ def test_deep_networks_are_bounded(allowed: float, tmp_path: Path, monkeypatch: 
     plain = bound_outputs(network, images, rows, np.zeros(4))
     monkeypatch.setattr(schedule, "_DEEP", 0.0)
     monkeypatch.setattr(schedule, "_ALLOWED", allowed)
-    monkeypatch.setattr(schedule, "_GIVEN_UP", allowed)
     threads = torch.get_num_threads()
     found = []
     try:
@@ -245,6 +244,54 @@ def test_chains_of_maxima_beside_their_input(tmp_path: Path) -> None:
     for cell in range(2):
         least, _ = attack(network, session(file), images, cell, rows, 32, 5)
         assert (lower[cell] <= least).all() and np.isfinite(lower[cell]).all()
+
+
+@pytest.mark.parametrize("deep", [False, True])
+def test_curves_are_bounded_by_what_rows_leave(deep: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Lines that are close beside the width of a form may be far apart beside the true one: rows find out."""
+    shape = (2, 8, 8)
+    f = OnnxFile(shape, 5)
+    for k in range(7):
+        f.conv(2 if not k else 8, 8, pads=[1, 1, 1, 1])
+        gate, value = f.node("Sigmoid", f.last), f.nodes[-2].output[0]
+        f.node("Mul", value, gate)
+    f.node("Flatten")
+    f.gemm(512, 3)
+    file = f.write(tmp_path / "net.onnx")
+    network, images, rows = load_network(file), image_sets(shape, 2, 2, 1e-3, 1e-4), np.eye(3)
+    if deep:
+        monkeypatch.setattr(schedule, "_DEEP", 0.0)
+    found = bound_outputs(network, images, rows, np.zeros(3), arithmetic="real").lower
+    with monkeypatch.context() as patch:
+        patch.setattr(module, "_HALF", -1.0)
+        without = bound_outputs(network, images, rows, np.zeros(3), arithmetic="real").lower
+    middle = network(torch.from_numpy(0.5 * (images.lower + images.upper)).reshape(2, *shape)).numpy()
+    assert (found <= middle).all()
+    assert (middle - without).mean() > 3.0 * (middle - found).mean()
+    found = bound_outputs(network, images, rows, np.zeros(3)).lower
+    for cell in range(2):
+        least, _ = attack(network, session(file), images, cell, rows, 32, 5)
+        assert (found[cell] <= least).all()
+
+
+def test_deep_networks_are_given_up_early(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    network = load_network(residual(tmp_path))
+    total = schedule.Costs(network).total
+    monkeypatch.setattr(schedule, "_ALLOWED", 0.1 * total)
+    at = len(network.nodes) - 1
+    run = schedule.Schedule(network)
+    # a little may be taken whatever it foretells; of more than that, a part of what is passed
+    assert run.takes(0.005 * total) and run.left == pytest.approx(0.095 * total)
+    assert not run.takes(0.02 * total) and run.left == 0.0
+    run = schedule.Schedule(network)
+    run.arrives(at)
+    run._passed += 0.9 * total
+    assert run.takes(0.02 * total) and run.left == pytest.approx(0.08 * total)
+    assert not run.takes(0.09 * total) and run.left > 0.0
+    run = schedule.Schedule(network)
+    assert run.vain(0.95, 0.0, 0.1) and run.left > 0.0
+    assert not run.vain(0.5, 0.5, 0.9) and run.left > 0.0
+    assert run.vain(0.5, 0.95, 0.9) and run.left == 0.0
 
 
 def test_rows_cost_what_their_windows_hold(tmp_path: Path) -> None:

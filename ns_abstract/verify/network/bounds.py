@@ -42,6 +42,10 @@ _OVERFLOW = 2.0**126
 _MANY, _SOME, _GAIN = 1024, 64, 0.95
 #: Signs of many units are given up if so few of some are found out, and so many of the layer before were not.
 _UNSURE = 0.25
+#: Numbers of a node that are probed by rows, and the part of widths past which forms are good enough.
+_PROBED, _HALF = 32, 0.5
+#: Lines that are apart by so small a part of a width are one line; by so large a part of what rows leave of it, open.
+_STRAIGHT, _BENT = 2.0**-20, 2.0**-5
 #: Differences in windows are bounded by rows if so large a part of those tried first is decided by it.
 _CLOSES = 0.1
 #: Room for rounding of lines relative to references and sizes.
@@ -350,8 +354,8 @@ class _Cells:
                 # what is known better of the input is also known to its other readers
                 source = node.inputs[0]
                 inputs[0] = self._assume(source, inputs[0])
-                open_ = node.layer.open(*inputs[0].interval)
-                better = self._known_better(source, inputs[0], open_, node.layer)
+                open_, apart = node.layer.open(*inputs[0].interval), node.layer.apart(*inputs[0].interval)
+                better = self._known_better(source, inputs[0], open_, apart, node.layer)
                 forms[source] = inputs[0] = self._assume(source, better)
                 if isinstance(node.layer, LeakyRelu):
                     self.unsure = float(node.layer.open(*inputs[0].interval).double().mean())
@@ -359,9 +363,10 @@ class _Cells:
                 if self.network.depth[source] > 1:
                     self.stops[source] = self._stop(source, inputs[0])
             elif isinstance(node.layer, Product):
-                open_ = node.layer.open(inputs[0].interval, inputs[1].interval)
+                intervals = inputs[0].interval, inputs[1].interval
+                open_, apart = node.layer.open(*intervals), node.layer.apart(*intervals)
                 for position, source in enumerate(node.inputs):
-                    forms[source] = inputs[position] = self._known_better(source, inputs[position], open_)
+                    forms[source] = inputs[position] = self._known_better(source, inputs[position], open_, apart)
                 forms.append(self._multiply(k, node.inputs, node.layer, inputs[0], inputs[1]))
             elif isinstance(node.layer, MaxPool):
                 forms.append(self._maximum(k, node.inputs[0], node.layer, inputs[0]))
@@ -728,16 +733,44 @@ class _Cells:
         found = zip((slopes, offsets, form.lower, form.upper), sizes, strict=True)
         return _Planes(*(t.reshape(size).contiguous().numpy() for t, size in found))
 
-    def _known_better(self, index: int, form: _Form, open_: Tensor, layer: Activation | None = None) -> _Form:
+    def _known_better(
+        self, index: int, form: _Form, open_: Tensor, apart: Tensor | None, layer: Activation | None = None
+    ) -> _Form:
         """The form of node ``index`` with better bounds of what is open before an activation or a product (None)."""
+        if self.network.depth[index] < 2:
+            return form
+        if self.schedule.deep:
+            self.schedule.arrives(index)
+        if apart is not None:
+            form, open_ = self._bent(index, form, open_, apart)
         if self.schedule.deep:
             return self._renew(index, form, open_, layer)
         return self._tighten(index, form, open_, isinstance(layer, LeakyRelu))
 
+    def _bent(self, index: int, form: _Form, open_: Tensor, apart: Tensor) -> tuple[_Form, Tensor]:
+        """The form with some numbers bounded by rows, and what is worth rows by what these have shown (N6).
+
+        Lines that are close beside the form's width may be far apart beside what rows leave of it.
+        """
+        known = torch.from_numpy(self.good).reshape(-1, *[1] * (open_.ndim - 1))
+        likely = (apart > _STRAIGHT) & ~open_ & known
+        where = likely.reshape(self.count, *grid(self.network.shape(index))).nonzero().numpy()
+        if not len(where):
+            return form, open_
+        some = where[:: -(-len(where) // _PROBED)]
+        if self.schedule.deep and not self.schedule.takes(len(some) * self.schedule.costs.row(index)):
+            return form, open_
+        found = self._bounded(index, form, some, False, False)
+        at = tuple(torch.from_numpy(some.T))
+        shape = self.count, *grid(self.network.shape(index))
+        before, after = ((f.upper - f.lower).reshape(shape)[at] for f in (form, found))
+        kept = float((after / before).nan_to_num(nan=1.0).median())
+        if kept > _HALF:
+            return found, open_
+        return found, open_ | (likely & (apart > _BENT * kept))
+
     def _tighten(self, index: int, form: _Form, open_: Tensor, decides: bool) -> _Form:
         """Better bounds of the numbers of node ``index`` that are open; a sign may be all that is asked (N6)."""
-        if self.network.depth[index] < 2:
-            return form
         item = self.network.shape(index)
         shape = grid(item)
         open_ = open_.reshape(self.count, *shape) & torch.from_numpy(self.good).reshape(-1, 1, 1, 1)
@@ -771,7 +804,7 @@ class _Cells:
         shape = grid(self.network.shape(index))
         open_ = open_.reshape(self.count, *shape) & torch.from_numpy(self.good).reshape(-1, 1, 1, 1)
         count = int(open_.sum())
-        if self.network.depth[index] < 2 or not count:
+        if not count:
             return form
         decides = isinstance(layer, LeakyRelu)
         where, early = open_, decides
@@ -796,9 +829,10 @@ class _Cells:
             widths = [(f.upper - f.lower).reshape(open_.shape)[at] for f in (form, found)]
             lower, upper = (v.reshape(open_.shape)[at] for v in found.interval)
             form = found
-            if self.schedule.hopeless(
+            if self.schedule.vain(
                 float((widths[1] / widths[0]).median()),
                 float(((lower < 0.0) & (upper > 0.0)).double().mean()) if decides else 0.0,
+                count / open_.numel(),
             ):
                 return form
         return self._bounded(index, form, chosen, early, decides)

@@ -189,12 +189,15 @@ class Curve(Activation):
         flat = torch.zeros_like(lower)
         return Lines(flat, self._extreme(cuts, flat, -1.0), flat, self._extreme(cuts, flat, 1.0))
 
-    def open(self, lower: Tensor, upper: Tensor) -> Tensor:
+    def apart(self, lower: Tensor, upper: Tensor) -> Tensor:
         band = self.band(lower, upper)
         width = upper - lower
         # rounding alone keeps the lines of a point apart
         wide = ~(width <= 2.0**-36 * _size(lower, upper))
-        return wide & ~(band.upper_offset - band.lower_offset <= _APART * width)
+        return torch.where(wide, (band.upper_offset - band.lower_offset) / width, torch.zeros_like(width))
+
+    def open(self, lower: Tensor, upper: Tensor) -> Tensor:
+        return ~(self.apart(lower, upper) <= _APART)
 
 
 class Assumed(Curve):

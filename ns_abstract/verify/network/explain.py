@@ -7,18 +7,18 @@ from collections.abc import Sequence
 import numpy as np
 
 from ns_abstract.verify.network.graph import Network, item
-from ns_abstract.verify.network.layers import Activation, Convolution, Linear, Matrix
+from ns_abstract.verify.network.layers import Convolution, Linear, Matrix
 from ns_abstract.verify.network.maps import Sparse, TransposedConvolution
-from ns_abstract.verify.network.products import Product
+from ns_abstract.verify.network.schedule import costs_of
 
 #: Numbers of float64 that every number of every layer takes in one cell, beside three for each parameter.
 _NUMBERS = 14
-#: Bytes of rows under way, whatever the network.
-_ROWS = 200 << 20
-#: Products a second of one core, of forms and of rows; measured on small and middling networks.
-_SPEED = 1.5e9
-#: Part of all units that rows are passed back for, in sets that are worth a proof.
-_OPEN = 0.1
+#: Bytes of rows under way and of weights in other orders, whatever the network.
+_ROWS = 256 << 20
+#: Products a second of one core: of forms in float64, and of rows in float32, few at a time and many; measured.
+_FORMS_SPEED, _FEW_SPEED, _MANY_SPEED = 1.5e9, 2.5e9, 2.5e10
+#: Part of all units that rows are passed back for, in sets that are worth a proof; of a deep network most.
+_OPEN, _DEEP_OPEN = 0.1, 0.6
 
 
 def products(network: Network, index: int) -> float:
@@ -36,19 +36,16 @@ def products(network: Network, index: int) -> float:
     return size
 
 
-def estimate(network: Network, dimensions: int) -> tuple[float, float]:
-    """(bytes, seconds of one core) of one cell in ``dimensions`` parameters; the seconds are rough."""
+def estimate(network: Network, dimensions: int) -> tuple[float, float, bool]:
+    """(bytes, seconds of one core, whether rows are given up) of one cell; the seconds are rough."""
     count = len(network.nodes)
     sizes = [float(np.prod(network.shape(k))) for k in range(count + 1)]
     memory = sum(sizes) * 8 * (3 * dimensions + _NUMBERS) + _ROWS
-    work = [products(network, k) for k in range(1, count + 1)]
-    forwards = 2.0 * sum(work) * (1 + dimensions)
-    backwards = 0.0
-    for k, node in enumerate(network.nodes, 1):
-        if isinstance(node.layer, (Activation, Product)) and network.depth[node.inputs[0]] > 1:
-            # a row sees a part of the maps, half of them as a rule
-            backwards += _OPEN * sizes[k] * 0.5 * sum(work[: k - 1])
-    return memory, (forwards + backwards) / _SPEED
+    forwards = 2.0 * sum(products(network, k) for k in range(1, count + 1)) * (1 + dimensions)
+    costs = costs_of(network)
+    rows, given_up = costs.foreseen(_OPEN, _DEEP_OPEN)
+    speed = _MANY_SPEED if costs.deep else _FEW_SPEED
+    return memory, forwards / _FORMS_SPEED + rows / speed, given_up
 
 
 def explain(network: Network, dimensions: int = 2) -> Sequence[str]:
@@ -61,11 +58,13 @@ def explain(network: Network, dimensions: int = 2) -> Sequence[str]:
         lines.append(f"{k:5d}  {kind:22s} {item(node.layer.shape):>14s}  of {inputs:12s} {node.op} {node.name}")
     total = sum(float(np.prod(network.shape(k))) for k in range(len(network.nodes) + 1))
     work = sum(products(network, k) for k in range(1, len(network.nodes) + 1))
-    memory, seconds = estimate(network, dimensions)
+    memory, seconds, given_up = estimate(network, dimensions)
     lines.append(f"{len(network.nodes)} layers, {total:,.0f} numbers, {work:,.0f} products an evaluation")
     lines.append(
         f"one cell in {dimensions} parameters: about {memory / 2**30:.2f} GiB, and {seconds:,.1f} s of one core "
         f"if one unit of {1 / _OPEN:.0f} is open"
     )
+    if given_up:
+        lines.append("deep: rows for its units cost more than they may, so they are given up and bounds are wide")
     lines += [f"covered: {line}" for line in network.guarantee()]
     return lines

@@ -370,6 +370,10 @@ class Activation:
         """Where better bounds of the input would give better lines."""
         raise AssertionError
 
+    def apart(self, lower: Tensor, upper: Tensor) -> Tensor | None:
+        """How far the lines of N3 are apart, as a part of the interval; None where `open` says all."""
+        return None
+
     def lines(self, lower: Tensor, upper: Tensor) -> Lines:
         """A lower and an upper line over [lower, upper], each the best by itself (N4)."""
         raise AssertionError

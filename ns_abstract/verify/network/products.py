@@ -57,6 +57,17 @@ class Product:
             sizes.append(torch.maximum(f.lower.abs(), f.upper.abs()))
         return (widths[0] > _MOVES * sizes[0]) & (widths[1] > _MOVES * sizes[1])
 
+    def apart(self, x: Interval, y: Interval) -> Tensor:
+        """How far the planes are apart, as a part of what the product moves along them."""
+        plane = self.plane(x, y)
+        moves = plane.first.abs() * (x.upper - x.lower) + plane.second.abs() * (y.upper - y.lower)
+        moves = moves.clamp(min=2.0**-1000)
+        # rounding alone keeps the planes of points apart
+        return (plane.high - plane.low - 2.0**-44 * self._sizes(x, y)).clamp(min=0.0) / moves
+
+    def _sizes(self, x: Interval, y: Interval) -> Tensor:
+        return torch.maximum(x.lower.abs(), x.upper.abs()) * torch.maximum(y.lower.abs(), y.upper.abs())
+
     def plane(self, x: Interval, y: Interval) -> Plane:
         """The planes half way between McCormick's: any slopes do, as ``x y - a x - b y`` is extreme at corners."""
         first = (0.5 * (y.lower + y.upper)).float().double()

@@ -130,34 +130,22 @@ def _scale(value, y, x, factor):
                     value[r, c, i, j] *= factor[c, Y, X] if 0 <= Y < H and 0 <= X < W else np.float32(0.0)
 
 
-@njit(cache=True, error_model="numpy", nogil=True, inline="always")
-def _one(rows, at, line, here, plane):
-    """Pass one number; returns what it adds below and above."""
-    a = rows[at]
-    # signs are as good as random: a branch would be guessed wrong half of the time
-    k = here + 3 * plane * np.int64(a < 0.0)
-    b = np.float64(a)
-    rows[at] = a * line[k]
-    return b * np.float64(line[k + plane]), b * np.float64(line[k + 2 * plane])
-
-
-@njit(cache=True, error_model="numpy", nogil=True)
-def _pass_whole(rows, at, line, here, size, plane, total):
-    """A row that covers its map, in four sums at a time: one alone waits for every addition."""
-    l0, l1, l2, l3 = 0.0, 0.0, 0.0, 0.0
-    m0, m1, m2, m3 = 0.0, 0.0, 0.0, 0.0
-    for j in range(0, size - 3, 4):
-        p0, q0 = _one(rows, at + j, line, here + j, plane)
-        p1, q1 = _one(rows, at + j + 1, line, here + j + 1, plane)
-        p2, q2 = _one(rows, at + j + 2, line, here + j + 2, plane)
-        p3, q3 = _one(rows, at + j + 3, line, here + j + 3, plane)
-        l0, l1, l2, l3 = l0 + p0, l1 + p1, l2 + p2, l3 + p3
-        m0, m1, m2, m3 = m0 + q0, m1 + q1, m2 + q2, m3 + q3
-    for j in range(size - size % 4, size):
-        p0, q0 = _one(rows, at + j, line, here + j, plane)
-        l0, m0 = l0 + p0, m0 + q0
-    total[0] += (l0 + l1) + (l2 + l3)
-    total[1] += (m0 + m1) + (m2 + m3)
+@njit(cache=True, error_model="numpy", nogil=True, fastmath={"reassoc", "nsz"})
+def _pass_run(rows, at, line, here, plane, count):
+    """Pass ``count`` numbers that lie together; returns what they add below and above, summed in any order."""
+    least, most = 0.0, 0.0
+    for j in range(count):
+        a = rows[at + j]
+        k = here + j
+        # all lines are read and one kept: signs are as good as random, and so eight numbers go at a time
+        s0, l0, m0 = line[k], line[k + plane], line[k + 2 * plane]
+        s1, l1, m1 = line[k + 3 * plane], line[k + 4 * plane], line[k + 5 * plane]
+        negative = a < np.float32(0.0)
+        b = np.float64(a)
+        least += b * np.float64(l1 if negative else l0)
+        most += b * np.float64(m1 if negative else m0)
+        rows[at + j] = a * (s1 if negative else s0)
+    return least, most
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
@@ -178,7 +166,9 @@ def pass_activation(value, y, x, cell, lines, total):
         top, left = y[r], x[r]
         if top == 0 and left == 0 and h == H and w == W:
             size = channels * H * W
-            _pass_whole(rows, r * size, line, cell[r] * size, size, plane, total[r])
+            below, above = _pass_run(rows, r * size, line, cell[r] * size, plane, size)
+            total[r, 0] += below
+            total[r, 1] += above
             continue
         first, past = min(w, max(0, -left)), max(0, min(w, W - left))
         least, most = 0.0, 0.0
@@ -194,14 +184,9 @@ def pass_activation(value, y, x, cell, lines, total):
                 for j in range(past, w):
                     rows[at + j] = np.float32(0.0)
                 here = ((cell[r] * channels + c) * H + Y) * W + left
-                for j in range(first, past):
-                    a = rows[at + j]
-                    # signs are as good as random: a branch would be guessed wrong half of the time
-                    k = here + j + 3 * plane * np.int64(a < 0.0)
-                    b = np.float64(a)
-                    least += b * np.float64(line[k + plane])
-                    most += b * np.float64(line[k + 2 * plane])
-                    rows[at + j] = a * line[k]
+                below, above = _pass_run(rows, at + first, line, here + first, plane, past - first)
+                least += below
+                most += above
         total[r, 0] += least
         total[r, 1] += most
 

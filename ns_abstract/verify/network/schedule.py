@@ -22,13 +22,16 @@ from ns_abstract.verify.network.rows import grid
 _PASSING = 40.0
 #: A network is deep if rows for all of its numbers take more products than this; about a minute of one core.
 _DEEP = 2e12
-#: Products that rows for numbers of inner nodes may take in one cell of a deep network; the same where not even the
-#: part of all numbers that is needed as a rule could be bounded.
-_ALLOWED, _GIVEN_UP, _NEEDED = 2e12, 1e11, 0.35
+#: Products that rows for inner nodes may take in one cell of a deep network; about three minutes of one core.
+_ALLOWED = 5e12
+#: Once such a part of them is taken, rows are given up where what was passed foretells so many times more.
+_SURE, _OVER = 0.1, 1.5
 #: Part of a node's numbers past which all of them are bounded by rows.
 _RENEW = 0.15
 #: Parts of widths and of signs not found out past which rows are given up.
 _KEPT, _LOST = 0.9, 0.9
+#: Part of a node's numbers that have to be open for that to end all.
+_MOST = 0.5
 #: Layers whose rows stay in their windows.
 _WINDOWED = (Activation, Channels, Pad, Product, Scale, Sum)
 
@@ -99,32 +102,65 @@ class Costs:
                     total += float(np.prod(self.network.shape(source))) * self.row(source)
         return total
 
+    @property
+    def deep(self) -> bool:
+        """Whether rows are rationed (N13)."""
+        return self.total > _DEEP
+
+    def foreseen(self, part: float, deep: float) -> tuple[float, bool]:
+        """Products that rows of one cell will take, and whether they are given up before the end (N13).
+
+        Args:
+            part, deep: Part of all numbers that are bounded by rows, in other networks and in deep ones.
+        """
+        if not self.deep:
+            return part * self.total, False
+        if deep * self.total > _OVER * _ALLOWED:
+            # hardly any are taken by then
+            return 0.0, True
+        return min(deep * self.total, _ALLOWED), False
+
 
 class Schedule:
     """How far the work of one cell has gone."""
 
     def __init__(self, network: Network) -> None:
+        self.network = network
         self.costs = costs_of(network)
-        total = self.costs.total
-        self.deep = total > _DEEP
-        # where rows would end on the way, what they are worth before is lost behind
-        self.left = _ALLOWED if _NEEDED * total <= _ALLOWED else _GIVEN_UP
+        self.deep = self.costs.deep
+        self.left = _ALLOWED
+        self._taken = self._passed = 0.0
+
+    def arrives(self, index: int) -> None:
+        """The work is at node ``index``."""
+        self._passed += float(np.prod(self.network.shape(index))) * self.costs.row(index)
 
     def renews(self, part: float) -> bool:
         """Whether all numbers of a node are bounded by rows if ``part`` of them is open."""
         return part > _RENEW
 
     def takes(self, products: float) -> bool:
-        """Whether so many products are left; they are taken then."""
+        """Whether so many products are left; they are taken then.
+
+        Where rows would end on the way, what they are worth before is lost behind, so they are given up early.
+        """
+        taken = self._taken + products
         if products > self.left:
             return False
+        if taken > _SURE * _ALLOWED and taken * self.costs.total > _OVER * _ALLOWED * self._passed:
+            self.left = 0.0
+            return False
         self.left -= products
+        self._taken = taken
         return True
 
-    def hopeless(self, kept: float, open_: float) -> bool:
-        """Give inner nodes up if rows leave so large a part of widths, or of signs not found out."""
+    def vain(self, kept: float, open_: float, part: float) -> bool:
+        """Leave a node as it is if rows leave so large a part of widths, or of signs not found out.
+
+        Where most of it is open, ``part``, the nodes behind it are given up, too.
+        """
         given = kept > _KEPT or open_ > _LOST
-        if given:
+        if given and part > _MOST:
             self.left = 0.0
         return given
 
