@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import itertools
+import math
 import re
 from fractions import Fraction
 from pathlib import Path
@@ -84,7 +85,7 @@ def exact_map(
                 rest *= exact_share(low[k], high[k], ends[0][k], ends[1][k])
         shares = [[exact_share(low[k], high[k], *pair) for pair in itertools.pairwise(lines[k])] for k in axes]
         for place in itertools.product(*(range(bins) for _ in axes)):
-            found[place] += rest * np.prod([shares[n][p] for n, p in enumerate(place)], initial=Fraction(1))
+            found[place] += math.prod((shares[n][p] for n, p in enumerate(place)), start=rest)
     return found
 
 
@@ -240,7 +241,7 @@ def test_counterexamples_are_marked_where_they_are() -> None:
     plot = page._plane(cells(2), frame, [0, 1], {})
     assert "x (rad)" in plot and "y (rad)" in plot
     (path,) = re.findall(r'class="broken" d="([^"]*)"', plot)
-    found = [(float(a) + 2, float(b) + 2) for a, b in re.findall(r"M([\d.]+),([\d.]+)", path)]
+    found = [(float(a) + 2.5, float(b) + 2.5) for a, b in re.findall(r"M([\d.]+),([\d.]+)", path)]
     # from 58 to 438 across, from 400 up to 20
     np.testing.assert_allclose(found, [(58 + 380 * v / 6, 400 - 380 * 2 / 6) for v in (2.25, 3.75)], atol=0.06)
     rings = page._map({"frames": [entry("azimuth")]}, {0: cells(1)}, {})
@@ -262,6 +263,13 @@ def test_a_path_is_one_strip() -> None:
     starts = [float(x) for x in re.findall(r'<rect class="certified" data-cell="\d+" x="([\d.]+)"', text)]
     np.testing.assert_allclose(starts, [20 + 980 * k / 3 for k in range(3)], atol=0.01)
     assert sorted(map(int, re.findall(r'data-cell="(\d+)"', text))) == list(range(12))
+    # the last keyframe is a single pose
+    end = [*frames, entry("segment", index=4, high=0.0)]
+    one = {"lower": [0.0], "upper": [0.0], "verdict": "falsified", "margin": -1.0, "counterexample": [0.0]}
+    text = page._map({"frames": end}, rows | {4: [one]}, {})
+    assert text.count("<svg") == 1 and text.count("<rect") == 13 and text.count('class="broken"') == 7
+    x, width = re.findall(r'<rect class="falsified" x="([\d.]+)" y="8" width="([\d.]+)"', text)[-1]
+    assert float(x) + float(width) == pytest.approx(1000.0, abs=0.02) and 5.0 < float(width) < 20.0
     # with another parameter every frame has a plot of its own
     other = [*frames[:2], entry("x", index=3, high=1.0)]
     assert page._map({"frames": other}, rows, {}).count("<svg") == 3
@@ -305,8 +313,8 @@ def test_regions_are_what_touches(d: int) -> None:
 
 
 def test_a_long_chain_is_one_region() -> None:
-    order = np.random.default_rng(0).permutation(3000)
-    numbers = touching(order[:, None] * 1.0, order[:, None] + 1.0)
+    lower = np.random.default_rng(0).permutation(np.arange(3000.0))[:, None]
+    numbers = touching(lower, lower + 1.0)
     assert not numbers.any()
 
 
@@ -376,7 +384,7 @@ def test_regions_on_the_page() -> None:
     assert text.count("<img") == 3 and text.count('class="region"') == 2 and "<y>" not in text and "<right>" not in text
     assert f"make {MOST + 3} regions" in text and "7 further regions, none of them larger: &lt;why&gt;." in text
     assert "50.00 % of its set in 2 cells: x 1 to 4 rad" in text and "margin not a number" in text
-    assert "&lt;y&gt; = 2 (same)" in text and "x = 1<br>" not in text and "No pose of this set near it" in text
+    assert "&lt;y&gt; = 2 (same)" in text and "x = 1<br>" not in text and "No pose of its own set" in text
     assert "<td>0.5</td><td>1.5</td>" in text and "not finite" in text
     assert regions_html([], [], {}, "") == ""
     ElementTree.fromstring(f"<part>{re.sub(r'(<img[^>]*|<br)>', r'', text)}</part>")
@@ -472,7 +480,10 @@ def test_pictures_are_written_and_those_of_others_are_left(tmp_path: Path) -> No
     assert list(tmp_path.iterdir()) == []
     (tmp_path / "mine.png").write_bytes(b"")
     (tmp_path / "cameras.png").symlink_to(tmp_path / "mine.png")
-    names = write_pictures(tmp_path, {"frames": way, "coverage": covered}, {k: cells(1, 1.0) for k in range(3)}, None)
+    way[2]["parameters"][0]["upper"] = 0.0
+    rows = {0: cells(1, 1.0), 1: cells(1, 1.0), 2: [{"lower": [0.0], "upper": [0.0], "verdict": "unknown"}]}
+    rows[2][0]["counterexample"] = None
+    names = write_pictures(tmp_path, {"frames": way, "coverage": covered}, rows, None)
     assert names == ["verdicts_path.png"]
     clear_pictures(tmp_path)
     assert sorted(f.name for f in tmp_path.iterdir()) == ["cameras.png", "mine.png"]

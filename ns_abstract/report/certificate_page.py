@@ -36,6 +36,7 @@ svg [data-cell] { cursor: pointer; } svg [data-cell].chosen { stroke: var(--ink)
 svg .ring path { stroke-width: .5; } svg .ring .certified { stroke: var(--good); }
 svg .ring .falsified { stroke: var(--bad); } svg .ring .unknown { stroke: #9aa0a6; }
 svg .broken { stroke: var(--ink); stroke-width: 1.2; fill: none; }
+svg .halo { stroke: var(--card); stroke-width: 3.2; fill: none; }
 svg image.pixels { image-rendering: pixelated; } svg .frame { fill: none; stroke: var(--line); }
 .region { background: var(--card); border: 1px solid var(--line); border-radius: 6px; padding: .4rem 1.2rem .8rem;
   margin: .7rem 0; } .region figure { flex: 0 1 15rem; } .region table { width: auto; }
@@ -298,12 +299,36 @@ def is_ring(parameter: Mapping[str, Any]) -> bool:
 
 
 def along_path(frames: Sequence[Mapping[str, Any]]) -> list[Mapping[str, Any]]:
-    """All frames if each is a way from one keyframe to the next and nothing else varies; else none."""
-    for entry in frames:
-        free = free_parameters(entry["parameters"])
-        if [entry["parameters"][k]["name"] for k in free] != ["segment"]:
+    """All frames if each is a way from one keyframe to the next, or the last keyframe, and nothing else varies."""
+    for position, entry in enumerate(frames):
+        names = [entry["parameters"][k]["name"] for k in free_parameters(entry["parameters"])]
+        if names != ["segment"] and (names or position < len(frames) - 1):
             return []
     return list(frames) if len(frames) > 1 else []
+
+
+def path_spans(
+    entry: Mapping[str, Any], rows: Sequence[Mapping[str, Any]], last: float
+) -> list[tuple[float, float, str, float | None]]:
+    """Cells of a frame of a path: from and to where, verdict, and where the counterexample is.
+
+    Args:
+        entry: The frame.
+        rows: Its cells.
+        last: How wide a keyframe by itself is drawn.
+    """
+    free = free_parameters(entry["parameters"])
+    found = []
+    for row in rows:
+        low, high = (row["lower"][free[0]], row["upper"][free[0]]) if free else (0.0, last)
+        example = row.get("counterexample")
+        at = None if example is None else example[free[0]] if free else 0.5 * last
+        found.append((low, high, row["verdict"], at))
+    return found
+
+
+#: How wide the last keyframe of a path is drawn, as a part of the path.
+LAST = 0.015
 
 
 def _broken(rows: Sequence[Mapping[str, Any]]) -> list[Sequence[float]]:
@@ -369,12 +394,15 @@ def _path(
     numbers: Mapping[tuple[int, int], int],
 ) -> str:
     """All ways from keyframe to keyframe, one after another."""
-    axis = Axis(0.0, float(len(frames)), 20, 1000, log=False)
+    ways = sum(bool(free_parameters(entry["parameters"])) for entry in frames)
+    last = LAST * ways
+    axis = Axis(0.0, ways + (last if ways < len(frames) else 0.0), 20, 1000, log=False)
     marks = []
     for position, entry in enumerate(frames):
-        rows, free = cells.get(entry["index"], ()), free_parameters(entry["parameters"])
-        spans = _spans(rows, free[0], entry["index"], numbers)
-        marks += _along(spans, axis, [e[free[0]] for e in _broken(rows)], position)
+        found = path_spans(entry, cells.get(entry["index"], ()), last)
+        spans = [(a, b, kind, numbers.get((entry["index"], k))) for k, (a, b, kind, _) in enumerate(found)]
+        broken = sorted({at for *_, at in found if at is not None})
+        marks += _along(spans, axis, broken[:: max(1, -(-len(broken) // _MOST_MARKS))], position)
         at = axis(position)
         marks.append(f'<path class="axis" d="M{at:.1f},4V48"/>')
         if position % math.ceil(len(frames) / 24) == 0:
@@ -407,9 +435,9 @@ def _plane(
             f'height="{y(row["lower"][j]) - y(row["upper"][j]):.2f}"/>'
             for k, row in enumerate(rows)
         )
-    places = "".join(f"M{x(e[i]) - 2:.1f},{y(e[j]) - 2:.1f}l4,4m-4,0l4,-4" for e in _broken(rows))
+    places = "".join(f"M{x(e[i]) - 2.5:.1f},{y(e[j]) - 2.5:.1f}l5,5m-5,0l5,-5" for e in _broken(rows))
     if places:
-        marks += f'<path class="broken" d="{places}" pointer-events="none"/>'
+        marks += "".join(f'<path class="{kind}" d="{places}" pointer-events="none"/>' for kind in ("halo", "broken"))
     labels = [escape(f"{p['name']} ({unit_of_axis(p['unit'])})") for p in parameters]
     return draw_plot(x, y, (labels[0], labels[1]), marks, size=(450, 440), title="Verdicts over two parameters")
 

@@ -180,7 +180,7 @@ def regions_html(
             if p["lower"] < p["upper"]
         )
         figures = "".join(_figure(one, other, sides) for one, other in ((broken, right), (right, broken)) if one)
-        none = "" if right else '<p class="soft">No pose of this set near it was seen to be right.</p>'
+        none = "" if right else '<p class="soft">No pose of its own set was seen to be right.</p>'
         outputs = _outputs(broken, right)
         parts.append(
             f'<div class="region"><p><b>frame {region.frame}</b>, {escape(percent(region.share))} of its set in '

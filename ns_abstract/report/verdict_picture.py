@@ -17,7 +17,7 @@ import numpy as np
 from ns_abstract.io.atomic import write_atomic
 from ns_abstract.io.folder import unwritable
 from ns_abstract.report.cameras import Cameras
-from ns_abstract.report.certificate_page import along_path, is_ring
+from ns_abstract.report.certificate_page import LAST, along_path, is_ring, path_spans
 from ns_abstract.report.figures import number, percent, unit_of_axis
 from ns_abstract.report.verdict_maps import BAD, GOOD, OPEN, free_parameters, maps_of, matrix_rows, mixed
 
@@ -73,13 +73,13 @@ def _examples(rows: Rows) -> np.ndarray:
     return np.array(list(found), np.float64)
 
 
-def _along(axes: Axes, rows: Rows, column: int, offset: float = 0.0) -> None:
+def _along(axes: Axes, spans: Sequence[tuple[float, float, str, float | None]], offset: float = 0.0) -> None:
     from matplotlib.patches import Rectangle
 
-    spans = [(row["lower"][column] + offset, row["upper"][column] - row["lower"][column]) for row in rows]
-    _collected(axes, [Rectangle((low, 0.0), size, 1.0) for low, size in spans], [row["verdict"] for row in rows])
-    if len(broken := _examples(rows)):
-        axes.plot(broken[:, column] + offset, np.full(len(broken), -0.12), "|", color=_INK, ms=5, mew=0.8)
+    shapes = [Rectangle((low + offset, 0.0), high - low, 1.0) for low, high, *_ in spans]
+    _collected(axes, shapes, [kind for _, _, kind, _ in spans])
+    if broken := [at + offset for *_, at in spans if at is not None]:
+        axes.plot(broken, np.full(len(broken), -0.12), "|", color=_INK, ms=5, mew=0.8)
     axes.set(ylim=(-0.25, 1.0), yticks=[])
 
 
@@ -116,7 +116,8 @@ def _plane(axes: Axes, rows: Rows, entry: Mapping[str, Any], free: Sequence[int]
         ]
         _collected(axes, shapes, [row["verdict"] for row in rows])
     if len(broken := _examples(rows)):
-        axes.plot(broken[:, i], broken[:, j], "x", color=_INK, ms=3, mew=0.7)
+        for color, width in (("white", 2.0), (_INK, 0.8)):
+            axes.plot(broken[:, i], broken[:, j], "x", color=color, ms=3.5, mew=width, clip_on=False, zorder=5)
     axes.set(xlim=extent[:2], ylim=extent[2:], xlabel=_label(sides[0]), ylabel=_label(sides[1]))
     if sides[0]["unit"] == sides[1]["unit"]:
         axes.set_aspect("equal")
@@ -158,7 +159,7 @@ def frame_figure(entry: Mapping[str, Any], rows: Rows) -> Figure | None:
     elif len(free) == 1:
         figure, side = _figure(7.2, 1.9), entry["parameters"][free[0]]
         axes = figure.subplots()
-        _along(axes, rows, free[0])
+        _along(axes, path_spans(entry, rows, 0.0))
         axes.set(xlim=(side["lower"], side["upper"]), xlabel=_label(side))
     elif len(free) == 2:
         figure = _figure(6.0, 6.0)
@@ -176,13 +177,14 @@ def path_figure(entries: Sequence[Mapping[str, Any]], rows: Mapping[int, Rows], 
     """The verdicts along a path that is swept from keyframe to keyframe."""
     figure = _figure(8.2, 2.0)
     axes = figure.subplots()
+    ways = sum(bool(free_parameters(entry["parameters"])) for entry in entries)
     for position, entry in enumerate(entries):
-        _along(axes, rows.get(entry["index"], ()), free_parameters(entry["parameters"])[0], position)
+        _along(axes, path_spans(entry, rows.get(entry["index"], ()), LAST * ways), position)
         axes.axvline(position, color=_SOFT, lw=0.6)
     every = max(1, len(entries) // 20)
     ticks = range(0, len(entries), every)
     axes.set_xticks(list(ticks), [str(entries[k]["index"]) for k in ticks])
-    axes.set(xlim=(0, len(entries)), xlabel="keyframe that the way begins at")
+    axes.set(xlim=(0.0, ways * (1.0 + LAST if ways < len(entries) else 1.0)), xlabel="keyframe that the way begins at")
     _titled(figure, "from keyframe to keyframe", covered)
     return figure
 

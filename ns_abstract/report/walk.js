@@ -12,8 +12,9 @@
     marks.forEach((mark, k) => mark.classList.toggle("here", k === at));
   }
 
-  show(0);
+  // it begins where something is certified
+  show(Math.max(0, marks.findIndex((mark) => mark.className === "certified-back")));
   const told = () => at + 1 + " of " + figures.length + ": " + figures[at].dataset.at;
-  document.getElementById("walk-control").append(textSlider("walk-slider", figures.length - 1, 0, told, show));
+  document.getElementById("walk-control").append(textSlider("walk-slider", figures.length - 1, at, told, show));
   place.classList.add("moves");
 })();
