@@ -334,8 +334,8 @@ def test_regions_have_their_size_and_worst_counterexample() -> None:
     assert found[2].margin is None
     single = {"lower": [0.0], "upper": [0.0], "verdict": "falsified", "margin": -1.0, "counterexample": [0.0]}
     one = entry("x", high=0.0)
-    (found,) = falsified_regions([one], {0: [single]})
-    assert found.share == 1.0
+    single_last = falsified_regions([one, entry("x", index=1)], {0: [single], 1: cells(1)})
+    assert [(r.frame, r.share) for r in single_last] == [(1, 0.5), (0, 1.0)]
 
 
 def test_the_nearest_certified_pose() -> None:

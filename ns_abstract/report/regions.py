@@ -87,7 +87,7 @@ def touching(lower: Float64, upper: Float64) -> NDArray[np.int64]:
 def falsified_regions(
     entries: Sequence[Mapping[str, Any]], rows: Mapping[int, Sequence[Mapping[str, Any]]]
 ) -> list[Region]:
-    """The regions of all frames, the largest parts of their sets first.
+    """The regions of all frames, the largest parts of their sets first, single poses last.
 
     Args:
         entries: Frames of report.json: index and parameters (name, lower, upper).
@@ -119,7 +119,8 @@ def falsified_regions(
                     worst["margin"],
                 )
             )
-    return sorted(found, key=lambda region: (-region.share, region.frame, region.cells))
+    # a set of one pose has no volume: behind all that have one
+    return sorted(found, key=lambda region: (region.lower == region.upper, -region.share, region.frame, region.cells))
 
 
 def _ranges(parameters: Sequence[Mapping[str, Any]]) -> Float64:
