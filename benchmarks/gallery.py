@@ -46,11 +46,14 @@ PATH = "demo/camera_path.json"
 _GOOD, _BAD, _OPEN, _BLUE, _INK = "#1d7440", "#b3261e", "#9aa0a6", "#0b57d0", "#333333"
 
 
-def gate_camera() -> dict[str, Any]:
-    """The gate seen from its axis, 8 x 8 pixels, as the demo's network sees it."""
-    pose = rotation()
-    pose[:3, 3] = 0.5, 0.0, 0.0
-    return path_json([View(pose, FOV, 8, 8)])
+def gate_camera(*places: tuple[float, float, float]) -> dict[str, Any]:
+    """The gate seen along x, from its axis or from ``places``, 8 x 8 pixels, as the demo's network sees it."""
+    views = []
+    for place in places or ((0.5, 0.0, 0.0),):
+        pose = rotation()
+        pose[:3, 3] = place
+        views.append(View(pose, FOV, 8, 8))
+    return path_json(views)
 
 
 @dataclass(frozen=True)
@@ -162,6 +165,28 @@ def certificate_picture(work: Path) -> Image.Image:
     return drawn(figure)
 
 
+def kept_picture(file: str) -> Callable[[Path], Image.Image]:
+    """A PNG that ns-abstract-certify itself writes."""
+    return lambda work: Image.open(work / file).convert("RGB")
+
+
+def broken_picture(work: Path) -> Image.Image:
+    """The largest region's two pictures, as the report's page has them."""
+    page = (work / "out/certificate/report.html").read_text()
+    region = page[page.index('<div class="region">') :].split('<div class="region">')[1]
+    found = re.findall(
+        r'base64,([^"]+)" alt="([^"]+)"><figcaption><b[^>]*>[^<]*</b>(, margin [^<]*)<br>([^<]*)<', region
+    )
+    figure = figure_of(6.0, 3.5)
+    for axes, (data, title, margin, pose) in zip(figure.subplots(1, len(found)), found, strict=True):
+        axes.imshow(Image.open(io.BytesIO(base64.b64decode(data))).convert("RGB"), interpolation="nearest")
+        axes.set_title(f"{title}{margin}", fontsize=9, color=_BAD if title == "counterexample" else _GOOD)
+        axes.set_xlabel(pose, fontsize=9, color=_INK)
+        axes.set_xticks([])
+        axes.set_yticks([])
+    return drawn(figure)
+
+
 def loop_picture(work: Path) -> Image.Image:
     """Tubes from above and from the side over the scene, as the report's page has them."""
     from matplotlib.patches import Polygon, Rectangle
@@ -233,6 +258,13 @@ _NEAR = {
     "tolerance": {"absolute": 0.03},
     "preprocess": {"resize": [8, 8]},
 }
+_THREE = {"version": 1, "frame": "world", "translation": {"x": 0.1, "y": 0.6, "z": 0.5}}
+_ROUTE = (0.2, 0.3, 0.1), (0.7, 0.1, 0.25), (1.1, -0.1, 0.0), (1.5, 0.0, -0.1)
+_CERTIFY_COMMAND = (
+    f"ns-abstract-certify --load-config {GATE} --camera-path-filename gate_path.json "
+    "--perturbation-filename offsets.json --model demo/gate/estimator.onnx --property near.json "
+    "--output-dir out/certificate --time-budget 240"
+)
 _PATH_COMMAND = (
     f"ns-abstract-render --load-config {AIRFIELD} --camera-path-filename {PATH} --perturbation-filename segments.json "
     "--frames 0 1 2 3 --downscale-factor 2 --output-dir out/path --time-budget 160"
@@ -292,12 +324,39 @@ ENTRIES = (
         "certificate", "A certificate",
         "Green: from every place of the cell, proved, the network tells how far beside and above the gate's axis it "
         "is, within 0.03; red: at a place of the cell it does not.",
-        f"ns-abstract-certify --load-config {GATE} --camera-path-filename gate_path.json "
-        "--perturbation-filename offsets.json --model demo/gate/estimator.onnx --property near.json "
-        "--output-dir out/certificate --time-budget 240",
+        _CERTIFY_COMMAND,
         "out/certificate", certificate_picture,
         {"gate_path.json": gate_camera(), "offsets.json": _OFFSETS, "near.json": _NEAR},
         {"gate_path.json": "a camera path with one pose, 8 × 8 pixels, at (0.5, 0, 0) and looking along x"},
+    ),
+    Entry(
+        "broken", "Where it fails",
+        "From the page of that certificate: the largest region where the network errs by more, its worst picture, and "
+        "the nearest pose at which it is proved not to.",
+        _CERTIFY_COMMAND, "out/certificate", broken_picture,
+    ),
+    Entry(
+        "pairs", "A certificate over three parameters",
+        "Every map is over two of them: below the diagonal what part of the volume over the third is certified, above "
+        "it what part is falsified; on the diagonal both along one parameter.",
+        f"ns-abstract-certify --load-config {GATE} --camera-path-filename gate_path.json "
+        "--perturbation-filename three.json --model demo/gate/estimator.onnx --property wide.json "
+        "--output-dir out/pairs --time-budget 240",
+        "out/pairs", kept_picture("out/pairs/verdicts_00000.png"),
+        {"three.json": _THREE, "wide.json": _NEAR | {"tolerance": {"absolute": 0.15}}},
+    ),
+    Entry(
+        "route", "A certificate along a path",
+        "The camera flies from keyframe to keyframe, and every pose on the way is looked at: the network is right on "
+        "every picture until the gate is near.",
+        f"ns-abstract-certify --load-config {GATE} --camera-path-filename route.json "
+        "--perturbation-filename segments.json --model demo/gate/estimator.onnx --property close.json "
+        "--output-dir out/route --time-budget 60",
+        "out/route", kept_picture("out/route/cameras.png"),
+        {"route.json": gate_camera(*_ROUTE), "segments.json": _SEGMENTS,
+         "close.json": _NEAR | {"tolerance": {"absolute": 0.08}}},
+        {"route.json": "a camera path with four such poses, at (0.2, 0.3, 0.1), (0.7, 0.1, 0.25), (1.1, -0.1, 0) and "
+         "(1.5, 0, -0.1)", "segments.json": "as above"},
     ),
     Entry(
         "loop", "A network in the loop",

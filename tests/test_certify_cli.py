@@ -5,10 +5,12 @@ from __future__ import annotations
 import base64
 import hashlib
 import importlib.util
+import io
 import itertools
 import json
 import os
 import re
+import shutil
 import signal
 import sqlite3
 import subprocess
@@ -24,8 +26,9 @@ import torch
 from certifying import classifier, linear
 from conftest import InProcess, Inputs, environment, write_json
 from interrupting import LONG, check_ended_in_a_library_call, check_interrupted, interrupted_at, stored, until
+from PIL import Image
 
-from ns_abstract.api import certifying
+from ns_abstract.api import certifying, showing
 from ns_abstract.api.certification import (
     Certification,
     CertifySettings,
@@ -33,6 +36,7 @@ from ns_abstract.api.certification import (
     examine_block,
     open_certification,
 )
+from ns_abstract.api.showing import look_closer
 from ns_abstract.cli import certify as certify_command
 from ns_abstract.cli.certify import Certify, certify
 from ns_abstract.demo.writing import write_demo
@@ -743,6 +747,66 @@ def test_page(finished: Path) -> None:
     rows = sqlite3.connect(finished / "cells.sqlite").execute("SELECT verdict, margin FROM cells").fetchall()
     assert sorted((cell[1], cell[4]) for cell in found["cells"]) == sorted(rows)
     assert found["pictures"] and {cell[6] for cell in found["cells"]} >= set(range(len(found["pictures"])))
+
+
+def test_where_it_fails_is_looked_at_closely(planted: Case, finished: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Pictures, outputs and margins are those of the renderer and the network; all is bounded in time, and repeats."""
+    entries = report(finished)["frames"]
+    names = "lower", "upper", "verdict", "margin", "counterexample"
+    rows: list[dict[str, Any]] = [
+        dict(
+            zip(names, (json.loads(low), json.loads(high), kind, margin, example and json.loads(example)), strict=True)
+        )
+        for _, low, high, kind, margin, example in cells(finished)
+    ]
+    job = planted.job
+    monkeypatch.setattr(showing, "SECONDS", np.inf)
+    found = look_closer(job, entries, {0: rows}, lambda *_: None, np.inf)
+    broken = sum(r["upper"][0] - r["lower"][0] for r in rows if r["verdict"] == "falsified") / 0.3
+    assert sum(region.share for region in found.regions) == pytest.approx(broken) and found.why == ""
+    pictures = job.pictures(0)
+    claim = job.claim(pictures)
+    proved = [(r["lower"][0], r["upper"][0]) for r in rows if r["verdict"] == "certified"]
+    assert len(found.pictures) == min(6, len(found.regions)) > 0
+    for region, (bad, good) in zip(found.regions, found.pictures, strict=False):
+        assert good is not None and tuple(bad.values) == region.pose and bad.margin == pytest.approx(region.margin)
+        assert bad.margin is not None and good.margin is not None and bad.margin <= 0.0 < good.margin
+        (x,), (pose,) = good.values, bad.values
+        assert any(low <= x <= high for low, high in proved)
+        assert abs(x - pose) == min(min(abs(end - pose) for end in ends) for ends in proved)
+    for shown in [s for pair in found.pictures for s in pair if s] + [s for _, s in found.stops]:
+        image = pictures.image(np.array(shown.values))
+        outputs = np.asarray(job.model.outputs(image[None]), np.float64)
+        assert shown.outputs == outputs[0].tolist()
+        margin = claim.margin(torch.from_numpy(outputs), torch.tensor([list(shown.values)], dtype=torch.float64))
+        assert shown.margin == float(margin[0])
+        stored = np.asarray(Image.open(io.BytesIO(shown.png)), np.int64)
+        assert np.abs(stored - image * 255.0).max() <= 1.0
+    assert len(found.stops) == 24 and {stop.verdict for stop, _ in found.stops} >= {"certified", "falsified"}
+    for stop, shown in found.stops:
+        assert stop.proven is None or (shown.margin is not None and shown.margin >= stop.proven)
+    assert look_closer(job, entries, {0: rows}, lambda *_: None, np.inf) == found
+    # no time: what is known without pictures stays
+    late = look_closer(job, entries, {0: rows}, lambda *_: None, -np.inf)
+    assert late.regions == found.regions and not late.pictures and not late.stops and "time" in late.why
+    # nothing certified: a right pose of a cell without a verdict
+    unsure = [r | {"verdict": "unknown"} if r["verdict"] == "certified" else r for r in rows]
+    found = look_closer(job, entries, {0: unsure}, lambda *_: None, np.inf)
+    assert any(good and "not certified" in good.title and good.margin > 0.0 for _, good in found.pictures)  # type: ignore[operator]
+
+
+def test_pictures_of_a_resumed_command(planted: Case, finished: Path, tmp_path: Path) -> None:
+    """They are made again, and are the same; what an interrupted command leaves is none of them."""
+    page = (finished / "report.html").read_text()
+    assert "Where it fails" in page and "Along the set" in page
+    names = {"verdicts_00000.png", "cameras.png"}
+    assert {file.name for file in finished.glob("*.png")} == names
+    shutil.copytree(finished, tmp_path / "out")
+    for name in names:
+        (tmp_path / "out" / name).write_bytes(b"another command's")
+    planted.run(tmp_path / "out", resume=True)
+    for name in names:
+        assert (tmp_path / "out" / name).read_bytes() == (finished / name).read_bytes()
 
 
 def test_ring_strip_plane_and_bars() -> None:

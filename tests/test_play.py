@@ -20,11 +20,13 @@ from ns_abstract.geometry.box import ParameterBox
 from ns_abstract.refine.result import FrameResult, Leaves, Views
 from ns_abstract.report import play
 from ns_abstract.report.certificate import CertifiedRun, certificate_document
-from ns_abstract.report.certificate_page import certificate_page
+from ns_abstract.report.certificate_page import Closer, certificate_page
 from ns_abstract.report.files import load_frame, save_frame
 from ns_abstract.report.picture import preview
 from ns_abstract.report.play import play_data
 from ns_abstract.report.record import Report
+from ns_abstract.report.regions import Shown
+from ns_abstract.report.walk import stops
 
 SIDE = 16
 LARGE = 10**9
@@ -389,9 +391,10 @@ def certificate(folder: Path) -> Path:
         scene_margin={"skipped": "not asked for", "kinds": []},
     )  # fmt: skip
     red = preview(np.full((4, 4, 3), (200, 10, 10), np.uint8), 64)
-    page = certificate_page(
-        document, {0: rows(0.0), 1: rows(4.0)}, [], {(0, 1): {"png": red, "text": "broken </script>"}}
-    )
+    cells = {0: rows(0.0), 1: rows(4.0)}
+    found = [(stop, Shown(stop.at, stop.values, red, [1.0], 0.5)) for stop in stops(document["frames"], cells, 8)]
+    seen = {(0, 1): {"png": red, "text": "broken </script>"}}
+    page = certificate_page(document, cells, [], seen, closer=Closer(stops=found))
     (folder / "certificate.html").write_text(page)
     return folder / "certificate.html"
 
@@ -418,3 +421,26 @@ def test_cell_of_a_certificate_is_told_about(tab: Browser, tmp_path: Path) -> No
     )
     assert size == [False, 4]
     tab.screenshot(tmp_path / "certificate.png")
+
+
+@needs_browser
+def test_slider_of_a_certificate_shows_one_picture_at_a_time(tab: Browser, tmp_path: Path) -> None:
+    opened(tab, certificate(tmp_path), "!!document.getElementById('walk-slider')")
+    seen = "[...document.querySelectorAll('#walk figure')].map(f => f.getBoundingClientRect().height > 0)"
+    # it begins at what is certified
+    assert tab.ask(seen) == [True] + [False] * 7
+    assert "1 of 8: frame 0, azimuth = 0 rad" in tab.ask("document.getElementById('walk').innerText")
+    tab.click(*tab.place("document.getElementById('walk-slider')"))
+    before = tab.ask("Number(document.getElementById('walk-slider').value)")
+    tab.key("ArrowRight", 39, 2)
+    at = tab.ask("Number(document.getElementById('walk-slider').value)")
+    assert at == before + 2 and tab.ask(seen) == [k == at for k in range(8)]
+    text = tab.ask("document.getElementById('walk').innerText")
+    assert f"{at + 1} of 8: frame {at // 4}, azimuth" in text and "margin of this picture 0.5" in text
+    assert tab.ask("[...document.querySelectorAll('#walk-verdicts .here')].length") == 1
+    # printed, and without scripts, all pictures are there
+    tab.call("Emulation.setScriptExecutionDisabled", value=True)
+    tab.call("Page.reload")
+    until(lambda: tab.ask("document.readyState") == "complete", "the page")
+    assert tab.ask(seen) == [True] * 8
+    tab.call("Emulation.setScriptExecutionDisabled", value=False)

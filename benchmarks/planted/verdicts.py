@@ -6,6 +6,7 @@ _SEARCH = "verify/search.py"
 _VNNLIB = "verify/vnnlib.py"
 _NETWORK = "verify/network/bounds.py"
 _RESPONSE = "verify/response.py"
+_MAPS = "report/verdict_maps.py"
 
 VERDICTS = (
     Fault(
@@ -167,5 +168,37 @@ VERDICTS = (
         "np.where(lower <= upper, least, np.nan)",
         "least",
         "test_response.py::test_sets_that_cross_or_are_no_numbers_stay_so",
+    ),
+    Fault(
+        "maps: a pair's map forgets how wide cells are in the other parameters",
+        _MAPS,
+        "pair_maps",
+        "np.delete(part, (i, j), axis=1).prod(axis=1)",
+        "np.delete(part, (i, j), axis=1).max(axis=1, initial=0.0)",
+        "test_verdict_maps.py::test_parts_are_those_of_the_boxes[4-16-2]",
+    ),
+    Fault(
+        "maps: parts of places are rounded upward",
+        _MAPS,
+        "_downward",
+        "1.0 - slack",
+        "1.0 + slack",
+        "test_verdict_maps.py::test_parts_are_those_of_the_boxes[6-12-3]",
+    ),
+    Fault(
+        "maps: a place counts as whole while cells are open",
+        _MAPS,
+        "_downward",
+        "(others == 0.0) & complete",
+        "others == 0.0",
+        "test_verdict_maps.py::test_a_place_is_whole_only_if_nothing_is_missing",
+    ),
+    Fault(
+        "regions: the nearest right pose lies outside of its cell",
+        "report/regions.py",
+        "nearest",
+        "np.clip(np.asarray(pose, np.float64), lower, upper)",
+        "np.clip(np.asarray(pose, np.float64), lower, None)",
+        "test_verdict_maps.py::test_the_nearest_certified_pose",
     ),
 )

@@ -23,6 +23,7 @@ from ns_abstract.api.margins import NOT_ASKED, SHARE, Margins, certified_cells
 from ns_abstract.api.poses import PoseSet
 from ns_abstract.api.scenes import Scene
 from ns_abstract.api.searching import paced, search_blocks
+from ns_abstract.api.showing import look_closer
 from ns_abstract.execution.ending import AbandonedError, abandoning
 from ns_abstract.execution.engines import Engine, EngineName, started
 from ns_abstract.execution.stopping import StopRequest, interruptible
@@ -31,10 +32,11 @@ from ns_abstract.io.errors import InputError
 from ns_abstract.io.memory import available_memory
 from ns_abstract.report.cameras import Cameras, cameras_entry, cell_cameras, standing
 from ns_abstract.report.certificate import CertifiedRun, certificate_document, coverage, verdict, write_certificate
-from ns_abstract.report.certificate_page import certificate_page
+from ns_abstract.report.certificate_page import Closer, certificate_page
 from ns_abstract.report.outside import Outside
 from ns_abstract.report.picture import preview, to_bytes
 from ns_abstract.report.record import file_stamp
+from ns_abstract.report.verdict_picture import clear_pictures, write_pictures
 from ns_abstract.verify.cells import Grid
 from ns_abstract.verify.eight_bit import Picture
 from ns_abstract.verify.network import NetworkArithmetic
@@ -105,6 +107,7 @@ class CertificateRun:
         self.shown: list[dict[str, Any]] = []
         self.seen: dict[tuple[int, int], dict[str, Any]] = {}
         self.rows: dict[int, list[dict[str, Any]]] = {}
+        self.closer: Closer | None = None
         self.cameras: Cameras | None = None
         #: Content of the last report.json, and its cells by frame.
         self.written: tuple[dict[str, Any], dict[int, list[dict[str, Any]]]] = {}, {}
@@ -243,6 +246,7 @@ class CertificateRun:
             try:
                 with stop.at_once():
                     if report:
+                        clear_pictures(self.folder)
                         self.report(store, "running", pictures=False)
                     self._foresee(budget)
                     on_open(store)
@@ -392,8 +396,12 @@ class CertificateRun:
             self.seen = {} if state == "running" else self._cell_pictures(rows)
         elif self.seen:
             self.seen = {}
+        ended = state in ("done", "budget")
+        self.closer = look_closer(self.job, document["frames"], rows, self._kept_image, self.over) if ended else None
         self.written = document, rows
         self._write()
+        if ended:
+            write_pictures(self.folder, document, rows, self.cameras)
         return document
 
     def interrupted(self) -> None:
@@ -404,7 +412,8 @@ class CertificateRun:
 
     def _write(self) -> None:
         document, rows = self.written
-        write_certificate(self.folder, document, certificate_page(document, rows, self.shown, self.seen, self.cameras))
+        page = certificate_page(document, rows, self.shown, self.seen, self.cameras, self.closer)
+        write_certificate(self.folder, document, page)
 
     def _entry(self, tally: Any, rows: list[dict[str, Any]]) -> dict[str, Any]:
         shares = fractions(tally)

@@ -12,13 +12,25 @@ from numpy.typing import NDArray
 from ns_abstract.geometry.camera_path import Camera
 from ns_abstract.geometry.poses import PoseSet
 from ns_abstract.report.figures import number
-from ns_abstract.report.outside import ABOVE, PICTURE_WIDTH, Outside, about, behind, draw_plane, plane_axes, sideways
+from ns_abstract.report.outside import (
+    ABOVE,
+    PICTURE_WIDTH,
+    Outside,
+    Window,
+    about,
+    behind,
+    draw_plane,
+    plane_axes,
+    sideways,
+)
 from ns_abstract.report.page import counted
 
 Float64 = NDArray[np.float64]
 
 #: Cells drawn at most, and the verdicts in the order in which they are drawn.
 MOST = 400
+#: Of these at least so many of every verdict, if it has them.
+_OF_VERDICT = 50
 _ORDER = ("certified", "unknown", "falsified")
 #: Poses of all sets that are looked at for where cameras may stand, and by parameter at most.
 _POSES, _STEPS = 2000, 17
@@ -67,12 +79,16 @@ def cell_cameras(
         names: Of all parameters, in the order of the cells' ends.
 
     Returns:
-        At most `MOST` cameras, and the number of cells that are left out.
+        At most `MOST` cameras, some of every verdict, and the number of cells that are left out.
     """
     keys = [(frame, k) for frame, found in rows.items() for k in range(len(found))]
     width = np.concatenate([np.ones(0), *(_shares(pose_sets[f].box, found, names) for f, found in rows.items())])
     # by parts of their sets; of equal ones some from everywhere
     order = np.lexsort(((_GOLDEN * np.arange(len(keys))) % 1.0, -width.round(12)))
+    # a verdict that has narrow cells alone is to be seen, too
+    kinds = np.array([rows[keys[n][0]][keys[n][1]]["verdict"] for n in order], str)
+    first = np.concatenate([np.flatnonzero(kinds == kind)[:_OF_VERDICT] for kind in _ORDER])
+    order = np.concatenate([order[first], np.delete(order, first)])
     found = []
     for frame, k in sorted(keys[n] for n in order[:MOST]):
         row, poses = rows[frame][k], pose_sets[frame]
@@ -127,6 +143,23 @@ def cameras_entry(cameras: Sequence[CellCamera], left_out: int) -> dict[str, Any
 
 
 @dataclass(frozen=True)
+class View:
+    """Cameras in a plane.
+
+    Attributes:
+        title: From where one looks.
+        nearest: As `ns_abstract.report.outside.Outside.picture` has it.
+        window: The part of the plane.
+        shapes: Cameras and the corners of their frusta, normalised units, in the order in which they are drawn.
+    """
+
+    title: str
+    nearest: float
+    window: Window
+    shapes: list[tuple[CellCamera, list[tuple[float, float]]]]
+
+
+@dataclass(frozen=True)
 class Cameras:
     """What the page shows of the cameras.
 
@@ -142,37 +175,50 @@ class Cameras:
     ends: tuple[Float64, Float64]
     outside: Outside | None
 
-    def html(self, numbers: Mapping[tuple[int, int], int]) -> str:
-        """The page's part; cells with numbers, by frame and position, can be chosen."""
-        if not self.cells:
-            return ""
+    def views(self, width: int) -> list[View]:
+        """What there is to see from above and from the side, in pictures so many pixels wide."""
         low, high = self.ends
         span = float((high - low).max())
         room = _LENGTH * max(span, _LEAST)
         around = room + 0.5 * max(0.0, _LEAST - span)
-        figures = []
+        found = []
         for axes, title, nearest in (
             # a ceiling would hide everything
             (ABOVE, "from above", float(high[2])),
             (sideways(low, high), "from the side", np.inf),
         ):
             chosen = list(axes)
-            window = about(self.outside, axes, low[chosen] - around, high[chosen] + around, nearest, PICTURE_WIDTH)
+            window = about(self.outside, axes, low[chosen] - around, high[chosen] + around, nearest, width)
             length = min(room, _OF_WINDOW * (window.high[0] - window.low[0]))
-            x, y = plane_axes(window)
             shapes = []
             for camera in sorted(self.cells, key=lambda cell: _ORDER.index(cell.verdict)):
                 place = camera.pose[:, 3]
                 points = np.concatenate([place[None], place + length * camera.rays])[:, chosen]
-                corners = "L".join(f"{a:.1f},{b:.1f}" for a, b in _hull([(x(a), y(b)) for a, b in points.tolist()]))
+                shapes.append((camera, _hull([(a, b) for a, b in points.tolist()])))
+            found.append(View(title, nearest, window, shapes))
+        return found
+
+    def html(self, numbers: Mapping[tuple[int, int], int]) -> str:
+        """The page's part; cells with numbers, by frame and position, can be chosen."""
+        if not self.cells:
+            return ""
+        low, high = self.ends
+        figures = []
+        for view in self.views(PICTURE_WIDTH):
+            x, y = plane_axes(view.window)
+            shapes = []
+            for camera, corners in view.shapes:
+                drawn = "L".join(f"{x(a):.1f},{y(b):.1f}" for a, b in corners)
                 cell = numbers.get((camera.frame, camera.row))
                 data = "" if cell is None else f' data-cell="{cell}"'
-                shapes.append(f'<path class="{camera.verdict}"{data} d="M{corners}Z"/>')
+                shapes.append(f'<path class="{camera.verdict}"{data} d="M{drawn}Z"/>')
             marks = f'<g class="frusta">{"".join(shapes)}</g>'
-            plot = draw_plane(self.outside, window, nearest, marks, f"Cameras seen {title}")
-            scene = behind(self.outside, nearest, "cameras alone")
-            figures.append(f"<figure>{plot}<figcaption><b>{title}</b> {scene}</figcaption></figure>")
-        left = f" {counted(self.left_out, 'further cell')}, none of them wider, not shown." if self.left_out else ""
+            plot = draw_plane(self.outside, view.window, view.nearest, marks, f"Cameras seen {view.title}")
+            scene = behind(self.outside, view.nearest, "cameras alone")
+            figures.append(f"<figure>{plot}<figcaption><b>{view.title}</b> {scene}</figcaption></figure>")
+        left = ""
+        if self.left_out:
+            left = f" {counted(self.left_out, 'further cell')}, none wider than those of its verdict here, not shown."
         where = " · ".join(
             f"{name} {number(a, 4)}" if a == b else f"{name} {number(a, 4)} to {number(b, 4)}"
             for name, a, b in zip("xyz", low.tolist(), high.tolist(), strict=True)

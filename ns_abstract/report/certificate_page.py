@@ -5,14 +5,18 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from html import escape
 from typing import Any
 
 from ns_abstract.report.cameras import Cameras
-from ns_abstract.report.figures import interval, number
+from ns_abstract.report.figures import interval, number, percent, unit_of_axis
 from ns_abstract.report.margins import scene_margin
 from ns_abstract.report.page import Axis, counted, draw_line, draw_plot, reproduce, script, uri, whole_page
 from ns_abstract.report.record import plain
+from ns_abstract.report.regions import Region, Shown, regions_html
+from ns_abstract.report.verdict_maps import TEXT, free_parameters, maps_of, matrix_svg, mixed, pixels
+from ns_abstract.report.walk import Stop, walk_html
 
 _STYLE = """
 svg .certified { fill: var(--good); } svg .falsified { fill: var(--bad); } svg .unknown { fill: #9aa0a6; }
@@ -29,6 +33,17 @@ svg [data-cell] { cursor: pointer; } svg [data-cell].chosen { stroke: var(--ink)
 #cell { background: var(--card); border: 1px solid var(--line); border-radius: 6px; padding: .8rem 1.2rem;
   flex: 1 1 20rem; }
 #cell img { width: 16rem; max-width: 100%; } #cell h3 { margin: 0 0 .4rem; font-size: 1rem; }
+svg .ring path { stroke-width: .5; } svg .ring .certified { stroke: var(--good); }
+svg .ring .falsified { stroke: var(--bad); } svg .ring .unknown { stroke: #9aa0a6; }
+svg .broken { stroke: var(--ink); stroke-width: 1.2; fill: none; }
+svg .halo { stroke: var(--card); stroke-width: 3.2; fill: none; }
+svg image.pixels { image-rendering: pixelated; } svg .frame { fill: none; stroke: var(--line); }
+.region { background: var(--card); border: 1px solid var(--line); border-radius: 6px; padding: .4rem 1.2rem .8rem;
+  margin: .7rem 0; } .region figure { flex: 0 1 15rem; } .region table { width: auto; }
+#walk-verdicts { display: flex; gap: 2px; margin: .3rem 0 .8rem; } #walk-verdicts i { flex: 1; height: .8rem; }
+#walk-verdicts i.here { outline: 2px solid var(--ink); } #walk.moves .images { display: block; max-width: 20rem; }
+#walk.moves figcaption span { display: none; } #walk label, #walk-verdicts { max-width: 40rem; }
+#walk label { display: block; font-size: .9rem; } #walk input { width: 100%; margin: .3rem 0 0; }
 #cell button { font: inherit; font-size: .85rem; margin-right: .5rem; }
 """
 _VERDICTS = ("certified", "falsified", "unknown")
@@ -38,18 +53,27 @@ _MOST_ROWS = 200
 _MOST_POINTS = 400
 #: Most cells that can be chosen one by one; neighbours of one verdict are drawn as one where there are more.
 _MOST_CELLS = 4000
+#: Places along a parameter where cells are drawn together; counterexamples marked, and frames with maps of all pairs.
+_FINE, _MOST_MARKS, _MOST_MATRICES = 160, 400, 4
+#: An orbit is drawn as a ring from so many radians on.
+_RING = 1.0
 
 
-def percent(part: float | None) -> str:
-    """A fraction for people; never 100 % or 0 % where it is not."""
-    if part is None:
-        return "–"
-    text = f"{100.0 * part:.2f}"
-    if part < 1.0 and text == "100.00":
-        return "> 99.99 %"
-    if part > 0.0 and text == "0.00":
-        return "< 0.01 %"
-    return f"{text} %"
+@dataclass(frozen=True)
+class Closer:
+    """What was looked at more closely when a search ended.
+
+    Attributes:
+        regions: Where the property fails.
+        pictures: Of the first of them: a counterexample, and the nearest pose that was seen to be right.
+        stops: Poses along the sets, with pictures.
+        why: Why there are no more pictures, as the end of a sentence; empty if there were not to be more.
+    """
+
+    regions: Sequence[Region] = ()
+    pictures: Sequence[tuple[Shown, Shown | None]] = ()
+    stops: Sequence[tuple[Stop, Shown]] = ()
+    why: str = ""
 
 
 def certificate_page(
@@ -58,6 +82,7 @@ def certificate_page(
     pictures: Sequence[Mapping[str, Any]],
     seen: Mapping[tuple[int, int], Mapping[str, Any]] | None = None,
     cameras: Cameras | None = None,
+    closer: Closer | None = None,
 ) -> str:
     """The page of a certificate.
 
@@ -67,16 +92,23 @@ def certificate_page(
         pictures: ``title``, ``text`` and ``png`` of images to show, in order.
         seen: ``text`` and ``png`` of a pose in a cell, by frame and position of the cell in it.
         cameras: Where cameras stand.
+        closer: Regions and poses that were looked at more closely.
 
     Returns:
         HTML, self-contained; every text of the document is escaped.
     """
     name = str(document["scene"].get("name", "scene"))
-    numbers = _numbered(document, cells)
+    numbers, closer = _numbered(document, cells), closer or Closer()
+    sides = {entry["index"]: entry["parameters"] for entry in document["frames"]}
+    scripts = ["cells.js"] if numbers else []
+    scripts += ["sliders.js", "walk.js"] if len(closer.stops) > 1 else []
     body = [
         _verdict(document, name),
         _map(document, cells, numbers),
         _cell_data(document, cells, numbers, seen or {}) if numbers else "",
+        _matrices(document, cells),
+        regions_html(closer.regions, closer.pictures, sides, closer.why),
+        walk_html(closer.stops),
         "" if cameras is None else cameras.html(numbers),
         _pictures(pictures),
         _counterexamples(document),
@@ -88,7 +120,7 @@ def certificate_page(
         _files(),
         reproduce(document),
     ]
-    return whole_page(f"Certificate of {name}", body, _STYLE, script("cells.js") if numbers else "")
+    return whole_page(f"Certificate of {name}", body, _STYLE, script(*scripts))
 
 
 def _numbered(
@@ -222,23 +254,19 @@ def _map(
     """Where: rings of one azimuth, strips of one other parameter, maps of two, bars of more."""
     frames = document["frames"][:_MOST_ROWS]
     drawn, bars = [], []
-    for entry in frames:
-        free = [k for k, p in enumerate(entry["parameters"]) if p["lower"] < p["upper"]]
+    if way := along_path(frames):
+        drawn.append(_path(way, cells, numbers))
+    for entry in [] if way else frames:
+        free = free_parameters(entry["parameters"])
         rows, parameters = cells.get(entry["index"], ()), entry["parameters"]
-        if rows and len(free) == 1 and parameters[free[0]]["name"] == "azimuth":
-            drawn.append(
-                _figure(
-                    _ring(_spans(rows, free[0], entry["index"], numbers), parameters[free[0]]),
-                    entry,
-                    "seen from the axis's tip",
-                )
-            )
-        elif rows and len(free) == 1:
-            drawn.append(
-                _figure(_strip(_spans(rows, free[0], entry["index"], numbers), parameters[free[0]]), entry, "")
-            )
+        if rows and len(free) == 1:
+            spans, marks = _spans(rows, free[0], entry["index"], numbers), [e[free[0]] for e in _broken(rows)]
+            if is_ring(parameters[free[0]]):
+                drawn.append(_figure(_ring(spans, parameters[free[0]], marks), entry, "seen from the axis's tip"))
+            else:
+                drawn.append(_figure(_strip(spans, parameters[free[0]], marks), entry, ""))
         elif rows and len(free) == 2:
-            drawn.append(_figure(_plane(rows, [parameters[k] for k in free], free, entry["index"], numbers), entry, ""))
+            drawn.append(_figure(_plane(rows, entry, free, numbers), entry, ""))
         else:
             bars.append(entry)
     text = "".join(drawn)
@@ -247,6 +275,8 @@ def _map(
     more = len(document["frames"]) - len(frames)
     note = f"<p>{counted(more, 'further frame')} in the table below.</p>" if more > 0 else ""
     hint = '<p class="soft" id="cell-hint" hidden>Click a cell for its margin and a picture.</p>' if numbers else ""
+    if 'class="broken"' in text:
+        hint += '<p class="soft">Small marks are counterexamples.</p>'
     return f'<h2>Where</h2>{hint}<div class="below">{text}{_CELL if numbers else ""}</div>{note}'
 
 
@@ -263,7 +293,51 @@ def _svg(width: int, height: int, title: str, marks: str) -> str:
     )
 
 
-def _ring(spans: Sequence[_Span], parameter: Mapping[str, Any]) -> str:
+def is_ring(parameter: Mapping[str, Any]) -> bool:
+    """Whether a parameter is drawn as a ring."""
+    return parameter["name"] == "azimuth" and parameter["upper"] - parameter["lower"] >= _RING
+
+
+def along_path(frames: Sequence[Mapping[str, Any]]) -> list[Mapping[str, Any]]:
+    """All frames if each is a way from one keyframe to the next, or the last keyframe, and nothing else varies."""
+    for position, entry in enumerate(frames):
+        names = [entry["parameters"][k]["name"] for k in free_parameters(entry["parameters"])]
+        if names != ["segment"] and (names or position < len(frames) - 1):
+            return []
+    return list(frames) if len(frames) > 1 else []
+
+
+def path_spans(
+    entry: Mapping[str, Any], rows: Sequence[Mapping[str, Any]], last: float
+) -> list[tuple[float, float, str, float | None]]:
+    """Cells of a frame of a path: from and to where, verdict, and where the counterexample is.
+
+    Args:
+        entry: The frame.
+        rows: Its cells.
+        last: How wide a keyframe by itself is drawn.
+    """
+    free = free_parameters(entry["parameters"])
+    found = []
+    for row in rows:
+        low, high = (row["lower"][free[0]], row["upper"][free[0]]) if free else (0.0, last)
+        example = row.get("counterexample")
+        at = None if example is None else example[free[0]] if free else 0.5 * last
+        found.append((low, high, row["verdict"], at))
+    return found
+
+
+#: How wide the last keyframe of a path is drawn, as a part of the path.
+LAST = 0.015
+
+
+def _broken(rows: Sequence[Mapping[str, Any]]) -> list[Sequence[float]]:
+    """Counterexamples, each once; some of many, evenly spread."""
+    found = list({tuple(e): e for row in rows if (e := row.get("counterexample")) is not None}.values())
+    return found[:: max(1, -(-len(found) // _MOST_MARKS))]
+
+
+def _ring(spans: Sequence[_Span], parameter: Mapping[str, Any], broken: Sequence[float]) -> str:
     """Azimuth 0 to the right, counter-clockwise."""
     middle, inner, outer = 170.0, 92.0, 138.0
     marks = []
@@ -281,6 +355,10 @@ def _ring(spans: Sequence[_Span], parameter: Mapping[str, Any]) -> str:
                 f'<path class="{kind}"{_chosen(number_of)} d="M{a:.2f},{b:.2f}A{outer},{outer} 0 0 0 '
                 f'{c:.2f},{d:.2f}L{e:.2f},{f:.2f}A{inner},{inner} 0 0 1 {g:.2f},{h:.2f}Z"/>'
             )
+    marks = ['<g class="ring">', *marks, "</g>"]
+    for angle in broken:
+        (a, b), (c, d) = ((middle + r * math.cos(angle), middle - r * math.sin(angle)) for r in (inner - 7, inner - 2))
+        marks.append(f'<path class="broken" d="M{a:.2f},{b:.2f}L{c:.2f},{d:.2f}"/>')
     for degrees in range(0, 360, 45):
         angle = math.radians(degrees)
         x, y = middle + 155 * math.cos(angle), middle - 155 * math.sin(angle) + 4
@@ -289,14 +367,9 @@ def _ring(spans: Sequence[_Span], parameter: Mapping[str, Any]) -> str:
     return _svg(340, 340, "Verdicts around the orbit", "".join(marks))
 
 
-def _strip(spans: Sequence[_Span], parameter: Mapping[str, Any]) -> str:
-    low, high = parameter["lower"], parameter["upper"]
-    axis = Axis(low, high, 20, 700, log=False)
-    marks = [
-        f'<rect class="{kind}"{_chosen(n)} x="{axis(a):.2f}" y="8" width="{max(0.3, axis(b) - axis(a)):.2f}" '
-        'height="34"/>'
-        for a, b, kind, n in spans
-    ]
+def _strip(spans: Sequence[_Span], parameter: Mapping[str, Any], broken: Sequence[float]) -> str:
+    axis = Axis(parameter["lower"], parameter["upper"], 20, 700, log=False)
+    marks = _along(spans, axis, broken)
     marks += [
         f'<text x="{axis(tick):.1f}" y="58" text-anchor="middle">{number(tick, 3)}</text>' for tick in axis.ticks()
     ]
@@ -305,25 +378,94 @@ def _strip(spans: Sequence[_Span], parameter: Mapping[str, Any]) -> str:
     return _svg(720, 80, f"Verdicts along {parameter['name']}", "".join(marks))
 
 
-def _plane(
-    rows: Sequence[Mapping[str, Any]],
-    parameters: Sequence[Mapping[str, Any]],
-    free: Sequence[int],
-    frame: int,
+def _along(spans: Sequence[_Span], axis: Axis, broken: Sequence[float], offset: float = 0.0) -> list[str]:
+    """Cells side by side, counterexamples below them."""
+    marks = [
+        f'<rect class="{kind}"{_chosen(n)} x="{axis(offset + a):.2f}" y="8" '
+        f'width="{max(0.3, axis(offset + b) - axis(offset + a)):.2f}" height="32"/>'
+        for a, b, kind, n in spans
+    ]
+    return marks + [f'<path class="broken" d="M{axis(offset + v):.2f},41v5"/>' for v in broken]
+
+
+def _path(
+    frames: Sequence[Mapping[str, Any]],
+    cells: Mapping[int, Sequence[Mapping[str, Any]]],
     numbers: Mapping[tuple[int, int], int],
 ) -> str:
-    x = Axis(parameters[0]["lower"], parameters[0]["upper"], 52, 340, log=False)
-    y = Axis(parameters[1]["lower"], parameters[1]["upper"], 300, 20, log=False)
+    """All ways from keyframe to keyframe, one after another."""
+    ways = sum(bool(free_parameters(entry["parameters"])) for entry in frames)
+    last = LAST * ways
+    axis = Axis(0.0, ways + (last if ways < len(frames) else 0.0), 20, 1000, log=False)
+    marks = []
+    for position, entry in enumerate(frames):
+        found = path_spans(entry, cells.get(entry["index"], ()), last)
+        spans = [(a, b, kind, numbers.get((entry["index"], k))) for k, (a, b, kind, _) in enumerate(found)]
+        broken = sorted({at for *_, at in found if at is not None})
+        marks += _along(spans, axis, broken[:: max(1, -(-len(broken) // _MOST_MARKS))], position)
+        at = axis(position)
+        marks.append(f'<path class="axis" d="M{at:.1f},4V48"/>')
+        if position % math.ceil(len(frames) / 24) == 0:
+            marks.append(f'<text x="{at:.1f}" y="60" text-anchor="middle">{entry["index"]}</text>')
+    marks.append('<text x="510" y="76" text-anchor="middle">keyframe that the way begins at</text>')
+    svg = _svg(1020, 82, "Verdicts along the path", "".join(marks))
+    return f"<figure>{svg}<figcaption>the whole path, from keyframe to keyframe</figcaption></figure>"
+
+
+def _plane(
+    rows: Sequence[Mapping[str, Any]],
+    entry: Mapping[str, Any],
+    free: Sequence[int],
+    numbers: Mapping[tuple[int, int], int],
+) -> str:
     i, j = free
-    marks = "".join(
-        f'<rect class="{row["verdict"]}"{_chosen(numbers.get((frame, k)))} x="{x(row["lower"][i]):.2f}" '
-        f'y="{y(row["upper"][j]):.2f}" '
-        f'width="{x(row["upper"][i]) - x(row["lower"][i]):.2f}" '
-        f'height="{y(row["lower"][j]) - y(row["upper"][j]):.2f}"/>'
-        for k, row in enumerate(rows)
+    parameters = [entry["parameters"][k] for k in free]
+    x = Axis(parameters[0]["lower"], parameters[0]["upper"], 58, 438, log=False)
+    y = Axis(parameters[1]["lower"], parameters[1]["upper"], 400, 20, log=False)
+    if len(rows) > _MOST_CELLS:
+        marks = (
+            f'<image class="pixels" x="58" y="20" width="380" height="380" preserveAspectRatio="none" '
+            f'href="{uri(pixels(mixed(maps_of(rows, entry, _FINE))))}"/>'
+        )
+    else:
+        marks = "".join(
+            f'<rect class="{row["verdict"]}"{_chosen(numbers.get((entry["index"], k)))} x="{x(row["lower"][i]):.2f}" '
+            f'y="{y(row["upper"][j]):.2f}" '
+            f'width="{x(row["upper"][i]) - x(row["lower"][i]):.2f}" '
+            f'height="{y(row["lower"][j]) - y(row["upper"][j]):.2f}"/>'
+            for k, row in enumerate(rows)
+        )
+    places = "".join(f"M{x(e[i]) - 2.5:.1f},{y(e[j]) - 2.5:.1f}l5,5m-5,0l5,-5" for e in _broken(rows))
+    if places:
+        marks += "".join(f'<path class="{kind}" d="{places}" pointer-events="none"/>' for kind in ("halo", "broken"))
+    labels = [escape(f"{p['name']} ({unit_of_axis(p['unit'])})") for p in parameters]
+    return draw_plot(x, y, (labels[0], labels[1]), marks, size=(450, 440), title="Verdicts over two parameters")
+
+
+def _matrices(document: Mapping[str, Any], cells: Mapping[int, Sequence[Mapping[str, Any]]]) -> str:
+    """Maps of all pairs of parameters, for sets of more than two; those that are certified least if there are many."""
+    several = [
+        entry
+        for entry in document["frames"]
+        if cells.get(entry["index"]) and len(free_parameters(entry["parameters"])) > 2
+    ]
+    if not several:
+        return ""
+    chosen = sorted(several, key=lambda entry: entry["coverage"]["certified"])[:_MOST_MATRICES]
+    figures = "".join(
+        _figure(
+            matrix_svg(
+                maps_of(cells[entry["index"]], entry),
+                [entry["parameters"][k] for k in free_parameters(entry["parameters"])],
+            ),
+            entry,
+            "",
+        )
+        for entry in sorted(chosen, key=lambda entry: entry["index"])
     )
-    labels = (escape(parameters[0]["name"]), escape(parameters[1]["name"]))
-    return draw_plot(x, y, labels, marks, size=(352, 340), title="Verdicts over two parameters")
+    more = len(several) - len(chosen)
+    note = f"<p>{counted(more, 'further frame')}, none of them certified less.</p>" if more else ""
+    return f"<h2>Verdicts over pairs of parameters</h2><p>{TEXT}</p>{figures}{note}"
 
 
 def _bars(

@@ -69,6 +69,23 @@ def number(value: float | None, digits: int = 4) -> str:
     return f"{mantissa}e{int(exponent)}"
 
 
+def percent(part: float | None) -> str:
+    """A fraction for people; never 100 % or 0 % where it is not."""
+    if part is None:
+        return "–"
+    text = f"{100.0 * part:.2f}"
+    if part < 1.0 and text == "100.00":
+        return "> 99.99 %"
+    if part > 0.0 and text == "0.00":
+        return "< 0.01 %"
+    return f"{text} %"
+
+
+def unit_of_axis(unit: str) -> str:
+    """A unit, short enough for an axis."""
+    return "units" if unit == "normalised units" else unit
+
+
 def interval(name: str, unit: str, low: float, high: float) -> str:
     """One side of a box for people, a symmetric one as a radius."""
     size = f"± {number(high)}" if low == -high else f"∈ [{number(low, 6)}, {number(high, 6)}]"

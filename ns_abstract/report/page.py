@@ -117,13 +117,13 @@ def render_page(
             for position, entry in enumerate(shown)
         ]
     body += [_plan(document), _table(document), _numbers(document), _files(document), reproduce(document)]
-    return whole_page(f"Abstract images of {name}", body, script=script("play.js") if plays else "")
+    return whole_page(f"Abstract images of {name}", body, script=script("sliders.js", "play.js") if plays else "")
 
 
 @cache
-def script(name: str) -> str:
-    """A script that lies beside this module."""
-    return (Path(__file__).parent / name).read_text(encoding="utf-8")
+def script(*names: str) -> str:
+    """Scripts that lie beside this module, one after another."""
+    return "".join((Path(__file__).parent / name).read_text(encoding="utf-8") for name in names)
 
 
 def whole_page(title: str, body: Sequence[str], more_style: str = "", script: str = "") -> str:

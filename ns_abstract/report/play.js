@@ -263,19 +263,12 @@
     get("play-none").hidden = f.cells || f.d === 0;
     if (!f.cells) return;
     f.names.forEach((name, k) => {
-      const label = document.createElement("label"), text = document.createElement("span"), range = document.createElement("input");
-      const [from, to] = f.ends[k], say = () => { text.textContent = name + " " + shortNumber(f.pose[k]) + " " + f.units[k]; };
-      Object.assign(range, { type: "range", min: 0, max: 1000, step: 1 });
-      range.id = "play-slider-" + k;
-      range.value = Math.round((1000 * (f.pose[k] - from)) / (to - from));
-      range.addEventListener("input", () => {
-        f.pose[k] = Math.min(to, Math.max(from, from + ((to - from) * Number(range.value)) / 1000));
+      const [from, to] = f.ends[k], told = () => name + " " + shortNumber(f.pose[k]) + " " + f.units[k];
+      box.append(textSlider("play-slider-" + k, 1000, Math.round((1000 * (f.pose[k] - from)) / (to - from)), told, (position) => {
+        f.pose[k] = Math.min(to, Math.max(from, from + ((to - from) * position) / 1000));
         get("play-whole").checked = false;
-        say(); draw();
-      });
-      say();
-      label.append(text, range);
-      box.append(label);
+        draw();
+      }));
       const option = document.createElement("option");
       option.value = String(k); option.textContent = name;
       choice.append(option);

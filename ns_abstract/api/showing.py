@@ -1,0 +1,104 @@
+"""Pictures of the poses that a certificate's page looks at more closely, in bounded time."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
+from typing import Any
+
+import numpy as np
+import torch
+
+from ns_abstract.api.certification import Certification, FramePictures
+from ns_abstract.execution.ending import AbandonedError, abandoning, checkpoint
+from ns_abstract.report import regions as broken
+from ns_abstract.report import walk
+from ns_abstract.report.certificate_page import Closer
+from ns_abstract.report.picture import preview, to_bytes
+from ns_abstract.report.regions import Region, Shown
+from ns_abstract.verify.properties import Claim
+
+#: Seconds that all of it may take; the longest side of a picture; cells without a verdict that are tried for a right
+#: pose where none is certified.
+SECONDS, _PIXELS, _TRIED = 10.0, 160, 4
+_OVER = ", without pictures: the time for them was over"
+
+Rows = Mapping[int, Sequence[Mapping[str, Any]]]
+
+
+class _Looks:
+    """Renders poses and shows them to the network."""
+
+    def __init__(self, job: Certification, kept: Callable[[int, np.ndarray], np.ndarray | None]) -> None:
+        self._job, self._kept = job, kept
+        self._names = [name for name, _ in job.parameters]
+        self._frames: dict[int, tuple[FramePictures, Claim]] = {}
+
+    def look(self, title: str, frame: int, values: Sequence[float]) -> Shown:
+        """The picture at values of all parameters, the network's outputs and the margin.
+
+        Raises:
+            AbandonedError: There is no time for it.
+        """
+        checkpoint()
+        if frame not in self._frames:
+            pictures = self._job.pictures(frame)
+            self._frames[frame] = pictures, self._job.claim(pictures)
+        pictures, claim = self._frames[frame]
+        pose = np.array([values[self._names.index(name)] for name in pictures.box.names], np.float64)
+        # of another scene of the set, maybe
+        image = self._kept(frame, pose) if pictures.pose_set.perturbation.scene else None
+        if image is None:
+            image = pictures.image(pose)
+        outputs = np.asarray(self._job.model.outputs(image[None]), np.float64)
+        with torch.no_grad():
+            margin = float(claim.margin(torch.from_numpy(outputs), torch.from_numpy(pose[None]))[0])
+        png = preview(to_bytes(image), _PIXELS)
+        return Shown(title, values, png, outputs[0].tolist(), margin if np.isfinite(margin) else None)
+
+    def right(self, region: Region, rows: Rows, parameters: Sequence[Mapping[str, Any]]) -> Shown | None:
+        """The nearest certified pose; where none is, the middle of a near cell at which the network is right."""
+        cells = rows[region.frame]
+        for _, pose in broken.nearest(cells, "certified", region.pose, parameters):
+            return self.look("nearest certified pose", region.frame, pose)
+        for k, _ in broken.nearest(cells, "unknown", region.pose, parameters, _TRIED):
+            pose = [0.5 * (a + b) for a, b in zip(cells[k]["lower"], cells[k]["upper"], strict=True)]
+            shown = self.look("a near pose, right but not certified", region.frame, pose)
+            if shown.margin is not None and shown.margin > 0.0:
+                return shown
+        return None
+
+
+def look_closer(
+    job: Certification,
+    entries: Sequence[Mapping[str, Any]],
+    rows: Rows,
+    kept: Callable[[int, np.ndarray], np.ndarray | None],
+    over: float,
+) -> Closer:
+    """Regions where the property fails, and poses along the sets, with pictures.
+
+    Args:
+        job: What is certified.
+        entries: Frames of report.json.
+        rows: Cells by frame.
+        kept: The stored image of a counterexample, by frame and pose.
+        over: Reading of `time.perf_counter` after which no picture is rendered; `SECONDS` from now at the latest.
+    """
+    over = min(over, time.perf_counter() + SECONDS)
+    looks = _Looks(job, kept)
+    regions = broken.falsified_regions(entries, rows)
+    sides = {entry["index"]: entry["parameters"] for entry in entries}
+    pictures: list[tuple[Shown, Shown | None]] = []
+    stops = walk.stops(entries, rows)
+    seen: dict[int, Shown] = {}
+    why = _OVER
+    with suppress(AbandonedError), abandoning(lambda: time.perf_counter() >= over):
+        for region in regions[: broken.MOST]:
+            shown = looks.look("counterexample", region.frame, region.pose)
+            pictures.append((shown, looks.right(region, rows, sides[region.frame])))
+        why = ""
+        for k in walk.coarse_first(len(stops)) if len(stops) > 1 else []:
+            seen[k] = looks.look(stops[k].at, stops[k].frame, stops[k].values)
+    return Closer(regions, pictures, [(stops[k], seen[k]) for k in sorted(seen)], why)

@@ -1,0 +1,235 @@
+"""Regions where a property fails: falsified cells that touch, and the nearest pose where it is proved."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from html import escape
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ns_abstract.report.figures import number, percent, unit_of_axis
+from ns_abstract.report.page import counted, uri
+
+Float64 = NDArray[np.float64]
+
+#: Regions with pictures; boxes that look for neighbours together; outputs that are told.
+MOST, _TOGETHER, _OUTPUTS = 6, 64, 10
+
+
+@dataclass(frozen=True)
+class Region:
+    """Falsified cells of a frame that hang together.
+
+    Attributes:
+        frame: Number of the set.
+        cells: Positions of the cells in their frame.
+        share: Part of the set's volume.
+        lower, upper: [n] ends of the box around them, all parameters.
+        pose: [n] the counterexample with the least margin.
+        margin: Its margin; None where that is no number.
+    """
+
+    frame: int
+    cells: tuple[int, ...]
+    share: float
+    lower: tuple[float, ...]
+    upper: tuple[float, ...]
+    pose: tuple[float, ...]
+    margin: float | None
+
+
+@dataclass(frozen=True)
+class Shown:
+    """A picture and what the network says of it.
+
+    Attributes:
+        title: What it is.
+        values: [n] all parameters.
+        png: The picture.
+        outputs: [m] the network's.
+        margin: The property's; None where that is no number.
+    """
+
+    title: str
+    values: Sequence[float]
+    png: bytes
+    outputs: Sequence[float]
+    margin: float | None
+
+
+def touching(lower: Float64, upper: Float64) -> NDArray[np.int64]:
+    """[n] numbers of regions: closed boxes [n, d] to [n, d] with a point in common, and so on, are of one."""
+    count = len(lower)
+    found = np.full(count, -1, np.int64)
+    left = np.arange(count)
+    regions = 0
+    while left.size:
+        found[left[0]] = regions
+        edge, left = left[:1], left[1:]
+        while edge.size:
+            some, edge = edge[-_TOGETHER:], edge[:-_TOGETHER]
+            low, high = lower[some], upper[some]
+            near = ((lower[left] <= high.max(axis=0)) & (upper[left] >= low.min(axis=0))).all(axis=1)
+            maybe = left[near]
+            meets = (lower[maybe, None] <= high) & (upper[maybe, None] >= low)
+            new = np.asarray(meets.all(axis=2)).any(axis=1)
+            found[maybe[new]] = regions
+            edge = np.concatenate([edge, maybe[new]])
+            near[near] = new
+            left = left[~near]
+        regions += 1
+    return found
+
+
+def falsified_regions(
+    entries: Sequence[Mapping[str, Any]], rows: Mapping[int, Sequence[Mapping[str, Any]]]
+) -> list[Region]:
+    """The regions of all frames, the largest parts of their sets first, single poses last.
+
+    Args:
+        entries: Frames of report.json: index and parameters (name, lower, upper).
+        rows: By frame, its cells: lower, upper, verdict, margin, counterexample.
+    """
+    found = []
+    for entry in entries:
+        cells = rows.get(entry["index"], ())
+        broken = [k for k, row in enumerate(cells) if row["verdict"] == "falsified"]
+        if not broken:
+            continue
+        lower, upper = (np.array([cells[k][key] for k in broken], np.float64) for key in ("lower", "upper"))
+        range_of = _ranges(entry["parameters"])
+        free = range_of > 0.0
+        shares = ((upper - lower)[:, free] / range_of[free]).prod(axis=1)
+        margins = np.array([-np.inf if (m := cells[k]["margin"]) is None else m for k in broken])
+        numbers = touching(lower, upper)
+        order = np.argsort(numbers, kind="stable")
+        for members in np.split(order, np.flatnonzero(np.diff(numbers[order])) + 1):
+            worst = cells[broken[members[np.argmin(margins[members])]]]
+            found.append(
+                Region(
+                    entry["index"],
+                    tuple(broken[k] for k in members),
+                    float(shares[members].sum()),
+                    tuple(lower[members].min(axis=0).tolist()),
+                    tuple(upper[members].max(axis=0).tolist()),
+                    tuple(worst["counterexample"]),
+                    worst["margin"],
+                )
+            )
+    # a set of one pose has no volume: behind all that have one
+    return sorted(found, key=lambda region: (region.lower == region.upper, -region.share, region.frame, region.cells))
+
+
+def _ranges(parameters: Sequence[Mapping[str, Any]]) -> Float64:
+    return np.array([p["upper"] - p["lower"] for p in parameters], np.float64)
+
+
+def distances(poses: Float64, pose: Sequence[float], parameters: Sequence[Mapping[str, Any]]) -> Float64:
+    """[n] distances of poses [n, d] from a pose, every parameter in units of its range; those without one are equal."""
+    range_of = _ranges(parameters)
+    free = range_of > 0.0
+    return np.linalg.norm((poses - np.asarray(pose, np.float64))[:, free] / range_of[free], axis=1)
+
+
+def nearest(
+    rows: Sequence[Mapping[str, Any]],
+    verdict: str,
+    pose: Sequence[float],
+    parameters: Sequence[Mapping[str, Any]],
+    count: int = 1,
+) -> list[tuple[int, list[float]]]:
+    """The cells of a verdict that are nearest to a pose, and the nearest pose of each; the nearest first.
+
+    Args:
+        rows: Cells of a frame.
+        verdict: Theirs.
+        pose: [n] all parameters.
+        parameters: Names and ends of all parameters; distances are in units of their ranges.
+        count: Most cells.
+    """
+    some = [k for k, row in enumerate(rows) if row["verdict"] == verdict]
+    if not some:
+        return []
+    lower, upper = (np.array([rows[k][key] for k in some], np.float64) for key in ("lower", "upper"))
+    poses = np.clip(np.asarray(pose, np.float64), lower, upper)
+    order = np.argsort(distances(poses, pose, parameters), kind="stable")[:count]
+    return [(some[n], poses[n].tolist()) for n in order]
+
+
+def regions_html(
+    regions: Sequence[Region],
+    pictures: Sequence[tuple[Shown, Shown | None]],
+    parameters: Mapping[int, Sequence[Mapping[str, Any]]],
+    why: str,
+) -> str:
+    """The page's part about regions; ``pictures`` are of the first ones, ``why`` there are no more of them."""
+    if not regions:
+        return ""
+    parts = [
+        f"<h2>Where it fails</h2><p>Falsified cells that touch make {counted(len(regions), 'region')}. Of the largest, "
+        "the counterexample with the least margin, and the nearest pose where the network was seen to be right, with "
+        "each parameter measured by its range.</p>"
+    ]
+    for region, (broken, right) in zip(regions, pictures, strict=False):
+        sides = parameters[region.frame]
+        box = ", ".join(
+            f"{p['name']} {number(a, 4)} to {number(b, 4)} {unit_of_axis(p['unit'])}"
+            for p, a, b in zip(sides, region.lower, region.upper, strict=True)
+            if p["lower"] < p["upper"]
+        )
+        figures = "".join(_figure(one, other, sides) for one, other in ((broken, right), (right, broken)) if one)
+        none = "" if right else '<p class="soft">No pose of its own set was seen to be right.</p>'
+        outputs = _outputs(broken, right)
+        parts.append(
+            f'<div class="region"><p><b>frame {region.frame}</b>, {escape(percent(region.share))} of its set in '
+            f"{counted(len(region.cells), 'cell')}{escape(': ' + box if box else '')}</p>"
+            f'<div class="below">{figures}{outputs}</div>{none}</div>'
+        )
+    more = len(regions) - len(pictures)
+    if more > 0:
+        least = "" if len(pictures) < 1 else ", none of them larger"
+        parts.append(f"<p>{counted(more, 'further region')}{least}{escape(why)}.</p>")
+    return "".join(parts)
+
+
+def _figure(one: Shown, other: Shown | None, sides: Sequence[Mapping[str, Any]]) -> str:
+    kind = "falsified" if one.margin is None or one.margin <= 0.0 else "certified"
+    pose = ", ".join(
+        f"{p['name']} = {number(v, 5)}" + (" (same)" if other is not None and other.values[k] == v else "")
+        for k, (p, v) in enumerate(zip(sides, one.values, strict=True))
+        if p["lower"] < p["upper"]
+    )
+    margin = "not a number" if one.margin is None else number(one.margin)
+    return (
+        f'<figure><img class="pixels" src="{uri(one.png)}" alt="{escape(one.title)}"><figcaption>'
+        f'<b class="{kind}-ink">{escape(one.title)}</b>, margin {margin}<br>{escape(pose)}</figcaption></figure>'
+    )
+
+
+def told_outputs(broken: Sequence[float], right: Sequence[float] | None, most: int = _OUTPUTS) -> list[int]:
+    """Numbers of the outputs to tell, in order: all, or those that differ most (without ``right``: the largest)."""
+    values = np.asarray(broken, np.float64)
+    change = np.abs(values if right is None else values - np.asarray(right, np.float64))
+    order = np.argsort(-np.where(np.isfinite(change), change, np.inf), kind="stable")[:most]
+    return sorted(order.tolist())
+
+
+def _outputs(broken: Shown, right: Shown | None) -> str:
+    told = told_outputs(broken.outputs, right and right.outputs)
+    rows = "".join(
+        f'<tr><td class="left">y[{k}]</td><td>{_value(broken.outputs[k])}</td>'
+        + (f"<td>{_value(right.outputs[k])}</td>" if right else "")
+        + "</tr>"
+        for k in told
+    )
+    more = len(broken.outputs) - len(told)
+    note = f'<p class="soft">{counted(more, "further output")}, which differ less.</p>' if more else ""
+    head = '<th class="left">output</th><th>broken</th>' + ("<th>right</th>" if right else "")
+    return f"<div><table><thead><tr>{head}</tr></thead><tbody>{rows}</tbody></table>{note}</div>"
+
+
+def _value(value: float) -> str:
+    return number(value) if np.isfinite(value) else "not finite"

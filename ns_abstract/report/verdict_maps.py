@@ -1,0 +1,221 @@
+"""Verdicts over pairs of parameters: parts of every place's volume over the others, exactly from the cells' boxes."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from html import escape
+from itertools import combinations
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ns_abstract.report.figures import number, unit_of_axis
+from ns_abstract.report.page import uri
+from ns_abstract.report.picture import png
+
+Float64 = NDArray[np.float64]
+
+#: Places along a parameter; cells that are looked at together.
+BINS, _TOGETHER = 24, 4096
+#: Relative roundings of one term: of four differences and quotients by axis, and of their products; doubled.
+_AXIS_ROUNDINGS = 10
+_UNIT = float(np.finfo(np.float64).eps)
+#: Colours of all, of nothing, and how strong what is hardly there and what is nearly all are.
+GOOD, BAD, OPEN, NONE = (29, 116, 64), (179, 38, 30), (154, 160, 166), (250, 250, 247)
+_LEAST, _MOST = 0.1, 0.85
+#: Pixels of the whole matrix, between its maps, and beside them.
+_WIDTH, _GAP, _LEFT, _BELOW, _TOP, _PANEL = 760, 10, 62, 34, 8, 190
+
+
+@dataclass(frozen=True)
+class PairMaps:
+    """Parts of a set's volume by place; none is larger than the truth.
+
+    Attributes:
+        certified, falsified: By pair (i, j), i < j, of positions of parameters: [bins, bins] parts of the volume over
+            the other parameters, place of i first.
+        along_certified, along_falsified: [d, bins] the same for one parameter.
+    """
+
+    certified: Mapping[tuple[int, int], Float64]
+    falsified: Mapping[tuple[int, int], Float64]
+    along_certified: Float64
+    along_falsified: Float64
+
+
+def bin_ends(low: float, high: float, bins: int) -> Float64:
+    """[bins + 1] ends of equal places of an interval; the first and the last are its own."""
+    ends = low + (high - low) * (np.arange(bins + 1) / bins)
+    ends[-1] = high
+    return ends
+
+
+def overlaps(lower: Float64, upper: Float64, ends: Float64) -> Float64:
+    """[n, bins] part of every place that intervals [n] to [n] take."""
+    shared = np.minimum(upper[:, None], ends[1:]) - np.maximum(lower[:, None], ends[:-1])
+    return np.maximum(shared, 0.0) / (ends[1:] - ends[:-1])
+
+
+def pair_maps(
+    lower: Float64,
+    upper: Float64,
+    verdicts: Sequence[str],
+    ends: tuple[Float64, Float64],
+    *,
+    complete: bool,
+    bins: int = BINS,
+) -> PairMaps:
+    """What part of every place of two parameters, and of one, is certified and falsified (docs/design.md, V15).
+
+    Args:
+        lower, upper: [n, d] ends of cells that do not overlap.
+        verdicts: [n] "certified", "falsified" or anything else.
+        ends: [d], [d] ends of the set; every one has a width.
+        complete: Whether the cells are all of the set.
+        bins: Places along a parameter.
+
+    Returns:
+        Parts rounded downward, but exactly 1 where the cells of one verdict are all of a place.
+    """
+    count, d = lower.shape
+    low, high = ends
+    lines = [bin_ends(low[k], high[k], bins) for k in range(d)]
+    pairs = list(combinations(range(d), 2))
+    kinds = np.array([0 if v == "certified" else 1 if v == "falsified" else 2 for v in verdicts], np.int64)
+    both = np.zeros((3, len(pairs), bins, bins))
+    one = np.zeros((3, d, bins))
+    for first in range(0, count, _TOGETHER):
+        for kind in range(3):
+            cells = first + np.flatnonzero(kinds[first : first + _TOGETHER] == kind)
+            part = (upper[cells] - lower[cells]) / (high - low)
+            shares = [overlaps(lower[cells, k], upper[cells, k], lines[k]) for k in range(d)]
+            for k in range(d):
+                one[kind, k] += np.delete(part, k, axis=1).prod(axis=1) @ shares[k]
+            for n, (i, j) in enumerate(pairs):
+                others = np.delete(part, (i, j), axis=1).prod(axis=1)
+                both[kind, n] += (others[:, None] * shares[i]).T @ shares[j]
+    slack = (count + _AXIS_ROUNDINGS * (d + 2)) * _UNIT
+    pair = [_downward(both, kind, slack, complete) for kind in (0, 1)]
+    along = [_downward(one, kind, slack, complete) for kind in (0, 1)]
+    return PairMaps(dict(zip(pairs, pair[0], strict=True)), dict(zip(pairs, pair[1], strict=True)), along[0], along[1])
+
+
+def _downward(parts: Float64, kind: int, slack: float, complete: bool) -> Float64:
+    """The parts of one verdict, no larger than the truth; ``parts`` [3, ...] by verdict."""
+    # no term is negative: a sum is 0 only where nothing of that verdict is
+    others = np.delete(parts, kind, axis=0).sum(axis=0)
+    whole = (others == 0.0) & complete
+    return np.where(whole, 1.0, np.minimum(parts[kind], 1.0) * (1.0 - slack))
+
+
+def shades(parts: Float64, color: tuple[int, int, int]) -> NDArray[np.uint8]:
+    """[..., 3] colours of parts: nothing, hardly any, nearly all and all of it can be told apart."""
+    strength = np.where(parts >= 1.0, 1.0, _LEAST + (_MOST - _LEAST) * parts)
+    strength = np.where(parts > 0.0, strength, 0.0)[..., None]
+    mixed = (1.0 - strength) * np.array(NONE, np.float64) + strength * np.array(color, np.float64)
+    return np.rint(mixed).astype(np.uint8)
+
+
+def matrix_rows(maps: PairMaps, d: int) -> list[list[NDArray[np.uint8]]]:
+    """[d][d] pictures, the first parameter's column at the left and its row at the top; upward is more.
+
+    Below the diagonal what is certified, above it what is falsified, on it both along one parameter.
+    """
+
+    def picture(row: int, column: int) -> NDArray[np.uint8]:
+        if row == column:
+            return _profile(maps.along_certified[row], maps.along_falsified[row])
+        key = min(row, column), max(row, column)
+        parts = maps.certified[key] if row > column else maps.falsified[key]
+        # rows of a picture: the row's parameter, from the top down
+        parts = parts.T if row > column else parts
+        return shades(parts[::-1], GOOD if row > column else BAD)
+
+    return [[picture(row, column) for column in range(d)] for row in range(d)]
+
+
+def _profile(certified: Float64, falsified: Float64) -> NDArray[np.uint8]:
+    """Columns of green from below and red from above, grey between."""
+    bins = len(certified)
+    level = (np.arange(bins)[::-1, None] + 0.5) / bins
+    image = np.full((bins, bins, 3), OPEN, np.uint8)
+    image[level < certified] = GOOD
+    image[level > 1.0 - falsified] = BAD
+    return image
+
+
+def pixels(image: NDArray[np.uint8]) -> bytes:
+    """PNG of pixels as they are."""
+    from PIL import Image
+
+    return png(Image.fromarray(image))
+
+
+def mixed(maps: PairMaps) -> NDArray[np.uint8]:
+    """[bins, bins, 3] picture over two parameters: the verdicts' colours, by their parts; upward is more."""
+    good, bad = maps.certified[0, 1], maps.falsified[0, 1]
+    parts = np.stack([good, bad, np.maximum(1.0 - good - bad, 0.0)], axis=-1)
+    colors = parts @ np.array([GOOD, BAD, OPEN], np.float64)
+    return np.rint(np.clip(colors, 0.0, 255.0)).astype(np.uint8).swapaxes(0, 1)[::-1]
+
+
+def free_parameters(parameters: Sequence[Mapping[str, Any]]) -> list[int]:
+    """Positions of the parameters that vary."""
+    return [k for k, p in enumerate(parameters) if p["lower"] < p["upper"]]
+
+
+def maps_of(rows: Sequence[Mapping[str, Any]], entry: Mapping[str, Any], bins: int = BINS) -> PairMaps:
+    """The maps of a frame of report.json from its cells, over the parameters that vary."""
+    parameters = entry["parameters"]
+    free = free_parameters(parameters)
+    lower, upper = (np.array([row[key] for row in rows], np.float64)[:, free] for key in ("lower", "upper"))
+    ends = tuple(np.array([parameters[k][key] for k in free], np.float64) for key in ("lower", "upper"))
+    complete = entry["coverage"]["not_examined"] == 0.0
+    return pair_maps(lower, upper, [row["verdict"] for row in rows], (ends[0], ends[1]), complete=complete, bins=bins)
+
+
+def matrix_svg(maps: PairMaps, parameters: Sequence[Mapping[str, Any]]) -> str:
+    """All pairs of parameters as one plot, for those that vary (their names, units and ends)."""
+    d = len(parameters)
+    panel = min(_PANEL, (_WIDTH - _LEFT - (d - 1) * _GAP) // d)
+    step = panel + _GAP
+    marks = []
+    for row, pictures in enumerate(matrix_rows(maps, d)):
+        for column, picture in enumerate(pictures):
+            names = escape(f"{parameters[row]['name']} over {parameters[column]['name']}")
+            what = "along" if row == column else "certified" if row > column else "falsified"
+            x, y = _LEFT + column * step, _TOP + row * step
+            marks.append(
+                f'<image class="pixels" x="{x}" y="{y}" width="{panel}" height="{panel}" preserveAspectRatio="none" '
+                f'href="{uri(pixels(picture))}"><title>{what}: {names}</title></image>'
+                f'<rect class="frame" x="{x}" y="{y}" width="{panel}" height="{panel}"/>'
+            )
+    bottom = _TOP + d * step - _GAP
+    for k, p in enumerate(parameters):
+        label = escape(f"{p['name']} ({unit_of_axis(p['unit'])})")
+        x, y = _LEFT + k * step, _TOP + k * step
+        low, high = number(p["lower"], 3), number(p["upper"], 3)
+        middle = x + 0.5 * panel
+        marks += [
+            f'<text x="{x}" y="{bottom + 13}">{low}</text>',
+            f'<text x="{x + panel}" y="{bottom + 13}" text-anchor="end">{high}</text>',
+            f'<text x="{middle:.0f}" y="{bottom + 28}" text-anchor="middle">{label}</text>',
+            f'<text x="{_LEFT - 4}" y="{y + panel}" text-anchor="end">{low}</text>',
+            f'<text x="{_LEFT - 4}" y="{y + 9}" text-anchor="end">{high}</text>',
+            f'<text x="{_LEFT - 4}" y="{y + 0.5 * panel + 4:.0f}" text-anchor="end">{escape(str(p["name"]))}</text>',
+        ]
+    width, height = _LEFT + d * step - _GAP + 8, bottom + _BELOW
+    return (
+        f'<svg class="pairs" role="img" viewBox="0 0 {width} {height}" width="{width}" height="{height}">'
+        f"<title>Verdicts over pairs of parameters</title>{''.join(marks)}</svg>"
+    )
+
+
+TEXT = (
+    "Every map is over two parameters, and tells of each of its places what part of the volume over the other "
+    "parameters is certified (green, below the diagonal) or falsified (red, above it): paler is less, the full colour "
+    "is all of it, paper is nothing. On the diagonal the same along one parameter: green from below, red from above, "
+    "grey what is unknown."
+)

@@ -1,0 +1,127 @@
+"""Poses along a set, one after another, with the verdict and a picture of each: a slider of the certificate's page."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from html import escape
+from typing import Any
+
+import numpy as np
+
+from ns_abstract.report.figures import number, unit_of_axis
+from ns_abstract.report.page import uri
+from ns_abstract.report.regions import Shown
+
+#: Pictures of the slider.
+MOST = 24
+_FULL_TURN = 2.0 * np.pi
+
+
+@dataclass(frozen=True)
+class Stop:
+    """A pose to be shown.
+
+    Attributes:
+        frame: Number of its set.
+        values: [n] all parameters.
+        verdict: Of the cell that it lies in; "unknown" where there is none.
+        proven: The proved lower bound of the margin, where it is certified.
+        at: Where it is, in words.
+    """
+
+    frame: int
+    values: tuple[float, ...]
+    verdict: str
+    proven: float | None
+    at: str
+
+
+def direction(parameters: Sequence[Mapping[str, Any]]) -> int | None:
+    """Position of the parameter to walk along: the way along a path, around an orbit, else the first that varies."""
+    free = [k for k, p in enumerate(parameters) if p["lower"] < p["upper"]]
+    named = {parameters[k]["name"]: k for k in reversed(free)}
+    return next((named[name] for name in ("segment", "azimuth") if name in named), free[0] if free else None)
+
+
+def stops(
+    entries: Sequence[Mapping[str, Any]], rows: Mapping[int, Sequence[Mapping[str, Any]]], most: int = MOST
+) -> list[Stop]:
+    """Poses along every frame's set in turn, evenly spread, the other parameters in the middle.
+
+    Args:
+        entries: Frames of report.json: index and parameters (name, unit, lower, upper).
+        rows: By frame, its cells.
+        most: Most poses; of more frames some, evenly spread.
+    """
+    if len(entries) > most:
+        entries = [entries[k * (len(entries) - 1) // (most - 1)] for k in range(most)]
+    each = most // max(1, len(entries))
+    found = []
+    for position, entry in enumerate(entries):
+        parameters = entry["parameters"]
+        axis = direction(parameters)
+        middle = [0.5 * (p["lower"] + p["upper"]) for p in parameters]
+        if axis is None or each < 2:
+            found.append(_stop(entry, rows, middle, None))
+            continue
+        low, high = parameters[axis]["lower"], parameters[axis]["upper"]
+        name = parameters[axis]["name"]
+        # the end is the next one's beginning, or its own
+        follows = position + 1 < len(entries) and name == "segment"
+        closed = name == "azimuth" and high - low >= _FULL_TURN * (1.0 - 1e-9)
+        for value in np.linspace(low, high, each, endpoint=not (follows or closed)).tolist():
+            found.append(_stop(entry, rows, [*middle[:axis], value, *middle[axis + 1 :]], axis))
+    return found
+
+
+def _stop(
+    entry: Mapping[str, Any], rows: Mapping[int, Sequence[Mapping[str, Any]]], values: list[float], axis: int | None
+) -> Stop:
+    row = cell_at(rows.get(entry["index"], ()), values)
+    at = f"frame {entry['index']}"
+    if axis is not None:
+        p = entry["parameters"][axis]
+        at += f", {p['name']} = {number(values[axis], 4)} {unit_of_axis(p['unit'])}"
+    verdict = "unknown" if row is None else row["verdict"]
+    return Stop(entry["index"], tuple(values), verdict, row["margin"] if row and verdict == "certified" else None, at)
+
+
+def cell_at(rows: Sequence[Mapping[str, Any]], values: Sequence[float]) -> Mapping[str, Any] | None:
+    """The cell that holds a pose; where several meet a certified one, which holds for its ends, too."""
+    if not rows:
+        return None
+    lower, upper = (np.array([row[key] for row in rows], np.float64) for key in ("lower", "upper"))
+    inside = np.flatnonzero(((lower <= values) & (upper >= values)).all(axis=1)).tolist()
+    order = ("certified", "falsified", "unknown")
+    return min((rows[k] for k in inside), key=lambda row: order.index(row["verdict"]), default=None)
+
+
+def coarse_first(count: int) -> list[int]:
+    """0 to ``count`` - 1 in an order whose every beginning is spread over the whole."""
+    bits = max(1, (count - 1).bit_length())
+    return sorted(range(count), key=lambda k: int(f"{k:0{bits}b}"[::-1], 2))
+
+
+def walk_html(found: Sequence[tuple[Stop, Shown]]) -> str:
+    """The page's part: all pictures; `walk.js` shows one at a time, as the slider stands."""
+    if len(found) < 2:
+        return ""
+    figures, marks = [], []
+    for stop, shown in found:
+        margin = "not a number" if shown.margin is None else number(shown.margin)
+        text = f"margin of this picture {margin}"
+        if stop.proven is not None:
+            text += f"; at least {number(stop.proven)} everywhere in its cell"
+        figures.append(
+            f'<figure data-at="{escape(stop.at)}"><img class="pixels" src="{uri(shown.png)}" alt="{escape(stop.at)}">'
+            f'<figcaption><b class="{stop.verdict}-ink">{stop.verdict}</b> <span>{escape(stop.at)}</span><br>'
+            f"{escape(text)}</figcaption></figure>"
+        )
+        marks.append(f'<i class="{stop.verdict}-back"></i>')
+    return (
+        "<h2>Along the set</h2><p>Pictures on the way through the set, the other parameters in the middle of their "
+        "ranges, with the verdict of the cell around each.</p>"
+        f'<div id="walk"><div id="walk-control"></div><div id="walk-verdicts">{"".join(marks)}</div>'
+        f'<div class="images">{"".join(figures)}</div></div>'
+    )
