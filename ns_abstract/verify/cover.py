@@ -314,8 +314,8 @@ class Cover:
             return margins
         # rows of a whole that is so far from a proof prove nothing for its parts
         for fresh, worst in ((False, _SHARED), (True, _FRESH)):
-            left = np.flatnonzero(~(margins > 0.0))
-            if not left.size or margin < -worst * here:
+            left = np.flatnonzero(~(margins > 0.0)).tolist()
+            if not left or margin < -worst * here:
                 continue
             chosen = [parts[k] for k in left]
             bounds = shared.parts(self._images(chosen), work.query, fresh=fresh)

@@ -122,12 +122,12 @@ class _Whole(_Cells):
         if index not in self._references or rows.value.nbytes > self._left:
             return
         self._left -= rows.value.nbytes
-        flat = np.ravel_multi_index(tuple(where[:, 1:].T), grid(self.network.shape(index)))
+        flat = np.array(np.ravel_multi_index(tuple(where[:, 1:].T), grid(self.network.shape(index))), np.int64)
         low, high = rows.total[:, 0] - self.flush[0], rows.total[:, 1] + self.flush[0]
         low, high = np.where(sign > 0.0, low, -high), np.where(sign > 0.0, high, -low)
         reference = self._references[index][flat]
         room = _ROOM * (np.abs(reference) + np.abs(low) + np.abs(high))
-        value = rows.value * sign[:, None].astype(np.float32)
+        value: NDArray[np.float32] = rows.value * sign[:, None].astype(np.float32)
         self.known.setdefault(index, _Known()).parts.append(
             (flat, value, reference + low - room, reference + high + room)
         )
@@ -156,7 +156,8 @@ class _Part(_Cells):
             )
             size = np.abs(a).sum(-1) + np.abs(b)
             middles = np.concatenate([a.transpose(1, 0, 2).reshape(-1, m * d), b.T], 1)
-            self._columns = np.float32(middles), np.float32(np.concatenate([radius.T, size.T], 1))
+            radii = np.concatenate([radius.T, size.T], 1)
+            self._columns = middles.astype(np.float32), radii.astype(np.float32)
         return self._columns
 
     def _evaluated(self, index: int) -> tuple[Int64, Float64, Float64, Float64, Float64]:
