@@ -35,6 +35,7 @@ from ns_abstract.perturbation.variations import SceneVariation
 from ns_abstract.refine.protocol import Frame, Member, Method, RayFrame
 from ns_abstract.report.record import file_stamp
 from ns_abstract.verify.cells import Cell, Grid, coarse_parts
+from ns_abstract.verify.cover import Cover
 from ns_abstract.verify.eight_bit import Picture, rounded, rounded_sets
 from ns_abstract.verify.model import NetworkModel, parametric
 from ns_abstract.verify.network import NetworkArithmetic, load_network
@@ -51,11 +52,13 @@ if TYPE_CHECKING:
     from ns_abstract.verify.interop import Form
 
 #: Of the search's rules: results of different ones are not mixed.
-_RULES = 2
+_RULES = 3
 #: Pixels that the picture moves by over a first cell: with one parameter, and with more.
 _MOTION_LINE, _MOTION = 0.08, 0.5
 #: Numbers that a network's layers may have together in a block's cells.
 _BLOCK_NUMBERS = 1 << 18
+#: Slanted parts of a cell at most, about: narrower cells need more of them in all.
+_MOST_SLANTED = 512
 #: Cells of the first blocks: early results, of which a kill leaves the more.
 _FIRST_BLOCKS = (1, 1, 1, 1, 2, 2, 4, 4)
 #: Frames whose bounds a process keeps at hand.
@@ -113,13 +116,19 @@ class FramePictures:
         poses: The frame's set.
         picture: Whether the network is shown floats or rounded pictures.
         response: The cameras that may show them; None: one that shows what is rendered.
+        slanted: Whether parameters may be counted otherwise than the set does, where that is tighter (P2).
     """
 
     def __init__(
-        self, method: Method, poses: PoseSet, picture: Picture = "float", response: Response | None = None
+        self,
+        method: Method,
+        poses: PoseSet,
+        picture: Picture = "float",
+        response: Response | None = None,
+        slanted: bool = False,
     ) -> None:
         self._rounded, self._response = picture == "8-bit", response
-        self.frame: Frame = method.frame(poses)
+        self.frame: Frame = method.frame(poses, slanted)
         #: What pixels of a cell cost, where pictures are made ray by ray: see `pixel_costs`.
         self.weigh: Callable[[ParameterBox], np.ndarray | None] = lambda box: None
         self._images: dict[bytes, np.ndarray] = {}
@@ -363,8 +372,36 @@ class Certification:
             every_unit = self.property.partitions is not None
             claim = self.claim(pictures)
             pictures.weigh = partial(pixel_costs, pictures, self.model, claim)
-            self._searches[key] = Search(pictures, self.model, claim, grid, every_unit=every_unit, block=self.block)
+            cover = self._cover(self.job.method, pictures)
+            self._searches[key] = Search(
+                pictures, self.model, claim, grid, every_unit=every_unit, block=self.block, cover=cover
+            )
         return self._searches[key]
+
+    def _cover(self, method: Method, pictures: FramePictures, response: Response | None = None) -> Cover | None:
+        """What proves cells of a frame part by part; None with one parameter, and where rays cost more than networks.
+
+        Args:
+            method: The scene.
+            pictures: The frame's pictures.
+            response: The cameras that may show them.
+        """
+        if pictures.box.dimensions < 2 or pictures.frame.tilewise:
+            return None
+        poses = pictures.pose_set
+        slanted = FramePictures(method, poses, self.picture, response, slanted=True)
+        if not (shear := slanted.pose_set.shear):
+            return Cover(pictures, self.model, self.model, self.claim(pictures))
+
+        def nominal() -> np.ndarray:
+            return self.model.outputs(pictures.image(pictures.box.middle)[None])[0]
+
+        def frame(cell: ParameterBox) -> tuple[ParameterBox, Callable[[ParameterBox], ParameterBox | None]]:
+            found = poses.within(cell).sheared(shear)
+            return found.box, found.feasible
+
+        claim = self.property.bind(slanted.pose_set, nominal)
+        return Cover(slanted, self.model, self.model, claim, frame, most=_MOST_SLANTED, block=1)
 
     def around(self, extra: SceneVariation) -> Certification:
         """The same with more scenes in the sets."""
@@ -377,21 +414,29 @@ class Certification:
         """Whether a kind's parameters can be bounded beside those of every set."""
         return all(poses.box.dimensions + len(kind.place) <= MAX_DIMENSIONS for poses in self.job.pose_sets)
 
-    def _varied(self, kind: Kind, radius: float, frame: int) -> tuple[FramePictures, SearchedScene, SearchedModel]:
-        """Pictures of a frame for all that may vary, as the search sees them, and the network behind them (V13)."""
+    def _varied(
+        self, kind: Kind, radius: float, frame: int
+    ) -> tuple[FramePictures, SearchedScene, SearchedModel, Cover | None]:
+        """Pictures of a frame for all that may vary, as the search sees them, and the network behind them (V13).
+
+        The last is what proves cells part by part.
+        """
         method, poses, model = self.job.method, self.job.pose_sets[frame], self.model
         if kind.place:
             pictures = FramePictures(method, poses.registered(kind.place, radius), self.picture)
-            return pictures, RegisteredScene(pictures, pictures.frame), RegisteredModel(model)
+            return pictures, RegisteredScene(pictures, pictures.frame), RegisteredModel(model), None
+        response = None
         if kind.response is not None:
-            pictures = FramePictures(method, poses, self.picture, Response(kind.response, radius))
+            response = Response(kind.response, radius)
+            pictures = FramePictures(method, poses, self.picture, response)
         else:
-            pictures = self.around(kind.variation(radius)).pictures(frame)
-        return pictures, pictures, model
+            around = self.around(kind.variation(radius))
+            pictures, method = around.pictures(frame), around.job.method
+        return pictures, pictures, model, self._cover(method, pictures, response)
 
     def settle(self, kind: Kind) -> Settle:
         """Bounds and attacks cells for all scenes around the stored one (V13)."""
-        kept: dict[tuple[float, int], tuple[FramePictures, SearchedScene, SearchedModel, Claim]] = {}
+        kept: dict[tuple[float, int], tuple[FramePictures, SearchedScene, SearchedModel, Cover | None, Claim]] = {}
 
         def settle(radius: float, frame: int, box: ParameterBox) -> Settled:
             key = radius, frame
@@ -400,8 +445,8 @@ class Certification:
                 kept.clear()
                 # what is claimed does not depend on the scenes
                 kept[key] = *self._varied(kind, radius, frame), self.claim(self.pictures(frame))
-            pictures, scene, model, claim = kept[key]
-            search = Search(scene, model, claim, Grid.adaptive(box, [1] * box.dimensions), cuts=False)
+            pictures, scene, model, cover, claim = kept[key]
+            search = Search(scene, model, claim, Grid.adaptive(box, [1] * box.dimensions), cuts=False, cover=cover)
             (leaf,) = search.examine(search.grid.roots()).leaves
             if leaf.verdict == "certified":
                 return Settled("holds", "", np.zeros(box.dimensions))

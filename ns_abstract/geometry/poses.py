@@ -205,6 +205,14 @@ class PoseSet:
             box = box.replace(axis, low - sum(b for _, b in ends) - room, high - sum(a for a, _ in ends) + room)
         return replace(self, box=box, shear=shear)
 
+    def within(self, box: ParameterBox) -> PoseSet:
+        """The poses of a box of the same parameters, as a set of their own; not of slanted ones."""
+        ranges = dict(self.perturbation.rotation)
+        for name, low, high in zip(box.names, box.lower, box.upper, strict=True):
+            if name in ROTATIONS:
+                ranges[name] = (low, high)
+        return replace(self, box=box, perturbation=replace(self.perturbation, rotation=ranges))
+
     def feasible(self, box: ParameterBox) -> ParameterBox | None:
         """A box that holds all parameters of ``box`` that belong to poses of the set; None where there are none.
 

@@ -117,8 +117,12 @@ class Grid:
             parts[axis] *= 2
             gains[axis] *= 0.5
             sizes[axis] //= 2
-        if math.prod(parts) == 1:
-            return []
+        return [] if math.prod(parts) == 1 else self.cut(cell, parts)
+
+    def cut(self, cell: Cell, parts: Sequence[int]) -> list[Cell]:
+        """The cell in ``parts[k]`` parts along each parameter, or in as many as it has units there."""
+        sizes = [past - first for first, past in zip(cell.first, cell.past, strict=True)]
+        parts = [min(n, size) for n, size in zip(parts, sizes, strict=True)]
         spans = [
             [(first + (past - first) * i // n, first + (past - first) * (i + 1) // n) for i in range(n)]
             for first, past, n in zip(cell.first, cell.past, parts, strict=True)

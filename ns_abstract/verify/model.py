@@ -11,6 +11,7 @@ import numpy as np
 import torch
 
 from ns_abstract.verify.network import (
+    Family,
     ImageSets,
     Network,
     NetworkArithmetic,
@@ -72,6 +73,11 @@ class NetworkModel:
     def input_sets(self, linear: tuple[np.ndarray, ...], lower: np.ndarray, upper: np.ndarray) -> ImageSets:
         return self.preprocess.sets((linear[0], linear[1], linear[2], linear[3]), lower, upper)
 
+    def family(self, images: ImageSets) -> ModelFamily:
+        """Bounds of one cell that its parts can share (N15)."""
+        shared = Family(self.network, parametric(images), memory=self.memory, arithmetic=self.arithmetic)
+        return ModelFamily(shared)
+
     def bound(self, images: ImageSets, query: Query, substitution: Substitution = "everywhere") -> OutputBounds:
         d = images.dimensions
         found = bound_outputs(
@@ -94,6 +100,19 @@ class NetworkModel:
         return branch(
             self.network, parametric(images), rows, offset, groups, most, memory=self.memory, arithmetic=self.arithmetic
         ).least
+
+
+@dataclasses.dataclass(frozen=True)
+class ModelFamily:
+    """A cell and its parts; see `ns_abstract.verify.cover.SharedBounds`."""
+
+    family: Family
+
+    def whole(self, query: Query) -> OutputBounds:
+        return self.family.whole(query.rows, query.offset)
+
+    def parts(self, images: ImageSets, query: Query, *, fresh: bool = False) -> OutputBounds:
+        return self.family.parts(images, query.rows, query.offset, fresh=fresh)
 
 
 def parametric(images: ImageSets) -> ImageSets:

@@ -21,6 +21,7 @@ from ns_abstract.geometry.box import ParameterBox
 from ns_abstract.io.errors import InputError
 from ns_abstract.refine.protocol import Member
 from ns_abstract.verify.cells import Cell, Grid
+from ns_abstract.verify.cover import Cover, PictureSets, Weights
 from ns_abstract.verify.properties import Claim, LinearClaim, Query
 
 if TYPE_CHECKING:
@@ -231,6 +232,7 @@ class Search:
         every_unit: Whether each unit of the grid needs a verdict of its own where the property fails (PCP-S).
         block: Most cells examined together.
         cuts: Whether cells without a verdict are cut; else they are done with.
+        cover: Proves cells that are too wide part by part; None: they are cut.
     """
 
     def __init__(
@@ -243,9 +245,11 @@ class Search:
         every_unit: bool = False,
         block: int = BLOCK,
         cuts: bool = True,
+        cover: Cover | None = None,
     ) -> None:
         self.scene, self.model, self.claim, self.grid = scene, model, claim, grid
-        self.every_unit, self.block, self.cuts = every_unit, block, cuts
+        self.every_unit, self.cuts, self.cover = every_unit, cuts, cover
+        self.block = block if cover is None else min(block, cover.block)
         self._latest: dict[tuple[bytes, int], np.ndarray] = {}
         self.varies = next(iter(scene.members(0)), None) is not None
 
@@ -276,9 +280,10 @@ class Search:
         reasons: dict[int, str] = {}
         slopes = np.zeros((len(seen), self.grid.box.dimensions))
         costs = np.full(len(seen), np.nan)
+        cuts: dict[int, tuple[int, ...]] = {}
         open_cells = [k for k, cell in enumerate(seen) if not (cell.broken or cell.undecided)]
         if open_cells:
-            self._bound([seen[k] for k in open_cells], outputs, open_cells, bounded, reasons, slopes, costs)
+            self._bound([seen[k] for k in open_cells], outputs, open_cells, bounded, reasons, slopes, costs, cuts)
         proved = {k for k in open_cells if bounded.get(k, -math.inf) > 0.0}
         self._sample([seen[k] for k in sorted(proved)], self._attack)
         failing = [seen[k] for k in open_cells if k not in proved]
@@ -286,7 +291,7 @@ class Search:
         self._ascend(failing)
         if self.varies:
             self._vary(failing)
-        leaves, children = self._verdicts(seen, bounded, reasons, slopes, costs)
+        leaves, children = self._verdicts(seen, bounded, reasons, slopes, costs, cuts)
         seconds = time.perf_counter() - begin
         # cells of one rank are examined together
         children.sort(key=lambda child: child[0])
@@ -436,8 +441,9 @@ class Search:
         reasons: dict[int, str],
         slopes: np.ndarray,
         costs: np.ndarray,
+        cuts: dict[int, tuple[int, ...]],
     ) -> None:
-        """Lower bounds of the margin by cell; what fails leaves a reason and no bound."""
+        """Lower bounds of the margin by cell; what fails leaves a reason and no bound, maybe how to cut the cell."""
         kept: list[int] = []
         parts: list[Any] = []
         seen = dict(zip(numbers, cells, strict=True))
@@ -453,8 +459,12 @@ class Search:
             slopes[number] = slope
             if not _sane(linear, lower, upper):
                 reasons[number] = "the image's bounds are not finite or cross"
-            elif self._splittable(cell.cell) and self._too_wide(cell, number, linear, lower, upper, costs):
+            elif (self._splittable(cell.cell) or self._coverable(cell.cell)) and self._too_wide(
+                cell, number, linear, lower, upper, costs
+            ):
                 reasons[number] = "the image's bounds are too wide"
+                if self._coverable(cell.cell):
+                    self._covered(cell, number, outputs[number], bounded, reasons, cuts)
             else:
                 kept.append(number)
                 parts.append((*linear, lower, upper, cell.box))
@@ -497,16 +507,41 @@ class Search:
         ``costs[number]`` becomes the part of the margin that they cost. A guess by the margin's gradient at the middle,
         which decides about work and not about verdicts.
         """
-        a_lower, _, a_upper, _ = linear
-        width = _widths(linear, lower, upper)
-        costs[number] = self._cost(cell, width, 0.5 * (a_lower.astype(np.float64) + a_upper))
-        return float(width.mean()) > _HOPELESS or costs[number] > _COSTLY
+        found = PictureSets(cell.box, linear, lower, upper)
+        weights = self._weights(cell)
+        costs[number] = math.nan if weights is None else weights.cost(found)
+        return float(found.widths.mean()) > _HOPELESS or costs[number] > _COSTLY
 
-    def _cost(self, cell: _Seen, width: np.ndarray, slopes: np.ndarray) -> float:
-        """What pictures of ``width`` [H, W, 3] and common ``slopes`` [H, W, 3, d] may take from the margin, by it.
+    def _coverable(self, cell: Cell) -> bool:
+        return self.cover is not None and len(cell.first) > 1 and cell.volume > 1
 
-        To first order about the middle; NaN where the gradient or the margin is no number.
-        """
+    def _covered(
+        self,
+        cell: _Seen,
+        number: int,
+        outputs: np.ndarray,
+        bounded: dict[int, float],
+        reasons: dict[int, str],
+        cuts: dict[int, tuple[int, ...]],
+    ) -> None:
+        """Bound a cell part by part, or find out how to cut it."""
+        weights = self._weights(cell)
+        if weights is None or self.cover is None:
+            return
+        try:
+            found = self.cover.prove(cell.box, outputs, weights)
+        except InputError:
+            raise
+        except FAILURES as error:
+            reasons[number] = failure_text(error)
+            return
+        if found.margin is not None and math.isfinite(found.margin):
+            bounded[number] = found.margin
+        elif found.cuts:
+            cuts[number] = found.cuts
+
+    def _weights(self, cell: _Seen) -> Weights | None:
+        """The margin's gradient at the middle, as a part of the margin; None where one of them is no number."""
         values = cell.box.middle
         image = self._latest.get(_key((values, None)))
         image = self._image(values, None) if image is None else image
@@ -514,14 +549,12 @@ class Search:
             picture = torch.from_numpy(image.astype(np.float64)).requires_grad_(True)
             margin = self.claim.margin(self.model.differentiable(picture[None]), torch.from_numpy(values)[None])[0]
             if not margin.requires_grad:
-                return math.nan
+                return None
             (gradient,) = torch.autograd.grad(margin, picture)
         except FAILURES:
-            return math.nan
-        slope = gradient.numpy()
-        lost = 0.5 * np.abs(slope * width).sum() + np.abs(np.tensordot(slope, slopes, 3)).sum()
+            return None
         here = float(margin.detach())
-        return float(lost) / here if here > 0.0 else math.nan
+        return Weights(gradient.numpy() / here, here) if here > 0.0 else None
 
     def _branching(self, cell: _Seen, margin: float) -> Sequence[Sequence[int]]:
         """The claim's groups, if branches may prove a cell that cannot be cut any more, and nothing else can (N15)."""
@@ -542,6 +575,7 @@ class Search:
         reasons: dict[int, str],
         slopes: np.ndarray,
         costs: np.ndarray,
+        cuts: Mapping[int, tuple[int, ...]],
     ) -> tuple[list[Leaf], list[tuple[float, Cell]]]:
         leaves: list[Leaf] = []
         children: list[tuple[float, Cell]] = []
@@ -563,7 +597,10 @@ class Search:
             hopeless = cell.hopeless and not self.every_unit
             if self._splittable(cell.cell) and not hopeless:
                 rank = self._rank(cell, bound, costs[number])
-                parts = self.grid.divide(cell.cell, slopes[number], *self._cuts(cell, bound, costs[number]))
+                if number in cuts and not cell.broken:
+                    parts = self.grid.cut(cell.cell, cuts[number])
+                else:
+                    parts = self.grid.divide(cell.cell, slopes[number], *self._cuts(cell, bound, costs[number]))
                 children += [(rank, part) for part in parts]
             elif cell.broken:
                 leaves.append(self._counterexample(cell))
@@ -648,10 +685,3 @@ def _generator(cell: Cell) -> np.random.Generator:
 def _sane(linear: tuple[np.ndarray, ...], lower: np.ndarray, upper: np.ndarray) -> bool:
     """Whether all is finite, and the bounds do not cross."""
     return bool(all(np.isfinite(v).all() for v in (*linear, lower, upper)) and (lower <= upper).all())
-
-
-def _widths(linear: tuple[np.ndarray, ...], lower: np.ndarray, upper: np.ndarray) -> np.ndarray:
-    """[H, W, 3] widths of the sets at a p."""
-    a_lower, b_lower, a_upper, b_upper = (np.asarray(v, np.float64) for v in linear)
-    wide = b_upper - b_lower + np.abs(a_upper - a_lower).sum(axis=-1)
-    return np.minimum(wide, np.asarray(upper, np.float64) - lower)

@@ -1,7 +1,17 @@
 """Neural networks behind the image: loaded from files, evaluated, and bounded over sets of images."""
 
 from ns_abstract.verify.network.bounds import ImageSets, OutputBounds, Substitution, bound_outputs
+from ns_abstract.verify.network.family import Family
 from ns_abstract.verify.network.graph import Network, NetworkArithmetic
 from ns_abstract.verify.network.load import load_network
 
-__all__ = ["ImageSets", "Network", "NetworkArithmetic", "OutputBounds", "Substitution", "bound_outputs", "load_network"]
+__all__ = [
+    "Family",
+    "ImageSets",
+    "Network",
+    "NetworkArithmetic",
+    "OutputBounds",
+    "Substitution",
+    "bound_outputs",
+    "load_network",
+]

@@ -227,6 +227,9 @@ class _Form:
 class _Cells:
     """Bounds of one network over some cells."""
 
+    #: Whether rows are handed to `_keep` when they have reached the image.
+    keeps = False
+
     def __init__(
         self,
         network: Network,
@@ -890,24 +893,40 @@ class _Cells:
             # as many rows as stay together to the image
             step = min(step, max(16, -(-len(where) // (4 * threads))))
 
-        def bound(first: int) -> tuple[Int64, _Reached]:
+        def bound(first: int) -> tuple[Int64, _Reached, list[_Arrived]]:
             number = np.arange(first, min(len(where), first + step))
             cell, channel, y, x = (np.ascontiguousarray(v) for v in where[number].T)
             value = np.zeros((len(cell), channels, 1, 1), np.float32)
             value[np.arange(len(cell)), channel, 0, 0] = sign[number]
-            return number, self._backward(index, Rows(value, y, x), cell, None if need is None else need[number])
+            arrived: list[_Arrived] = []
+            part = self._backward(index, Rows(value, y, x), cell, None if need is None else need[number], arrived)
+            return number, part, arrived
 
-        for number, part in on_threads(bound, range(0, len(where), step), threads):
+        for number, part, arrived in on_threads(bound, range(0, len(where), step), threads):
             found.put(number, part)
+            for rows in arrived:
+                self._keep(index, where[number[rows.number]], sign[number[rows.number]], rows)
         return found
 
-    def _backward(self, index: int, rows: Rows, cell: Int64, need: Float64 | None = None) -> _Reached:
+    def _keep(self, index: int, where: Int64, sign: Float64, rows: _Arrived) -> None:
+        """Take notice of rows of ``sign`` times single numbers of node ``index`` that have reached the image."""
+
+    def _backward(
+        self,
+        index: int,
+        rows: Rows,
+        cell: Int64,
+        need: Float64 | None = None,
+        arrived: list[_Arrived] | None = None,
+    ) -> _Reached:
         """Bounds of rows on node ``index``, relative to the reference.
 
-        Those that are at least ``need`` [R] for certain may stop before the image.
+        Those that are at least ``need`` [R] for certain may stop before the image; ``arrived`` takes in the others, if
+        rows are kept.
         """
         found = _Reached.unknown(len(cell), self.d)
         batch = _Batch({index: rows}, cell, np.zeros((len(cell), 2)), np.arange(len(cell)))
+        batch.arrived = arrived if self.keeps else None
         self._descend(index, index, batch, found, need)
         return found
 
@@ -966,6 +985,11 @@ class _Cells:
         if batch.chosen is not None and 0 in batch.waiting:
             whole = full(batch.waiting[0], self.network.input_shape, force=True)
             batch.chosen.keep(0, whole.value, batch.number, len(found.lower))
+        if batch.arrived is not None and 0 in batch.waiting:
+            whole = full(batch.waiting[0], self.network.input_shape, force=True)
+            # what is bounded next goes through the same memory
+            value = whole.value.reshape(len(batch.cell), -1).copy()
+            batch.arrived.append(_Arrived(batch.number, value, batch.total.copy()))
         self._bound_rows(0, batch, self.image, found)
 
     def _bound_rows(self, at: int, batch: _Batch, planes: _Planes, found: _Reached) -> None:
@@ -1180,6 +1204,20 @@ class _Maxima(NamedTuple):
         return Rows(target, rows.y * down - layer.pads[0], rows.x * right - layer.pads[1])
 
 
+class _Arrived(NamedTuple):
+    """Rows on the image.
+
+    Attributes:
+        number: [R] which rows of a call of `_Cells._backward` they are.
+        value: [R, n] float32.
+        total: [R, 2] what they gathered on their way, at least and at most.
+    """
+
+    number: Int64
+    value: NDArray[np.float32]
+    total: Float64
+
+
 @dataclass
 class _Batch:
     """Rows under way.
@@ -1190,6 +1228,7 @@ class _Batch:
         total: [R, 2] what rows gathered so far, at least and at most.
         number: [R] positions in the result.
         chosen: Lines of rows' own, and a place for what rows are on the way.
+        arrived: A place for rows that reach the image.
     """
 
     waiting: dict[int, Rows]
@@ -1197,10 +1236,11 @@ class _Batch:
     total: Float64
     number: Int64
     chosen: Chosen | None = None
+    arrived: list[_Arrived] | None = None
 
     def __getitem__(self, part: Any) -> _Batch:
         waiting = {k: rows[part] for k, rows in self.waiting.items()}
-        return _Batch(waiting, self.cell[part], self.total[part], self.number[part], self.chosen)
+        return _Batch(waiting, self.cell[part], self.total[part], self.number[part], self.chosen, self.arrived)
 
     @property
     def bytes(self) -> int:
