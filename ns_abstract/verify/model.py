@@ -94,7 +94,7 @@ class NetworkModel:
     def branch(self, images: ImageSets, query: Query, groups: Sequence[Sequence[int]], most: int) -> float:
         """A lower bound of the margin ``min over groups of max over its rows`` in the one cell of ``images``.
 
-        It is positive if ``most`` branches on the signs of units prove it (N15).
+        It is positive if ``most`` branches on the signs of units prove it (N16).
         """
         rows, offset = query.rows, query.offset
         return branch(

@@ -557,7 +557,7 @@ class Search:
         return Weights(gradient.numpy() / here, here) if here > 0.0 else None
 
     def _branching(self, cell: _Seen, margin: float) -> Sequence[Sequence[int]]:
-        """The claim's groups, if branches may prove a cell that cannot be cut any more, and nothing else can (N15)."""
+        """The claim's groups, if branches may prove a cell that cannot be cut any more, and nothing else can (N16)."""
         if not isinstance(self.claim, LinearClaim) or self._splittable(cell.cell) or cell.broken or cell.undecided:
             return ()
         near = -_NEAR * min(cell.margins, default=0.0) < margin <= 0.0

@@ -1,4 +1,4 @@
-"""Bounds of a network's outputs over sets of images (docs/design.md, N, N0, N1, N2, N6, N12, N13, N14, N15)."""
+"""Bounds of a network's outputs over sets of images (docs/design.md, N, N0, N1, N2, N6, N12, N13, N14, N16)."""
 
 from __future__ import annotations
 
@@ -145,7 +145,7 @@ def bound_outputs(
         slope_steps: Steps towards the best slopes below open ReLUs, for every row of its own (N14); a bound never
             is worse for them, and each takes as long as two passes of the rows.
         assumed: By cell: signs of inputs of (leaky) ReLUs, by node; bounds are of the images for which these numbers
-            have them in the evaluation that is bounded (N15). ``slope_steps`` must be positive then.
+            have them in the evaluation that is bounded (N16). ``slope_steps`` must be positive then.
     """
     offset = np.asarray(offset, np.float64)
     if images.a_lower.shape[1] != network.input_size:
@@ -325,7 +325,7 @@ class _Cells:
         fine &= torch.isfinite(form.a).all(1)
         good = fine.reshape(self.count, -1).all(1)
         if self.assumed is not None and not bool(good.all()):
-            # bounds that hold for all images with these signs contradict each other: there are none (N15)
+            # bounds that hold for all images with these signs contradict each other: there are none (N16)
             crossed = torch.isfinite(low) & torch.isfinite(high) & (low > high)
             told = np.array([len(signs) > 0 for signs in self.assumed]) & self.good
             self.vacant |= told & crossed.reshape(self.count, -1).any(1).numpy()
@@ -384,7 +384,7 @@ class _Cells:
         return end
 
     def _assume(self, source: int, z: _Form) -> _Form:
-        """What is known of node ``source`` where its numbers have the signs that are assumed (N15)."""
+        """What is known of node ``source`` where its numbers have the signs that are assumed (N16)."""
         if self.assumed is None or not any(source in signs for signs in self.assumed):
             return z
         lower, upper = (v.flatten(1).clone() for v in (z.lower, z.upper))
@@ -1007,7 +1007,7 @@ class _Cells:
         found.improve(batch.number, plane, box)
 
     def _climb(self, index: int, rows: Rows, cell: Int64, need: Float64) -> tuple[_Reached, Int64]:
-        """Bounds below of rows on node ``index``, with the best slopes and multipliers that were tried (N14, N15).
+        """Bounds below of rows on node ``index``, with the best slopes and multipliers that were tried (N14, N16).
 
         Where signs are assumed, a cell whose rows are above ``need`` [R] is done. Also returns `OutputBounds.loosest`
         of the rows.

@@ -1,4 +1,4 @@
-"""Proofs by branching on the signs of units (docs/design.md, N15)."""
+"""Proofs by branching on the signs of units (docs/design.md, N16)."""
 
 from __future__ import annotations
 

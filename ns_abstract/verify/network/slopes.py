@@ -1,4 +1,4 @@
-"""Slopes of lower lines and multipliers of assumed signs, chosen for a row (docs/design.md, N14, N15)."""
+"""Slopes of lower lines and multipliers of assumed signs, chosen for a row (docs/design.md, N14, N16)."""
 
 from __future__ import annotations
 
@@ -75,7 +75,7 @@ class OpenUnits:
 
 @dataclass(frozen=True)
 class Held:
-    """Numbers of one node of one cell whose signs are assumed (N15).
+    """Numbers of one node of one cell whose signs are assumed (N16).
 
     Attributes:
         flat: [B] where they are.
