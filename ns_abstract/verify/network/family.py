@@ -111,9 +111,11 @@ class _Whole(_Cells):
         self.keeps = images.lower.shape[1] <= _MOST_NUMBERS
         super().__init__(network, images, "everywhere", memory, arithmetic)
 
-    def _known_better(self, index: int, form: _Form, open_: Tensor, layer: Activation | None = None) -> _Form:
+    def _known_better(
+        self, index: int, form: _Form, open_: Tensor, apart: Tensor | None, layer: Activation | None = None
+    ) -> _Form:
         self._references[index] = form.reference.reshape(-1).numpy()
-        found = super()._known_better(index, form, open_, layer)
+        found = super()._known_better(index, form, open_, apart, layer)
         lower, upper = found.interval
         self.ranges[index] = lower[0], upper[0]
         return found
@@ -181,13 +183,15 @@ class _Part(_Cells):
         room = _ROOM * (np.abs(least) + np.abs(most) + np.abs(base) + np.abs(slopes).sum(-1) + half)
         return flat, slopes, middle, half + room, room
 
-    def _known_better(self, index: int, form: _Form, open_: Tensor, layer: Activation | None = None) -> _Form:
+    def _known_better(
+        self, index: int, form: _Form, open_: Tensor, apart: Tensor | None, layer: Activation | None = None
+    ) -> _Form:
         form = self._inherited(index, form)
         if not self.fresh:
             return form
         if layer is not None:
-            open_ = layer.open(*form.interval)
-        return super()._known_better(index, form, open_, layer)
+            open_, apart = layer.open(*form.interval), layer.apart(*form.interval)
+        return super()._known_better(index, form, open_, apart, layer)
 
     def _inherited(self, index: int, form: _Form) -> _Form:
         """The form with what is known of the whole cell."""
