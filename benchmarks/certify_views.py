@@ -109,10 +109,8 @@ ROWS |= {
 }
 # what certified training is for: parts so coarse that not all can be certified
 ROWS |= {
-    f"airfield, {' and '.join(translation)}, {training}, {' x '.join(map(str, parts))}": Row(
-        f"estimator_airfield{suffix}", "airfield", *estimate(0.05, **translation), parts
-    )
-    for translation, parts in (({"x": 0.35}, (80,)), ({"x": 0.35}, (160,)), ({"x": 0.35}, (320,)))
+    f"airfield, {training}, {parts[0]}": Row(f"estimator_airfield{suffix}", "airfield", *estimate(0.05, x=0.35), parts)
+    for parts in ((80,), (160,))
     for training, suffix in (("plain", ""), ("certified", "_certified"))
 }
 
