@@ -108,7 +108,7 @@ VERDICTS = (
     Fault(
         "network: rows take the lower line whatever their sign",
         "verify/network/rows.py",
-        "_pass_run",
+        "_passed",
         "l1 if negative else l0",
         "l0",
         "test_network_bounds.py::test_bounds_lie_below_the_exact_minimum[1.0]",

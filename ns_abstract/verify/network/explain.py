@@ -12,9 +12,9 @@ from ns_abstract.verify.network.maps import Sparse, TransposedConvolution
 from ns_abstract.verify.network.schedule import costs_of
 
 #: Numbers of float64 that every number of every layer takes in one cell, beside three for each parameter.
-_NUMBERS = 14
-#: Bytes of rows under way and of weights in other orders, whatever the network.
-_ROWS = 256 << 20
+_NUMBERS = 8
+#: Bytes of rows under way and of weights in other orders: of a network whose rows are few, and of a deep one.
+_FEW_ROWS, _MANY_ROWS = 128 << 20, 420 << 20
 #: Products a second of one core: of forms in float64, and of rows in float32, few at a time and many; measured.
 _FORMS_SPEED, _FEW_SPEED, _MANY_SPEED = 1.5e9, 2.5e9, 2.5e10
 #: Part of all units that rows are passed back for, in sets that are worth a proof; of a deep network most.
@@ -40,11 +40,12 @@ def estimate(network: Network, dimensions: int) -> tuple[float, float, bool]:
     """(bytes, seconds of one core, whether rows are given up) of one cell; the seconds are rough."""
     count = len(network.nodes)
     sizes = [float(np.prod(network.shape(k))) for k in range(count + 1)]
-    memory = sum(sizes) * 8 * (3 * dimensions + _NUMBERS) + _ROWS
     forwards = 2.0 * sum(products(network, k) for k in range(1, count + 1)) * (1 + dimensions)
     costs = costs_of(network)
     rows, given_up = costs.foreseen(_OPEN, _DEEP_OPEN)
-    speed = _MANY_SPEED if costs.deep else _FEW_SPEED
+    many = costs.deep and not given_up
+    memory = sum(sizes) * 8 * (3 * dimensions + _NUMBERS) + (_MANY_ROWS if many else _FEW_ROWS)
+    speed = _MANY_SPEED if many else _FEW_SPEED
     return memory, forwards / _FORMS_SPEED + rows / speed, given_up
 
 

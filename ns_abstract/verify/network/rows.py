@@ -130,22 +130,39 @@ def _scale(value, y, x, factor):
                     value[r, c, i, j] *= factor[c, Y, X] if 0 <= Y < H and 0 <= X < W else np.float32(0.0)
 
 
-@njit(cache=True, error_model="numpy", nogil=True, fastmath={"reassoc", "nsz"})
+@njit(cache=True, error_model="numpy", nogil=True, inline="always")
+def _passed(rows, at, line, here, plane):
+    """What a number becomes, and what it adds below and above."""
+    a = rows[at]
+    # all lines are read and one kept: signs are as good as random, and so several numbers go side by side
+    s0, l0, m0 = line[here], line[here + plane], line[here + 2 * plane]
+    s1, l1, m1 = line[here + 3 * plane], line[here + 4 * plane], line[here + 5 * plane]
+    negative = a < np.float32(0.0)
+    b = np.float64(a)
+    below, above = b * np.float64(l1 if negative else l0), b * np.float64(m1 if negative else m0)
+    return a * (s1 if negative else s0), below, above
+
+
+@njit(cache=True, error_model="numpy", nogil=True, inline="always")
 def _pass_run(rows, at, line, here, plane, count):
-    """Pass ``count`` numbers that lie together; returns what they add below and above, summed in any order."""
-    least, most = 0.0, 0.0
-    for j in range(count):
-        a = rows[at + j]
-        k = here + j
-        # all lines are read and one kept: signs are as good as random, and so eight numbers go at a time
-        s0, l0, m0 = line[k], line[k + plane], line[k + 2 * plane]
-        s1, l1, m1 = line[k + 3 * plane], line[k + 4 * plane], line[k + 5 * plane]
-        negative = a < np.float32(0.0)
-        b = np.float64(a)
-        least += b * np.float64(l1 if negative else l0)
-        most += b * np.float64(m1 if negative else m0)
-        rows[at + j] = a * (s1 if negative else s0)
-    return least, most
+    """Pass ``count`` numbers that lie together; returns what they add below and above."""
+    l0, l1, l2, l3 = 0.0, 0.0, 0.0, 0.0
+    m0, m1, m2, m3 = 0.0, 0.0, 0.0, 0.0
+    for j in range(0, count - 3, 4):
+        i, k = at + j, here + j
+        a0, p0, q0 = _passed(rows, i, line, k, plane)
+        a1, p1, q1 = _passed(rows, i + 1, line, k + 1, plane)
+        a2, p2, q2 = _passed(rows, i + 2, line, k + 2, plane)
+        a3, p3, q3 = _passed(rows, i + 3, line, k + 3, plane)
+        # nothing is stored before all is read
+        rows[i], rows[i + 1], rows[i + 2], rows[i + 3] = a0, a1, a2, a3
+        l0, l1, l2, l3 = l0 + p0, l1 + p1, l2 + p2, l3 + p3
+        m0, m1, m2, m3 = m0 + q0, m1 + q1, m2 + q2, m3 + q3
+    for j in range(count - count % 4, count):
+        a0, p0, q0 = _passed(rows, at + j, line, here + j, plane)
+        rows[at + j] = a0
+        l0, m0 = l0 + p0, m0 + q0
+    return (l0 + l1) + (l2 + l3), (m0 + m1) + (m2 + m3)
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
