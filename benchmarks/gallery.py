@@ -265,6 +265,7 @@ _CERTIFY_COMMAND = (
     "--perturbation-filename offsets.json --model demo/gate/estimator.onnx --property near.json "
     "--output-dir out/certificate --time-budget 240"
 )
+_CERTIFY_FILES = {"gate_path.json": gate_camera(), "offsets.json": _OFFSETS, "near.json": _NEAR}
 _PATH_COMMAND = (
     f"ns-abstract-render --load-config {AIRFIELD} --camera-path-filename {PATH} --perturbation-filename segments.json "
     "--frames 0 1 2 3 --downscale-factor 2 --output-dir out/path --time-budget 160"
@@ -326,14 +327,14 @@ ENTRIES = (
         "is, within 0.03; red: at a place of the cell it does not.",
         _CERTIFY_COMMAND,
         "out/certificate", certificate_picture,
-        {"gate_path.json": gate_camera(), "offsets.json": _OFFSETS, "near.json": _NEAR},
+        _CERTIFY_FILES,
         {"gate_path.json": "a camera path with one pose, 8 × 8 pixels, at (0.5, 0, 0) and looking along x"},
     ),
     Entry(
         "broken", "Where it fails",
         "From the page of that certificate: the largest region where the network errs by more, its worst picture, and "
         "the nearest pose at which it is proved not to.",
-        _CERTIFY_COMMAND, "out/certificate", broken_picture,
+        _CERTIFY_COMMAND, "out/certificate", broken_picture, _CERTIFY_FILES,
     ),
     Entry(
         "pairs", "A certificate over three parameters",
@@ -343,7 +344,9 @@ ENTRIES = (
         "--perturbation-filename three.json --model demo/gate/estimator.onnx --property wide.json "
         "--output-dir out/pairs --time-budget 240",
         "out/pairs", kept_picture("out/pairs/verdicts_00000.png"),
-        {"three.json": _THREE, "wide.json": _NEAR | {"tolerance": {"absolute": 0.15}}},
+        {"gate_path.json": gate_camera(), "three.json": _THREE,
+         "wide.json": _NEAR | {"tolerance": {"absolute": 0.15}}},
+        {"gate_path.json": "as above"},
     ),
     Entry(
         "route", "A certificate along a path",

@@ -761,7 +761,7 @@ def test_where_it_fails_is_looked_at_closely(planted: Case, finished: Path, monk
     ]
     job = planted.job
     monkeypatch.setattr(showing, "SECONDS", np.inf)
-    found = look_closer(job, entries, {0: rows}, lambda *_: None, np.inf)
+    found = look_closer(job, entries, {0: rows}, lambda *_: None, lambda: False)
     broken = sum(r["upper"][0] - r["lower"][0] for r in rows if r["verdict"] == "falsified") / 0.3
     assert sum(region.share for region in found.regions) == pytest.approx(broken) and found.why == ""
     pictures = job.pictures(0)
@@ -785,13 +785,13 @@ def test_where_it_fails_is_looked_at_closely(planted: Case, finished: Path, monk
     assert len(found.stops) == 24 and {stop.verdict for stop, _ in found.stops} >= {"certified", "falsified"}
     for stop, shown in found.stops:
         assert stop.proven is None or (shown.margin is not None and shown.margin >= stop.proven)
-    assert look_closer(job, entries, {0: rows}, lambda *_: None, np.inf) == found
+    assert look_closer(job, entries, {0: rows}, lambda *_: None, lambda: False) == found
     # no time: what is known without pictures stays
-    late = look_closer(job, entries, {0: rows}, lambda *_: None, -np.inf)
+    late = look_closer(job, entries, {0: rows}, lambda *_: None, lambda: True)
     assert late.regions == found.regions and not late.pictures and not late.stops and "time" in late.why
     # nothing certified: a right pose of a cell without a verdict
     unsure = [r | {"verdict": "unknown"} if r["verdict"] == "certified" else r for r in rows]
-    found = look_closer(job, entries, {0: unsure}, lambda *_: None, np.inf)
+    found = look_closer(job, entries, {0: unsure}, lambda *_: None, lambda: False)
     assert any(good and "not certified" in good.title and good.margin > 0.0 for _, good in found.pictures)  # type: ignore[operator]
 
 

@@ -125,6 +125,15 @@ def test_a_place_is_whole_only_if_nothing_is_missing() -> None:
     # cells that are still open have no rows
     maps = pair_maps(lower, upper, kinds, ends, complete=False)
     assert all((m < 1.0).all() and (m > 1.0 - 1e-9).all() for m in maps.certified.values())
+    # of a search that runs and of one that has ended, which lists what is open
+    rows = [
+        {"lower": a.tolist(), "upper": b.tolist(), "verdict": "certified"} for a, b in zip(lower, upper, strict=True)
+    ]
+    running = entry("x", "y", "z", open_part=0.5)
+    for side, low, high in zip(running["parameters"], *ends, strict=True):
+        side["lower"], side["upper"] = low, high
+    assert (maps_of(rows, running).certified[0, 1] < 1.0).all()
+    assert (maps_of(rows, running | {"cells": {"open": 3}}).certified[0, 1] == 1.0).all()
     # a sliver that breaks the property can be seen
     thin = upper[0].copy()
     thin[0] = lower[0, 0] + 1e-12 * (upper[0, 0] - lower[0, 0])
@@ -183,7 +192,7 @@ def entry(*names: str, index: int = 0, high: float = 6.0, open_part: float = 0.0
     """A frame of report.json."""
     covered = {"certified": 0.5, "falsified": 0.25, "unknown": 0.25, "not_examined": open_part}
     sides = [{"name": n, "unit": "rad", "lower": 0.0, "upper": high} for n in names]
-    return {"index": index, "parameters": sides, "coverage": covered}
+    return {"index": index, "parameters": sides, "coverage": covered, "cells": {"open": 0}}
 
 
 def cells(d: int, high: float = 6.0) -> list[dict[str, Any]]:

@@ -111,8 +111,9 @@ class CertificateRun:
         self.cameras: Cameras | None = None
         #: Content of the last report.json, and its cells by frame.
         self.written: tuple[dict[str, Any], dict[int, list[dict[str, Any]]]] = {}, {}
-        #: When no more pictures are rendered for the report.
+        #: When no more pictures are rendered for the report, and who may say so before.
         self.over = float("inf")
+        self.stop: Callable[[], bool] = lambda: False
         self.scene_margin: dict[str, Any] = {"skipped": NOT_ASKED, "kinds": []}
         prop = job.property
         self.about = CertifiedRun(
@@ -233,7 +234,7 @@ class CertificateRun:
         if scene_margin:
             check_scenes(any(p.perturbation.scene for p in self.job.job.pose_sets), self.job.job.rays)
         searching = (1.0 - SHARE) * budget if scene_margin else budget
-        begin, rays = time.perf_counter(), self.job.job.rays
+        begin, rays, self.stop = time.perf_counter(), self.job.job.rays, stop
         with ExitStack() as stack:
             # a signal waits until there is a store to report on
             store = self.open(resume=resume)
@@ -397,12 +398,15 @@ class CertificateRun:
         elif self.seen:
             self.seen = {}
         ended = state in ("done", "budget")
-        self.closer = look_closer(self.job, document["frames"], rows, self._kept_image, self.over) if ended else None
+        self.closer = look_closer(self.job, document["frames"], rows, self._kept_image, self._late) if ended else None
         self.written = document, rows
         self._write()
         if ended:
             write_pictures(self.folder, document, rows, self.cameras)
         return document
+
+    def _late(self) -> bool:
+        return time.perf_counter() >= self.over or self.stop()
 
     def interrupted(self) -> None:
         """Say of the last report that it is one; nothing else is looked at."""

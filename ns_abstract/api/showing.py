@@ -12,6 +12,7 @@ import torch
 
 from ns_abstract.api.certification import Certification, FramePictures
 from ns_abstract.execution.ending import AbandonedError, abandoning, checkpoint
+from ns_abstract.io.errors import InputError
 from ns_abstract.report import regions as broken
 from ns_abstract.report import walk
 from ns_abstract.report.certificate_page import Closer
@@ -22,7 +23,7 @@ from ns_abstract.verify.properties import Claim
 #: Seconds that all of it may take; the longest side of a picture; cells without a verdict that are tried for a right
 #: pose where none is certified.
 SECONDS, _PIXELS, _TRIED = 10.0, 160, 4
-_OVER = ", without pictures: the time for them was over"
+_OVER = ", without pictures: there was no time for them"
 
 Rows = Mapping[int, Sequence[Mapping[str, Any]]]
 
@@ -75,7 +76,7 @@ def look_closer(
     entries: Sequence[Mapping[str, Any]],
     rows: Rows,
     kept: Callable[[int, np.ndarray], np.ndarray | None],
-    over: float,
+    over: Callable[[], bool],
 ) -> Closer:
     """Regions where the property fails, and poses along the sets, with pictures.
 
@@ -84,9 +85,9 @@ def look_closer(
         entries: Frames of report.json.
         rows: Cells by frame.
         kept: The stored image of a counterexample, by frame and pose.
-        over: Reading of `time.perf_counter` after which no picture is rendered; `SECONDS` from now at the latest.
+        over: Whether no more pictures are to be rendered; `SECONDS` from now none are, either.
     """
-    over = min(over, time.perf_counter() + SECONDS)
+    end = time.perf_counter() + SECONDS
     looks = _Looks(job, kept)
     regions = broken.falsified_regions(entries, rows)
     sides = {entry["index"]: entry["parameters"] for entry in entries}
@@ -94,7 +95,8 @@ def look_closer(
     stops = walk.stops(entries, rows)
     seen: dict[int, Shown] = {}
     why = _OVER
-    with suppress(AbandonedError), abandoning(lambda: time.perf_counter() >= over):
+    # a property that makes no sense for a frame is told by who searches
+    with suppress(AbandonedError, InputError), abandoning(lambda: over() or time.perf_counter() >= end):
         for region in regions[: broken.MOST]:
             shown = looks.look("counterexample", region.frame, region.pose)
             pictures.append((shown, looks.right(region, rows, sides[region.frame])))

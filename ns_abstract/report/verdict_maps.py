@@ -172,7 +172,8 @@ def maps_of(rows: Sequence[Mapping[str, Any]], entry: Mapping[str, Any], bins: i
     free = free_parameters(parameters)
     lower, upper = (np.array([row[key] for row in rows], np.float64)[:, free] for key in ("lower", "upper"))
     ends = tuple(np.array([parameters[k][key] for k in free], np.float64) for key in ("lower", "upper"))
-    complete = entry["coverage"]["not_examined"] == 0.0
+    # a search that has ended lists what is open, all of it at once, as unknown
+    complete = entry["coverage"]["not_examined"] == 0.0 or entry["cells"]["open"] > 0
     return pair_maps(lower, upper, [row["verdict"] for row in rows], (ends[0], ends[1]), complete=complete, bins=bins)
 
 
