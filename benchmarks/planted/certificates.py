@@ -30,7 +30,47 @@ _BRANCHING, _SLOPES = "verify/network/branching.py", "verify/network/slopes.py"
 _BRANCHES = "test_network_branching.py::test_claims_next_to_the_exact_minimum"
 _LEVELS = "test_eight_bit.py::test_sets_hold_rounded_pictures"
 
+_FAMILY, _COVER = "verify/network/family.py", "verify/cover.py"
+_SHARED = "test_cover.py::test_rows_of_the_whole_hold_for_parts[0.1-0.05-False]"
+
 CERTIFICATES = (
+    Fault(
+        "families: rows of the whole are taken from the part's reference",
+        _FAMILY, "_Part._pictures", "self.middle - self.whole.middle", "0.0 * self.middle", _SHARED,
+    ),
+    Fault(
+        "families: rows that were passed back with a negative sign keep their ends",
+        _FAMILY, "_Whole._keep", "np.where(sign > 0.0, low, -high)", "low", _SHARED,
+    ),
+    Fault(
+        "families: the part's own width is left out",
+        _FAMILY, "_Part._evaluated", "spread[:, :m].T", "0.0 * spread[:, :m].T", _SHARED,
+    ),
+    Fault(
+        "families: what float32 products lose is not charged",
+        _FAMILY, "_Part._evaluated", "gamma * spread[:, m:].T", "0.0 * spread[:, m:].T",
+        "test_cover.py::test_products_of_rows_are_charged",
+    ),
+    Fault(
+        "parts: joined sets forget that slopes differ",
+        _COVER, "joined", "np.abs(a_low - by * common).sum(axis=-1)", "0.0",
+        "test_cover.py::test_joined_sets_hold_every_part[0.0]",
+    ),
+    Fault(
+        "parts: ends of boxes are taken to be exact",
+        _COVER, "joined", "(np.abs(lower) + np.abs(upper)).max(axis=0) / reach", "0.0 * reach",
+        "test_cover.py::test_joined_sets_hold_every_part[300000.0]",
+    ),
+    Fault(
+        "parts: one without a proof is passed over",
+        _COVER, "Cover._family", "self._give_up()", "None",
+        "test_cover.py::test_one_part_without_a_proof_leaves_the_cell_without",
+    ),
+    Fault(
+        "parts: a cell's slanted box is that of narrower rotations",
+        "geometry/poses.py", "PoseSet.within", "(low, high)", "(low, 0.5 * (low + high))",
+        "test_cover.py::test_poses_of_a_cell_are_in_its_slanted_parts[six]",
+    ),
     Fault(
         "scene margin: scenes of a tenth of the radius",
         "api/certification.py", "Certification._varied", "kind.variation(radius)", "kind.variation(0.1 * radius)",
@@ -260,7 +300,7 @@ CERTIFICATES = (
     ),
     Fault(
         "search: networks are asked about the widest cells",
-        _SEARCH, "Search._too_wide", "float(width.mean()) > _HOPELESS or costs[number] > _COSTLY", "False", _CHEAP,
+        _SEARCH, "Search._too_wide", "float(found.widths.mean()) > _HOPELESS or costs[number] > _COSTLY", "False", _CHEAP,
     ),
     Fault(
         "search: only the stored scene is shown",

@@ -206,7 +206,7 @@ class PoseSet:
         return replace(self, box=box, shear=shear)
 
     def within(self, box: ParameterBox) -> PoseSet:
-        """The poses of a box of the same parameters, as a set of their own; not of slanted ones."""
+        """The poses of a box of the same parameters, as a set of their own (design.md, V15); not of slanted ones."""
         ranges = dict(self.perturbation.rotation)
         for name, low, high in zip(box.names, box.lower, box.upper, strict=True):
             if name in ROTATIONS:

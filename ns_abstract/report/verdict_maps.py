@@ -67,7 +67,7 @@ def pair_maps(
     complete: bool,
     bins: int = BINS,
 ) -> PairMaps:
-    """What part of every place of two parameters, and of one, is certified and falsified (docs/design.md, V15).
+    """What part of every place of two parameters, and of one, is certified and falsified (docs/design.md, V16).
 
     Args:
         lower, upper: [n, d] ends of cells that do not overlap.

@@ -296,12 +296,15 @@ class Cover:
             if margins[k] > 0.0:
                 work.done += node.share
             elif node.depth == _DEEP:
-                raise _StoppedError
+                self._give_up()
             else:
                 effects = work.weights.effects(parts[k])
                 # as expensive as what fails
                 cost = max(costs[k], work.aim)
                 self._all(work, _Node(node.box, effects, cost, node.share, node.depth + 1))
+
+    def _give_up(self) -> None:
+        raise _StoppedError
 
     def _shared(self, work: _Work, parts: Sequence[PictureSets], whole: PictureSets) -> np.ndarray:
         """[m] margins of neighbours, those of the whole first."""

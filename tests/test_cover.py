@@ -1,0 +1,342 @@
+"""Cells that are proved part by part: shared rows, joined sets, slanted parts, verdicts (design.md, N15, V15)."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from flint import fmpq
+from onnx_files import OnnxFile, attack, image_sets, session
+from oracle import rational
+from test_certify_search import CLAIM, Ramp, Threshold, drive, volume
+from test_poses import SETS, camera, random_rotation
+from test_slanted import SHEARS, exact, holds
+
+from ns_abstract.geometry.box import ParameterBox
+from ns_abstract.geometry.poses import PoseSet
+from ns_abstract.verify.cells import Grid
+from ns_abstract.verify.cover import Cover, PictureSets, Weights, halvings, joined
+from ns_abstract.verify.network import Family, ImageSets, Network, bound_outputs, load_network
+from ns_abstract.verify.network.family import _Part
+from ns_abstract.verify.properties import Query
+from ns_abstract.verify.search import Search
+
+SHAPE = (2, 6, 6)
+
+
+def network(folder: Path, seed: int) -> tuple[Network, Callable[[np.ndarray], np.ndarray]]:
+    """Convolutions with a branch, a product of two nodes, two linear layers."""
+    f = OnnxFile(SHAPE, seed)
+    f.conv(2, 4, pads=[1, 1, 1, 1], strides=[2, 2])
+    one = f.node("Relu")
+    f.conv(4, 4, pads=[1, 1, 1, 1])
+    two = f.node("Relu")
+    f.node("Add", one, two)
+    f.conv(4, 4, pads=[1, 1, 1, 1])
+    three = f.node("Relu")
+    f.conv(4, 4, 1)
+    four = f.node("Sigmoid")
+    f.node("Mul", three, four)
+    f.node("Flatten")
+    f.gemm(36, 8)
+    f.node("Relu")
+    f.gemm(8, 3)
+    file = f.write(folder / "shared.onnx")
+    return load_network(file), session(file)
+
+
+def split(box: ParameterBox, axes: list[int]) -> list[ParameterBox]:
+    """The parts of a box that is halved along ``axes``."""
+    parts = [box]
+    for axis in axes:
+        parts = [half for part in parts for half in part.split(axis)]
+    return parts
+
+
+def halved(images: ImageSets) -> ImageSets:
+    """A cell in 2^d parts: the same images, in parameters of each part's own."""
+    d = images.dimensions
+    corners = np.array(np.meshgrid(*[[-0.5, 0.5]] * d)).reshape(d, -1).T
+    found = {}
+    for side in ("lower", "upper"):
+        a, b = getattr(images, f"a_{side}")[0], getattr(images, f"b_{side}")[0]
+        found[f"a_{side}"], found[f"b_{side}"] = np.repeat(0.5 * a[None], len(corners), 0), b + corners @ a.T
+        found[side] = np.repeat(getattr(images, side), len(corners), 0)
+    return ImageSets(**found)
+
+
+@pytest.mark.parametrize("fresh", [False, True])
+@pytest.mark.parametrize(("radius", "slack"), [(0.02, 0.02), (0.1, 0.05), (1e-6, 1e-6)])
+def test_rows_of_the_whole_hold_for_parts(radius: float, slack: float, fresh: bool, tmp_path: Path) -> None:
+    for seed in range(2):
+        net, run = network(tmp_path, seed)
+        images = image_sets(SHAPE, 1, 2, radius, slack, seed)
+        rows = np.random.default_rng(seed).normal(size=(4, 3))
+        family = Family(net, images)
+        parts = halved(images)
+        found = family.parts(parts, rows, np.zeros(4), fresh=fresh)
+        assert np.isfinite(found.lower).all()
+        for cell in range(parts.count):
+            least, compared = attack(net, run, parts, cell, rows, 32, 5, seed)
+            assert compared > 20
+            assert (found.lower[cell] <= least).all()
+
+
+def test_products_of_rows_are_charged(tmp_path: Path) -> None:
+    """Without any width, nothing but the rounding of float32 products is left; float64 has none to speak of."""
+    net, _ = network(tmp_path, 0)
+    images = image_sets(SHAPE, 1, 2, 0.3, 0.0)
+    whole = Family(net, images)._cell
+    part = _Part(whole, halved(images), 1 << 30, "float32", False)
+    slopes, offsets = part.image.slopes.reshape(4, 2, -1, 2), part.image.offsets.reshape(4, 2, -1)
+    assert whole.known
+    for index, known in whole.known.items():
+        _, rows, least, most = known.joined()
+        _, a, middle, half, _ = part._evaluated(index)
+        values = rows.astype(np.float64)
+        moved = values @ (offsets.mean(1) + part.middle - whole.middle).T
+        off = np.abs(moved.T + 0.5 * (least + most) - middle) + np.abs(values @ slopes.mean(1) - a).sum(-1)
+        assert off.max() > 0.0 and (off <= half - 0.5 * (most - least)).all()
+
+
+def test_parts_gain_by_rows_of_the_whole(tmp_path: Path) -> None:
+    """Nearly as much as by rows of their own; and with these nothing is lost."""
+    gains, own = [], []
+    for seed in range(2):
+        net, _ = network(tmp_path, seed)
+        images = image_sets(SHAPE, 1, 2, 0.1, 0.02, seed)
+        rows, offset = np.random.default_rng(seed).normal(size=(4, 3)), np.zeros(4)
+        family, parts = Family(net, images), halved(images)
+        whole = family.whole(rows, offset)
+        assert np.array_equal(whole.lower, bound_outputs(net, images, rows, offset).lower)
+        alone = bound_outputs(net, parts, rows, offset).lower
+        shared = family.parts(parts, rows, offset).lower
+        fresh = family.parts(parts, rows, offset, fresh=True).lower
+        gains.append(np.mean(shared - whole.lower) / np.mean(alone - whole.lower))
+        own.append(np.mean(fresh - whole.lower) / np.mean(alone - whole.lower))
+    assert np.mean(gains) > 0.5
+    assert np.mean(own) > 0.98
+
+
+def test_a_whole_without_bounds_helps_nothing(tmp_path: Path) -> None:
+    net, _ = network(tmp_path, 0)
+    images = image_sets(SHAPE, 1, 2, 0.1, 0.02)
+    broken = replace(images, b_upper=np.full_like(images.b_upper, np.nan))
+    rows, offset = np.eye(3), np.zeros(3)
+    family, parts = Family(net, broken), halved(images)
+    assert (family.whole(rows, offset).lower == -np.inf).all()
+    assert np.array_equal(family.parts(parts, rows, offset).lower, bound_outputs(net, parts, rows, offset).lower)
+
+
+# ---------------------------------------------------------------- joined sets
+
+
+def random_sets(box: ParameterBox, rng: np.random.Generator) -> PictureSets:
+    d = box.dimensions
+    a, apart = rng.normal(size=(2, 3, 3, d)), 0.1 * rng.normal(size=(2, 3, 3, d))
+    b, wide = rng.normal(size=(2, 3, 3)), np.abs(apart).sum(-1) + rng.uniform(0.0, 0.2, (2, 3, 3))
+    reach = np.abs(a).sum(-1) + np.abs(apart).sum(-1) + wide
+    return PictureSets(box, (a - apart, b - wide, a + apart, b + wide), b - reach, b + reach)
+
+
+@pytest.mark.parametrize("offset", [0.0, 0.7, 3e5])
+def test_joined_sets_hold_every_part(offset: float) -> None:
+    """At exact corners of every part, in exact arithmetic."""
+    names, rng = ("x", "y", "z"), np.random.default_rng(5)
+    whole = ParameterBox(names, ("m",) * 3, (offset - 0.1,) * 3, (offset + 0.2, offset + 0.1, offset + 0.3))
+    boxes = split(whole, [0, 2, 1])
+    # slanted parts leave something out
+    boxes[3] = boxes[3].replace(1, boxes[3].lower[1], boxes[3].middle[1])
+    parts = [random_sets(box, rng) for box in boxes]
+    found = joined(parts)
+    assert found.sane
+    wide = found.box
+    for part in parts:
+        box = part.box
+        assert (found.lower <= part.lower).all() and (found.upper >= part.upper).all()
+        for corner in box.corners():
+            q = [_scaled(v, low, high) for v, low, high in zip(corner, box.lower, box.upper, strict=True)]
+            p = [_scaled(v, low, high) for v, low, high in zip(corner, wide.lower, wide.upper, strict=True)]
+            for at in [(0, 1, 2), (1, 2, 0)]:
+                for side, sign in ((0, 1), (2, -1)):
+                    inner = _plane(part.linear, side, at, q)
+                    assert sign * (inner - _plane(found.linear, side, at, p)) >= 0
+
+
+def _scaled(value: float, low: float, high: float) -> fmpq:
+    """A parameter as a form has it: the middle and the half of a box are floats."""
+    middle = 0.5 * (low + high)
+    half = max(high - middle, middle - low) * (1.0 + 2.0**-51)
+    return (rational(value) - rational(middle)) / rational(half)
+
+
+def _plane(linear: tuple[np.ndarray, ...], side: int, at: tuple[int, ...], p: list[fmpq]) -> fmpq:
+    slopes = linear[side][at]
+    return rational(float(linear[side + 1][at])) + sum(
+        (rational(float(s)) * v for s, v in zip(slopes, p, strict=True)), fmpq(0)
+    )
+
+
+def test_joined_sets_of_what_is_linear_are_as_narrow() -> None:
+    box = ParameterBox(("x", "y"), ("m",) * 2, (-1.0, -1.0), (1.0, 1.0))
+    parts = [_ramp_sets(Ramp(2), part) for part in split(box, [0, 1, 0])]
+    found = joined(parts)
+    assert np.allclose(found.widths, 2e-3, atol=1e-9)
+    assert np.allclose(found.linear[0], [0.2, 0.1], atol=1e-9)
+
+
+def _ramp_sets(scene: Ramp, box: ParameterBox) -> PictureSets:
+    linear, lower, upper, _ = scene.sets(box)
+    return PictureSets(box, linear, lower, upper)
+
+
+# ---------------------------------------------------------------- slanted parts
+
+
+@pytest.mark.parametrize("name", SHEARS)
+def test_poses_of_a_cell_are_in_its_slanted_parts(name: str) -> None:
+    plain = PoseSet.around(camera(random_rotation(1)), SETS[name])
+    cell = plain.box
+    for axis in range(cell.dimensions):
+        cell = cell.split(axis, 4)[1 + axis % 2]
+    poses = plain.within(cell).sheared(SHEARS[name])
+    parts = [box for part in split(poses.box, [0, 1, cell.dimensions - 1]) if (box := poses.feasible(part)) is not None]
+    rng = np.random.default_rng(2)
+    for weights in [*rng.choice([0.0, 1.0], (20, cell.dimensions)), *rng.uniform(0.0, 1.0, (20, cell.dimensions))]:
+        values = {
+            name: rational(low) + rational(float(w)) * (rational(high) - rational(low))
+            for name, low, high, w in zip(cell.names, cell.lower, cell.upper, weights, strict=True)
+        }
+        assert any(holds(part, exact(poses, values)) for part in parts)
+
+
+def test_halvings_aim_at_what_parts_may_cost() -> None:
+    effects = np.array([4.0, 1.0, 0.0])
+    axes = halvings(effects, 0.24 * 4.0**1.6, 1, 0.24, 1 << 20)
+    left = effects / 2.0 ** np.bincount(axes, minlength=3)
+    assert left.sum() <= 0.25 * effects.sum() and axes[:2] == [0, 0] and 2 not in axes
+    assert len(halvings(effects, 0.1, 3, 0.24, 16)) == 3
+    assert 2 ** len(halvings(effects, 1e9, 3, 0.24, 16)) == 32
+
+
+# ---------------------------------------------------------------- verdicts
+
+
+class Rounded(Threshold):
+    """A network whose bounds lose ten times what the sets leave open, and that can be shared."""
+
+    def __init__(self, threshold: float) -> None:
+        super().__init__(threshold)
+        self.asked: list[tuple[str, int]] = []
+
+    def bound(self, images: ImageSets, query: Query, substitution: Any = "everywhere") -> Any:
+        self.asked.append(("alone", images.count))
+        return self._lost(images, query)
+
+    def _lost(self, images: ImageSets, query: Query) -> Any:
+        found = super().bound(images, query)
+        gap = (images.b_upper - images.b_lower + np.abs(images.a_upper - images.a_lower).sum(-1)).mean(1)[:, None]
+        return replace(found, lower=found.lower - 9.0 * gap, b=found.b - 9.0 * gap)
+
+    def family(self, images: ImageSets) -> Any:
+        return Shared(self, images)
+
+
+class Shared:
+    def __init__(self, model: Rounded, images: ImageSets) -> None:
+        self.model, self.images = model, images
+
+    def whole(self, query: Query) -> Any:
+        self.model.asked.append(("whole", 1))
+        return self.model._lost(self.images, query)
+
+    def parts(self, images: ImageSets, query: Query, *, fresh: bool = False) -> Any:
+        self.model.asked.append(("fresh" if fresh else "shared", images.count))
+        return self.model._lost(images, query)
+
+
+class Curved(Ramp):
+    """Pictures of brightness ``0.5 + 0.2 x + 0.1 y``; sets are loose by the square of the width."""
+
+    def sets(self, box: ParameterBox) -> Any:
+        half = 0.5 * (np.array(box.upper) - np.array(box.lower))
+        self.slack = 0.05 * float(half.max()) ** 2
+        return super().sets(box)
+
+
+def covered(threshold: float, **settings: Any) -> tuple[Search, Rounded]:
+    scene, model = Curved(2), Rounded(threshold)
+    pictures: Any = scene
+    cover = Cover(pictures, model, model, CLAIM, **settings)
+    return Search(pictures, model, CLAIM, Grid.adaptive(scene.box, (2, 2)), cover=cover), model
+
+
+@pytest.mark.parametrize("threshold", [0.1, 0.31, 0.43])
+def test_verdicts_of_covered_cells_are_the_truth(threshold: float) -> None:
+    search, model = covered(threshold)
+    leaves, _ = drive(search, 150)
+    scene = Curved(2)
+    assert {kind for kind, _ in model.asked} >= {"whole"}
+    for leaf in leaves:
+        ends = [float(0.5 + scene.gains @ c) - threshold for c in search.grid.box_of(leaf.cell).corners()]
+        if leaf.verdict == "certified":
+            assert min(ends) > 0.0 and leaf.margin is not None and 0.0 < leaf.margin <= min(ends) + 1e-9
+        if leaf.verdict == "falsified":
+            assert min(ends) <= 1e-7
+    if threshold == 0.1:
+        assert volume(leaves, "certified") == search.grid.volume
+
+
+def test_one_part_without_a_proof_leaves_the_cell_without() -> None:
+    """Whatever bounds say of the other parts."""
+    search, _ = covered(0.1, most=64)
+    cell = search.grid.box_of(search.grid.roots()[0])
+    weights = Weights(np.full((2, 2, 3), 0.5 / 12.0), 0.4)
+    assert search.cover is not None
+    good = search.cover.prove(cell, np.array([0.5, 0.1]), weights)
+    assert good.margin is not None and good.margin > 0.0
+
+    class Hole(Curved):
+        def sets(self, box: ParameterBox) -> Any:
+            linear, lower, upper, slopes = super().sets(box)
+            if box.contains(np.array([-0.37, -0.61])):
+                linear = (*linear[:1], linear[1] - 0.6, *linear[2:])
+                lower = lower - 0.6
+            return linear, lower, upper, slopes
+
+    scene = Hole(2)
+    holed = replace(search.cover, scene=scene).prove(cell, np.array([0.5, 0.1]), weights)
+    assert holed.margin is None and math.prod(holed.cuts) > 1
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf])
+def test_bad_bounds_of_parts_certify_nothing(bad: float) -> None:
+    search, _ = covered(0.1)
+    cell = search.grid.box_of(search.grid.roots()[0])
+    weights = Weights(np.full((2, 2, 3), 0.5 / 12.0), 0.4)
+
+    class Bad(Curved):
+        def sets(self, box: ParameterBox) -> Any:
+            linear, lower, upper, slopes = super().sets(box)
+            if box.contains(np.array([-0.37, -0.61])):
+                upper = np.full_like(upper, bad)
+            return linear, lower, upper, slopes
+
+    assert search.cover is not None
+    assert replace(search.cover, scene=Bad(2)).prove(cell, np.array([0.5, 0.1]), weights).margin is None
+
+
+def test_cells_that_take_too_many_parts_are_cut_where_that_helps() -> None:
+    """A cut of what needs no cut leaves as many parts to be bounded."""
+    search, _ = covered(0.1, most=4)
+    assert search.cover is not None
+    box = search.grid.box
+    weights = Weights(np.full((2, 2, 3), 40.0 / 12.0), 0.4)
+    found = search.cover.prove(box, np.array([0.5, 0.1]), weights)
+    assert found.margin is None and found.parts == 0
+    assert found.cuts[0] > found.cuts[1] >= 1
