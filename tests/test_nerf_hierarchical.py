@@ -6,14 +6,18 @@ import dataclasses
 
 import numpy as np
 import pytest
+import torch
 from nerfs import UNIFORM, pixels_of, poses, tiny_scene
 
+from ns_abstract.arithmetic.rounding import COMPOSITE_ROUNDING
 from ns_abstract.geometry.poses import PoseSet
 from ns_abstract.io.errors import InputError
 from ns_abstract.methods.nerf import bounds as bounds_module
 from ns_abstract.methods.nerf.bounds import NerfBounds, RayBounds
 from ns_abstract.methods.nerf.frame import NerfFrame
 from ns_abstract.methods.nerf.method import NerfMethod
+from ns_abstract.methods.nerf.render import NerfRenderer
+from ns_abstract.methods.nerf.samples import composite, edge_bounds
 from ns_abstract.methods.nerf.scene import NerfScene
 from ns_abstract.verify.attack.falsify import falsify
 from ns_abstract.verify.attack.soundness import nerf_renderer
@@ -58,6 +62,71 @@ def test_a_smooth_field_is_tight() -> None:
     scene, pose_set = tiny_scene(3, density=1.0, color=0.5), poses(SETS["yaw"])
     found = bounded(scene, pose_set)
     assert (found.upper - found.lower).mean() < 0.25
+
+
+def test_where_samples_lie_makes_opaque_fields_tight(monkeypatch: pytest.MonkeyPatch) -> None:
+    scene, pose_set = tiny_scene(1, density=1e3), poses({"rotation": {"yaw": 1e-4}})
+    found = bounded(scene, pose_set)
+    monkeypatch.setattr(bounds_module._Work, "_sampled", lambda self, low, high: (np.zeros(1), np.ones(1)))
+    wide = bounded(scene, pose_set)
+    assert (wide.lower <= found.lower).all() and (found.upper <= wide.upper).all()
+    assert (found.upper - found.lower).mean() < 0.3 * (wide.upper - wide.lower).mean()
+
+
+@pytest.mark.parametrize("kind", ["any", "empty", "opaque", "known"])
+def test_edges_of_samples_are_enclosed(kind: str) -> None:
+    rng = np.random.default_rng(0)
+    ends = np.sort(rng.uniform(0.0, 1.0, (2, 60, BINS.samples)) ** 4, axis=0)
+    if kind == "empty":
+        ends *= 1e-9
+    elif kind == "opaque":
+        ends[:, :, 7] = 1.0
+    elif kind == "known":
+        ends[1] = ends[0]
+    low, high = edge_bounds(*ends, BINS)
+    renderer = NerfRenderer(tiny_scene(0), BINS)
+    bins = torch.linspace(0.0, 1.0, BINS.samples + 1, dtype=torch.float64).expand(60, -1)
+    for mix in (0.0, 1.0, None, None, "turns"):
+        share = rng.uniform(0.0, 1.0, ends[0].shape) if mix is None else mix
+        if mix == "turns":
+            # more light than ever before a place and less than ever behind it
+            share = (np.arange(BINS.samples) >= rng.integers(0, BINS.samples, (60, 1))).astype(np.float64)
+        alpha = torch.from_numpy(np.clip(ends[0] + share * (ends[1] - ends[0]), *ends))
+        light = torch.cumprod(torch.cat([torch.ones(60, 1), 1.0 - alpha[:, :-1]], dim=1), dim=1)
+        edges = renderer._distances(renderer._refined(bins, alpha * light)).numpy()
+        assert (low <= edges).all() and (edges <= high).all()
+    if kind == "known":
+        assert (high - low).max() < 1e-9
+
+
+@pytest.mark.parametrize("spread", [0.0, 0.003, 0.3])
+def test_sampled_parts_are_enclosed(spread: float) -> None:
+    rng = np.random.default_rng(1)
+    rows, count, parts = 12, 24, 40
+    edges = np.sort(rng.uniform(0.0, 1.0, (rows, count + 1)), axis=1)
+    edges[:, 0], edges[:, -1] = 0.0, 1.0
+    width = spread * rng.uniform(0.0, 1.0, edges.shape)
+    low, high = np.sort(np.maximum(edges - width, 0.0), axis=1), np.sort(np.minimum(edges + width, 1.0), axis=1)
+    low[:, -1], high[:, 0] = 1.0, 0.0
+    density = rng.uniform(0.0, 12.0, (rows, parts)) * np.array([1.0, 1.2])[:, None, None]
+    color = rng.uniform(0.0, 0.8, (rows, parts, 3)) + np.array([0.0, 0.2])[:, None, None, None]
+    lower, upper = np.full((rows, 3), 0.5), np.full((rows, 3), 0.5)
+    composite(low, high, 0.0, 1.0 / parts, *density, *color, lower, upper)
+    slack = 4.0 * COMPOSITE_ROUNDING * (2 * count + 7)
+    for mix in (0, 1, None, None, None):
+        at = np.sort(np.clip(edges + (0 if mix is None else 2 * mix - 1) * width, low, high), axis=1)
+        if mix is None:
+            at = np.sort(rng.uniform(low, high), axis=1)
+        place = np.minimum((0.5 * (at[:, 1:] + at[:, :-1]) * parts).astype(int), parts - 1)
+        share = rng.integers(0, 2, (rows, count))
+        there = np.take_along_axis(density[0], place, 1), np.take_along_axis(density[1], place, 1)
+        alpha = 1.0 - np.exp(-np.diff(at, axis=1) * np.where(share, *there))
+        shown = np.full((rows, 3), 0.5)
+        for k in range(count - 1, -1, -1):
+            seen = color[rng.integers(0, 2), np.arange(rows), place[:, k]]
+            shown += alpha[:, k, None] * (seen - shown)
+        assert (lower - slack <= shown).all() and (shown <= upper + slack).all()
+    assert spread > 0.0 or (upper - lower).mean() < 0.5
 
 
 def only_middles(self, values, end, axis=-1):

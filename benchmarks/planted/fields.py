@@ -5,6 +5,7 @@ from planted.fault import Fault
 _ZONOTOPE, _BOUNDS = "methods/nerf/zonotope.py", "methods/nerf/bounds.py"
 _HSV, _OCCUPANCY, _RELU = "methods/nerf/hsv.py", "methods/nerf/occupancy.py", "methods/nerf/relu_kernel.py"
 _PLANES, _STRIPS = "methods/nerf/planes.py", "methods/nerf/strips.py"
+_SAMPLES = "methods/nerf/samples.py"
 _PARTS = "test_nerf_certify.py::test_planes_lie_beyond_every_part_exactly"
 _FIELDS = "test_nerf_zonotope.py::test_fields_are_enclosed"
 _LAYERS = "test_nerf_zonotope.py::test_linear_layers_are_enclosed"
@@ -188,5 +189,26 @@ FIELDS = (
         _STRIPS, "Strips._part_ends", "ends[:-1, None] + (ends[1:] - ends[:-1])[:, None] * inner",
         "ends[:-1, None] + 0.5 * (ends[1:] - ends[:-1])[:, None] * inner",
         "test_nerf_certify.py::test_planted_faults_are_found", True,
+    ),
+    Fault(
+        "samples: shares of light before a place are taken with the light behind it at its other end",
+        _SAMPLES, "edge_bounds", "share(before[1], after[0])", "share(before[1], after[1])",
+        "test_nerf_hierarchical.py::test_edges_of_samples_are_enclosed[any]",
+    ),
+    Fault(
+        "samples: the rounding of shares is not charged",
+        _SAMPLES, "edge_bounds", "2.0**-46 * (bins + 16)", "0.0",
+        "test_nerf_hierarchical.py::test_edges_of_samples_are_enclosed[known]",
+    ),
+    Fault(
+        "samples: the last middle is looked for where it lies at least",
+        _SAMPLES, "composite", "far = 0.5 * (edges_high[r, last] + edges_high[r, last + 1])",
+        "far = 0.5 * (edges_low[r, last] + edges_low[r, last + 1])",
+        "test_nerf_hierarchical.py::test_sampled_parts_are_enclosed[0.003]",
+    ),
+    Fault(
+        "samples: an interval that may have begun over a segment is forgotten",
+        _SAMPLES, "composite", "edges_low[r, last] >= ends[k + 1]", "edges_high[r, last] >= ends[k + 1]",
+        "test_nerf_hierarchical.py::test_sampled_parts_are_enclosed[0.3]",
     ),
 )  # fmt: skip

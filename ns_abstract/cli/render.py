@@ -54,7 +54,7 @@ class Render(GivenSet):
     its float64 evaluation."""
     sampling: Literal["uniform", "hierarchical"] | None = None
     """NeRF. uniform (default): the fine field in the middles of equal bins. hierarchical: Nerfstudio's own picture,
-    bounded for every choice of samples in the bins of the coarse pass."""
+    bounded by where samples may lie in the coarse pass' bins."""
     num_samples: int | None = None
     """NeRF: bins of every ray. Default: 64."""
     near_plane: float | None = None

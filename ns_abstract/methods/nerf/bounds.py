@@ -1,4 +1,4 @@
-"""Bounds of rays over a box of poses: cells by sample, densities and colours, compositing (design.md, F6-F8).
+"""Bounds of rays over a box of poses: cells by sample, densities and colours, compositing (design.md, F6-F8, F10, F14).
 
 Every sample of a ray gets cells of its own width: where the field is rough over the sample's path, the box is cut
 finer. The polynomials that come out of the network are then cut into parts at no cost, and compositing is done
@@ -25,6 +25,7 @@ from ns_abstract.geometry.box import ParameterBox
 from ns_abstract.geometry.poses import PoseSet
 from ns_abstract.methods.nerf.hsv import Range, shifted_bounds
 from ns_abstract.methods.nerf.render import Sampling, camera_rays
+from ns_abstract.methods.nerf.samples import composite, edge_bounds
 from ns_abstract.methods.nerf.scene import NerfScene
 from ns_abstract.methods.nerf.zonotope import Affine, FieldBounds, Pieces
 
@@ -244,7 +245,7 @@ class NerfBounds:
 
     Args:
         scene: The scene.
-        sampling: Uniform, or hierarchical: then the samples of the fine field may be anywhere (design.md, F10).
+        sampling: Uniform, or hierarchical: bounded wherever the fine field may be sampled (design.md, F10, F14).
         dimensions: Number of parameters.
         device: Where the network is bounded.
     """
@@ -258,6 +259,8 @@ class NerfBounds:
         self.field = FieldBounds(scene.fine, self.basis, device=device)
         edges = sampling.edges
         self.occupancy = scene.occupancy
+        #: Of the coarse pass, by pose alone.
+        self.coarse = FieldBounds(scene.coarse, basis_of(dimensions), device=device) if self.swept else None
         self.distances = 0.5 * (edges[1:] + edges[:-1])
         self.lengths = edges[1:] - edges[:-1]
         self.taylor = min(_TAYLOR, max(1, self.basis.degree))
@@ -312,7 +315,36 @@ class NerfBounds:
                 lower, upper, alpha, halves[0].cells + halves[1].cells, typical_displacement(halves),
                 np.concatenate(parts, axis=1) if parts else None,
             )  # fmt: skip
-        return _Work(self, pencil, division, moves, tolerance, known, aim).run(shifts or [], given_division is not None)
+        edges = None
+        if self.coarse is not None:
+            edges = self._edges(self.coarse, Pencil(pose_set, box, pixels, self.taylor), division)
+        work = _Work(self, pencil, division, moves, tolerance, known, aim, edges)
+        return work.run(shifts or [], given_division is not None)
+
+    def _edges(self, coarse: FieldBounds, pencil: Pencil, division: Division) -> tuple[np.ndarray, np.ndarray]:
+        """Bounds [n parts, .] of the fine samples' edges by parts of the poses (design.md, F14)."""
+        n, samples, parts = len(pencil.direction), self.distances.size, division.parts[:-1]
+        low, high = np.zeros((n, samples, math.prod(parts))), np.ones((n, samples, math.prod(parts)))
+        basis = coarse.basis
+        monomials = torch.from_numpy(np.prod(basis.nodes[:, None, :] ** pencil.exponents, axis=-1)).to(self.device)
+        bernstein = torch.from_numpy(basis.bernstein(parts)).to(self.device)
+        rays, places = (a.ravel() for a in np.mgrid[:n, :samples])
+        for first in range(0, rays.size, _BATCH):
+            checkpoint()
+            ray, place = rays[first : first + _BATCH], places[first : first + _BATCH]
+            lines, radius = pencil.points(ray, self.distances[place], 0.0 * self.distances[place])
+            nodes = monomials @ torch.from_numpy(lines).to(self.device)
+            encoded = coarse.encode(nodes, torch.from_numpy(radius).to(self.device), coarse.weights.position)
+            z = coarse.density(coarse.base(*encoded))
+            ends = _parts(z, bernstein)
+            length = torch.from_numpy(self.lengths[place]).to(self.device)[:, None]
+            alpha = [opacity(ends[up][..., 0], length, up=bool(up)).cpu().numpy() for up in (0, 1)]
+            good = ~z.failed.cpu().numpy()[:, None] & (alpha[0] <= alpha[1])
+            # density is 0 where it is declared
+            low[ray, place] = np.where(good & (self.occupancy is None), alpha[0], 0.0)
+            high[ray, place] = np.where(good, alpha[1], 1.0)
+        rows = (np.moveaxis(a, 1, 2).reshape(-1, samples) for a in (low, high))
+        return edge_bounds(*rows, self.sampling)
 
     def division(self, moves: np.ndarray, most: int = _PARTS) -> Division | None:
         """Levels for samples that move by ``moves`` [n, samples, d].
@@ -358,7 +390,9 @@ class _Work:
         tolerance: float,
         known: np.ndarray | None,
         aim: tuple[np.ndarray, np.ndarray] | None,
+        edges: tuple[np.ndarray, np.ndarray] | None = None,
     ) -> None:
+        self.edges = edges
         self.owner, self.pencil, self.division, self.tolerance, self.aim = owner, pencil, division, tolerance, aim
         self.basis, self.field = owner.basis, owner.field
         n, samples = moves.shape[:2]
@@ -692,6 +726,40 @@ class _Work:
         if self.owner.swept:
             other_low, other_high = self._composited(True)
             low, high = np.maximum(low, other_low), np.minimum(high, other_high)
+        if self.edges is not None:
+            other_low, other_high = self._sampled(*self.edges)
+            low, high = np.maximum(low, other_low), np.minimum(high, other_high)
+        return low, high
+
+    def _sampled(self, edges_low: np.ndarray, edges_high: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """[n, parts, 3] bounds by parts, from where the fine field is sampled (design.md, F14)."""
+        owner, inner = self.owner, self.division.parts[-1]
+        rows, samples, n = len(edges_low), self.alpha_low.shape[0], self.alpha_low.shape[1]
+
+        def along(values: np.ndarray) -> np.ndarray:
+            """[samples, n, parts, ...] as [n parts of the poses, parts of the ray, ...]."""
+            apart = values.reshape(samples, n, rows // n, inner, *values.shape[3:])
+            return np.ascontiguousarray(np.moveaxis(apart, 0, 2)).reshape(rows, samples * inner, *values.shape[3:])
+
+        with np.errstate(divide="ignore"):
+            density_low = -np.log1p(-self.alpha_low) / owner.lengths[:, None, None] * (1.0 - 2.0**-40)
+            density_high = -np.log1p(-self.alpha_high) / owner.lengths[:, None, None] * (1.0 + 2.0**-40)
+        weight = self.before * self.alpha_high
+        dim = weight <= self._negligible
+        # what is negligible takes the colour of what is not, at the price of its weight
+        price = along(np.where(dim, weight, 0.0)).reshape(rows, samples, inner).max(axis=2).sum(axis=1)
+        color_low = along(np.where(dim[..., None], np.inf, self.color_low))
+        color_high = along(np.where(dim[..., None], -np.inf, self.color_high))
+        low = np.tile(np.array(owner.sampling.background, np.float64), (rows, 1))
+        high = low.copy()
+        near, far = owner.sampling.near, owner.sampling.far
+        composite(
+            edges_low, edges_high, near, (far - near) / (samples * inner), along(density_low), along(density_high),
+            color_low, color_high, low, high,
+        )  # fmt: skip
+        slack = 4.0 * COMPOSITE_ROUNDING * (2 * edges_low.shape[1] + 5) + (price * (1.0 + 2.0**-20))[:, None]
+        ends = np.clip(low - slack, 0.0, 1.0), np.clip(high + slack, 0.0, 1.0)
+        low, high = (np.repeat(end.reshape(n, rows // n, 3), inner, axis=1) for end in ends)
         return low, high
 
     def _composited(self, apart: bool) -> tuple[np.ndarray, np.ndarray]:

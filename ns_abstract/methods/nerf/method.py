@@ -176,8 +176,7 @@ class NerfMethod:
         if s.kind == "hierarchical":
             return (
                 f"bounded: Nerfstudio's own {shows} samples from {s.near:g} to {s.far:g}, by what the fine field can "
-                f"show anywhere in the {s.samples} bins of the coarse pass, wherever the coarse field puts samples",
-                "the coarse field left out: the bounds hold for every choice of samples in the bins",
+                f"show in the {s.samples} bins of the coarse pass and by where in them the coarse field puts samples",
                 *declared,
             )
         return (

@@ -1,0 +1,97 @@
+"""Where Nerfstudio's own samples lie, and what a ray shows that is sampled there (design.md, F14)."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit
+
+from ns_abstract.methods.nerf.render import HISTOGRAM_PADDING, Sampling
+
+#: What a place may be off by in parts of a bin, by rounding.
+_PLACE = 2.0**-30
+
+
+def edge_bounds(alpha_low: np.ndarray, alpha_high: np.ndarray, sampling: Sampling) -> tuple[np.ndarray, np.ndarray]:
+    """Bounds [r, S + 1] of the sorted distances between which the fine field is sampled (design.md, F14).
+
+    Args:
+        alpha_low, alpha_high: [r, samples] opacities of the coarse pass.
+        sampling: Hierarchical; S is its ``samples + importance + 1``.
+    """
+    rows, bins = alpha_low.shape
+    rounding = 2.0**-46 * (bins + 16)
+    one = np.ones((rows, 1))
+    # light that passes the bins before a knot, and those behind it, least and largest
+    before, after = [], []
+    for passed in (1.0 - alpha_high, 1.0 - alpha_low):
+        before.append(np.cumprod(np.concatenate([one, passed], axis=1), axis=1))
+        after.append(np.cumprod(np.concatenate([one, passed[:, ::-1]], axis=1), axis=1)[:, ::-1])
+    padding = HISTOGRAM_PADDING * np.arange(bins + 1)
+
+    def share(before: np.ndarray, after: np.ndarray) -> np.ndarray:
+        return (1.0 - before + padding) / (1.0 - before * after + padding[-1])
+
+    least = np.maximum.accumulate(share(before[1], after[0]) - rounding, axis=1)
+    most = np.minimum.accumulate((share(before[0], after[1]) + rounding)[:, ::-1], axis=1)[:, ::-1]
+    count = sampling.importance + 1
+    wanted = (np.arange(count) + 0.5) / count
+    knots = np.linspace(0.0, 1.0, bins + 1)
+    found = []
+    for shares, sign in ((most, -1.0), (least, 1.0)):
+        new = np.stack([np.interp(wanted + sign * rounding, row, knots) for row in shares])
+        places = np.sort(np.concatenate([np.broadcast_to(knots, (rows, bins + 1)), new], axis=1), axis=1)
+        places = np.clip(places + sign * rounding, 0.0, 1.0)
+        places[:, 0], places[:, -1] = 0.0, 1.0
+        ends = places * sampling.far + (1.0 - places) * sampling.near
+        ends[:, 1:-1] += sign * rounding * sampling.far
+        found.append(np.clip(ends, sampling.near, sampling.far))
+    return found[0], found[1]
+
+
+@njit(cache=True, error_model="numpy")
+def composite(edges_low, edges_high, start, step, density_low, density_high, color_low, color_high, lower, upper):
+    """Bounds of rays' colours from where they are sampled and what the field is there (design.md, F14).
+
+    Args:
+        edges_low, edges_high: [r, S + 1] of `edge_bounds`.
+        start, step: Where the first part begins, and the length of all.
+        density_low, density_high: [r, parts] densities on equal parts of the rays.
+        color_low, color_high: [r, parts, 3] colours; crossed where they do not count.
+        lower, upper: [r, 3] the background; overwritten.
+    """
+    count, parts = edges_low.shape[1] - 1, density_low.shape[1]
+    ends = np.empty(2 * count + 2)
+    for r in range(edges_low.shape[0]):
+        ends[: count + 1] = edges_low[r]
+        ends[count + 1 :] = edges_high[r]
+        ends.sort()
+        first = last = count - 1
+        for k in range(2 * count, -1, -1):
+            length = ends[k + 1] - ends[k]
+            if length <= 0.0:
+                continue
+            # the intervals that may lie over this segment
+            while first > 0 and edges_high[r, first] > ends[k]:
+                first -= 1
+            while last > 0 and edges_low[r, last] >= ends[k + 1]:
+                last -= 1
+            near = 0.5 * (edges_low[r, first] + edges_low[r, first + 1])
+            far = 0.5 * (edges_high[r, last] + edges_high[r, last + 1])
+            # and the parts in which their middles may lie
+            begin = min(max(math.floor((near - start) / step - _PLACE), 0), parts - 1)
+            stop = min(max(math.floor((far - start) / step + _PLACE), begin), parts - 1)
+            least, most = density_low[r, begin], density_high[r, begin]
+            for i in range(begin + 1, stop + 1):
+                least, most = min(least, density_low[r, i]), max(most, density_high[r, i])
+            least, most = -math.expm1(-length * least), -math.expm1(-length * most)
+            for c in range(3):
+                dark, bright = np.inf, -np.inf
+                for i in range(begin, stop + 1):
+                    dark, bright = min(dark, color_low[r, i, c]), max(bright, color_high[r, i, c])
+                if not dark <= bright:
+                    dark, bright = 0.0, 1.0
+                rise, fall = bright - upper[r, c], dark - lower[r, c]
+                upper[r, c] += (most if rise > 0.0 else least) * rise
+                lower[r, c] += (most if fall < 0.0 else least) * fall
