@@ -300,7 +300,8 @@ CERTIFICATES = (
     ),
     Fault(
         "search: networks are asked about the widest cells",
-        _SEARCH, "Search._too_wide", "float(found.widths.mean()) > _HOPELESS or costs[number] > _COSTLY", "False", _CHEAP,
+        _SEARCH, "Search._too_wide", "float(found.widths.mean()) > _HOPELESS or costs[number] > _COSTLY", "False",
+        _CHEAP,
     ),
     Fault(
         "search: only the stored scene is shown",
