@@ -10,8 +10,9 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
 from flint import fmpq
-from onnx_files import OnnxFile, attack, image_sets, session
+from onnx_files import OnnxFile, attack, image_sets, members, session
 from oracle import rational
 from test_certify_search import CLAIM, Ramp, Threshold, drive, volume
 from test_poses import SETS, camera, random_rotation
@@ -85,6 +86,34 @@ def test_rows_of_the_whole_hold_for_parts(radius: float, slack: float, fresh: bo
             least, compared = attack(net, run, parts, cell, rows, 32, 5, seed)
             assert compared > 20
             assert (found.lower[cell] <= least).all()
+
+
+def test_ranges_of_parts_hold_every_value(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What the whole's rows say of every number, against the exact network on images of each part."""
+    found: dict[int, Any] = {}
+    inherited = _Part._inherited
+
+    def watched(self: _Part, index: int, form: Any) -> Any:
+        found[index] = inherited(self, index, form).interval
+        return inherited(self, index, form)
+
+    monkeypatch.setattr(_Part, "_inherited", watched)
+    for seed in range(2):
+        net, _ = network(tmp_path, seed)
+        images = image_sets(SHAPE, 1, 2, 0.2, 1e-3, seed)
+        family, parts = Family(net, images, arithmetic="real"), halved(images)
+        family.parts(parts, np.eye(3), np.zeros(3))
+        assert len(family._cell.known) > 3 and len(found) > 3
+        rng = np.random.default_rng(seed)
+        for cell in range(parts.count):
+            p, t = rng.choice([-1.0, 1.0, 0.3], (40, 2)), rng.uniform(size=(40, net.input_size))
+            x, inside = members(parts, cell, p, t)
+            assert inside.sum() > 10
+            values = [torch.from_numpy(x[inside].astype(np.float64)).reshape(-1, *SHAPE)]
+            for node in net.nodes:
+                values.append(node.layer([values[k] for k in node.inputs]))
+            for index, (lower, upper) in found.items():
+                assert bool((values[index] >= lower[cell]).all() and (values[index] <= upper[cell]).all())
 
 
 def test_products_of_rows_are_charged(tmp_path: Path) -> None:
@@ -162,7 +191,7 @@ def test_joined_sets_hold_every_part(offset: float) -> None:
         for corner in box.corners():
             q = [_scaled(v, low, high) for v, low, high in zip(corner, box.lower, box.upper, strict=True)]
             p = [_scaled(v, low, high) for v, low, high in zip(corner, wide.lower, wide.upper, strict=True)]
-            for at in [(0, 1, 2), (1, 2, 0)]:
+            for at in np.ndindex(2, 3, 3):
                 for side, sign in ((0, 1), (2, -1)):
                     inner = _plane(part.linear, side, at, q)
                     assert sign * (inner - _plane(found.linear, side, at, p)) >= 0
@@ -310,7 +339,7 @@ def test_one_part_without_a_proof_leaves_the_cell_without() -> None:
             return linear, lower, upper, slopes
 
     scene = Hole(2)
-    holed = replace(search.cover, scene=scene).prove(cell, np.array([0.5, 0.1]), weights)
+    holed = replace(search.cover, scene=scene, most=1 << 12).prove(cell, np.array([0.5, 0.1]), weights)
     assert holed.margin is None and math.prod(holed.cuts) > 1
 
 

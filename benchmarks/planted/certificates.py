@@ -31,7 +31,7 @@ _BRANCHES = "test_network_branching.py::test_claims_next_to_the_exact_minimum"
 _LEVELS = "test_eight_bit.py::test_sets_hold_rounded_pictures"
 
 _FAMILY, _COVER = "verify/network/family.py", "verify/cover.py"
-_SHARED = "test_cover.py::test_rows_of_the_whole_hold_for_parts[0.1-0.05-False]"
+_SHARED = "test_cover.py::test_ranges_of_parts_hold_every_value"
 
 CERTIFICATES = (
     Fault(
@@ -39,8 +39,8 @@ CERTIFICATES = (
         _FAMILY, "_Part._pictures", "self.middle - self.whole.middle", "0.0 * self.middle", _SHARED,
     ),
     Fault(
-        "families: rows that were passed back with a negative sign keep their ends",
-        _FAMILY, "_Whole._keep", "np.where(sign > 0.0, low, -high)", "low", _SHARED,
+        "families: rows that were passed back with a negative sign keep it",
+        _FAMILY, "_Whole._keep", "rows.value * sign[:, None].astype(np.float32)", "rows.value", _SHARED,
     ),
     Fault(
         "families: the part's own width is left out",
@@ -300,8 +300,8 @@ CERTIFICATES = (
     ),
     Fault(
         "search: networks are asked about the widest cells",
-        _SEARCH, "Search._too_wide", "float(found.widths.mean()) > _HOPELESS or costs[number] > _COSTLY", "False",
-        _CHEAP,
+        _SEARCH, "Search._too_wide",
+        "float(found.widths.mean()) > _HOPELESS or costs[number] > _COSTLY", "False", _CHEAP,
     ),
     Fault(
         "search: only the stored scene is shown",
@@ -321,7 +321,7 @@ CERTIFICATES = (
     ),
     Fault(
         "cells: parts of a cut leave a gap",
-        _CELLS, "Grid.divide", "first + (past - first) * i // n", "first + (past - first + 1) * i // n",
+        _CELLS, "Grid.cut", "first + (past - first) * i // n", "first + (past - first + 1) * i // n",
         "test_certify_search.py::test_grid",
     ),
     Fault(
