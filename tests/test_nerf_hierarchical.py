@@ -83,7 +83,7 @@ def test_edges_of_samples_are_enclosed(kind: str) -> None:
         ends[:, :, 7] = 1.0
     elif kind == "known":
         ends[1] = ends[0]
-    low, high = edge_bounds(*ends, BINS)
+    low, high = edge_bounds(ends[0], ends[1], BINS)
     renderer = NerfRenderer(tiny_scene(0), BINS)
     bins = torch.linspace(0.0, 1.0, BINS.samples + 1, dtype=torch.float64).expand(60, -1)
     for mix in (0.0, 1.0, None, None, "turns"):
@@ -111,7 +111,7 @@ def test_sampled_parts_are_enclosed(spread: float) -> None:
     density = rng.uniform(0.0, 12.0, (rows, parts)) * np.array([1.0, 1.2])[:, None, None]
     color = rng.uniform(0.0, 0.8, (rows, parts, 3)) + np.array([0.0, 0.2])[:, None, None, None]
     lower, upper = np.full((rows, 3), 0.5), np.full((rows, 3), 0.5)
-    composite(low, high, 0.0, 1.0 / parts, *density, *color, lower, upper)
+    composite(low, high, 0.0, 1.0 / parts, density[0], density[1], color[0], color[1], lower, upper)
     slack = 4.0 * COMPOSITE_ROUNDING * (2 * count + 7)
     for mix in (0, 1, None, None, None):
         at = np.sort(np.clip(edges + (0 if mix is None else 2 * mix - 1) * width, low, high), axis=1)

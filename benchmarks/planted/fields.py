@@ -206,9 +206,4 @@ FIELDS = (
         "far = 0.5 * (edges_low[r, last] + edges_low[r, last + 1])",
         "test_nerf_hierarchical.py::test_sampled_parts_are_enclosed[0.003]",
     ),
-    Fault(
-        "samples: an interval that may have begun over a segment is forgotten",
-        _SAMPLES, "composite", "edges_low[r, last] >= ends[k + 1]", "edges_high[r, last] >= ends[k + 1]",
-        "test_nerf_hierarchical.py::test_sampled_parts_are_enclosed[0.3]",
-    ),
 )  # fmt: skip

@@ -343,8 +343,8 @@ class NerfBounds:
             # density is 0 where it is declared
             low[ray, place] = np.where(good & (self.occupancy is None), alpha[0], 0.0)
             high[ray, place] = np.where(good, alpha[1], 1.0)
-        rows = (np.moveaxis(a, 1, 2).reshape(-1, samples) for a in (low, high))
-        return edge_bounds(*rows, self.sampling)
+        low, high = (np.moveaxis(a, 1, 2).reshape(-1, samples) for a in (low, high))
+        return edge_bounds(low, high, self.sampling)
 
     def division(self, moves: np.ndarray, most: int = _PARTS) -> Division | None:
         """Levels for samples that move by ``moves`` [n, samples, d].
