@@ -45,7 +45,7 @@ def estimate(network: Network, dimensions: int) -> tuple[float, float, bool]:
     rows, given_up = costs.foreseen(_OPEN, _DEEP_OPEN)
     many = costs.deep and not given_up
     memory = sum(sizes) * 8 * (3 * dimensions + _NUMBERS) + (_MANY_ROWS if many else _FEW_ROWS)
-    speed = _MANY_SPEED if many else _FEW_SPEED
+    speed = _MANY_SPEED if costs.deep else _FEW_SPEED
     return memory, forwards / _FORMS_SPEED + rows / speed, given_up
 
 

@@ -26,6 +26,8 @@ _DEEP = 2e12
 _ALLOWED = 5e12
 #: Once such a part of them is taken, rows are given up where what was passed foretells so many times more.
 _SURE, _OVER = 0.1, 1.5
+#: Layers that forms pass well, as a rule.
+_TIGHT = 4
 #: Part of a node's numbers past which all of them are bounded by rows.
 _RENEW = 0.15
 #: Parts of widths and of signs not found out past which rows are given up.
@@ -93,14 +95,19 @@ class Costs:
         return total + _PASSING * float(np.prod(self.network.input_shape))
 
     @cached_property
-    def total(self) -> float:
-        """Products that rows for every number before an activation or a product take."""
-        total = 0.0
+    def nodes(self) -> list[tuple[int, float]]:
+        """Nodes before an activation or a product, and the products that rows for all of their numbers take."""
+        found = []
         for node in self.network.nodes:
             if isinstance(node.layer, (Activation, Product)) and self.network.depth[node.inputs[0]] > 1:
-                for source in set(node.inputs):
-                    total += float(np.prod(self.network.shape(source))) * self.row(source)
-        return total
+                for source in dict.fromkeys(node.inputs):
+                    found.append((source, float(np.prod(self.network.shape(source))) * self.row(source)))
+        return found
+
+    @cached_property
+    def total(self) -> float:
+        """Products that rows for every number before an activation or a product take."""
+        return sum(products for _, products in self.nodes)
 
     @property
     def deep(self) -> bool:
@@ -115,10 +122,21 @@ class Costs:
         """
         if not self.deep:
             return part * self.total, False
-        if deep * self.total > _OVER * _ALLOWED:
-            # hardly any are taken by then
-            return 0.0, True
-        return min(deep * self.total, _ALLOWED), False
+        taken = passed = 0.0
+        for index, products in self.nodes:
+            passed += products
+            if self.network.depth[index] <= _TIGHT:
+                continue
+            # where most of a node is open, rows bound all of it
+            if _in_vain(taken + products, passed, self.total):
+                return taken, True
+            taken += deep * products
+        return min(taken, _ALLOWED), False
+
+
+def _in_vain(taken: float, passed: float, total: float) -> bool:
+    """Whether rows would end on the way: ``taken`` of what all rows take up to a node, ``passed``, and to the end."""
+    return taken > _SURE * _ALLOWED and taken * total > _OVER * _ALLOWED * passed
 
 
 class Schedule:
@@ -147,7 +165,7 @@ class Schedule:
         taken = self._taken + products
         if products > self.left:
             return False
-        if taken > _SURE * _ALLOWED and taken * self.costs.total > _OVER * _ALLOWED * self._passed:
+        if _in_vain(taken, self._passed, self.costs.total):
             self.left = 0.0
             return False
         self.left -= products
