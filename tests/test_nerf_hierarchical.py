@@ -154,3 +154,29 @@ def test_options() -> None:
     for options in ({"num_samples": 64}, {"renderer": "paper"}):
         with pytest.raises(InputError):
             NerfMethod(scene, sampling="hierarchical", **options)  # type: ignore[arg-type]
+
+
+def test_segments_take_every_interval_that_may_lie_over_them() -> None:
+    """Fields that are constant on parts, sampled between any edges that the bounds allow."""
+    rng = np.random.default_rng(4)
+    parts, count, span = 24, 5, 2.0
+    for _ in range(60):
+        middle = np.sort(rng.uniform(0.0, span, count + 1))
+        wide = rng.choice([0.0, 0.05, 0.4])
+        low, high = (np.clip(middle + side * wide * span, 0.0, span)[None] for side in (-0.5, 0.5))
+        low[0, 0] = high[0, 0] = 0.0
+        low[0, -1] = high[0, -1] = span
+        density, color = 4.0 * rng.random((1, parts)) ** 2, rng.random((1, parts, 3))
+        lower, upper = np.full((1, 3), 0.3), np.full((1, 3), 0.3)
+        composite(low, high, 0.0, span / parts, density, density, color, color, lower, upper)
+        for _ in range(40):
+            share = rng.choice([0.0, 1.0], count + 1) if rng.random() < 0.5 else rng.random(count + 1)
+            edges = np.sort(low[0] + share * (high[0] - low[0]))
+            at = np.minimum((0.5 * (edges[1:] + edges[:-1]) / span * parts).astype(int), parts - 1)
+            shown = np.full(3, 0.3)
+            for k in range(count - 1, -1, -1):
+                opacity = -np.expm1(-(edges[k + 1] - edges[k]) * density[0, at[k]])
+                shown += opacity * (color[0, at[k]] - shown)
+            # what the caller charges for rounding
+            room = 4.0 * COMPOSITE_ROUNDING * (count + 5)
+            assert (lower[0] - room <= shown).all() and (shown <= upper[0] + room).all()
