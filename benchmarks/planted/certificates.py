@@ -273,11 +273,12 @@ CERTIFICATES = (
     ),
     Fault(
         "search: bounds that cross are taken",
-        _SEARCH, "_sane", "(lower <= upper).all()", "True", _IMAGES + "[crossed]",
+        _COVER, "PictureSets.sane", "(self.lower <= self.upper).all()", "True", _IMAGES + "[crossed]",
     ),
     Fault(
         "search: linear sets that are no numbers are taken",
-        _SEARCH, "_sane", "(*linear, lower, upper)", "(lower, upper)", _IMAGES + "[NaN slope]",
+        _COVER, "PictureSets.sane", "(*self.linear, self.lower, self.upper)", "(self.lower, self.upper)",
+        _IMAGES + "[NaN slope]",
     ),
     Fault(
         "search: infinite bounds of the network prove",
@@ -301,7 +302,7 @@ CERTIFICATES = (
     Fault(
         "search: networks are asked about the widest cells",
         _SEARCH, "Search._too_wide",
-        "float(found.widths.mean()) > _HOPELESS or costs[number] > _COSTLY", "False", _CHEAP,
+        "float(sets.widths.mean()) > _HOPELESS or costs[number] > _COSTLY", "False", _CHEAP,
     ),
     Fault(
         "search: only the stored scene is shown",

@@ -320,8 +320,12 @@ class Certification:
         """Frame ``index``, ready to be rendered and bounded."""
         return FramePictures(self.job.method, self.job.pose_sets[index], self.picture)
 
-    def claim(self, pictures: FramePictures) -> Claim:
+    def claim(self, pictures: FramePictures, poses: PoseSet | None = None) -> Claim:
         """What is to hold in a frame.
+
+        Args:
+            pictures: Of the frame.
+            poses: The frame's set, if its parameters are counted otherwise than the pictures have them.
 
         Raises:
             InputError: The property makes no sense there.
@@ -330,7 +334,7 @@ class Certification:
         def nominal() -> np.ndarray:
             return self.model.outputs(pictures.image(pictures.box.middle)[None])[0]
 
-        return self.property.bind(pictures.pose_set, nominal)
+        return self.property.bind(pictures.pose_set if poses is None else poses, nominal)
 
     def grid(self, index: int) -> Grid:
         """The cells of a frame whose search begins.
@@ -393,14 +397,11 @@ class Certification:
         if not (shear := slanted.pose_set.shear):
             return Cover(pictures, self.model, self.model, self.claim(pictures))
 
-        def nominal() -> np.ndarray:
-            return self.model.outputs(pictures.image(pictures.box.middle)[None])[0]
-
         def frame(cell: ParameterBox) -> tuple[ParameterBox, Callable[[ParameterBox], ParameterBox | None]]:
             found = poses.within(cell).sheared(shear)
             return found.box, found.feasible
 
-        claim = self.property.bind(slanted.pose_set, nominal)
+        claim = self.claim(pictures, slanted.pose_set)
         return Cover(slanted, self.model, self.model, claim, frame, most=_MOST_SLANTED, block=1)
 
     def around(self, extra: SceneVariation) -> Certification:

@@ -457,10 +457,11 @@ class Search:
                 reasons[number] = failure_text(error)
                 continue
             slopes[number] = slope
-            if not _sane(linear, lower, upper):
+            sets = PictureSets(cell.box, linear, lower, upper)
+            if not sets.sane:
                 reasons[number] = "the image's bounds are not finite or cross"
             elif (self._splittable(cell.cell) or self._coverable(cell.cell)) and self._too_wide(
-                cell, number, linear, lower, upper, costs
+                cell, number, sets, costs
             ):
                 reasons[number] = "the image's bounds are too wide"
                 if self._coverable(cell.cell):
@@ -474,12 +475,12 @@ class Search:
         stacked = [np.stack(values) for values in arrays]
         try:
             query = self.claim.query(np.stack([outputs[number] for number in kept]))
-            sets = self.model.input_sets(tuple(stacked[:4]), stacked[4], stacked[5])
-            found = np.array(self.claim.proved(query, self.model.bound(sets, query), boxes), np.float64)
+            inputs = self.model.input_sets(tuple(stacked[:4]), stacked[4], stacked[5])
+            found = np.array(self.claim.proved(query, self.model.bound(inputs, query), boxes), np.float64)
             for place, number in enumerate(kept):
                 groups = self._branching(seen[number], float(found[place]))
                 if groups:
-                    better = self.model.branch(sets[place : place + 1], query, groups, _BRANCHES)
+                    better = self.model.branch(inputs[place : place + 1], query, groups, _BRANCHES)
                     found[place] = max(found[place], better)
         except InputError:
             raise
@@ -493,24 +494,15 @@ class Search:
             else:
                 reasons[number] = "the network's bounds are not finite"
 
-    def _too_wide(
-        self,
-        cell: _Seen,
-        number: int,
-        linear: tuple[np.ndarray, ...],
-        lower: np.ndarray,
-        upper: np.ndarray,
-        costs: np.ndarray,
-    ) -> bool:
+    def _too_wide(self, cell: _Seen, number: int, sets: PictureSets, costs: np.ndarray) -> bool:
         """Whether the network's bounds would be wasted on the sets.
 
         ``costs[number]`` becomes the part of the margin that they cost. A guess by the margin's gradient at the middle,
         which decides about work and not about verdicts.
         """
-        found = PictureSets(cell.box, linear, lower, upper)
         weights = self._weights(cell)
-        costs[number] = math.nan if weights is None else weights.cost(found)
-        return float(found.widths.mean()) > _HOPELESS or costs[number] > _COSTLY
+        costs[number] = math.nan if weights is None else weights.cost(sets)
+        return float(sets.widths.mean()) > _HOPELESS or costs[number] > _COSTLY
 
     def _coverable(self, cell: Cell) -> bool:
         return self.cover is not None and len(cell.first) > 1 and cell.volume > 1
@@ -680,8 +672,3 @@ def _key(sample: Sample) -> tuple[bytes, int]:
 
 def _generator(cell: Cell) -> np.random.Generator:
     return np.random.default_rng([*cell.first, *cell.past])
-
-
-def _sane(linear: tuple[np.ndarray, ...], lower: np.ndarray, upper: np.ndarray) -> bool:
-    """Whether all is finite, and the bounds do not cross."""
-    return bool(all(np.isfinite(v).all() for v in (*linear, lower, upper)) and (lower <= upper).all())
