@@ -22,7 +22,7 @@ from ns_abstract.geometry.box import ParameterBox
 from ns_abstract.geometry.poses import PoseSet
 from ns_abstract.verify.cells import Grid
 from ns_abstract.verify.cover import Cover, PictureSets, Weights, halvings, joined
-from ns_abstract.verify.network import Family, ImageSets, Network, bound_outputs, load_network
+from ns_abstract.verify.network import Family, Fresh, ImageSets, Network, bound_outputs, load_network
 from ns_abstract.verify.network.family import _Part
 from ns_abstract.verify.properties import Query
 from ns_abstract.verify.search import Search
@@ -71,9 +71,9 @@ def halved(images: ImageSets) -> ImageSets:
     return ImageSets(**found)
 
 
-@pytest.mark.parametrize("fresh", [False, True])
+@pytest.mark.parametrize("fresh", ["last", "all"])
 @pytest.mark.parametrize(("radius", "slack"), [(0.02, 0.02), (0.1, 0.05), (1e-6, 1e-6)])
-def test_rows_of_the_whole_hold_for_parts(radius: float, slack: float, fresh: bool, tmp_path: Path) -> None:
+def test_rows_of_the_whole_hold_for_parts(radius: float, slack: float, fresh: Fresh, tmp_path: Path) -> None:
     for seed in range(2):
         net, run = network(tmp_path, seed)
         images = image_sets(SHAPE, 1, 2, radius, slack, seed)
@@ -121,7 +121,7 @@ def test_products_of_rows_are_charged(tmp_path: Path) -> None:
     net, _ = network(tmp_path, 0)
     images = image_sets(SHAPE, 1, 2, 0.3, 0.0)
     whole = Family(net, images)._cell
-    part = _Part(whole, halved(images), 1 << 30, "float32", False)
+    part = _Part(whole, halved(images), 1 << 30, "float32", len(net.nodes))
     slopes, offsets = part.image.slopes.reshape(4, 2, -1, 2), part.image.offsets.reshape(4, 2, -1)
     assert whole.known
     for index, known in whole.known.items():
@@ -145,7 +145,7 @@ def test_parts_gain_by_rows_of_the_whole(tmp_path: Path) -> None:
         assert np.array_equal(whole.lower, bound_outputs(net, images, rows, offset).lower)
         alone = bound_outputs(net, parts, rows, offset).lower
         shared = family.parts(parts, rows, offset).lower
-        fresh = family.parts(parts, rows, offset, fresh=True).lower
+        fresh = family.parts(parts, rows, offset, fresh="all").lower
         gains.append(np.mean(shared - whole.lower) / np.mean(alone - whole.lower))
         own.append(np.mean(fresh - whole.lower) / np.mean(alone - whole.lower))
     assert np.mean(gains) > 0.5
@@ -284,8 +284,8 @@ class Shared:
         self.model.asked.append(("whole", 1))
         return self.model._lost(self.images, query)
 
-    def parts(self, images: ImageSets, query: Query, *, fresh: bool = False) -> Any:
-        self.model.asked.append(("fresh" if fresh else "shared", images.count))
+    def parts(self, images: ImageSets, query: Query, *, fresh: Fresh = "last") -> Any:
+        self.model.asked.append((fresh, images.count))
         return self.model._lost(images, query)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from dataclasses import replace
 from fractions import Fraction
 from pathlib import Path
 
@@ -15,6 +16,7 @@ from ns_abstract.io.errors import InputError
 from ns_abstract.verify.network import ImageSets, Network, NetworkArithmetic, bound_outputs, load_network, schedule
 from ns_abstract.verify.network import bounds as module
 from ns_abstract.verify.network.layers import Convolution
+from ns_abstract.verify.network.rows import columns_of, concretize
 
 Vector = list[Fraction]
 SHAPE = (2, 4, 4)
@@ -466,3 +468,70 @@ def test_float32_rounding_is_needed(tmp_path: Path, monkeypatch: pytest.MonkeyPa
         broken[charged] = int((lower > y @ rows.T).sum())
     assert broken[True] == 0
     assert broken[False] > 0
+
+
+@pytest.mark.parametrize("tilted", [False, True])
+@pytest.mark.parametrize("window", [(3, 3), (2, 11), (5, 13)])
+def test_rows_are_bounded_on_windows_as_on_maps(window: tuple[int, int], tilted: bool) -> None:
+    """Sums of rows over windows that lie partly outside, against exact ones; what lies beside them plays no part."""
+    rng = np.random.default_rng(sum(window))
+    (h, w), (m, d, channels, height, width), count = window, (2, 3, 2, 5, 13), 12
+    value = rng.normal(size=(count, channels, h, w)).astype(np.float32)
+    whole = (h, w) == (height, width)
+    y, x = (
+        np.zeros(count, np.int64) if whole else rng.integers(1 - n, size, count)
+        for n, size in ((h, height), (w, width))
+    )
+    cell = rng.integers(0, m, count)
+    shape = (m, 2, channels, height, width)
+    slopes, offsets = rng.normal(size=(*shape, d)), np.sort(rng.normal(size=shape), axis=1)
+    if not tilted:
+        slopes[:, 1] = slopes[:, 0]
+    lower, upper = offsets[:, 0] - 0.1, offsets[:, 1] + 0.1
+    # a number that no row reaches
+    reached = np.zeros((m, height, width), bool)
+    for k in range(count):
+        reached[cell[k], max(0, y[k]) : max(0, y[k] + h), max(0, x[k]) : max(0, x[k] + w)] = True
+    for array in (offsets[:, 1], upper):
+        array.transpose(0, 2, 3, 1)[~reached] = np.inf
+    total = np.sort(rng.normal(size=(count, 2)), axis=1)
+    plane, box = np.zeros((count, 2, d + 1)), np.zeros((count, 2))
+    concretize(value, y, x, cell, columns_of(slopes, offsets, lower, upper), total, plane, box)
+    assert np.isfinite(plane).all() and np.isfinite(box).all()
+    for k in range(count):
+        sums = [[Fraction(float(v)) for v in total[k]] for _ in range(2)]
+        steep = [[Fraction(0)] * d for _ in range(2)]
+        for c, i, j in itertools.product(range(channels), range(h), range(w)):
+            at = (c, i + y[k], j + x[k])
+            if not (0 <= at[1] < height and 0 <= at[2] < width):
+                continue
+            a = Fraction(float(value[k, c, i, j]))
+            for side in range(2):
+                # what is below a number is above its negative
+                other = side if a > 0 else 1 - side
+                sums[0][side] += a * Fraction(float(offsets[(cell[k], other, *at)]))
+                sums[1][side] += a * Fraction(float((lower, upper)[other][(cell[k], *at)]))
+                for l in range(d):
+                    steep[side][l] += a * Fraction(float(slopes[(cell[k], other, *at)][l]))
+        for side, sign in ((0, 1), (1, -1)):
+            lost = [
+                sign * (Fraction(found) - exact)
+                for found, exact in zip(plane[k, side, :d].tolist(), steep[side], strict=True)
+            ]
+            room = sign * (sums[0][side] - Fraction(float(plane[k, side, d])))
+            assert sum(abs(v) for v in lost) <= room <= Fraction(2.0**-18)
+            assert 0 <= sign * (sums[1][side] - Fraction(float(box[k, side]))) <= Fraction(2.0**-18)
+
+
+@pytest.mark.parametrize(("size", "stride"), [(3, 2), (2, 3), (1, 2), (4, 4), (5, 2)])
+def test_transposed_strides(size: int, stride: int, tmp_path: Path) -> None:
+    """Rows on a strided convolution's output become rows on its input: exact for small whole numbers."""
+    f = OnnxFile((2, 11, 9), size)
+    f.conv(2, 3, size, strides=[stride, stride])
+    net = load_network(f.write(tmp_path / "strided.onnx"))
+    layer = next(node.layer for node in net.nodes if isinstance(node.layer, Convolution))
+    rng = np.random.default_rng(size)
+    value = torch.from_numpy(rng.integers(-8, 9, (5, 3, 3, 2)).astype(np.float32))
+    weight = torch.from_numpy(rng.integers(-8, 9, tuple(layer.weight.shape)).astype(np.float64))
+    found = replace(layer, weight=weight)._transposed(value)
+    assert torch.equal(found, torch.nn.functional.conv_transpose2d(value, weight.float(), stride=stride))

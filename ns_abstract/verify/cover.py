@@ -8,7 +8,7 @@ wider set, over which the network is bounded once, and its rows serve for each o
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Protocol
 
@@ -19,7 +19,7 @@ from ns_abstract.geometry.box import ParameterBox
 from ns_abstract.verify.properties import Claim
 
 if TYPE_CHECKING:
-    from ns_abstract.verify.network import ImageSets, OutputBounds
+    from ns_abstract.verify.network import Fresh, ImageSets, OutputBounds
     from ns_abstract.verify.properties import Query
     from ns_abstract.verify.search import Model, Scene
 
@@ -36,10 +36,9 @@ _FAMILY = 3
 _DEEP, _MORE = 3, 2.0
 #: Most halvings of a cell that is too wide to be covered at once.
 _CUTS = 6
-#: Multiples of the margin by which neighbours may miss a proof for their rows to prove parts, and for what these leave
-#: open to be worth rows of its own.
-_SHARED, _FRESH = 1.5, 10.0
-#: What the aim is multiplied by where neighbours are proved together, and where some part is not.
+#: Multiples of the margin by which neighbours may miss a proof for their rows to prove parts.
+_FRESH = 10.0
+#: The aim is so much more at least than parts cost that are proved together, and so much less where some part is not.
 _EASY, _HARD = 1.1, 0.85
 #: Room for rounding of the joined sets: a few operations on each term.
 _ROOM = 2.0**-44
@@ -52,7 +51,7 @@ class SharedBounds(Protocol):
         """Bounds of the query's rows over the cell."""
         ...
 
-    def parts(self, images: ImageSets, query: Query, *, fresh: bool = False) -> OutputBounds:
+    def parts(self, images: ImageSets, query: Query, *, fresh: Fresh = "last") -> OutputBounds:
         """The same over its parts."""
         ...
 
@@ -255,21 +254,75 @@ class Cover:
         parts = [node]
         for axis in plan:
             parts = [half for part in parts for half in part.halves(axis)]
-        kept: list[_Node] = []
-        for part in parts:
-            box = work.feasible(part.box)
-            if box is None:
-                work.done += part.share
-            else:
-                kept.append(replace(part, box=box))
+        kept = self._feasible(work, parts)
         if kept:
             self._family(work, kept)
+
+    def _feasible(self, work: _Work, nodes: Iterable[_Node]) -> list[_Node]:
+        """What the poses of the cell leave of them; what holds none is done with."""
+        kept: list[_Node] = []
+        for node in nodes:
+            box = work.feasible(node.box)
+            if box is None:
+                work.done += node.share
+            else:
+                kept.append(replace(node, box=box))
+        return kept
 
     def _family(self, work: _Work, nodes: list[_Node]) -> None:
         """Prove neighbouring parts.
 
         Raises:
             _StoppedError: It takes too many parts, or one cannot be proved.
+        """
+        parts = self._bounded(work, nodes)
+        costs = [work.weights.loss(sets) for sets in parts]
+        margins = np.full(len(parts), -np.inf)
+        whole, rows = joined(parts), None
+        if len(parts) > 1 and work.weights.loss(whole) < _TOGETHER * work.aim:
+            rows = self.sharing.family(self._images([whole]))
+            margin = float(self._proved(work, rows.whole(work.query), [whole])[0])
+            margins[:] = margin
+            if margin > 0.0:
+                # what cost so much was not too much
+                work.aim = max(work.aim, _EASY * float(np.mean(costs)))
+            elif margin < -_FRESH * work.weights.margin:
+                # rows of a whole that is so far from a proof prove nothing for its parts
+                rows = None
+            else:
+                margins = self._by_rows(work, rows, parts)
+            if not (margins > 0.0).all():
+                work.aim *= _HARD
+        else:
+            left = [k for k, cost in enumerate(costs) if cost < _ALONE * work.aim]
+            if left:
+                chosen = [parts[k] for k in left]
+                margins[left] = self._proved(work, self.model.bound(self._images(chosen), work.query), chosen)
+        for k, node in self._left(work, nodes, margins):
+            effects = work.weights.effects(parts[k])
+            # as expensive as what fails
+            rest = _Node(node.box, effects, max(costs[k], work.aim), node.share, node.depth + 1)
+            if rows is None:
+                self._all(work, rest)
+            else:
+                self._halved(work, rows, rest)
+
+    def _halved(self, work: _Work, rows: SharedBounds, node: _Node) -> None:
+        """Prove a part that nearly was, by the rows that it nearly was proved by.
+
+        Raises:
+            _StoppedError: It takes too many parts, or one cannot be proved.
+        """
+        halves = self._feasible(work, node.halves(int(np.argmax(node.effects))))
+        parts = self._bounded(work, halves)
+        for _, half in self._left(work, halves, self._by_rows(work, rows, parts)):
+            self._all(work, replace(half, depth=node.depth + 1))
+
+    def _bounded(self, work: _Work, nodes: Sequence[_Node]) -> list[PictureSets]:
+        """Sets of parts.
+
+        Raises:
+            _StoppedError: There are too many, or one has none.
         """
         work.parts += len(nodes)
         expected = work.parts / max(work.done, 1e-9)
@@ -281,50 +334,30 @@ class Cover:
             if sets is None:
                 raise _StoppedError
             parts.append(sets)
-        costs = [work.weights.loss(sets) for sets in parts]
+        return parts
+
+    def _left(self, work: _Work, nodes: Sequence[_Node], margins: np.ndarray) -> list[tuple[int, _Node]]:
+        """Those of ``nodes`` that have no proof, by number; the others are done with.
+
+        Raises:
+            _StoppedError: One cannot be cut any further.
+        """
+        work.margins += [float(margin) for margin in margins if margin > 0.0]
+        work.done += sum(node.share for node, margin in zip(nodes, margins, strict=True) if margin > 0.0)
+        left = [(k, node) for k, node in enumerate(nodes) if not margins[k] > 0.0]
+        if any(node.depth >= _DEEP for _, node in left):
+            raise _StoppedError
+        return left
+
+    def _by_rows(self, work: _Work, rows: SharedBounds, parts: Sequence[PictureSets]) -> np.ndarray:
+        """[m] margins of parts of a whole that is not proved, by its rows and by some of their own."""
         margins = np.full(len(parts), -np.inf)
-        whole = joined(parts)
-        if len(parts) > 1 and work.weights.loss(whole) < _TOGETHER * work.aim:
-            margins[:] = self._shared(work, parts, whole)
-        else:
-            left = [k for k, cost in enumerate(costs) if cost < _ALONE * work.aim]
+        for fresh in ("last", "all"):
+            left = np.flatnonzero(~(margins > 0.0)).tolist()
             if left:
                 chosen = [parts[k] for k in left]
-                margins[left] = self._proved(work, self.model.bound(self._images(chosen), work.query), chosen)
-        work.margins += [float(margin) for margin in margins if margin > 0.0]
-        for k, node in enumerate(nodes):
-            if margins[k] > 0.0:
-                work.done += node.share
-            elif node.depth == _DEEP:
-                self._give_up()
-            else:
-                effects = work.weights.effects(parts[k])
-                # as expensive as what fails
-                cost = max(costs[k], work.aim)
-                self._all(work, _Node(node.box, effects, cost, node.share, node.depth + 1))
-
-    def _give_up(self) -> None:
-        raise _StoppedError
-
-    def _shared(self, work: _Work, parts: Sequence[PictureSets], whole: PictureSets) -> np.ndarray:
-        """[m] margins of neighbours, those of the whole first."""
-        here = work.weights.margin
-        shared = self.sharing.family(self._images([whole]))
-        margin = float(self._proved(work, shared.whole(work.query), [whole])[0])
-        margins = np.full(len(parts), margin)
-        if margin > 0.0:
-            work.aim *= _EASY
-            return margins
-        # rows of a whole that is so far from a proof prove nothing for its parts
-        for fresh, worst in ((False, _SHARED), (True, _FRESH)):
-            left = np.flatnonzero(~(margins > 0.0)).tolist()
-            if not left or margin < -worst * here:
-                continue
-            chosen = [parts[k] for k in left]
-            bounds = shared.parts(self._images(chosen), work.query, fresh=fresh)
-            margins[left] = self._proved(work, bounds, chosen)
-        if not (margins > 0.0).all():
-            work.aim *= _HARD
+                bounds = rows.parts(self._images(chosen), work.query, fresh=fresh)
+                margins[left] = self._proved(work, bounds, chosen)
         return margins
 
     def _images(self, parts: Sequence[PictureSets]) -> ImageSets:

@@ -12,6 +12,7 @@ import torch
 
 from ns_abstract.verify.network import (
     Family,
+    Fresh,
     ImageSets,
     Network,
     NetworkArithmetic,
@@ -111,7 +112,7 @@ class ModelFamily:
     def whole(self, query: Query) -> OutputBounds:
         return self.family.whole(query.rows, query.offset)
 
-    def parts(self, images: ImageSets, query: Query, *, fresh: bool = False) -> OutputBounds:
+    def parts(self, images: ImageSets, query: Query, *, fresh: Fresh = "last") -> OutputBounds:
         return self.family.parts(images, query.rows, query.offset, fresh=fresh)
 
 

@@ -18,7 +18,18 @@ from ns_abstract.verify.network.layers import Activation, Convolution, LeakyRelu
 from ns_abstract.verify.network.maps import TransposedConvolution
 from ns_abstract.verify.network.maxima import Candidates, MaxPool, upper_planes
 from ns_abstract.verify.network.products import Product
-from ns_abstract.verify.network.rows import Rows, charge, concretize, full, grid, join, pass_activation, pass_maximum
+from ns_abstract.verify.network.rows import (
+    Columns,
+    Rows,
+    charge,
+    columns_of,
+    concretize,
+    full,
+    grid,
+    join,
+    pass_activation,
+    pass_maximum,
+)
 from ns_abstract.verify.network.schedule import Schedule, on_threads
 from ns_abstract.verify.network.slopes import Ascent, Chosen, Held, OpenUnits, derivatives
 
@@ -269,7 +280,7 @@ class _Cells:
         #: nodes whose rounding is in that of their only reader
         self.folded: set[int] = set()
         #: what rows may stop at
-        self.stops: dict[int, _Planes] = {}
+        self.stops: dict[int, Columns] = {}
         #: part of the latest ReLU's inputs whose signs have not been found out
         self.unsure = 0.0
         self.last = self._forward()
@@ -303,6 +314,7 @@ class _Cells:
             np.ascontiguousarray(lower).reshape(self.count, *shape),
             np.ascontiguousarray(upper).reshape(self.count, *shape),
         )
+        self.columns = columns_of(*self.image)
 
     def _image(self) -> _Form:
         """The image as a form: the middle of its planes."""
@@ -726,7 +738,7 @@ class _Cells:
             closed += int((above <= 0.0).sum())
         return closed
 
-    def _stop(self, index: int, form: _Form) -> _Planes:
+    def _stop(self, index: int, form: _Form) -> Columns:
         """What is known of node ``index``, for rows that arrive there."""
         m, d, shape = self.count, self.d, grid(self.network.shape(index))
         room = 2.0**-48 * (form.c.abs() + form.r)
@@ -734,7 +746,7 @@ class _Cells:
         offsets = torch.stack([form.c - form.r - room, form.c + form.r + room], 1)
         sizes = (m, 2, *shape, d), (m, 2, *shape), (m, *shape), (m, *shape)
         found = zip((slopes, offsets, form.lower, form.upper), sizes, strict=True)
-        return _Planes(*(t.reshape(size).contiguous().numpy() for t, size in found))
+        return columns_of(*(t.reshape(size).numpy() for t, size in found))
 
     def _known_better(
         self, index: int, form: _Form, open_: Tensor, apart: Tensor | None, layer: Activation | None = None
@@ -990,9 +1002,9 @@ class _Cells:
             # what is bounded next goes through the same memory
             value = whole.value.reshape(len(batch.cell), -1).copy()
             batch.arrived.append(_Arrived(batch.number, value, batch.total.copy()))
-        self._bound_rows(0, batch, self.image, found)
+        self._bound_rows(0, batch, self.columns, found)
 
-    def _bound_rows(self, at: int, batch: _Batch, planes: _Planes, found: _Reached) -> None:
+    def _bound_rows(self, at: int, batch: _Batch, known: Columns, found: _Reached) -> None:
         """Bounds of a batch whose rows are all on node ``at``."""
         count = len(batch.cell)
         plane, box = np.zeros((count, 2, self.d + 1)), np.zeros((count, 2))
@@ -1000,7 +1012,7 @@ class _Cells:
         if rows is None:
             plane[:, :, -1] = box[:] = batch.total
         else:
-            concretize(rows.value, rows.y, rows.x, batch.cell, *planes, total=batch.total, plane=plane, box=box)
+            concretize(rows.value, rows.y, rows.x, batch.cell, known, batch.total, plane, box)
         lost = self.flush[batch.cell][:, None] * np.array([-1.0, 1.0])
         plane[:, :, -1] += lost
         box += lost

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -32,6 +32,10 @@ _ROWS_SHARE = 0.25
 #: Room for rounding of a few sums in float64.
 _ROOM = 2.0**-46
 
+#: Of which numbers, if the whole's rows leave them open, a part's own rows are passed back: of those before the last
+#: activation or product, or before all.
+Fresh = Literal["last", "all"]
+
 
 class Family:
     """Bounds of one cell, and of its parts by the rows that were passed back for the whole.
@@ -56,13 +60,13 @@ class Family:
         """Lower bounds of ``rows @ y + offset`` over the cell."""
         return self._cell.outputs(rows, np.asarray(offset, np.float64))
 
-    def parts(self, images: ImageSets, rows: Any, offset: Float64, *, fresh: bool = False) -> OutputBounds:
+    def parts(self, images: ImageSets, rows: Any, offset: Float64, *, fresh: Fresh = "last") -> OutputBounds:
         """Lower bounds of ``rows @ y + offset`` over parts of the cell.
 
         Args:
             images: m sets, each in parameters of its own, of images that obey those of the whole as well.
             rows, offset: As in `ns_abstract.verify.network.bound_outputs`.
-            fresh: Whether rows of the part's own are passed back for what those of the whole leave open.
+            fresh: What has rows of the part's own.
         """
         offset = np.asarray(offset, np.float64)
         if not self._cell.good[0]:
@@ -70,9 +74,10 @@ class Family:
         shapes = [self.network.shape(k) for k in range(len(self.network.nodes) + 1)]
         by_cell = sum(int(np.prod(shape)) for shape in shapes) * 8 * (3 * images.dimensions + 14)
         step = max(1, int(0.25 * self.memory) // by_cell)
+        own = max(self._cell.ranges, default=0) if fresh == "last" else 0
         found = []
         for first in range(0, images.count, step):
-            part = _Part(self._cell, images[first : first + step], self.memory, self.arithmetic, fresh)
+            part = _Part(self._cell, images[first : first + step], self.memory, self.arithmetic, own)
             found.append(part.outputs(rows, offset))
         return OutputBounds(*(np.concatenate([getattr(part, name) for part in found]) for name in ("lower", "a", "b")))
 
@@ -136,12 +141,13 @@ class _Whole(_Cells):
 
 
 class _Part(_Cells):
-    """Parts of a cell: rows of the whole are evaluated on their sets (N15)."""
+    """Parts of a cell: rows of the whole are evaluated on their sets (N15).
 
-    def __init__(
-        self, whole: _Whole, images: ImageSets, memory: int, arithmetic: NetworkArithmetic, fresh: bool
-    ) -> None:
-        self.whole, self.fresh = whole, fresh
+    From node ``own`` on, rows of the part's own are passed back for what these leave open.
+    """
+
+    def __init__(self, whole: _Whole, images: ImageSets, memory: int, arithmetic: NetworkArithmetic, own: int) -> None:
+        self.whole, self.own = whole, own
         self._columns: tuple[NDArray[np.float32], NDArray[np.float32]] | None = None
         super().__init__(whole.network, images, "everywhere", memory, arithmetic)
 
@@ -187,7 +193,7 @@ class _Part(_Cells):
         self, index: int, form: _Form, open_: Tensor, apart: Tensor | None, layer: Activation | None = None
     ) -> _Form:
         form = self._inherited(index, form)
-        if not self.fresh:
+        if index < self.own:
             return form
         if layer is not None:
             open_, apart = layer.open(*form.interval), layer.apart(*form.interval)

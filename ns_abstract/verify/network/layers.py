@@ -21,7 +21,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from ns_abstract.verify.network.rows import Rows, full, grid, unflatten
+from ns_abstract.verify.network.rows import Rows, full, grid, interleave, unflatten
 
 Shape = tuple[int, ...]
 #: Room for rounding of the lines of an activation, computed with float64: a few operations.
@@ -134,14 +134,11 @@ class Convolution(Linear):
             found[:, :, ::s, ::t] = near
             return found
         high, wide = phases.shape[2:]
-        found = functional.conv2d(value, phases, padding=(high - 1, wide - 1))
-        h, w = found.shape[2:]
-        found = found.reshape(-1, s, t, self.weight.shape[1], h, w).permute(0, 3, 4, 1, 5, 2)
-        whole = found.reshape(-1, self.weight.shape[1], h * s, w * t)
-        down, right = (value.shape[2] - 1) * s + kh, (value.shape[3] - 1) * t + kw
-        # a kernel smaller than its stride leaves its last rows out
-        whole = functional.pad(whole, (0, max(0, right - w * t), 0, max(0, down - h * s)))
-        return whole[:, :, :down, :right].contiguous()
+        found = functional.conv2d(value, phases, padding=(high - 1, wide - 1)).numpy()
+        size = (value.shape[2] - 1) * s + kh, (value.shape[3] - 1) * t + kw
+        whole = np.empty((len(value), self.weight.shape[1], *size), np.float32)
+        interleave(found, s, t, whole)
+        return torch.from_numpy(whole)
 
     def roundings(self, active: Sequence[Tensor]) -> Tensor | int:
         out, taps = self.weight.shape[0] // self.groups, self.weight[0].numel()

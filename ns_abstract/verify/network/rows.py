@@ -8,14 +8,17 @@ are set to zero by whatever passes next.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from ns_abstract.arithmetic.simd.intrinsics import pointer
+from ns_abstract.arithmetic.elementary import fma
+from ns_abstract.arithmetic.simd.intrinsics import advanced, pointer
+from ns_abstract.arithmetic.simd.lanes import load8, store, where
 
 Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
@@ -116,6 +119,30 @@ def _place(value, y, x, target):
             for i in range(max(0, -y[r]), min(h, H - y[r])):
                 for j in range(first, past):
                     target[r, c, y[r] + i, x[r] + j] = value[r, c, i, j]
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def interleave(parts, s, t, whole):
+    """Put the ``s t`` parts of a transposed stride together.
+
+    Args:
+        parts: [R, s t C, h', w'], part by part; row ``s i + a`` and column ``t j + b`` of the whole is number i, j of
+            part ``t a + b``.
+        s, t: The stride.
+        whole: [R, C, h, w], h <= s h' and w <= t w'.
+    """
+    count, channels, h, w = whole.shape
+    high, wide = parts.shape[2:]
+    source, target = pointer(parts), pointer(whole)
+    for r in range(count):
+        for c in range(channels):
+            for y in range(h):
+                i, a = y // s, y % s
+                here = ((r * channels + c) * h + y) * w
+                for b in range(t):
+                    at = ((r * s * t * channels + (a * t + b) * channels + c) * high + i) * wide
+                    for j in range(-(-(w - b) // t)):
+                        target[here + b + t * j] = source[at + j]
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
@@ -282,59 +309,119 @@ def charge(value, y, x, cell, noise, total):
         total[r, 1] += shaken
 
 
+class Columns(NamedTuple):
+    """What is known of the numbers of a node, as `concretize` takes it (design.md, N5).
+
+    Attributes:
+        values: [m K C H W + 8]: for each cell the middles of the planes' slopes and offsets [d + 1] and of the
+            intervals, half of what offsets and intervals are apart, sizes of all that is added up, and half of what
+            slopes are apart [d] unless no planes are; the numbers behind the end are there to be read.
+        count: K.
+        height, width: H, W.
+    """
+
+    values: Float64
+    count: int
+    height: int
+    width: int
+
+
+def columns_of(slopes: Float64, offsets: Float64, lower: Float64, upper: Float64) -> Columns:
+    """The `Columns` of planes and intervals.
+
+    Args:
+        slopes: [m, 2, C, H, W, d] of the lower and upper planes.
+        offsets: [m, 2, C, H, W].
+        lower, upper: [m, C, H, W].
+    """
+    m, d, shape = slopes.shape[0], slopes.shape[-1], offsets.shape[2:]
+    apart = slopes[:, 1] - slopes[:, 0]
+    tilted = bool(apart.any())
+    count = d + 5 + (d if tilted else 0)
+    values = np.zeros(m * count * math.prod(shape) + 8)
+    found = values[:-8].reshape(m, count, *shape)
+    found[:, :d] = np.moveaxis(0.5 * slopes[:, 0] + 0.5 * slopes[:, 1], -1, 1)
+    found[:, d], found[:, d + 1] = 0.5 * offsets.sum(1), 0.5 * (lower + upper)
+    found[:, d + 2], found[:, d + 3] = 0.5 * (offsets[:, 1] - offsets[:, 0]), 0.5 * (upper - lower)
+    found[:, d + 4] = np.abs(offsets).sum(1) + np.abs(slopes).sum((1, -1)) + np.abs(lower) + np.abs(upper)
+    if tilted:
+        found[:, d + 5 :] = np.moveaxis(0.5 * apart, -1, 1)
+    return Columns(values, count, shape[1], shape[2])
+
+
 @njit(cache=True, error_model="numpy", nogil=True)
-def concretize(value, y, x, cell, slopes, offsets, lower, upper, total, plane, box):
+def _add_run(tape, n, column, here, step, columns, signed, sums):
+    """Add ``n`` coefficients [tape] times their columns to ``sums`` [columns, 8]; signs count in the first ``signed``.
+
+    The tape ends with zeros; 0 times what lies behind the run is nothing.
+    """
+    last = n - n % 8
+    for k in range(columns):
+        at = here + k * step
+        total = load8(sums, 8 * k)
+        if k < signed:
+            for j in range(0, last, 8):
+                total = fma(load8(tape, j), load8(column, at + j), total)
+        else:
+            for j in range(0, last, 8):
+                total = fma(abs(load8(tape, j)), load8(column, at + j), total)
+        if last < n:
+            a = load8(tape, last)
+            product = (a if k < signed else abs(a)) * load8(column, at + last)
+            total = total + where(a != 0.0, product, 0.0)
+        store(sums, 8 * k, total)
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def concretize(value, y, x, cell, known, total, plane, box):
     """Bounds of rows on a node of which planes and intervals are known (N5).
 
     Args:
         value, y, x, cell: Rows.
-        slopes: [m, 2, C, H, W, d] of the lower and upper planes.
-        offsets: [m, 2, C, H, W].
-        lower, upper: [m, C, H, W].
+        known: `Columns` of the node.
         total: [R, 2] what the rows gathered on their way.
         plane: [R, 2, d + 1] becomes slopes and offset of planes below and above.
-        box: [R, 2] becomes a lower and an upper bound from ``lower`` and ``upper`` alone.
+        box: [R, 2] becomes a lower and an upper bound from the intervals alone.
     """
     count, channels, h, w = value.shape
-    H, W, d = slopes.shape[3:]
+    H, W, columns, d = known.height, known.width, known.count, plane.shape[2] - 1
     size = channels * H * W
-    rows, slope, offset = pointer(value), pointer(slopes), pointer(offsets)
-    least, most = pointer(lower), pointer(upper)
-    sums_ = np.empty((2, d))
-    sums = pointer(sums_)
+    rows, column = pointer(value), pointer(known.values)
+    whole = h == H and w == W
+    # lanes by column, then coefficients of a run
+    memory = np.empty(8 * columns + (size if whole else w) + 8)
+    sums = pointer(memory)
+    tape = advanced(sums, 8 * columns)
     for r in range(count):
-        top, left, whole = y[r], x[r], 2 * size * cell[r]
-        first, past = max(0, -left), min(w, W - left)
-        below, above, low, high, total_size = 0.0, 0.0, 0.0, 0.0, 0.0
-        sums_[:] = 0.0
-        for c in range(channels):
-            for i in range(max(0, -top), min(h, H - top)):
-                at = ((r * channels + c) * h + i) * w
-                here = (c * H + top + i) * W + left
-                for j in range(first, past):
-                    a = np.float64(rows[at + j])
-                    # the plane below for positive coefficients, the one above for others, without a branch
-                    other = size * np.int64(a <= 0.0)
-                    one = whole + other + here + j
-                    two = whole + (size - other) + here + j
-                    b0, b1 = a * offset[one], a * offset[two]
-                    below += b0
-                    above += b1
-                    reached = abs(b0) + abs(b1)
-                    for l in range(d):
-                        s0, s1 = a * slope[one * d + l], a * slope[two * d + l]
-                        sums[l] += s0
-                        sums[d + l] += s1
-                        reached += abs(s0) + abs(s1)
-                    k = size * cell[r] + here + j
-                    e0, e1 = a * least[k], a * most[k]
-                    low += min(e0, e1)
-                    high += max(e0, e1)
-                    total_size += reached + abs(e0) + abs(e1)
-        for l in range(d):
-            plane[r, 0, l] += sums[l]
-            plane[r, 1, l] += sums[d + l]
+        top, left, cells = y[r], x[r], cell[r] * columns * size
+        memory[: 8 * columns] = 0.0
+        if whole and top == 0 and left == 0:
+            for j in range(size):
+                tape[j] = np.float64(rows[r * size + j])
+            for j in range(size, size + 8):
+                tape[j] = 0.0
+            _add_run(tape, size, column, cells, size, columns, d + 2, sums)
+        else:
+            first, past = max(0, -left), min(w, W - left)
+            n = max(0, past - first)
+            for c in range(channels):
+                for i in range(max(0, -top), min(h, H - top)):
+                    at = ((r * channels + c) * h + i) * w + first
+                    for j in range(n):
+                        tape[j] = np.float64(rows[at + j])
+                    for j in range(n, n + 8):
+                        tape[j] = 0.0
+                    here = cells + (c * H + top + i) * W + left + first
+                    _add_run(tape, n, column, here, size, columns, d + 2, sums)
+        for k in range(columns):
+            low = (sums[8 * k] + sums[8 * k + 1]) + (sums[8 * k + 2] + sums[8 * k + 3])
+            sums[k] = low + ((sums[8 * k + 4] + sums[8 * k + 5]) + (sums[8 * k + 6] + sums[8 * k + 7]))
+        for k in range(d):
+            apart = sums[d + 5 + k] if columns > d + 5 else 0.0
+            plane[r, 0, k] += sums[k] - apart
+            plane[r, 1, k] += sums[k] + apart
         # sums of at most 2^24 products
-        room = 2.0**-28 * total_size + 2.0**-48 * (abs(total[r, 0]) + abs(total[r, 1]))
-        plane[r, 0, d], box[r, 0] = total[r, 0] + below - room, total[r, 0] + low - room
-        plane[r, 1, d], box[r, 1] = total[r, 1] + above + room, total[r, 1] + high + room
+        room = 2.0**-28 * sums[d + 4] + 2.0**-48 * (abs(total[r, 0]) + abs(total[r, 1]))
+        least, most = total[r, 0] - room, total[r, 1] + room
+        plane[r, 0, d], plane[r, 1, d] = least + (sums[d] - sums[d + 2]), most + (sums[d] + sums[d + 2])
+        box[r, 0], box[r, 1] = least + (sums[d + 1] - sums[d + 3]), most + (sums[d + 1] + sums[d + 3])
