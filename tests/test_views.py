@@ -15,9 +15,11 @@ from torch import nn
 import ns_abstract as nsa
 from ns_abstract.demo.airfield import airfield
 from ns_abstract.demo.paths import airfield_orbit
+from ns_abstract.demo.writing import write_demo
 from ns_abstract.geometry.poses import PoseSet
 from ns_abstract.methods.splat.method import SplatMethod
 from ns_abstract.perturbation.specification import Perturbation
+from ns_abstract.verify.cover import Cover, Covered
 from ns_abstract.verify.model import NetworkModel
 from ns_abstract.verify.network import load_network
 from ns_abstract.verify.preprocess import Preprocess
@@ -203,3 +205,30 @@ def test_a_part_is_certified(scripts: Any, name: str, tmp_path: Path) -> None:
     file, scene = NETWORKS / f"{row.network}.onnx", nsa.load_scene(config)
     line = scripts.certify.certify(name, part, file, scene, path, tmp_path / "row", 1.0, attacks=10)
     assert "| 100.0% | 100.0% | 1.000 |" in line and "10 / 0" in line
+
+
+@pytest.mark.parametrize(("name", "shift", "turn"), [("airfield, x", 0.01, 0.01), ("lawn, car", 0.03, 0.02)])
+def test_slanted_parts_of_an_estimator_and_a_detector(
+    scripts: Any, name: str, shift: float, turn: float, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Cells whose parts make up for a shift by a turn are proved, and no attack breaks them."""
+    covered: list[Covered] = []
+
+    def watched(self: Cover, *arguments: Any) -> Covered:
+        covered.append(prove(self, *arguments))
+        return covered[-1]
+
+    prove = Cover.prove
+    monkeypatch.setattr(Cover, "prove", watched)
+    row = scripts.certify.ROWS[name]
+    if row.scene == "airfield":
+        config, files = write_demo(tmp_path)
+        path = files["orbit"]
+    else:
+        config, path = scripts.objects.write_run(tmp_path, row.scene)
+    narrow = {"translation": {"x": shift}, "rotation": {"yaw": turn}}
+    part = scripts.certify.Row(row.network, row.scene, narrow, row.property, (16, 16))
+    file, scene = NETWORKS / f"{row.network}.onnx", nsa.load_scene(config)
+    line = scripts.certify.certify(name, part, file, scene, path, tmp_path / "row", 1.0, attacks=40)
+    assert "| 100.0% | 100.0% | 1.000 |" in line and "40 / 0" in line
+    assert any(found.margin is not None and found.parts > 1 for found in covered)
