@@ -23,23 +23,22 @@ if TYPE_CHECKING:
     from ns_abstract.verify.properties import Query
     from ns_abstract.verify.search import Model, Scene
 
-#: What a part's sets may cost (`Weights.cost`): what parts are cut for, times this the network is asked about one by
-#: itself, and about neighbours together; and the power of the width that it is about.
-_AIM, _ALONE, _TOGETHER, _POWER = 0.24, 1.8, 2.5, 1.6
+#: Times what parts are cut for, the network is asked about one by itself, and about neighbours together; and the power
+#: of the width that sets cost.
+_ALONE, _TOGETHER, _POWER = 1.8, 2.5, 1.6
 #: What the mean width of pixels costs, however little the margin's gradient says: signs of units become open by it.
-_OPENING = 18.0
+_OPENING = 42.0
 #: What a box may cost is foreseen by so small a part of it: wide ones show nothing.
-_PROBE = 8
+_PROBE = 4
 #: Halvings that make the parts of a family.
 _FAMILY = 3
 #: How often parts are cut again, and how many times more parts there may be than a cell should take.
 _DEEP, _MORE = 3, 2.0
 #: Most halvings of a cell that is too wide to be covered at once.
 _CUTS = 6
-#: Multiples of the margin by which neighbours may miss a proof for their rows to prove parts.
-_FRESH = 10.0
-#: The aim is so much more at least than parts cost that are proved together, and so much less where some part is not.
-_EASY, _HARD = 1.1, 0.85
+#: The aim is at least what parts cost that are proved together and so much of the margin left more, and at most so much
+#: of what they cost where neighbours are far from a proof.
+_EASY, _HARD = 0.6, 0.75
 #: Room for rounding of the joined sets: a few operations on each term.
 _ROOM = 2.0**-44
 
@@ -150,17 +149,29 @@ class _Work:
         query: What the network is asked.
         aim: What parts may cost, by what was found so far.
         parts: Parts that were bounded.
+        asked: Those of which the network was asked.
         done: What part of the box is proved, or holds no pose.
         margins: Lower bounds of the margin over what is proved.
+        dear: The least that parts cost of neighbours that were far from a proof.
     """
 
     feasible: Callable[[ParameterBox], ParameterBox | None]
     weights: Weights
     query: Query
-    aim: float = _AIM
+    aim: float
     parts: int = 0
+    asked: int = 0
     done: float = 0.0
     margins: list[float] = field(default_factory=list)
+    dear: float = math.inf
+
+    def learn(self, cost: float, margin: float, far: float) -> None:
+        """Take notice of what came of neighbours whose parts cost so much: a multiple of the margin."""
+        if margin < -far:
+            self.dear = min(self.dear, cost)
+            self.aim = min(self.aim, _HARD * cost)
+        elif margin > 0.0:
+            self.aim = min(max(self.aim, (1.0 + _EASY * margin) * cost), _HARD * self.dear)
 
 
 @dataclass(frozen=True)
@@ -194,6 +205,9 @@ class Cover:
         frame: From cells to boxes of these parameters.
         most: Most parts of a cell, about; one that would take more is cut first.
         block: Most cells that are examined together.
+        aim: What the sets of parts may cost of the margin (`Weights.loss`), at first.
+        far: Multiple of the margin by which neighbours may miss a proof for their rows to prove parts; where they miss
+            it by more there are smaller neighbours. What a cut gains is the less the more parameters there are.
     """
 
     scene: Scene
@@ -201,8 +215,10 @@ class Cover:
     sharing: SharingModel
     claim: Claim
     frame: Frame = straight
-    most: int = 16
+    most: int = 32
     block: int = 4
+    aim: float = 0.2
+    far: float = 1.3
 
     def prove(self, cell: ParameterBox, outputs: np.ndarray, weights: Weights) -> Covered:
         """Try to prove a cell, if it takes few enough parts.
@@ -221,9 +237,9 @@ class Cover:
         if found is None:
             return Covered(None, self._cuts(cell, root, None, 1.0), 0)
         cost, effects = weights.loss(found) * _PROBE**_POWER, weights.effects(found) * _PROBE
-        if 2 ** len(halvings(effects, cost, _FAMILY, _AIM, self.most)) > self.most:
+        if 2 ** len(halvings(effects, cost, _FAMILY, self.aim, self.most)) > self.most:
             return Covered(None, self._cuts(cell, root, effects, cost), 0)
-        work = _Work(feasible, weights, self.claim.query(outputs[None]))
+        work = _Work(feasible, weights, self.claim.query(outputs[None]), self.aim)
         try:
             self._all(work, _Node(root, effects, cost, 1.0, 0))
         except _StoppedError:
@@ -256,7 +272,7 @@ class Cover:
             parts = [half for part in parts for half in part.halves(axis)]
         kept = self._feasible(work, parts)
         if kept:
-            self._family(work, kept)
+            self._family(work, node, kept)
 
     def _feasible(self, work: _Work, nodes: Iterable[_Node]) -> list[_Node]:
         """What the poses of the cell leave of them; what holds none is done with."""
@@ -269,8 +285,8 @@ class Cover:
                 kept.append(replace(node, box=box))
         return kept
 
-    def _family(self, work: _Work, nodes: list[_Node]) -> None:
-        """Prove neighbouring parts.
+    def _family(self, work: _Work, node: _Node, nodes: list[_Node]) -> None:
+        """Prove the parts ``nodes`` of a box.
 
         Raises:
             _StoppedError: It takes too many parts, or one cannot be proved.
@@ -280,32 +296,41 @@ class Cover:
         margins = np.full(len(parts), -np.inf)
         whole, rows = joined(parts), None
         if len(parts) > 1 and work.weights.loss(whole) < _TOGETHER * work.aim:
+            work.asked += len(parts)
             rows = self.sharing.family(self._images([whole]))
-            margin = float(self._proved(work, rows.whole(work.query), [whole])[0])
-            margins[:] = margin
-            if margin > 0.0:
-                # what cost so much was not too much
-                work.aim = max(work.aim, _EASY * float(np.mean(costs)))
-            elif margin < -_FRESH * work.weights.margin:
-                # rows of a whole that is so far from a proof prove nothing for its parts
-                rows = None
-            else:
+            margin = float(self._proved(work, rows.whole(work.query), [whole])[0]) / work.weights.margin
+            work.learn(float(np.mean(costs)), margin, self.far)
+            if margin < -self.far:
+                # rows of what is so far from a proof prove little: smaller neighbours
+                self._apart(work, node)
+                return
+            margins[:] = margin * work.weights.margin
+            if not margin > 0.0:
                 margins = self._by_rows(work, rows, parts)
-            if not (margins > 0.0).all():
-                work.aim *= _HARD
         else:
             left = [k for k, cost in enumerate(costs) if cost < _ALONE * work.aim]
             if left:
                 chosen = [parts[k] for k in left]
                 margins[left] = self._proved(work, self.model.bound(self._images(chosen), work.query), chosen)
-        for k, node in self._left(work, nodes, margins):
+        for k, part in self._left(work, nodes, margins):
             effects = work.weights.effects(parts[k])
             # as expensive as what fails
-            rest = _Node(node.box, effects, max(costs[k], work.aim), node.share, node.depth + 1)
+            rest = _Node(part.box, effects, max(costs[k], work.aim), part.share, part.depth + 1)
             if rows is None:
                 self._all(work, rest)
             else:
                 self._halved(work, rows, rest)
+
+    def _apart(self, work: _Work, node: _Node) -> None:
+        """Prove the halves of a box whose parts are too different.
+
+        Raises:
+            _StoppedError: It takes too many parts, or one cannot be proved.
+        """
+        if node.depth >= _DEEP:
+            raise _StoppedError
+        for half in self._feasible(work, node.halves(int(np.argmax(node.effects)))):
+            self._all(work, replace(half, depth=node.depth + 1))
 
     def _halved(self, work: _Work, rows: SharedBounds, node: _Node) -> None:
         """Prove a part that nearly was, by the rows that it nearly was proved by.
@@ -325,8 +350,8 @@ class Cover:
             _StoppedError: There are too many, or one has none.
         """
         work.parts += len(nodes)
-        expected = work.parts / max(work.done, 1e-9)
-        if work.parts > _MORE * self.most or (work.parts > self.most // 2 and expected > _MORE * self.most):
+        late = work.asked > self.most // 2 and work.asked > _MORE * self.most * work.done
+        if late or work.parts > 2.0 * _MORE * self.most:
             raise _StoppedError
         parts: list[PictureSets] = []
         for node in nodes:
@@ -381,7 +406,7 @@ class Cover:
         d = cell.dimensions
         width = np.array(root.upper) - np.array(root.lower)
         effects = width if effects is None or not effects.any() else effects
-        goal = (_AIM / max(cost, _AIM)) ** (1.0 / _POWER) * float(effects.sum()) / d
+        goal = (self.aim / max(cost, self.aim)) ** (1.0 / _POWER) * float(effects.sum()) / d
         cuts = [1] * d
         for _ in range(_CUTS):
             if not always and self._parts(cell, width, effects, goal) <= math.log2(self.most) and max(cuts) > 1:
