@@ -846,7 +846,8 @@ class _Cells:
                 chosen, goal = open_.nonzero().numpy(), _Goal() if decides else None
         spared = self.spared
         found = self._bounded(index, form, chosen, goal, decides)
-        self.schedule.spares(self.spared - spared)
+        # where a sign is not all that is asked, every number has two rows
+        self.schedule.spares((self.spared - spared) * (1.0 if decides else 0.5))
         return found
 
     def _goal(self, form: _Form, products: float, layer: Activation | None) -> _Goal | None:
