@@ -17,12 +17,15 @@ import time
 import warnings
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
 from torch import nn
 from torch.nn import functional
+
+if TYPE_CHECKING:
+    from ns_abstract.verify.network import NetworkArithmetic
 
 ROWS = 10
 
@@ -457,8 +460,11 @@ def export(name: str, exporter: str, file: Path) -> tuple[int, ...]:
     return 3, side, side
 
 
-def measure(name: str, exporter: str, runs: int, width: float) -> dict[str, Any]:
-    """Everything about one network; runs in a process of its own."""
+def measure(name: str, exporter: str, runs: int, width: float, arithmetic: NetworkArithmetic) -> dict[str, Any]:
+    """Everything about one network; runs in a process of its own.
+
+    Bounds in real arithmetic are attacked by the network as it was read, in float64.
+    """
     import onnxruntime
 
     from ns_abstract.io.errors import InputError
@@ -496,7 +502,7 @@ def measure(name: str, exporter: str, runs: int, width: float) -> dict[str, Any]
         # the process's peak from here on
         Path("/proc/self/clear_refs").write_text("5")
         start = time.process_time()
-        bounds = bound_outputs(network, images, rows, np.zeros(2 * k))
+        bounds = bound_outputs(network, images, rows, np.zeros(2 * k), arithmetic=arithmetic)
         found["seconds"] = round(time.process_time() - start, 2)
         peak = next(v for v in Path("/proc/self/status").read_text().splitlines() if v.startswith("VmHWM"))
         found["GiB"] = round(int(peak.split()[1]) / 2**20, 2)
@@ -513,10 +519,13 @@ def measure(name: str, exporter: str, runs: int, width: float) -> dict[str, Any]
             p = rng.uniform(-1, 1, d) if done % 2 else rng.choice([-1.0, 1.0], d)
             t = rng.uniform(-1, 1, n) if done % 3 else rng.choice([-1.0, 1.0], n)
             middle = a[0] @ p + c[0]
-            x = (middle + 0.999 * float(ends[0]) * t).astype(np.float32)
+            x = middle + 0.999 * float(ends[0]) * t
             done += 1
-            outputs = session.run(None, {entry: x.reshape(1, *shape)})
-            y = rows @ np.concatenate([np.asarray(v).reshape(-1) for v in outputs]).astype(np.float64)
+            if arithmetic == "real":
+                y = rows @ network(torch.from_numpy(x).reshape(1, *shape))[0].numpy()
+            else:
+                outputs = session.run(None, {entry: x.astype(np.float32).reshape(1, *shape)})
+                y = rows @ np.concatenate([np.asarray(v).reshape(-1) for v in outputs]).astype(np.float64)
             least = np.minimum(least, y)
             outside += int((y < lower).sum() + (y < bounds.a[0] @ p + bounds.b[0]).sum())
         spread = (least[:k] + least[k:]) * -0.5
@@ -534,13 +543,14 @@ def main() -> None:
     parser.add_argument("--exporters", nargs="*", default=["dynamo", "17"], help="dynamo, pt2 or operator sets")
     parser.add_argument("--runs", type=int, default=2000, help="of onnxruntime; 0: networks are loaded and not bounded")
     parser.add_argument("--width", type=float, default=2e-3, help="how far an image moves with one parameter")
+    parser.add_argument("--arithmetic", choices=["float32", "real"], default="float32", help="that bounds are of")
     parser.add_argument("--limit", type=float, default=300.0, help="processor seconds a network may take")
     parser.add_argument("--output", type=Path, default=None, help="JSON lines")
     parser.add_argument("--together", action="store_true", help="in one process: quicker, and an end ends all")
     parser.add_argument("--one", nargs=2, default=None, help=argparse.SUPPRESS)
     arguments = parser.parse_args()
     if arguments.one:
-        print(json.dumps(measure(*arguments.one, arguments.runs, arguments.width)), flush=True)
+        print(json.dumps(measure(*arguments.one, arguments.runs, arguments.width, arguments.arithmetic)), flush=True)
         return
     signal.signal(signal.SIGALRM, _late)
     for name in NETWORKS:
@@ -552,7 +562,7 @@ def main() -> None:
             if arguments.together:
                 signal.alarm(int(arguments.limit))
                 try:
-                    found = measure(name, exporter, arguments.runs, arguments.width)
+                    found = measure(name, exporter, arguments.runs, arguments.width, arguments.arithmetic)
                 except TimeoutError:
                     found = {"name": name, "exporter": exporter, "why": f"more than {arguments.limit:.0f} s"}
                 signal.alarm(0)
@@ -560,6 +570,7 @@ def main() -> None:
                 continue
             command = [sys.executable, __file__, "--one", name, exporter]
             command += ["--runs", str(arguments.runs), "--width", str(arguments.width)]
+            command += ["--arithmetic", arguments.arithmetic]
             try:
                 # of a busy machine a process may get a tenth
                 command = ["prlimit", f"--cpu={arguments.limit:.0f}", *command]

@@ -6,6 +6,7 @@ import itertools
 from dataclasses import replace
 from fractions import Fraction
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -22,16 +23,17 @@ Vector = list[Fraction]
 SHAPE = (2, 4, 4)
 
 
-def mlp(folder: Path, seed: int, scale: float = 1.0) -> tuple[Network, list[tuple[np.ndarray, np.ndarray]], Path]:
-    """A 3-5-4-2 ReLU network and its weights."""
+def mlp(
+    folder: Path, seed: int, scale: float = 1.0, sizes: tuple[int, ...] = (3, 5, 4, 2)
+) -> tuple[Network, list[tuple[np.ndarray, np.ndarray]], Path]:
+    """A ReLU network and its weights."""
     from onnx import numpy_helper
 
-    f = OnnxFile((3,), seed)
-    f.gemm(3, 5, scale)
-    f.node("Relu")
-    f.gemm(5, 4)
-    f.node("Relu")
-    f.gemm(4, 2)
+    f = OnnxFile(sizes[:1], seed)
+    for k, (before, after) in enumerate(itertools.pairwise(sizes)):
+        if k:
+            f.node("Relu")
+        f.gemm(before, after, 1.0 if k else scale)
     file = f.write(folder / "mlp.onnx")
     arrays = [numpy_helper.to_array(c) for c in f.constants]
     return load_network(file), list(zip(arrays[::2], arrays[1::2], strict=True)), file
@@ -178,6 +180,96 @@ def test_deep_networks_are_bounded(allowed: float, tmp_path: Path, monkeypatch: 
     assert gaps[1] >= (0.9 if allowed else 1.1) * gaps[0]
 
 
+@pytest.mark.parametrize("enough", [0.0, 0.3, 1e9])
+def test_rows_that_end_on_the_way_lie_below_the_exact_minimum(
+    enough: float, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Rows for all numbers of a layer may end at an earlier one: what they say there holds, and is not for nothing."""
+    monkeypatch.setattr(schedule, "_DEEP", 0.0)
+    monkeypatch.setattr(schedule, "_CHEAP", 0.0)
+    monkeypatch.setattr(schedule, "_RENEW", -1.0)
+    monkeypatch.setattr(schedule, "_ENOUGH", enough)
+    ended, said, gaps, spans = 0, {}, 0.0, 0.0
+    one_hot, bounded = module._Cells._one_hot, module._Cells._bounded
+
+    def watched(*arguments: Any) -> Any:
+        nonlocal ended
+        found = one_hot(*arguments)
+        ended += int((found.ended > 0).sum())
+        return found
+
+    def heard(cells: Any, index: int, *arguments: Any) -> Any:
+        said[index] = bounded(cells, index, *arguments)
+        return said[index]
+
+    monkeypatch.setattr(module._Cells, "_one_hot", watched)
+    monkeypatch.setattr(module._Cells, "_bounded", heard)
+    for seed in range(3):
+        network, layers, _ = mlp(tmp_path, seed, sizes=(3, 6, 6, 6, 2))
+        rng = np.random.default_rng(seed)
+        b, a = rng.normal(size=(1, 3)), 0.7 * rng.normal(size=(1, 3, 1))
+        reach, rows = np.abs(a[..., 0]), rng.normal(size=(3, 2))
+        images = ImageSets(a, b, a, b, np.nextafter(b - reach, -np.inf), np.nextafter(b + reach, np.inf))
+        middle = rows @ network(torch.from_numpy(b))[0].numpy()
+        found = bound_outputs(network, images, rows, np.zeros(3), arithmetic="real")
+        for k, row in enumerate(rows):
+            least = exact_least(layers, b[0], a[0, :, 0], row)
+            assert Fraction(float(found.lower[0, k])) <= least
+            gaps, spans = gaps + middle[k] - found.lower[0, k], spans + middle[k] - float(least)
+        assert set(said) == {3, 5}
+        for index, form in said.items():
+            for unit, (low, high) in enumerate(zip(*(v[0].tolist() for v in form.interval), strict=True)):
+                least, most = (
+                    exact_least(layers[: index // 2 + 1], b[0], a[0, :, 0], s * np.eye(6)[unit]) for s in (1, -1)
+                )
+                assert Fraction(low) <= least and -most <= Fraction(high)
+    assert (ended > 0) == (enough > 0.0)
+    assert gaps <= 3.0 * spans
+
+
+def test_what_ends_rows() -> None:
+    """A sign; or both ends close, and no kink between; what a ReLU cuts off may be as wide as it likes."""
+    lower = np.array([-3.0, -3.0, 1.0, 1.0, -1.0, -0.1, 2.0])
+    upper = np.array([-1.0, 3.0, 1.1, 3.0, -0.9, 0.1, 2.1])
+    found = module._Reached(np.zeros((7, 2, 2)), lower, upper, np.zeros(7, np.int64))
+    every = np.arange(7)
+
+    def done(goal: module._Goal, negative: bool, zero: float = 0.0) -> list[int]:
+        enough = module._Enough(goal, np.full(7, zero), np.full(7, negative))
+        return np.flatnonzero(enough.done(found, every)).tolist()
+
+    assert done(module._Goal(), False) == [2, 3, 6]
+    assert done(module._Goal(0.2), False) == [0, 2, 4, 6]
+    assert done(module._Goal(0.2), True) == [2, 3, 4, 6]
+    assert done(module._Goal(0.2, cut=False), False) == [2, 4, 6]
+    assert done(module._Goal(0.2, kink=False), False) == [2, 4, 5, 6]
+    # relative to references zero is elsewhere
+    assert done(module._Goal(0.2, cut=False), False, zero=2.05) == [2, 4, 5]
+    enough = module._Enough(module._Goal(0.2), np.zeros(7), every > 3)
+    np.testing.assert_array_equal(enough[4:].done(found, every[:3]), [False, False, True])
+
+
+def test_early_rows_keep_later_ones_exact(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What rows lose of themselves is relative to what is known: cheap nodes are bounded though none is open."""
+    shape = (2, 8, 8)
+    f = OnnxFile(shape, 5)
+    for k in range(11):
+        f.conv(8 if k else 2, 8, pads=[1, 1, 1, 1])
+        f.node("Relu")
+    f.node("Flatten")
+    f.gemm(512, 3)
+    network, rows = load_network(f.write(tmp_path / "net.onnx")), np.eye(3)
+    images = image_sets(shape, 1, 2, 1e-8, 1e-9)
+    monkeypatch.setattr(schedule, "_DEEP", 0.0)
+    middle = rows @ network(torch.from_numpy(0.5 * (images.lower + images.upper)).reshape(1, *shape)).numpy().T
+    gaps = []
+    for cheap in (0.0, 0.03):
+        monkeypatch.setattr(schedule, "_CHEAP", cheap)
+        found = bound_outputs(network, images, rows, np.zeros(3), arithmetic="real").lower
+        gaps.append((middle.T - found).mean())
+    assert 0.0 < gaps[1] < 0.5 * gaps[0]
+
+
 @pytest.mark.parametrize("arithmetic", ["float32", "real"])
 def test_chosen_slopes_are_never_worse_and_sound(arithmetic: NetworkArithmetic, tmp_path: Path) -> None:
     gains = 0.0
@@ -263,6 +355,8 @@ def test_curves_are_bounded_by_what_rows_leave(deep: bool, tmp_path: Path, monke
     network, images, rows = load_network(file), image_sets(shape, 2, 2, 1e-3, 1e-4), np.eye(3)
     if deep:
         monkeypatch.setattr(schedule, "_DEEP", 0.0)
+        # nor are all numbers of a node bounded for another reason
+        monkeypatch.setattr(schedule, "_CHEAP", 0.0)
     found = bound_outputs(network, images, rows, np.zeros(3), arithmetic="real").lower
     with monkeypatch.context() as patch:
         patch.setattr(module, "_HALF", -1.0)
@@ -283,7 +377,7 @@ def test_deep_networks_are_given_up_early(tmp_path: Path, monkeypatch: pytest.Mo
     at = len(network.nodes) - 1
     run = schedule.Schedule(network)
     # a little may be taken whatever it foretells; of more than that, a part of what is passed
-    assert run.takes(0.005 * total) and run.left == pytest.approx(0.095 * total)
+    assert run.takes(0.004 * total) and run.left == pytest.approx(0.096 * total)
     assert not run.takes(0.02 * total) and run.left == 0.0
     run = schedule.Schedule(network)
     run.arrives(at)

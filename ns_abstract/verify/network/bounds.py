@@ -1,4 +1,4 @@
-"""Bounds of a network's outputs over sets of images (docs/design.md, N, N0, N1, N2, N6, N12, N13, N14, N16)."""
+"""Bounds of a network's outputs over sets of images (docs/design.md, N, N0-N2, N6, N12-N14, N16, N17)."""
 
 from __future__ import annotations
 
@@ -281,6 +281,8 @@ class _Cells:
         self.folded: set[int] = set()
         #: what rows may stop at
         self.stops: dict[int, Columns] = {}
+        #: products that rows have not taken because they ended on the way
+        self.spared = 0.0
         #: part of the latest ReLU's inputs whose signs have not been found out
         self.unsure = 0.0
         self.last = self._forward()
@@ -731,7 +733,8 @@ class _Cells:
             ahead = (near[0] - near[1]).numpy()
             room = 2.0**-50 * (near[0].abs() + near[1].abs()).numpy()
             rows = Rows(value, y * layer.stride[0] - layer.pads[0], x * layer.stride[1] - layer.pads[1])
-            found = self._backward(source, rows, np.ascontiguousarray(cell), room - ahead)
+            enough = _Enough(_Goal(), room - ahead, np.zeros(len(part), bool))
+            found = self._backward(source, rows, np.ascontiguousarray(cell), enough)
             above, below = torch.from_numpy(room - ahead - found.lower), torch.from_numpy(room + ahead + found.upper)
             apart[window, other, one] = torch.minimum(apart[window, other, one], above)
             apart[window, one, other] = torch.minimum(apart[window, one, other], below)
@@ -775,7 +778,7 @@ class _Cells:
         some = where[:: -(-len(where) // _PROBED)]
         if self.schedule.deep and not self.schedule.takes(len(some) * self.schedule.costs.row(index)):
             return form, open_
-        found = self._bounded(index, form, some, False, False)
+        found = self._bounded(index, form, some, None, False)
         at = tuple(torch.from_numpy(some.T))
         shape = self.count, *grid(self.network.shape(index))
         before, after = ((f.upper - f.lower).reshape(shape)[at] for f in (form, found))
@@ -807,10 +810,10 @@ class _Cells:
                 return found
             form, open_ = found, open_ & ~first
             where = open_.nonzero().numpy()
-        return self._bounded(index, form, where, decides, decides)
+        return self._bounded(index, form, where, _Goal() if decides else None, decides)
 
     def _renew(self, index: int, form: _Form, open_: Tensor, layer: Activation | None) -> _Form:
-        """Better bounds of a deep network's node, within the work allowed; of closed numbers, too (N13).
+        """Better bounds of a deep network's node, within the work allowed; of closed numbers, too (N13, N17).
 
         Rows for numbers that are open are all that the lines ask for. But forms forget what neighbours share: behind
         two or three layers they leave nearly everything open. Where they leave much open, rows bound all numbers
@@ -819,43 +822,59 @@ class _Cells:
         shape = grid(self.network.shape(index))
         open_ = open_.reshape(self.count, *shape) & torch.from_numpy(self.good).reshape(-1, 1, 1, 1)
         count = int(open_.sum())
-        if not count:
-            return form
         decides = isinstance(layer, LeakyRelu)
-        where, early = open_, decides
-        if self.schedule.renews(count / open_.numel()):
-            early = False
-            where = torch.from_numpy(self.good).reshape(-1, 1, 1, 1) & torch.ones_like(open_)
-            if isinstance(layer, LeakyRelu) and layer.alpha == 0.0:
-                # what is certainly cut off is exact behind the layer
-                where &= form.interval.upper.reshape(open_.shape) > 0.0
-        chosen = where.nonzero().numpy()
+        matters = torch.from_numpy(self.good).reshape(-1, 1, 1, 1) & torch.ones_like(open_)
+        if isinstance(layer, LeakyRelu) and layer.alpha == 0.0:
+            # what is certainly cut off is exact behind the layer
+            matters &= form.interval.upper.reshape(open_.shape) > 0.0
         cost = self.schedule.costs.row(index)
+        whole = self.schedule.renews(count / open_.numel(), int(matters.sum()) * cost)
+        if not (count or whole):
+            return form
+        goal = _Goal() if decides else None
+        chosen = (matters if whole else open_).nonzero().numpy()
         if len(chosen) * cost > self.schedule.left:
-            chosen, early = open_.nonzero().numpy(), decides
+            chosen, whole = open_.nonzero().numpy(), False
+        if whole:
+            goal = self._goal(form, len(chosen) * cost, layer)
         if not self.schedule.takes(len(chosen) * cost):
             return form
         if len(chosen) >= _MANY:
             # some first, of the open ones: where they gain nothing, the others are not worth their rows
-            some = open_.nonzero().numpy()
+            some = open_.nonzero().numpy() if count >= _SOME else chosen
             some = some[:: max(1, len(some) // _SOME)]
-            found = self._bounded(index, form, some, False, decides)
+            found = self._bounded(index, form, some, None, decides)
             at = tuple(torch.from_numpy(some.T))
             widths = [(f.upper - f.lower).reshape(open_.shape)[at] for f in (form, found)]
             lower, upper = (v.reshape(open_.shape)[at] for v in found.interval)
             form = found
-            if self.schedule.vain(
-                float((widths[1] / widths[0]).median()),
-                float(((lower < 0.0) & (upper > 0.0)).double().mean()) if decides else 0.0,
-                count / open_.numel(),
-            ):
+            kept = float((widths[1] / widths[0]).median())
+            part = count / open_.numel()
+            undecided = float(((lower < 0.0) & (upper > 0.0)).double().mean()) if decides else 0.0
+            if self.schedule.vain(kept, undecided, part):
                 return form
-        return self._bounded(index, form, chosen, early, decides)
+            if whole and not self.schedule.gains(kept, part):
+                self.schedule.spares((len(chosen) - count) * cost)
+                chosen, goal = open_.nonzero().numpy(), _Goal() if decides else None
+        spared = self.spared
+        found = self._bounded(index, form, chosen, goal, decides)
+        # where a sign is not all that is asked, every number has two rows
+        self.schedule.spares((self.spared - spared) * (1.0 if decides else 0.5))
+        return found
 
-    def _bounded(self, index: int, form: _Form, where: Int64, early: bool, decides: bool) -> _Form:
+    def _goal(self, form: _Form, products: float, layer: Activation | None) -> _Goal | None:
+        """What rows for all numbers of a node, which take so many products to the image, are to find out (N17)."""
+        part = self.schedule.suffices(products)
+        if not part:
+            return None
+        size = float(form.reference.abs().median())
+        relu = isinstance(layer, LeakyRelu)
+        return _Goal(part * size, relu, relu and layer.alpha == 0.0)
+
+    def _bounded(self, index: int, form: _Form, where: Int64, goal: _Goal | None, decides: bool) -> _Form:
         """The form with bounds by rows of the numbers ``where`` [R, (cell, channel, row, column)] of node ``index``.
 
-        ``early``: rows end where a sign is found out; ``decides``: the other side is not asked for then.
+        ``goal``: rows end where it is reached; ``decides``: the other side is not asked for where a sign is found out.
         """
         item = self.network.shape(index)
         cell, flat = where[:, 0], np.ravel_multi_index(tuple(where[:, 1:].T), grid(item))
@@ -863,14 +882,17 @@ class _Cells:
         # the likelier side first; what it decides needs no other
         reference = form.reference.flatten(1)[at].numpy()
         sign = np.where(reference + form.c.flatten(1)[at].numpy() >= 0.0, 1.0, -1.0)
-        found = self._one_hot(index, where, sign, -sign * reference if early else None)
+
+        def enough(part: Int64, sign: Float64) -> _Enough | None:
+            return None if goal is None else _Enough(goal, -sign * reference[part], sign < 0.0)
+
+        found = self._one_hot(index, where, sign, enough(np.arange(len(where)), sign))
         found.turn(sign < 0.0)
         lower, upper = form.lower.flatten(1).clone(), form.upper.flatten(1).clone()
         low = np.maximum(lower[at].numpy(), found.lower) + reference
         high = np.minimum(upper[at].numpy(), found.upper) + reference
         left = np.flatnonzero((low < 0.0) & (high > 0.0)) if decides else np.arange(len(where))
-        need = sign[left] * reference[left] if early else None
-        again = self._one_hot(index, where[left], -sign[left], need)
+        again = self._one_hot(index, where[left], -sign[left], enough(left, -sign[left]))
         again.turn(sign[left] > 0.0)
         found.meet(left, again, sign[left] < 0.0)
         c, r = form.c.flatten(1).clone(), form.r.flatten(1).clone()
@@ -895,7 +917,7 @@ class _Cells:
 
     # ------------------------------------------------------------ backwards
 
-    def _one_hot(self, index: int, where: Int64, sign: Float64, need: Float64 | None) -> _Reached:
+    def _one_hot(self, index: int, where: Int64, sign: Float64, enough: _Enough | None) -> _Reached:
         """Bounds of ``sign`` [R] times single numbers [R, (cell, channel, row, column)] of node ``index``."""
         channels = grid(self.network.shape(index))[0]
         found = _Reached.unknown(len(where), self.d)
@@ -911,11 +933,14 @@ class _Cells:
             value = np.zeros((len(cell), channels, 1, 1), np.float32)
             value[np.arange(len(cell)), channel, 0, 0] = sign[number]
             arrived: list[_Arrived] = []
-            part = self._backward(index, Rows(value, y, x), cell, None if need is None else need[number], arrived)
+            part = self._backward(index, Rows(value, y, x), cell, None if enough is None else enough[number], arrived)
             return number, part, arrived
 
         for number, part, arrived in on_threads(bound, range(0, len(where), step), threads):
             found.put(number, part)
+            if self.schedule.deep:
+                ends, count = np.unique(part.ended[part.ended > 0], return_counts=True)
+                self.spared += sum(n * self.schedule.costs.row(int(at)) for at, n in zip(ends, count, strict=True))
             for rows in arrived:
                 self._keep(index, where[number[rows.number]], sign[number[rows.number]], rows)
         return found
@@ -928,21 +953,20 @@ class _Cells:
         index: int,
         rows: Rows,
         cell: Int64,
-        need: Float64 | None = None,
+        enough: _Enough | None = None,
         arrived: list[_Arrived] | None = None,
     ) -> _Reached:
         """Bounds of rows on node ``index``, relative to the reference.
 
-        Those that are at least ``need`` [R] for certain may stop before the image; ``arrived`` takes in the others, if
-        rows are kept.
+        Those of which ``enough`` is known may stop before the image; ``arrived`` takes in the others, if rows are kept.
         """
         found = _Reached.unknown(len(cell), self.d)
         batch = _Batch({index: rows}, cell, np.zeros((len(cell), 2)), np.arange(len(cell)))
         batch.arrived = arrived if self.keeps else None
-        self._descend(index, index, batch, found, need)
+        self._descend(index, index, batch, found, enough)
         return found
 
-    def _descend(self, start: int, at: int, batch: _Batch, found: _Reached, need: Float64 | None) -> None:
+    def _descend(self, start: int, at: int, batch: _Batch, found: _Reached, enough: _Enough | None) -> None:
         """Pass a batch from node ``at`` on to the image."""
         checkpoint()
         while at > 0:
@@ -952,12 +976,13 @@ class _Cells:
             if batch.bytes > min(_ROWS_AT_ONCE, self.memory // 16) and len(batch.cell) > 1:
                 half = len(batch.cell) // 2
                 for part in (slice(0, half), slice(half, None)):
-                    self._descend(start, at, batch[part], found, need)
+                    self._descend(start, at, batch[part], found, enough)
                 return
-            if need is not None and at != start and at in self.stops and len(batch.waiting) == 1:
+            if enough is not None and at != start and at in self.stops and len(batch.waiting) == 1:
                 self._bound_rows(at, batch, self.stops[at], found)
-                going_on = found.lower[batch.number] < need[batch.number]
+                going_on = ~enough.done(found, batch.number)
                 if going_on.mean() < 0.75:
+                    found.ended[batch.number[~going_on]] = at
                     batch = batch[going_on]
                 if not len(batch.cell):
                     return
@@ -1259,6 +1284,50 @@ class _Batch:
         return sum(rows.value.nbytes for rows in self.waiting.values())
 
 
+class _Goal(NamedTuple):
+    """What rows of a node's numbers are to find out; a matter of tightness alone (N6, N17).
+
+    Attributes:
+        width: How far apart a number's bounds may be; None: its sign is all that is asked.
+        kink: Whether the sign is asked for.
+        cut: Whether a number that is certainly not positive may have any bounds.
+    """
+
+    width: float | None = None
+    kink: bool = True
+    cut: bool = True
+
+
+@dataclass(frozen=True)
+class _Enough:
+    """When rows of single numbers need not go on to the image.
+
+    Attributes:
+        goal: What is asked for.
+        zero: [R] what a row is where its number is zero.
+        negative: [R] whether a row is its number's negative.
+    """
+
+    goal: _Goal
+    zero: Float64
+    negative: np.ndarray
+
+    def __getitem__(self, chosen: Any) -> _Enough:
+        return replace(self, zero=self.zero[chosen], negative=self.negative[chosen])
+
+    def done(self, found: _Reached, number: Int64) -> np.ndarray:
+        """Which of the rows ``number`` are done."""
+        zero, lower, upper = self.zero[number], found.lower[number], found.upper[number]
+        if self.goal.width is None:
+            # the other side is asked for by another row
+            return lower >= zero
+        tight = upper - lower <= self.goal.width
+        if not self.goal.kink:
+            return tight
+        off = np.where(self.negative[number], lower >= zero, upper <= zero) & self.goal.cut
+        return off | (tight & ((lower >= zero) | (upper <= zero)))
+
+
 @dataclass
 class _Reached:
     """What rows are at least and at most.
@@ -1266,18 +1335,22 @@ class _Reached:
     Attributes:
         plane: [R, 2, d + 1] slopes and offset of a plane below and one above; NaN if unknown.
         lower, upper: [R]; infinite if unknown.
+        ended: [R] the node at which they ended; 0 is the image.
     """
 
     plane: Float64
     lower: Float64
     upper: Float64
+    ended: Int64
 
     @staticmethod
     def unknown(count: int, d: int) -> _Reached:
-        return _Reached(np.full((count, 2, d + 1), np.nan), np.full(count, -np.inf), np.full(count, np.inf))
+        infinite = np.full(count, np.inf)
+        return _Reached(np.full((count, 2, d + 1), np.nan), -infinite, infinite, np.zeros(count, np.int64))
 
     def put(self, number: Int64, other: _Reached) -> None:
         self.plane[number], self.lower[number], self.upper[number] = other.plane, other.lower, other.upper
+        self.ended[number] = other.ended
 
     def turn(self, mask: np.ndarray) -> None:
         """Negate the rows of ``mask``."""

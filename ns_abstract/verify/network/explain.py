@@ -18,7 +18,7 @@ _FEW_ROWS, _MANY_ROWS = 128 << 20, 420 << 20
 #: Products a second of one core: of forms in float64, and of rows in float32, few at a time and many; measured.
 _FORMS_SPEED, _FEW_SPEED, _MANY_SPEED = 1.5e9, 2.5e9, 2.5e10
 #: Part of all units that rows are passed back for, in sets that are worth a proof; of a deep network most.
-_OPEN, _DEEP_OPEN = 0.1, 0.6
+_OPEN, _DEEP_OPEN = 0.1, 0.4
 
 
 def products(network: Network, index: int) -> float:

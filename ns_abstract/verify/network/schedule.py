@@ -1,4 +1,4 @@
-"""What rows cost, and how many of them a deep network is worth (docs/design.md, N13)."""
+"""What rows cost, and how many of them a deep network is worth (docs/design.md, N13, N17)."""
 
 from __future__ import annotations
 
@@ -25,11 +25,17 @@ _DEEP = 2e12
 #: Products that rows for inner nodes may take in one cell of a deep network; about three minutes of one core.
 _ALLOWED = 5e12
 #: Once such a part of them is taken, rows are given up where what was passed foretells so many times more.
-_SURE, _OVER = 0.1, 1.5
+_SURE, _OVER = 0.05, 1.5
 #: Layers that forms pass well, as a rule.
 _TIGHT = 4
 #: Part of a node's numbers past which all of them are bounded by rows.
-_RENEW = 0.15
+_RENEW = 0.01
+#: Part of what is allowed that rows of one node may take whatever is open.
+_CHEAP = 0.03
+#: Part of widths that these have to leave at most.
+_WORTH = 0.1
+#: Widths, as a part of a node's numbers, that rows of dearer nodes need not improve.
+_ENOUGH = 0.03
 #: Parts of widths and of signs not found out past which rows are given up.
 _KEPT, _LOST = 0.9, 0.9
 #: Part of a node's numbers that have to be open for that to end all.
@@ -153,9 +159,18 @@ class Schedule:
         """The work is at node ``index``."""
         self._passed += float(np.prod(self.network.shape(index))) * self.costs.row(index)
 
-    def renews(self, part: float) -> bool:
-        """Whether all numbers of a node are bounded by rows if ``part`` of them is open."""
-        return part > _RENEW
+    def renews(self, part: float, products: float) -> bool:
+        """Whether all numbers of a node are bounded by rows, for ``products``, if ``part`` of them is open."""
+        return part > _RENEW or products < self._cheap
+
+    @property
+    def _cheap(self) -> float:
+        """Products that rows of one node may take whatever is open: fewer where not all rows can be afforded."""
+        return _CHEAP * _ALLOWED * min(1.0, _ALLOWED / self.costs.total)
+
+    def suffices(self, products: float) -> float:
+        """Width, as a part of a node's numbers, at which rows for all of them may end on the way (N17)."""
+        return 0.0 if products < self._cheap else _ENOUGH
 
     def takes(self, products: float) -> bool:
         """Whether so many products are left; they are taken then.
@@ -171,6 +186,15 @@ class Schedule:
         self.left -= products
         self._taken = taken
         return True
+
+    def spares(self, products: float) -> None:
+        """So many products were not taken after all."""
+        self.left += products
+        self._taken -= products
+
+    def gains(self, kept: float, part: float) -> bool:
+        """Whether rows for all numbers are worth it that leave so large a part of widths, if ``part`` is open."""
+        return part > _RENEW or kept < _WORTH
 
     def vain(self, kept: float, open_: float, part: float) -> bool:
         """Leave a node as it is if rows leave so large a part of widths, or of signs not found out.
