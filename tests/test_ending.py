@@ -321,6 +321,24 @@ def test_a_signal_ends_at_once_where_nothing_is_to_be_saved() -> None:
     assert signal.getsignal(signal.SIGTERM) == signal.SIG_DFL
 
 
+def _in_compiled_code(cause: BaseException | None) -> int:
+    """What a compiled function does that an exception of a signal's handler reaches."""
+    raise SystemError("returned a result with an exception set") from cause
+
+
+def test_a_signal_in_compiled_code(capsys: pytest.CaptureFixture[str]) -> None:
+    stop = StopRequest()
+    with pytest.raises(KeyboardInterrupt), stop.at_once():
+        _in_compiled_code(KeyboardInterrupt())
+    with pytest.raises(SystemError), stop.at_once():
+        _in_compiled_code(ValueError())
+    with pytest.raises(SystemExit) as left:
+        run(lambda options: _in_compiled_code(KeyboardInterrupt()), lambda: None)
+    assert left.value.code == 3 and capsys.readouterr().err == "interrupted\n"
+    with pytest.raises(SystemError):
+        run(lambda options: _in_compiled_code(None), lambda: None)
+
+
 def test_a_signal_is_noted_where_something_is(capfd: pytest.CaptureFixture[str]) -> None:
     stop = Stop()
     with stop.installed():

@@ -16,7 +16,7 @@ from contextlib import contextmanager, redirect_stderr, suppress
 from types import FrameType
 from typing import Any, NoReturn
 
-from ns_abstract.execution.stopping import StopRequest
+from ns_abstract.execution.stopping import StopRequest, is_interruption
 from ns_abstract.io.errors import InputError, visible
 
 DONE, BAD_INPUT, INTERRUPTED = 0, 2, 3
@@ -200,7 +200,9 @@ def run(
     except InputError as error:
         print(f"error: {error}", file=sys.stderr)
         code = BAD_INPUT
-    except KeyboardInterrupt:
+    except (KeyboardInterrupt, SystemError) as error:
+        if not is_interruption(error):
+            raise
         print("interrupted", file=sys.stderr)
         code = INTERRUPTED
     except BrokenPipeError:

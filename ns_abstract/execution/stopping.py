@@ -9,6 +9,13 @@ from contextlib import contextmanager
 from types import FrameType
 
 
+def is_interruption(error: BaseException) -> bool:
+    """Whether a signal ended the work: compiled functions that its exception reaches raise SystemError."""
+    if isinstance(error, SystemError):
+        return isinstance(error.__cause__, KeyboardInterrupt)
+    return isinstance(error, KeyboardInterrupt)
+
+
 class StopRequest:
     """A request to stop that is asked for between pieces of work; a second signal stops at once."""
 
@@ -37,6 +44,10 @@ class StopRequest:
             if self.signal is not None:
                 raise KeyboardInterrupt
             yield
+        except SystemError as error:
+            if is_interruption(error):
+                raise KeyboardInterrupt from error
+            raise
         finally:
             self._raising -= 1
 

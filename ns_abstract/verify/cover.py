@@ -298,14 +298,13 @@ class Cover:
         if len(parts) > 1 and work.weights.loss(whole) < _TOGETHER * work.aim:
             work.asked += len(parts)
             rows = self.sharing.family(self._images([whole]))
-            margin = float(self._proved(work, rows.whole(work.query), [whole])[0]) / work.weights.margin
-            work.learn(float(np.mean(costs)), margin, self.far)
-            if margin < -self.far:
+            margins[:] = self._proved(work, rows.whole(work.query), [whole])[0]
+            work.learn(float(np.mean(costs)), float(margins[0]) / work.weights.margin, self.far)
+            if margins[0] < -self.far * work.weights.margin:
                 # rows of what is so far from a proof prove little: smaller neighbours
                 self._apart(work, node)
                 return
-            margins[:] = margin * work.weights.margin
-            if not margin > 0.0:
+            if not margins[0] > 0.0:
                 margins = self._by_rows(work, rows, parts)
         else:
             left = [k for k, cost in enumerate(costs) if cost < _ALONE * work.aim]
