@@ -831,17 +831,16 @@ class _Cells:
         whole = self.schedule.renews(count / open_.numel(), int(matters.sum()) * cost)
         if not (count or whole):
             return form
-        goal = _Goal() if decides else None
-        chosen = (matters if whole else open_).nonzero().numpy()
+        opened, signs = open_.nonzero().numpy(), _Goal() if decides else None
+        chosen = matters.nonzero().numpy() if whole else opened
         if len(chosen) * cost > self.schedule.left:
-            chosen, whole = open_.nonzero().numpy(), False
-        if whole:
-            goal = self._goal(form, len(chosen) * cost, layer)
+            chosen, whole = opened, False
+        goal = self._goal(form, len(chosen) * cost, layer) if whole else signs
         if not self.schedule.takes(len(chosen) * cost):
             return form
         if len(chosen) >= _MANY:
             # some first, of the open ones: where they gain nothing, the others are not worth their rows
-            some = open_.nonzero().numpy() if count >= _SOME else chosen
+            some = opened if count >= _SOME else chosen
             some = some[:: max(1, len(some) // _SOME)]
             found = self._bounded(index, form, some, None, decides)
             at = tuple(torch.from_numpy(some.T))
@@ -855,7 +854,7 @@ class _Cells:
                 return form
             if whole and not self.schedule.gains(kept, part):
                 self.schedule.spares((len(chosen) - count) * cost)
-                chosen, goal = open_.nonzero().numpy(), _Goal() if decides else None
+                chosen, goal = opened, signs
         spared = self.spared
         found = self._bounded(index, form, chosen, goal, decides)
         # where a sign is not all that is asked, every number has two rows
