@@ -21,31 +21,33 @@ from test_slanted import SHEARS, exact, holds
 from ns_abstract.geometry.box import ParameterBox
 from ns_abstract.geometry.poses import PoseSet
 from ns_abstract.verify.cells import Grid
-from ns_abstract.verify.cover import Cover, PictureSets, Weights, halvings, joined
-from ns_abstract.verify.network import Family, Fresh, ImageSets, Network, bound_outputs, load_network
-from ns_abstract.verify.network.family import _Part
+from ns_abstract.verify.cover import Cover, PictureSets, Weights, divisions, joined
+from ns_abstract.verify.network import Family, ImageSets, Network, bound_outputs, lends_anywhere, load_network
+from ns_abstract.verify.network.family import _Other, _Said
 from ns_abstract.verify.properties import Query
 from ns_abstract.verify.search import Search
 
 SHAPE = (2, 6, 6)
 
 
-def network(folder: Path, seed: int) -> tuple[Network, Callable[[np.ndarray], np.ndarray]]:
-    """Convolutions with a branch, a product of two nodes, two linear layers."""
+def network(folder: Path, seed: int, product: bool = False) -> tuple[Network, Callable[[np.ndarray], np.ndarray]]:
+    """Convolutions with a branch, maybe a product of two nodes, a sum before an activation, two linear layers."""
     f = OnnxFile(SHAPE, seed)
     f.conv(2, 4, pads=[1, 1, 1, 1], strides=[2, 2])
     one = f.node("Relu")
-    f.conv(4, 4, pads=[1, 1, 1, 1])
+    before = f.conv(4, 4, pads=[1, 1, 1, 1])
     two = f.node("Relu")
-    f.node("Add", one, two)
+    # what two nodes read has a charge of its own
+    f.node("Add", two, before)
+    f.node("Add", f.last, one)
     f.conv(4, 4, pads=[1, 1, 1, 1])
     three = f.node("Relu")
     f.conv(4, 4, 1)
     four = f.node("Sigmoid")
-    f.node("Mul", three, four)
+    f.node("Mul" if product else "Add", three, four)
     f.node("Flatten")
     f.gemm(36, 8)
-    f.node("Relu")
+    f.node("LeakyRelu", alpha=0.1)
     f.gemm(8, 3)
     file = f.write(folder / "shared.onnx")
     return load_network(file), session(file)
@@ -71,95 +73,176 @@ def halved(images: ImageSets) -> ImageSets:
     return ImageSets(**found)
 
 
-@pytest.mark.parametrize("fresh", ["last", "all"])
+def moved(images: ImageSets, by: float, seed: int) -> ImageSets:
+    """Sets as wide about other pictures, with other slopes."""
+    rng = np.random.default_rng(seed)
+    shift = by * rng.normal(size=images.b_lower.shape)
+    turn = by * 0.05 * rng.normal(size=images.a_lower.shape)
+    reach = np.abs(turn).sum(-1)
+    return ImageSets(
+        images.a_lower + turn, images.b_lower + shift, images.a_upper + turn, images.b_upper + shift,
+        images.lower + shift - reach, images.upper + shift + reach,
+    )  # fmt: skip
+
+
+def others(images: ImageSets, product: bool) -> ImageSets:
+    """Parts of a cell, and neighbours nearby and far away where rows serve for these."""
+    cells = [halved(images)] if product else [halved(images), *(moved(images, by, 3) for by in (0.02, 0.2, 1.0))]
+    fields = ImageSets.__dataclass_fields__
+    return ImageSets(*(np.concatenate([getattr(cell, name) for cell in cells]) for name in fields))
+
+
+@pytest.mark.parametrize("product", [False, True])
+@pytest.mark.parametrize("fresh", [False, True])
 @pytest.mark.parametrize(("radius", "slack"), [(0.02, 0.02), (0.1, 0.05), (1e-6, 1e-6)])
-def test_rows_of_the_whole_hold_for_parts(radius: float, slack: float, fresh: Fresh, tmp_path: Path) -> None:
+def test_rows_of_one_cell_hold_for_others(
+    radius: float, slack: float, fresh: bool, product: bool, tmp_path: Path
+) -> None:
     for seed in range(2):
-        net, run = network(tmp_path, seed)
+        net, run = network(tmp_path, seed, product)
+        assert lends_anywhere(net) is not product
         images = image_sets(SHAPE, 1, 2, radius, slack, seed)
         rows = np.random.default_rng(seed).normal(size=(4, 3))
-        family = Family(net, images)
-        parts = halved(images)
-        found = family.parts(parts, rows, np.zeros(4), fresh=fresh)
+        family, cells = Family(net, images), others(images, product)
+        found = family.others(cells, rows, np.zeros(4), fresh=fresh)
         assert np.isfinite(found.lower).all()
-        for cell in range(parts.count):
-            least, compared = attack(net, run, parts, cell, rows, 32, 5, seed)
+        for cell in range(cells.count):
+            least, compared = attack(net, run, cells, cell, rows, 32, 5, seed)
             assert compared > 20
             assert (found.lower[cell] <= least).all()
 
 
-def test_ranges_of_parts_hold_every_value(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """What the whole's rows say of every number, against the exact network on images of each part."""
-    found: dict[int, Any] = {}
-    inherited = _Part._inherited
+@pytest.mark.parametrize("product", [False, True])
+def test_rows_of_one_cell_hold_every_value(product: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What the first cell's rows say of every number, against the exact network on images of each other one."""
+    found: dict[int, tuple[_Said, np.ndarray]] = {}
+    borrowed = _Other._borrowed
 
-    def watched(self: _Part, index: int, form: Any) -> Any:
-        found[index] = inherited(self, index, form).interval
-        return inherited(self, index, form)
+    def watched(self: _Other, index: int, form: Any) -> Any:
+        if index in self.first.lent:
+            reference = form.reference.flatten(1).numpy()[:, self.first.lent[index].flat]
+            found[index] = self._said(index), reference
+        return borrowed(self, index, form)
 
-    monkeypatch.setattr(_Part, "_inherited", watched)
+    monkeypatch.setattr(_Other, "_borrowed", watched)
     for seed in range(2):
-        net, _ = network(tmp_path, seed)
+        net, _ = network(tmp_path, seed, product)
         images = image_sets(SHAPE, 1, 2, 0.2, 1e-3, seed)
-        family, parts = Family(net, images, arithmetic="real"), halved(images)
-        family.parts(parts, np.eye(3), np.zeros(3))
-        assert len(family._cell.known) > 3 and len(found) > 3
+        family, cells = Family(net, images, arithmetic="real"), others(images, product)
+        found.clear()
+        family.others(cells, np.eye(3), np.zeros(3))
+        lent = family._first.lent
+        assert len(lent) >= 3 and found.keys() == lent.keys()
         rng = np.random.default_rng(seed)
-        for cell in range(parts.count):
-            p, t = rng.choice([-1.0, 1.0, 0.3], (40, 2)), rng.uniform(size=(40, net.input_size))
-            x, inside = members(parts, cell, p, t)
+        for cell in range(cells.count):
+            p, t = rng.choice([-1.0, 1.0, 0.3], (160, 2)), rng.uniform(size=(160, net.input_size))
+            x, inside = members(cells, cell, p, t)
             assert inside.sum() > 10
             values = [torch.from_numpy(x[inside].astype(np.float64)).reshape(-1, *SHAPE)]
             for node in net.nodes:
                 values.append(node.layer([values[k] for k in node.inputs]))
-            for index, (lower, upper) in found.items():
-                assert bool((values[index] >= lower[cell]).all() and (values[index] <= upper[cell]).all())
+            for index, (said, reference) in found.items():
+                number = values[index].flatten(1).numpy()[:, lent[index].flat] - reference[cell]
+                assert (number >= said.lower[cell]).all() and (number <= said.upper[cell]).all()
+                plane = p[inside] @ said.slopes[cell].T + said.middle[cell]
+                assert (np.abs(number - plane) <= said.half[cell]).all()
 
 
-def test_products_of_rows_are_charged(tmp_path: Path) -> None:
-    """Without any width, nothing but the rounding of float32 products is left; float64 has none to speak of."""
-    net, _ = network(tmp_path, 0)
-    images = image_sets(SHAPE, 1, 2, 0.3, 0.0)
-    whole = Family(net, images)._cell
-    part = _Part(whole, halved(images), 1 << 30, "float32", len(net.nodes))
-    slopes, offsets = part.image.slopes.reshape(4, 2, -1, 2), part.image.offsets.reshape(4, 2, -1)
-    assert whole.known
-    for index, known in whole.known.items():
-        _, rows, least, most = known.joined()
-        _, a, middle, half, _ = part._evaluated(index)
-        values = rows.astype(np.float64)
-        moved = values @ (offsets.mean(1) + part.middle - whole.middle).T
-        off = np.abs(moved.T + 0.5 * (least + most) - middle) + np.abs(values @ slopes.mean(1) - a).sum(-1)
-        assert off.max() > 0.0 and (off <= half - 0.5 * (most - least)).all()
+@pytest.mark.parametrize("product", [False, True])
+def test_products_of_rows_are_charged(product: bool, tmp_path: Path) -> None:
+    """The same sums in float64 lie between, whatever products of float32 lose."""
+    net, _ = network(tmp_path, 0, product)
+    images = image_sets(SHAPE, 1, 2, 0.3, 1e-4)
+    family, cells = Family(net, images, arithmetic="real"), others(images, product)
+    other = _Other(family._first, cells, 1 << 30, "real", False)
+    m, off = cells.count, []
+    slopes, offsets = other.image.slopes.reshape(m, 2, -1, 2), other.image.offsets.reshape(m, 2, -1)
+    for index, lent in family._first.lent.items():
+        said = other._said(index)
+        tilt = np.zeros((m, len(lent.flat), 2))
+        low, high = (np.repeat(v[None], m, 0) for v in lent.fixed.T)
+        for at, rows in lent.rows.items():
+            values = rows.astype(np.float64)
+            one, two = np.maximum(values, 0.0), np.minimum(values, 0.0)
+            if at == 0:
+                tilt = tilt + values @ slopes.mean(1)
+                middle = offsets.mean(1)
+                half = 0.5 * (offsets[:, 1] - offsets[:, 0]) + 0.5 * np.abs(slopes[:, 1] - slopes[:, 0]).sum(-1)
+                low = low + middle @ values.T - half @ np.abs(values).T
+                high = high + middle @ values.T + half @ np.abs(values).T
+            elif at in other.offered:
+                offered = other.offered[at]
+                _, below, above, _, top, bottom = offered.lines.reshape(6, m, -1).astype(np.float64)
+                tilt = tilt + one @ np.moveaxis(offered.tilts[0], 1, 2)
+                tilt = tilt + two @ np.moveaxis(offered.tilts[1], 1, 2)
+                low, high = low + below @ one.T + top @ two.T, high + above @ one.T + bottom @ two.T
+        # one side and the other of a row's own numbers
+        turned = lent.sign < 0.0
+        tilt = tilt * lent.sign[:, None]
+        ends = np.where(turned, -high, low), np.where(turned, -low, high)
+        for p in ((1.0, 1.0), (-1.0, 1.0), (0.0, 0.0)):
+            plane, exact_plane = said.slopes @ p + said.middle, tilt @ p
+            assert (exact_plane + ends[0] >= plane - said.half).all()
+            assert (exact_plane + ends[1] <= plane + said.half).all()
+            off.append(np.abs(exact_plane + 0.5 * (ends[0] + ends[1]) - plane).max())
+    assert max(off) > 0.0
 
 
-def test_parts_gain_by_rows_of_the_whole(tmp_path: Path) -> None:
-    """Nearly as much as by rows of their own; and with these nothing is lost."""
-    gains, own = [], []
-    for seed in range(2):
+def test_rows_of_a_cell_say_as_much_of_it_as_its_bounds(tmp_path: Path) -> None:
+    """Of itself nothing is lost but rounding; of neighbours not much."""
+    near = []
+    for seed in range(4):
         net, _ = network(tmp_path, seed)
         images = image_sets(SHAPE, 1, 2, 0.1, 0.02, seed)
         rows, offset = np.random.default_rng(seed).normal(size=(4, 3)), np.zeros(4)
+        family = Family(net, images)
+        first = family.first(rows, offset).lower
+        assert (first >= bound_outputs(net, images, rows, offset).lower - 1e-6).all()
+        mine = family.others(images, rows, offset).lower
+        middle = images.b_lower + 0.5 * (images.b_upper - images.b_lower)
+        value = net(torch.from_numpy(middle.reshape(1, *SHAPE))).numpy() @ rows.T
+        assert (first - mine).max() <= 0.06 * (value - first).max()
+        cells = moved(images, 0.02, 3)
+        alone = bound_outputs(net, cells, rows, offset).lower
+        lent, fresh = (family.others(cells, rows, offset, fresh=own).lower for own in (False, True))
+        away = net(torch.from_numpy((middle + cells.b_lower - images.b_lower).reshape(1, *SHAPE))).numpy() @ rows.T
+        near.append([np.mean(away - v) / np.mean(away - alone) for v in (lent, fresh)])
+    assert np.mean(near, axis=0)[0] < 1.5 and np.mean(near, axis=0)[1] < 1.4
+
+
+def test_rows_of_a_whole_serve_its_parts_behind_products(tmp_path: Path) -> None:
+    gains = []
+    for seed in range(2):
+        net, _ = network(tmp_path, seed, True)
+        images = image_sets(SHAPE, 1, 2, 0.1, 0.02, seed)
+        rows, offset = np.random.default_rng(seed).normal(size=(4, 3)), np.zeros(4)
         family, parts = Family(net, images), halved(images)
-        whole = family.whole(rows, offset)
-        assert np.array_equal(whole.lower, bound_outputs(net, images, rows, offset).lower)
+        whole = family.first(rows, offset).lower
         alone = bound_outputs(net, parts, rows, offset).lower
-        shared = family.parts(parts, rows, offset).lower
-        fresh = family.parts(parts, rows, offset, fresh="all").lower
-        gains.append(np.mean(shared - whole.lower) / np.mean(alone - whole.lower))
-        own.append(np.mean(fresh - whole.lower) / np.mean(alone - whole.lower))
+        gains.append(np.mean(family.others(parts, rows, offset).lower - whole) / np.mean(alone - whole))
     assert np.mean(gains) > 0.5
-    assert np.mean(own) > 0.98
 
 
-def test_a_whole_without_bounds_helps_nothing(tmp_path: Path) -> None:
+def test_a_cell_without_bounds_helps_nothing(tmp_path: Path) -> None:
     net, _ = network(tmp_path, 0)
     images = image_sets(SHAPE, 1, 2, 0.1, 0.02)
     broken = replace(images, b_upper=np.full_like(images.b_upper, np.nan))
     rows, offset = np.eye(3), np.zeros(3)
     family, parts = Family(net, broken), halved(images)
-    assert (family.whole(rows, offset).lower == -np.inf).all()
-    assert np.array_equal(family.parts(parts, rows, offset).lower, bound_outputs(net, parts, rows, offset).lower)
+    assert (family.first(rows, offset).lower == -np.inf).all()
+    assert np.array_equal(family.others(parts, rows, offset).lower, bound_outputs(net, parts, rows, offset).lower)
+
+
+def test_rows_that_take_too_much_memory_are_not_kept(tmp_path: Path) -> None:
+    """What is not known is not used, and bounds hold."""
+    net, run = network(tmp_path, 0)
+    images = image_sets(SHAPE, 1, 2, 0.1, 0.05)
+    rows = np.eye(3)
+    family = Family(net, images, memory=1 << 17)
+    assert len(family._first.lent) < len(Family(net, images)._first.lent)
+    found = family.others(moved(images, 0.02, 3), rows, np.zeros(3))
+    least, _ = attack(net, run, moved(images, 0.02, 3), 0, rows, 32, 5)
+    assert (found.lower[0] <= least).all()
 
 
 # ---------------------------------------------------------------- joined sets
@@ -244,13 +327,13 @@ def test_poses_of_a_cell_are_in_its_slanted_parts(name: str) -> None:
         assert any(holds(part, exact(poses, values)) for part in parts)
 
 
-def test_halvings_aim_at_what_parts_may_cost() -> None:
+def test_divisions_aim_at_what_parts_may_cost() -> None:
     effects = np.array([4.0, 1.0, 0.0])
-    axes = halvings(effects, 0.24 * 4.0**1.6, 1, 0.24, 1 << 20)
-    left = effects / 2.0 ** np.bincount(axes, minlength=3)
-    assert left.sum() <= 0.25 * effects.sum() and axes[:2] == [0, 0] and 2 not in axes
-    assert len(halvings(effects, 0.1, 3, 0.24, 16)) == 3
-    assert 2 ** len(halvings(effects, 1e9, 3, 0.24, 16)) == 32
+    counts = divisions(effects, 0.24 * 4.0**1.6, 0.24, 1 << 20)
+    assert (effects / counts).sum() <= 0.25 * effects.sum() and counts[0] > counts[1] and counts[2] == 1
+    assert math.prod(counts) <= 12
+    assert divisions(effects, 0.1, 0.24, 16) == [1, 1, 1]
+    assert 16 < math.prod(divisions(effects, 1e9, 0.24, 16)) <= 32
 
 
 # ---------------------------------------------------------------- verdicts
@@ -259,8 +342,9 @@ def test_halvings_aim_at_what_parts_may_cost() -> None:
 class Rounded(Threshold):
     """A network whose bounds lose ten times what the sets leave open, and that can be shared."""
 
-    def __init__(self, threshold: float) -> None:
+    def __init__(self, threshold: float, lends_anywhere: bool = True) -> None:
         super().__init__(threshold)
+        self.lends_anywhere = lends_anywhere
         self.asked: list[tuple[str, int]] = []
 
     def bound(self, images: ImageSets, query: Query, substitution: Any = "everywhere") -> Any:
@@ -280,12 +364,12 @@ class Shared:
     def __init__(self, model: Rounded, images: ImageSets) -> None:
         self.model, self.images = model, images
 
-    def whole(self, query: Query) -> Any:
-        self.model.asked.append(("whole", 1))
+    def first(self, query: Query) -> Any:
+        self.model.asked.append(("first", 1))
         return self.model._lost(self.images, query)
 
-    def parts(self, images: ImageSets, query: Query, *, fresh: Fresh = "last") -> Any:
-        self.model.asked.append((fresh, images.count))
+    def others(self, images: ImageSets, query: Query, *, fresh: bool = False) -> Any:
+        self.model.asked.append(("fresh" if fresh else "others", images.count))
         return self.model._lost(images, query)
 
 
@@ -298,19 +382,20 @@ class Curved(Ramp):
         return super().sets(box)
 
 
-def covered(threshold: float, **settings: Any) -> tuple[Search, Rounded]:
-    scene, model = Curved(2), Rounded(threshold)
+def covered(threshold: float, lends_anywhere: bool = True, **settings: Any) -> tuple[Search, Rounded]:
+    scene, model = Curved(2), Rounded(threshold, lends_anywhere)
     pictures: Any = scene
     cover = Cover(pictures, model, model, CLAIM, **settings)
     return Search(pictures, model, CLAIM, Grid.adaptive(scene.box, (2, 2)), cover=cover), model
 
 
+@pytest.mark.parametrize("lends_anywhere", [False, True])
 @pytest.mark.parametrize("threshold", [0.1, 0.31, 0.43])
-def test_verdicts_of_covered_cells_are_the_truth(threshold: float) -> None:
-    search, model = covered(threshold)
+def test_verdicts_of_covered_cells_are_the_truth(threshold: float, lends_anywhere: bool) -> None:
+    search, model = covered(threshold, lends_anywhere)
     leaves, _ = drive(search, 150)
     scene = Curved(2)
-    assert {kind for kind, _ in model.asked} >= {"whole"}
+    assert {kind for kind, _ in model.asked} >= {"first"}
     for leaf in leaves:
         ends = [float(0.5 + scene.gains @ c) - threshold for c in search.grid.box_of(leaf.cell).corners()]
         if leaf.verdict == "certified":
@@ -365,7 +450,7 @@ def test_cells_that_take_too_many_parts_are_cut_where_that_helps() -> None:
     search, _ = covered(0.1, most=4)
     assert search.cover is not None
     box = search.grid.box
-    weights = Weights(np.full((2, 2, 3), 40.0 / 12.0), 0.4)
+    weights = Weights(np.full((2, 2, 3), 20.0 / 12.0), 0.4)
     found = search.cover.prove(box, np.array([0.5, 0.1]), weights)
     assert found.margin is None and found.parts == 0
     assert found.cuts[0] > found.cuts[1] >= 1

@@ -31,25 +31,46 @@ _BRANCHES = "test_network_branching.py::test_claims_next_to_the_exact_minimum"
 _LEVELS = "test_eight_bit.py::test_sets_hold_rounded_pictures"
 
 _FAMILY, _COVER = "verify/network/family.py", "verify/cover.py"
-_SHARED = "test_cover.py::test_ranges_of_parts_hold_every_value"
+_SHARED = "test_cover.py::test_rows_of_one_cell_hold_every_value"
 
 CERTIFICATES = (
     Fault(
-        "families: rows of the whole are taken from the part's reference",
-        _FAMILY, "_Part._pictures", "self.middle - self.whole.middle", "0.0 * self.middle", _SHARED,
+        "families: parts are taken about their own reference",
+        _FAMILY, "_Other._about", "np.repeat(self.first.middle, len(middle), axis=0)", "middle", _SHARED + "[True]",
     ),
     Fault(
         "families: rows that were passed back with a negative sign keep it",
-        _FAMILY, "_Whole._keep", "rows.value * sign[:, None].astype(np.float32)", "rows.value", _SHARED,
+        _FAMILY, "_Other._said", "middle * lent.sign", "middle", _SHARED + "[False]",
     ),
     Fault(
-        "families: the part's own width is left out",
-        _FAMILY, "_Part._evaluated", "spread[:, :m].T", "0.0 * spread[:, :m].T", _SHARED,
+        "families: the cell's own width is left out",
+        _FAMILY, "_Other._said", "half[0] + spread", "0.0 * half[0] + spread", _SHARED + "[False]",
+    ),
+    Fault(
+        "families: activations are taken to follow the first cell's slopes",
+        _FAMILY, "_Other._said", "spread[here] += sizes[:, -2]", "spread[here] += 0.0 * sizes[:, -2]",
+        _SHARED + "[False]",
+    ),
+    Fault(
+        "families: what rows gathered at products is forgotten",
+        _FAMILY, "_Other._said", "middle + 0.5 * (low + high)", "middle", _SHARED + "[True]",
     ),
     Fault(
         "families: what float32 products lose is not charged",
-        _FAMILY, "_Part._evaluated", "gamma * spread[:, m:].T", "0.0 * spread[:, m:].T",
-        "test_cover.py::test_products_of_rows_are_charged",
+        _FAMILY, "_Other._said", "gamma / (1.0 - gamma)", "0.0",
+        "test_cover.py::test_products_of_rows_are_charged[False]",
+    ),
+    Fault(
+        "families: an activation's range forgets the kink",
+        "verify/network/layers.py", "LeakyRelu.offsets", "least.clamp(max=0.0)", "least", _SHARED + "[False]",
+    ),
+    Fault(
+        "families: what follows the parameters has no width",
+        "verify/network/bounds.py", "_tilted", "z.r * (1.0 + 2.0**-40)", "0.0 * z.r", _SHARED + "[False]",
+    ),
+    Fault(
+        "families: what is between the offsets does not follow the parameters",
+        "verify/network/bounds.py", "_tilted", "t[:, None] * z.a", "0.0 * t[:, None] * z.a", _SHARED + "[False]",
     ),
     Fault(
         "parts: joined sets forget that slopes differ",

@@ -59,9 +59,6 @@ _MOTION_LINE, _MOTION = 0.08, 0.5
 _BLOCK_NUMBERS = 1 << 18
 #: Slanted parts of a cell at most, about: narrower cells need more of them in all.
 _MOST_SLANTED = 512
-#: What the sets of slanted parts may cost of the margin at first, and multiples of it by which neighbours may miss a
-#: proof for their rows to prove parts.
-_AIM_SLANTED, _FAR_SLANTED = 0.3, 10.0
 #: Cells of the first blocks: early results, of which a kill leaves the more.
 _FIRST_BLOCKS = (1, 1, 1, 1, 2, 2, 4, 4)
 #: Frames whose bounds a process keeps at hand.
@@ -405,10 +402,7 @@ class Certification:
             return found.box, found.feasible
 
         claim = self.claim(pictures, slanted.pose_set)
-        return Cover(
-            slanted, self.model, self.model, claim, frame, most=_MOST_SLANTED, block=1, aim=_AIM_SLANTED,
-            far=_FAR_SLANTED,
-        )  # fmt: skip
+        return Cover(slanted, self.model, self.model, claim, frame, most=_MOST_SLANTED, block=1)
 
     def around(self, extra: SceneVariation) -> Certification:
         """The same with more scenes in the sets."""

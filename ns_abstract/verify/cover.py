@@ -19,47 +19,55 @@ from ns_abstract.geometry.box import ParameterBox
 from ns_abstract.verify.properties import Claim
 
 if TYPE_CHECKING:
-    from ns_abstract.verify.network import Fresh, ImageSets, OutputBounds
+    from ns_abstract.verify.network import ImageSets, OutputBounds
     from ns_abstract.verify.properties import Query
     from ns_abstract.verify.search import Model, Scene
 
-#: Times what parts are cut for, the network is asked about one by itself, and about neighbours together; and the power
-#: of the width that sets cost.
-_ALONE, _TOGETHER, _POWER = 1.8, 2.5, 1.6
+#: The power of the width that sets cost.
+_POWER = 1.6
 #: What the mean width of pixels costs, however little the margin's gradient says: signs of units become open by it.
 _OPENING = 42.0
 #: What a box may cost is foreseen by so small a part of it: wide ones show nothing.
 _PROBE = 4
-#: Halvings that make the parts of a family.
-_FAMILY = 3
+#: Most parts that are bounded together.
+_GROUP = 64
+#: Times what parts are cut for from which on the network is not asked.
+_ALONE = 1.8
 #: How often parts are cut again, and how many times more parts there may be than a cell should take.
 _DEEP, _MORE = 3, 2.0
 #: Most halvings of a cell that is too wide to be covered at once.
 _CUTS = 6
-#: The aim is at least what parts cost that are proved together and so much of the margin left more, and at most so much
-#: of what they cost where neighbours are far from a proof.
-_EASY, _HARD = 0.6, 0.75
+#: Part of the margin that is to be left over of a part by its own rows, for them to serve its neighbours; and how much
+#: of what is left more, or less, parts are made dearer for.
+_SPARE, _STEP = 0.35, 0.6
+#: How many margins a part may miss a proof by for rows of its own before the last activation to help.
+_NEAR = 1.0
 #: Room for rounding of the joined sets: a few operations on each term.
 _ROOM = 2.0**-44
 
 
 class SharedBounds(Protocol):
-    """Bounds of a cell and its parts; see `ns_abstract.verify.network.family.Family`."""
+    """Bounds of a cell, and of others by its rows; see `ns_abstract.verify.network.family.Family`."""
 
-    def whole(self, query: Query) -> OutputBounds:
+    def first(self, query: Query) -> OutputBounds:
         """Bounds of the query's rows over the cell."""
         ...
 
-    def parts(self, images: ImageSets, query: Query, *, fresh: Fresh = "last") -> OutputBounds:
-        """The same over its parts."""
+    def others(self, images: ImageSets, query: Query, *, fresh: bool = False) -> OutputBounds:
+        """The same over other cells."""
         ...
 
 
 class SharingModel(Protocol):
     """A network whose rows can be shared."""
 
+    @property
+    def lends_anywhere(self) -> bool:
+        """Whether rows of a cell serve for others that are no parts of it."""
+        ...
+
     def family(self, images: ImageSets) -> SharedBounds:
-        """Bounds of one cell, to be shared with its parts."""
+        """Bounds of one cell, whose rows are to serve for others."""
         ...
 
 
@@ -152,7 +160,7 @@ class _Work:
         asked: Those of which the network was asked.
         done: What part of the box is proved, or holds no pose.
         margins: Lower bounds of the margin over what is proved.
-        dear: The least that parts cost of neighbours that were far from a proof.
+        rows: Of the latest part with rows of its own, if they serve for others.
     """
 
     feasible: Callable[[ParameterBox], ParameterBox | None]
@@ -163,15 +171,12 @@ class _Work:
     asked: int = 0
     done: float = 0.0
     margins: list[float] = field(default_factory=list)
-    dear: float = math.inf
+    rows: SharedBounds | None = None
 
-    def learn(self, cost: float, margin: float, far: float) -> None:
-        """Take notice of what came of neighbours whose parts cost so much: a multiple of the margin."""
-        if margin < -far:
-            self.dear = min(self.dear, cost)
-            self.aim = min(self.aim, _HARD * cost)
-        elif margin > 0.0:
-            self.aim = min(max(self.aim, (1.0 + _EASY * margin) * cost), _HARD * self.dear)
+    def learn(self, cost: float, margin: float) -> None:
+        """Take notice of the margin that own rows prove for a part that costs so much."""
+        left = max(margin / self.weights.margin, -1.0) - _SPARE
+        self.aim = cost * (1.0 + _STEP * left)
 
 
 @dataclass(frozen=True)
@@ -184,13 +189,14 @@ class _Node:
     share: float
     depth: int
 
-    def halves(self, axis: int) -> Iterator[_Node]:
+    def parts(self, axis: int, count: int) -> Iterator[_Node]:
+        """Equal parts along a parameter; neighbours share their ends."""
         effects = self.effects.copy()
-        effects[axis] *= 0.5
+        effects[axis] /= count
         whole = float(self.effects.sum())
         cost = self.cost * (float(effects.sum()) / whole) ** _POWER if whole > 0.0 else self.cost
-        for half in self.box.split(axis):
-            yield _Node(half, effects, cost, 0.5 * self.share, self.depth)
+        for part in self.box.split(axis, count):
+            yield _Node(part, effects, cost, self.share / count, self.depth)
 
 
 @dataclass(frozen=True)
@@ -206,8 +212,6 @@ class Cover:
         most: Most parts of a cell, about; one that would take more is cut first.
         block: Most cells that are examined together.
         aim: What the sets of parts may cost of the margin (`Weights.loss`), at first.
-        far: Multiple of the margin by which neighbours may miss a proof for their rows to prove parts; where they miss
-            it by more there are smaller neighbours. What a cut gains is the less the more parameters there are.
     """
 
     scene: Scene
@@ -215,10 +219,9 @@ class Cover:
     sharing: SharingModel
     claim: Claim
     frame: Frame = straight
-    most: int = 32
-    block: int = 4
-    aim: float = 0.2
-    far: float = 1.3
+    most: int = 64
+    block: int = 2
+    aim: float = 0.26
 
     def prove(self, cell: ParameterBox, outputs: np.ndarray, weights: Weights) -> Covered:
         """Try to prove a cell, if it takes few enough parts.
@@ -237,7 +240,7 @@ class Cover:
         if found is None:
             return Covered(None, self._cuts(cell, root, None, 1.0), 0)
         cost, effects = weights.loss(found) * _PROBE**_POWER, weights.effects(found) * _PROBE
-        if 2 ** len(halvings(effects, cost, _FAMILY, self.aim, self.most)) > self.most:
+        if math.prod(divisions(effects, cost, self.aim, self.most)) > self.most:
             return Covered(None, self._cuts(cell, root, effects, cost), 0)
         work = _Work(feasible, weights, self.claim.query(outputs[None]), self.aim)
         try:
@@ -257,22 +260,20 @@ class Cover:
         return found if found.sane else None
 
     def _all(self, work: _Work, node: _Node) -> None:
-        """Prove a box, in families of parts.
+        """Prove a box, in groups of parts.
 
         Raises:
             _StoppedError: It takes too many, or one cannot be proved.
         """
-        plan = halvings(node.effects, node.cost, _FAMILY, work.aim, self.most)
-        if len(plan) > _FAMILY:
-            for half in node.halves(plan[0]):
+        counts = divisions(node.effects, node.cost, work.aim, self.most)
+        if math.prod(counts) > _GROUP:
+            for half in node.parts(int(np.argmax(counts)), 2):
                 self._all(work, half)
             return
         parts = [node]
-        for axis in plan:
-            parts = [half for part in parts for half in part.halves(axis)]
-        kept = self._feasible(work, parts)
-        if kept:
-            self._family(work, node, kept)
+        for axis, count in enumerate(counts):
+            parts = [part for whole in parts for part in whole.parts(axis, count)]
+        self._group(work, parts)
 
     def _feasible(self, work: _Work, nodes: Iterable[_Node]) -> list[_Node]:
         """What the poses of the cell leave of them; what holds none is done with."""
@@ -285,62 +286,71 @@ class Cover:
                 kept.append(replace(node, box=box))
         return kept
 
-    def _family(self, work: _Work, node: _Node, nodes: list[_Node]) -> None:
-        """Prove the parts ``nodes`` of a box.
+    def _group(self, work: _Work, nodes: Sequence[_Node]) -> None:
+        """Prove neighbouring parts.
 
         Raises:
             _StoppedError: It takes too many parts, or one cannot be proved.
         """
+        nodes = self._feasible(work, nodes)
+        if not nodes:
+            return
         parts = self._bounded(work, nodes)
-        costs = [work.weights.loss(sets) for sets in parts]
+        costs = np.array([work.weights.loss(sets) for sets in parts])
         margins = np.full(len(parts), -np.inf)
-        whole, rows = joined(parts), None
-        if len(parts) > 1 and work.weights.loss(whole) < _TOGETHER * work.aim:
-            work.asked += len(parts)
-            rows = self.sharing.family(self._images([whole]))
-            margins[:] = self._proved(work, rows.whole(work.query), [whole])[0]
-            work.learn(float(np.mean(costs)), float(margins[0]) / work.weights.margin, self.far)
-            if margins[0] < -self.far * work.weights.margin:
-                # rows of what is so far from a proof prove little: smaller neighbours
-                self._apart(work, node)
-                return
-            if not margins[0] > 0.0:
-                margins = self._by_rows(work, rows, parts)
-        else:
-            left = [k for k, cost in enumerate(costs) if cost < _ALONE * work.aim]
+        asked = np.flatnonzero(costs < _ALONE * work.aim).tolist()
+        if asked:
+            work.asked += len(asked)
+            margins[asked] = self._together(work, [parts[k] for k in asked], costs[asked])
+        halves: list[_Node] = []
+        for k, part in self._left(work, nodes, margins):
+            # as expensive as what fails
+            cost = max(float(costs[k]), work.aim)
+            rest = _Node(part.box, work.weights.effects(parts[k]), cost, part.share, part.depth + 1)
+            halves += rest.parts(int(np.argmax(rest.effects)), 2)
+        for first in range(0, len(halves), _GROUP):
+            self._group(work, halves[first : first + _GROUP])
+
+    def _together(self, work: _Work, parts: Sequence[PictureSets], costs: np.ndarray) -> np.ndarray:
+        """[m] margins of parts, by as few rows as possible."""
+        if not self.sharing.lends_anywhere:
+            return self._joined(work, parts, costs)
+        margins = np.full(len(parts), -np.inf)
+        if work.rows is not None:
+            self._lent(work, work.rows, parts, margins)
+        middles = np.array([sets.box.middle for sets in parts])
+        size = np.maximum(np.array(parts[0].box.upper) - np.array(parts[0].box.lower), 1e-300)
+        while len(left := np.flatnonzero(~(margins > 0.0))):
+            # the middle one serves most
+            at = middles[left] / size
+            chosen = int(left[np.abs(at - at.mean(axis=0)).sum(axis=1).argmin()])
+            rows = self.sharing.family(self._images([parts[chosen]]))
+            margins[chosen] = self._proved(work, rows.first(work.query), [parts[chosen]])[0]
+            work.learn(float(costs[chosen]), float(margins[chosen]))
+            if not margins[chosen] > 0.0:
+                break
+            work.rows = rows
+            self._lent(work, rows, parts, margins)
+        return margins
+
+    def _lent(self, work: _Work, rows: SharedBounds, parts: Sequence[PictureSets], margins: np.ndarray) -> None:
+        """Prove those of ``parts`` without a margin by rows of another, in place."""
+        for fresh in (False, True):
+            # before, nothing is known of some
+            near = margins >= -_NEAR * work.weights.margin if fresh else True
+            left = np.flatnonzero(~(margins > 0.0) & near).tolist()
             if left:
                 chosen = [parts[k] for k in left]
-                margins[left] = self._proved(work, self.model.bound(self._images(chosen), work.query), chosen)
-        for k, part in self._left(work, nodes, margins):
-            effects = work.weights.effects(parts[k])
-            # as expensive as what fails
-            rest = _Node(part.box, effects, max(costs[k], work.aim), part.share, part.depth + 1)
-            if rows is None:
-                self._all(work, rest)
-            else:
-                self._halved(work, rows, rest)
+                margins[left] = self._proved(work, rows.others(self._images(chosen), work.query, fresh=fresh), chosen)
 
-    def _apart(self, work: _Work, node: _Node) -> None:
-        """Prove the halves of a box whose parts are too different.
-
-        Raises:
-            _StoppedError: It takes too many parts, or one cannot be proved.
-        """
-        if node.depth >= _DEEP:
-            raise _StoppedError
-        for half in self._feasible(work, node.halves(int(np.argmax(node.effects)))):
-            self._all(work, replace(half, depth=node.depth + 1))
-
-    def _halved(self, work: _Work, rows: SharedBounds, node: _Node) -> None:
-        """Prove a part that nearly was, by the rows that it nearly was proved by.
-
-        Raises:
-            _StoppedError: It takes too many parts, or one cannot be proved.
-        """
-        halves = self._feasible(work, node.halves(int(np.argmax(node.effects))))
-        parts = self._bounded(work, halves)
-        for _, half in self._left(work, halves, self._by_rows(work, rows, parts)):
-            self._all(work, replace(half, depth=node.depth + 1))
+    def _joined(self, work: _Work, parts: Sequence[PictureSets], costs: np.ndarray) -> np.ndarray:
+        """[m] margins of parts, by rows of sets that hold all of them."""
+        whole = joined(parts)
+        rows = self.sharing.family(self._images([whole]))
+        margins = np.full(len(parts), self._proved(work, rows.first(work.query), [whole])[0])
+        work.learn(float(costs.mean()), float(margins[0]))
+        self._lent(work, rows, parts, margins)
+        return margins
 
     def _bounded(self, work: _Work, nodes: Sequence[_Node]) -> list[PictureSets]:
         """Sets of parts.
@@ -372,17 +382,6 @@ class Cover:
         if any(node.depth >= _DEEP for _, node in left):
             raise _StoppedError
         return left
-
-    def _by_rows(self, work: _Work, rows: SharedBounds, parts: Sequence[PictureSets]) -> np.ndarray:
-        """[m] margins of parts of a whole that is not proved, by its rows and by some of their own."""
-        margins = np.full(len(parts), -np.inf)
-        for fresh in ("last", "all"):
-            left = np.flatnonzero(~(margins > 0.0)).tolist()
-            if left:
-                chosen = [parts[k] for k in left]
-                bounds = rows.parts(self._images(chosen), work.query, fresh=fresh)
-                margins[left] = self._proved(work, bounds, chosen)
-        return margins
 
     def _images(self, parts: Sequence[PictureSets]) -> ImageSets:
         linear = [np.stack([sets.linear[k] for sets in parts]) for k in range(4)]
@@ -427,19 +426,18 @@ class Cover:
         return float(np.log2(np.maximum(effects * part / goal, 1.0)).sum())
 
 
-def halvings(effects: np.ndarray, cost: float, least: int, aim: float, most: int) -> list[int]:
-    """Axes along which to halve, in turn, until the sets cost ``aim`` of the margin; ``least`` at least.
+def divisions(effects: np.ndarray, cost: float, aim: float, most: int) -> list[int]:
+    """Into how many equal parts to divide each parameter, for their sets to cost ``aim`` of the margin.
 
     There is no use in many more parts than ``most``.
     """
     gains = np.where(np.isfinite(effects), effects, 0.0) + 1e-300
     goal = (aim / cost) ** (1.0 / _POWER) * float(gains.sum()) if cost > aim else math.inf
-    axes: list[int] = []
-    while len(axes) < least or (gains.sum() > goal and 2 ** len(axes) <= most):
-        axis = int(np.argmax(gains))
-        gains[axis] *= 0.5
-        axes.append(axis)
-    return axes
+    counts = np.ones(len(gains), np.int64)
+    while (gains / counts).sum() > goal and counts.prod() <= most:
+        # what a further part gains, by what it costs
+        counts[np.argmax(gains / (counts * (counts + 1) * np.log1p(1.0 / counts)))] += 1
+    return counts.tolist()
 
 
 def joined(parts: Sequence[PictureSets]) -> PictureSets:

@@ -12,13 +12,13 @@ import torch
 
 from ns_abstract.verify.network import (
     Family,
-    Fresh,
     ImageSets,
     Network,
     NetworkArithmetic,
     OutputBounds,
     Substitution,
     bound_outputs,
+    lends_anywhere,
 )
 from ns_abstract.verify.network.branching import branch
 from ns_abstract.verify.preprocess import Preprocess
@@ -74,8 +74,12 @@ class NetworkModel:
     def input_sets(self, linear: tuple[np.ndarray, ...], lower: np.ndarray, upper: np.ndarray) -> ImageSets:
         return self.preprocess.sets((linear[0], linear[1], linear[2], linear[3]), lower, upper)
 
+    @property
+    def lends_anywhere(self) -> bool:
+        return lends_anywhere(self.network)
+
     def family(self, images: ImageSets) -> ModelFamily:
-        """Bounds of one cell that its parts can share (N15)."""
+        """Bounds of one cell, whose rows can serve for others (N15)."""
         shared = Family(self.network, parametric(images), memory=self.memory, arithmetic=self.arithmetic)
         return ModelFamily(shared)
 
@@ -105,15 +109,15 @@ class NetworkModel:
 
 @dataclasses.dataclass(frozen=True)
 class ModelFamily:
-    """A cell and its parts; see `ns_abstract.verify.cover.SharedBounds`."""
+    """A cell and others; see `ns_abstract.verify.cover.SharedBounds`."""
 
     family: Family
 
-    def whole(self, query: Query) -> OutputBounds:
-        return self.family.whole(query.rows, query.offset)
+    def first(self, query: Query) -> OutputBounds:
+        return self.family.first(query.rows, query.offset)
 
-    def parts(self, images: ImageSets, query: Query, *, fresh: Fresh = "last") -> OutputBounds:
-        return self.family.parts(images, query.rows, query.offset, fresh=fresh)
+    def others(self, images: ImageSets, query: Query, *, fresh: bool = False) -> OutputBounds:
+        return self.family.others(parametric(images), query.rows, query.offset, fresh=fresh)
 
 
 def parametric(images: ImageSets) -> ImageSets:

@@ -238,7 +238,7 @@ class _Form:
 class _Cells:
     """Bounds of one network over some cells."""
 
-    #: Whether rows are handed to `_keep` when they have reached the image.
+    #: Whether rows are handed to `_keep` when they have reached the image, and whether they may end before.
     keeps = False
 
     def __init__(
@@ -269,6 +269,8 @@ class _Cells:
         fields = self._fields(images)
         self._planes(fields, substitution)
         self.lines: dict[int, np.ndarray] = {}
+        #: the same with slopes of another cell's rows
+        self.offered: dict[int, _Offered] = {}
         #: what rows on a product become on its first and its second factor
         self.products: dict[int, tuple[np.ndarray, ...]] = {}
         #: what rows on a maximum become on the numbers of its windows
@@ -297,8 +299,12 @@ class _Cells:
         self.good &= finite
         fields = [np.where(finite.reshape(-1, *[1] * (f.ndim - 1)), f, 0.0) for f in fields]
         #: the images' reference
-        self.middle = 0.5 * (np.maximum(fields[1], fields[4]) + np.minimum(fields[3], fields[5]))
+        self.middle = self._about(0.5 * (np.maximum(fields[1], fields[4]) + np.minimum(fields[3], fields[5])))
         return fields
+
+    def _about(self, middle: Float64) -> Float64:
+        """[m, n] pictures that all is relative to, for the sets' middles: any will do."""
+        return middle
 
     def _planes(self, fields: list[np.ndarray], substitution: Substitution) -> None:
         """Image sets as rows want them, relative to the reference."""
@@ -335,8 +341,12 @@ class _Cells:
     def _within(self, form: _Form, lower: Tensor, upper: Tensor) -> _Form:
         """The form with bounds that are known besides; a cell without values in it is given up."""
         low, high = torch.maximum(form.lower, lower), torch.minimum(form.upper, upper)
-        fine = (low <= high) & torch.isfinite(form.reference) & torch.isfinite(form.c) & torch.isfinite(form.r)
-        fine &= torch.isfinite(form.a).all(1)
+        fine = low <= high
+        for known in (form.reference, form.c, form.r, form.a):
+            # sums are finite unless a number, or they, are not
+            if not bool(torch.isfinite(known.sum())):
+                finite = torch.isfinite(known)
+                fine = fine & (finite.all(1) if known.ndim > fine.ndim else finite)
         good = fine.reshape(self.count, -1).all(1)
         if self.assumed is not None and not bool(good.all()):
             # bounds that hold for all images with these signs contradict each other: there are none (N16)
@@ -524,38 +534,53 @@ class _Cells:
         # the slope as stored, rows' products with it and sums where branches meet
         unit = (_SPARE + self.network.readers[source]) * UNIT
         fold = source in self.noise and self.network.readers[source] == 1
-        stored = []
-        for slope, offset, side in (
-            (lines.lower_slope, lines.lower_offset, -1.0),
-            (lines.upper_slope, lines.upper_offset, 1.0),
-        ):
-            rounded = slope.float().double()
-            # the other side of a line with this slope, from the band
-            apart = band.lower_slope - slope
-            ends = apart * lower, apart * upper
-            if side < 0.0:
-                other = torch.maximum(*ends) + band.upper_offset
-            else:
-                other = torch.minimum(*ends) + band.lower_offset
-            base = slope * z.reference - reference
-            give = ((rounded - slope).abs() + unit * slope.abs()) * z.width + 2.0**-48 * apart.abs() * size + room
-            give = give + 2.0**-48 * (offset.abs() + other.abs() + slope.abs() * z.reference.abs())
-            if fold:
-                give = give + rounded.abs() * self.noise[source]
-            stored.append(rounded.float())
-            stored += [_outward(offset + base + side * give, side), _outward(other + base - side * give, -side)]
+
+        def stored(chosen: Sequence[tuple[Tensor, Tensor, Tensor]]) -> np.ndarray:
+            """As `pass_activation` wants slope, lower and upper offset for rows of either sign."""
+            found = []
+            for (slope, low, high), side in zip(chosen, (-1.0, 1.0), strict=True):
+                rounded = slope.float().double()
+                base, apart = slope * z.reference - reference, band.lower_slope - slope
+                give = ((rounded - slope).abs() + unit * slope.abs()) * z.width + 2.0**-48 * apart.abs() * size + room
+                give = give + 2.0**-48 * (low.abs() + high.abs() + slope.abs() * z.reference.abs())
+                if fold:
+                    give = give + rounded.abs() * self.noise[source]
+                ends = _outward(low + base - give, -1.0), _outward(high + base + give, 1.0)
+                found += [rounded.float(), *(ends if side < 0.0 else reversed(ends))]
+            return torch.stack(found).reshape(6, self.count, *grid(layer.shape)).numpy()
+
+        # the other sides of lines with these slopes are the band's
+        above = layer.offsets(lines.lower_slope, lower, upper, band)[1]
+        below = layer.offsets(lines.upper_slope, lower, upper, band)[0]
+        own = (lines.lower_slope, lines.lower_offset, above), (lines.upper_slope, below, lines.upper_offset)
+        self.lines[k] = stored(own)
+        lent = self._lent(k)
+        if lent is not None:
+            slopes = [torch.from_numpy(v).double().expand(self.count, *layer.shape) for v in lent]
+            plain = [layer.offsets(slope, lower, upper, band) for slope in slopes]
+            tilted = [_tilted(slope, z, line) for slope, line in zip(slopes, own, strict=True)]
+            # each is there for one side
+            better = tilted[0][0] > plain[0][0], tilted[1][1] < plain[1][1]
+            offsets, tilts = [], []
+            for slope, ends, (low, high, tilt), use in zip(slopes, plain, tilted, better, strict=True):
+                offsets.append((slope, torch.where(use, low, ends[0]), torch.where(use, high, ends[1])))
+                tilts.append(torch.where(use[:, None], tilt, torch.zeros_like(tilt)))
+            self.offered[k] = _Offered(stored(offsets), torch.stack(tilts).flatten(3).numpy())
         if fold:
             self.folded.add(source)
         if self.slope_steps and isinstance(layer, LeakyRelu):
             loose = unit * z.width + (self.noise[source] if fold else 0.0)
             given = (lower, upper, z.reference, reference, loose, room + torch.zeros_like(lower))
             self.open[k] = _open_units(layer, given)
-        self.lines[k] = torch.stack(stored).reshape(6, self.count, *grid(layer.shape)).numpy()
         lost = int(np.prod(layer.shape)) * 2 * _FLUSH
         self.flush += lost * z.width.reshape(self.count, -1).amax(1).numpy()
         ends = layer.range(lower, upper)
         room = room + 2.0**-48 * (ends[0].abs() + ends[1].abs())
         return self._within(form, ends[0] - reference - room, ends[1] - reference + room)
+
+    def _lent(self, k: int) -> tuple[np.ndarray, np.ndarray] | None:
+        """Slopes [1, *shape] of rows of another cell on node ``k``, not negative and negative ones."""
+        return None
 
     def _multiply(self, k: int, sources: tuple[int, ...], layer: Product, x: _Form, y: _Form) -> _Form:
         """A product of two nodes (N9)."""
@@ -926,26 +951,26 @@ class _Cells:
             # as many rows as stay together to the image
             step = min(step, max(16, -(-len(where) // (4 * threads))))
 
-        def bound(first: int) -> tuple[Int64, _Reached, list[_Arrived]]:
+        def bound(first: int) -> tuple[Int64, _Reached, Trace | None]:
             number = np.arange(first, min(len(where), first + step))
             cell, channel, y, x = (np.ascontiguousarray(v) for v in where[number].T)
             value = np.zeros((len(cell), channels, 1, 1), np.float32)
             value[np.arange(len(cell)), channel, 0, 0] = sign[number]
-            arrived: list[_Arrived] = []
-            part = self._backward(index, Rows(value, y, x), cell, None if enough is None else enough[number], arrived)
-            return number, part, arrived
+            trace = Trace(len(cell)) if self.keeps else None
+            part = self._backward(index, Rows(value, y, x), cell, None if enough is None else enough[number], trace)
+            return number, part, trace
 
-        for number, part, arrived in on_threads(bound, range(0, len(where), step), threads):
+        for number, part, trace in on_threads(bound, range(0, len(where), step), threads):
             found.put(number, part)
             if self.schedule.deep:
                 ends, count = np.unique(part.ended[part.ended > 0], return_counts=True)
                 self.spared += sum(n * self.schedule.costs.row(int(at)) for at, n in zip(ends, count, strict=True))
-            for rows in arrived:
-                self._keep(index, where[number[rows.number]], sign[number[rows.number]], rows)
+            if trace is not None:
+                self._keep(index, where[number], sign[number], trace)
         return found
 
-    def _keep(self, index: int, where: Int64, sign: Float64, rows: _Arrived) -> None:
-        """Take notice of rows of ``sign`` times single numbers of node ``index`` that have reached the image."""
+    def _keep(self, index: int, where: Int64, sign: Float64, trace: Trace) -> None:
+        """Take notice of rows of ``sign`` times single numbers of node ``index``."""
 
     def _backward(
         self,
@@ -953,15 +978,15 @@ class _Cells:
         rows: Rows,
         cell: Int64,
         enough: _Enough | None = None,
-        arrived: list[_Arrived] | None = None,
+        trace: Trace | None = None,
     ) -> _Reached:
         """Bounds of rows on node ``index``, relative to the reference.
 
-        Those of which ``enough`` is known may stop before the image; ``arrived`` takes in the others, if rows are kept.
+        Those of which ``enough`` is known may stop before the image; ``trace`` takes in what rows are on the way.
         """
         found = _Reached.unknown(len(cell), self.d)
         batch = _Batch({index: rows}, cell, np.zeros((len(cell), 2)), np.arange(len(cell)))
-        batch.arrived = arrived if self.keeps else None
+        batch.trace = trace
         self._descend(index, index, batch, found, enough)
         return found
 
@@ -977,7 +1002,8 @@ class _Cells:
                 for part in (slice(0, half), slice(half, None)):
                     self._descend(start, at, batch[part], found, enough)
                 return
-            if enough is not None and at != start and at in self.stops and len(batch.waiting) == 1:
+            ends = enough is not None and (batch.trace is None or self.schedule.deep)
+            if enough is not None and ends and at != start and at in self.stops and len(batch.waiting) == 1:
                 self._bound_rows(at, batch, self.stops[at], found)
                 going_on = ~enough.done(found, batch.number)
                 if going_on.mean() < 0.75:
@@ -995,6 +1021,9 @@ class _Cells:
             if batch.chosen is not None and not isinstance(node.layer, Linear):
                 here = full(here, node.layer.shape, force=True)
                 batch.chosen.keep(at, here.value, batch.number, len(found.lower))
+            gathered = batch.total.copy() if batch.trace is not None else batch.total
+            if batch.trace is not None and self._depends(start, at):
+                batch.trace.keep(at, here, node.layer.shape, batch.number)
             if isinstance(node.layer, Activation):
                 lines, which = self.lines[at], batch.cell
                 if batch.chosen is not None and at in batch.chosen.lines:
@@ -1014,6 +1043,8 @@ class _Cells:
                     noise = self.noise[at].reshape(self.count, *shape).contiguous().numpy()
                     charge(here.value, here.y, here.x, batch.cell, noise, batch.total)
                 parts = node.layer.backward(here)
+            if batch.trace is not None and isinstance(node.layer, (MaxPool, Product)):
+                batch.trace.fixed[batch.number] += batch.total - gathered
             for source, part in zip(node.inputs, parts, strict=True):
                 known = batch.waiting.get(source)
                 shape = self.network.shape(source)
@@ -1021,12 +1052,16 @@ class _Cells:
         if batch.chosen is not None and 0 in batch.waiting:
             whole = full(batch.waiting[0], self.network.input_shape, force=True)
             batch.chosen.keep(0, whole.value, batch.number, len(found.lower))
-        if batch.arrived is not None and 0 in batch.waiting:
-            whole = full(batch.waiting[0], self.network.input_shape, force=True)
-            # what is bounded next goes through the same memory
-            value = whole.value.reshape(len(batch.cell), -1).copy()
-            batch.arrived.append(_Arrived(batch.number, value, batch.total.copy()))
+        if batch.trace is not None:
+            batch.trace.reached[batch.number] = True
+            if 0 in batch.waiting:
+                batch.trace.keep(0, batch.waiting[0], self.network.input_shape, batch.number)
         self._bound_rows(0, batch, self.columns, found)
+
+    def _depends(self, start: int, at: int) -> bool:
+        """Whether what rows that start at node ``start`` gather at another one depends on the cell's ranges (N15)."""
+        layer = self.network.nodes[at - 1].layer
+        return isinstance(layer, Activation) or (isinstance(layer, Linear) and at != start and at not in self.folded)
 
     def _bound_rows(self, at: int, batch: _Batch, known: Columns, found: _Reached) -> None:
         """Bounds of a batch whose rows are all on node ``at``."""
@@ -1159,6 +1194,18 @@ class _Cells:
         return OutputBounds(lower, np.where(usable[..., None], a, 0.0), np.where(usable, b, -np.inf), loosest)
 
 
+def _tilted(slope: Tensor, z: _Form, line: tuple[Tensor, Tensor, Tensor]) -> tuple[Tensor, Tensor, Tensor]:
+    """(low, high, tilt [m, d, *shape]): an activation less ``slope`` times its input is between low and high + tilt p.
+
+    ``line``: slope and offsets of lines on both sides of it; the input is followed in between.
+    """
+    own, below, above = line
+    t = own - slope
+    middle, size = t * (z.reference + z.c), z.reference.abs() + z.c.abs() + z.a.abs().sum(1)
+    half = t.abs() * (z.r * (1.0 + 2.0**-40) + 2.0**-48 * size)
+    return below + middle - half, above + middle + half, t[:, None] * z.a
+
+
 def _open_units(layer: LeakyRelu, given: tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]) -> OpenUnits:
     """The units [m, *shape] of a ReLU that are open, with what `OpenUnits` holds of them."""
     where = layer.open(given[0], given[1]).flatten(1).nonzero()
@@ -1240,18 +1287,42 @@ class _Maxima(NamedTuple):
         return Rows(target, rows.y * down - layer.pads[0], rows.x * right - layer.pads[1])
 
 
-class _Arrived(NamedTuple):
-    """Rows on the image.
+class _Offered(NamedTuple):
+    """An activation beside slopes of another cell's rows (N15).
 
     Attributes:
-        number: [R] which rows of a call of `_Cells._backward` they are.
-        value: [R, n] float32.
-        total: [R, 2] what they gathered on their way, at least and at most.
+        lines: [6, m, C, H, W] float32 as `pass_activation` takes them.
+        tilts: [2, m, d, n] slopes in the parameters of what is between the offsets, for rows of either sign.
     """
 
-    number: Int64
-    value: NDArray[np.float32]
-    total: Float64
+    lines: np.ndarray
+    tilts: Float64
+
+
+class Trace:
+    """What rows of one call of `_Cells._backward` are on their way to the image.
+
+    Args:
+        count: Rows R.
+
+    Attributes:
+        rows: By node: [R, n] float32 rows on outputs of nodes at which they gather what depends on the cell's ranges,
+            and on the image (0).
+        fixed: [R, 2] what they gather at other nodes but the first, at least and at most.
+        reached: [R] which of them reach the image.
+    """
+
+    def __init__(self, count: int) -> None:
+        self.rows: dict[int, NDArray[np.float32]] = {}
+        self.fixed = np.zeros((count, 2))
+        self.reached = np.zeros(count, bool)
+
+    def keep(self, at: int, rows: Rows, shape: tuple[int, ...], number: Int64) -> None:
+        """Remember rows ``number`` on the output of node ``at``."""
+        if at not in self.rows:
+            self.rows[at] = np.zeros((len(self.fixed), int(np.prod(shape))), np.float32)
+        whole = full(rows, shape, force=True)
+        self.rows[at][number] = whole.value.reshape(len(number), -1)
 
 
 @dataclass
@@ -1264,7 +1335,7 @@ class _Batch:
         total: [R, 2] what rows gathered so far, at least and at most.
         number: [R] positions in the result.
         chosen: Lines of rows' own, and a place for what rows are on the way.
-        arrived: A place for rows that reach the image.
+        trace: A place for what rows are on the way.
     """
 
     waiting: dict[int, Rows]
@@ -1272,11 +1343,11 @@ class _Batch:
     total: Float64
     number: Int64
     chosen: Chosen | None = None
-    arrived: list[_Arrived] | None = None
+    trace: Trace | None = None
 
     def __getitem__(self, part: Any) -> _Batch:
         waiting = {k: rows[part] for k, rows in self.waiting.items()}
-        return _Batch(waiting, self.cell[part], self.total[part], self.number[part], self.chosen, self.arrived)
+        return _Batch(waiting, self.cell[part], self.total[part], self.number[part], self.chosen, self.trace)
 
     @property
     def bytes(self) -> int:

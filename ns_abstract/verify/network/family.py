@@ -1,8 +1,9 @@
-"""Bounds of the parts of a cell by rows of the whole (docs/design.md, N15)."""
+"""Bounds of cells by the rows of one of them (docs/design.md, N15)."""
 
 from __future__ import annotations
 
-from typing import Any, Literal
+from dataclasses import dataclass
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -14,16 +15,18 @@ from ns_abstract.verify.network.bounds import (
     ImageSets,
     Int64,
     OutputBounds,
-    _Arrived,
+    Trace,
     _Cells,
     _Form,
     bound_outputs,
 )
 from ns_abstract.verify.network.graph import Network, NetworkArithmetic
-from ns_abstract.verify.network.layers import Activation
+from ns_abstract.verify.network.layers import Activation, LeakyRelu
+from ns_abstract.verify.network.maxima import MaxPool
+from ns_abstract.verify.network.products import Product
 from ns_abstract.verify.network.rows import grid
 
-#: Unit roundoff of the products of rows and pictures, and the smallest normal number of float32.
+#: Unit roundoff of the products of rows and columns, and the smallest normal number of float32.
 _UNIT, _FLUSH = 2.0**-24, 2.0**-126
 #: Largest images of which rows are kept: their sums' rounding must stay small.
 _MOST_NUMBERS = 1 << 19
@@ -31,87 +34,105 @@ _MOST_NUMBERS = 1 << 19
 _ROWS_SHARE = 0.25
 #: Room for rounding of a few sums in float64.
 _ROOM = 2.0**-46
+#: Rows that are multiplied at a time: their absolute values should stay in a processor's cache.
+_ROWS_AT_ONCE = 256
 
-#: Of which numbers, if the whole's rows leave them open, a part's own rows are passed back: of those before the last
-#: activation or product, or before all.
-Fresh = Literal["last", "all"]
+#: Part of a number's width by which it may miss being open for the first cell to pass back a row for it.
+_NEARLY = 0.25
+
+
+def lends_anywhere(network: Network) -> bool:
+    """Whether rows of a cell serve for others that are no parts of it.
+
+    At maxima and products they gather what holds for the cell alone.
+    """
+    return not any(isinstance(node.layer, (MaxPool, Product)) for node in network.nodes)
 
 
 class Family:
-    """Bounds of one cell, and of its parts by the rows that were passed back for the whole.
+    """Bounds of one cell, and of others by the rows that were passed back for it.
 
     Args:
         network: The network.
-        whole: One cell.
+        first: One cell.
         memory: Bytes to stay within, roughly.
         arithmetic: As in `ns_abstract.verify.network.bound_outputs`.
     """
 
     def __init__(
-        self, network: Network, whole: ImageSets, *, memory: int = 1 << 30, arithmetic: NetworkArithmetic = "float32"
+        self, network: Network, first: ImageSets, *, memory: int = 1 << 30, arithmetic: NetworkArithmetic = "float32"
     ) -> None:
-        if whole.count != 1:
-            raise ValueError(f"one cell expected, got {whole.count}")
+        if first.count != 1:
+            raise ValueError(f"one cell expected, got {first.count}")
         self.network, self.memory = network, memory
         self.arithmetic: NetworkArithmetic = arithmetic
-        self._cell = _Whole(network, whole, memory, arithmetic)
+        self._first = _First(network, first, memory, arithmetic)
 
-    def whole(self, rows: Any, offset: Float64) -> OutputBounds:
-        """Lower bounds of ``rows @ y + offset`` over the cell."""
-        return self._cell.outputs(rows, np.asarray(offset, np.float64))
+    def first(self, rows: Any, offset: Float64) -> OutputBounds:
+        """Lower bounds of ``rows @ y + offset`` over the first cell."""
+        return self._first.outputs(rows, np.asarray(offset, np.float64))
 
-    def parts(self, images: ImageSets, rows: Any, offset: Float64, *, fresh: Fresh = "last") -> OutputBounds:
-        """Lower bounds of ``rows @ y + offset`` over parts of the cell.
+    def others(self, images: ImageSets, rows: Any, offset: Float64, *, fresh: bool = False) -> OutputBounds:
+        """Lower bounds of ``rows @ y + offset`` over other cells.
 
         Args:
-            images: m sets, each in parameters of its own, of images that obey those of the whole as well.
+            images: m sets, each in parameters of its own; of images that obey those of the first cell as well unless
+                the network `lends_anywhere`.
             rows, offset: As in `ns_abstract.verify.network.bound_outputs`.
-            fresh: What has rows of the part's own.
+            fresh: Whether all that is open before the last activation or product has rows of the cell's own.
         """
         offset = np.asarray(offset, np.float64)
-        if not self._cell.good[0]:
+        if not self._first.good[0]:
             return bound_outputs(self.network, images, rows, offset, memory=self.memory, arithmetic=self.arithmetic)
         shapes = [self.network.shape(k) for k in range(len(self.network.nodes) + 1)]
-        by_cell = sum(int(np.prod(shape)) for shape in shapes) * 8 * (3 * images.dimensions + 14)
+        by_cell = sum(int(np.prod(shape)) for shape in shapes) * 8 * (3 * images.dimensions + 18)
         step = max(1, int(0.25 * self.memory) // by_cell)
-        own = max(self._cell.ranges, default=0) if fresh == "last" else 0
         found = []
         for first in range(0, images.count, step):
-            part = _Part(self._cell, images[first : first + step], self.memory, self.arithmetic, own)
+            part = _Other(self._first, images[first : first + step], self.memory, self.arithmetic, fresh)
             found.append(part.outputs(rows, offset))
         return OutputBounds(*(np.concatenate([getattr(part, name) for part in found]) for name in ("lower", "a", "b")))
 
 
-class _Known:
-    """What a whole cell's rows say of some numbers of a node.
+@dataclass
+class _Lent:
+    """Rows of one cell on numbers of one node.
 
     Attributes:
         flat: [R] which numbers; a number may have two rows.
-        rows: [R, n] float32.
-        least, most: [R]: number - rows @ (image - reference image) lies between them.
+        sign: [R] what the rows are of: 1, or -1 for the numbers' negatives.
+        rows: By node: [R, n] float32 as in `Trace`.
+        fixed: [R, 2] as in `Trace`.
     """
 
-    def __init__(self) -> None:
-        self.parts: list[tuple[Int64, NDArray[np.float32], Float64, Float64]] = []
+    flat: Int64
+    sign: Float64
+    rows: dict[int, NDArray[np.float32]]
+    fixed: Float64
 
-    def joined(self) -> tuple[Int64, NDArray[np.float32], Float64, Float64]:
-        """(flat, rows, least, most)."""
-        if len(self.parts) > 1:
-            flat, rows, least, most = zip(*self.parts, strict=True)
-            self.parts = [tuple(np.concatenate(v) for v in (flat, rows, least, most))]  # pyright: ignore[reportAttributeAccessIssue]
-        return self.parts[0]
+    def joined(self, other: _Lent) -> _Lent:
+        """With those of another."""
+        rows = {}
+        for at in self.rows.keys() | other.rows.keys():
+            both = [
+                lent.rows[at] if at in lent.rows else np.zeros((len(lent.flat), width), np.float32)
+                for width in [(self.rows if at in self.rows else other.rows)[at].shape[1]]
+                for lent in (self, other)
+            ]
+            rows[at] = np.concatenate(both)
+        one, two = self, other
+        return _Lent(
+            np.concatenate([one.flat, two.flat]), np.concatenate([one.sign, two.sign]), rows,
+            np.concatenate([one.fixed, two.fixed]),
+        )  # fmt: skip
 
 
-class _Whole(_Cells):
-    """One cell that remembers what it finds out about numbers before activations and products."""
-
-    keeps = True
+class _First(_Cells):
+    """One cell that remembers rows of numbers before activations and products."""
 
     def __init__(self, network: Network, images: ImageSets, memory: int, arithmetic: NetworkArithmetic) -> None:
-        #: by node: rows, and what all numbers are at least and at most
-        self.known: dict[int, _Known] = {}
-        self.ranges: dict[int, tuple[Tensor, Tensor]] = {}
-        self._references: dict[int, Float64] = {}
+        #: by node
+        self.lent: dict[int, _Lent] = {}
         self._left = _ROWS_SHARE * memory
         self.keeps = images.lower.shape[1] <= _MOST_NUMBERS
         super().__init__(network, images, "everywhere", memory, arithmetic)
@@ -119,114 +140,190 @@ class _Whole(_Cells):
     def _known_better(
         self, index: int, form: _Form, open_: Tensor, apart: Tensor | None, layer: Activation | None = None
     ) -> _Form:
-        self._references[index] = form.reference.reshape(-1).numpy()
-        found = super()._known_better(index, form, open_, apart, layer)
-        lower, upper = found.interval
-        self.ranges[index] = lower[0], upper[0]
-        return found
+        if isinstance(layer, LeakyRelu):
+            # they may be open elsewhere
+            lower, upper = form.interval
+            near = _NEARLY * (upper - lower)
+            open_ = (lower < near) & (upper > -near)
+        return super()._known_better(index, form, open_, apart, layer)
 
-    def _keep(self, index: int, where: Int64, sign: Float64, rows: _Arrived) -> None:
-        if index not in self._references or rows.value.nbytes > self._left:
+    def _keep(self, index: int, where: Int64, sign: Float64, trace: Trace) -> None:
+        size = sum(rows.nbytes for rows in trace.rows.values())
+        if size > self._left or not trace.reached.any():
             return
-        self._left -= rows.value.nbytes
+        self._left -= size
         flat = np.array(np.ravel_multi_index(tuple(where[:, 1:].T), grid(self.network.shape(index))), np.int64)
-        low, high = rows.total[:, 0] - self.flush[0], rows.total[:, 1] + self.flush[0]
-        low, high = np.where(sign > 0.0, low, -high), np.where(sign > 0.0, high, -low)
-        reference = self._references[index][flat]
-        room = _ROOM * (np.abs(reference) + np.abs(low) + np.abs(high))
-        value: NDArray[np.float32] = rows.value * sign[:, None].astype(np.float32)
-        self.known.setdefault(index, _Known()).parts.append(
-            (flat, value, reference + low - room, reference + high + room)
-        )
+        found = _Lent(flat, np.asarray(sign, np.float64), trace.rows, trace.fixed)
+        if not trace.reached.all():
+            kept = trace.reached
+            found = _Lent(
+                flat[kept], found.sign[kept], {at: rows[kept] for at, rows in trace.rows.items()}, trace.fixed[kept]
+            )
+        self.lent[index] = self.lent[index].joined(found) if index in self.lent else found
 
 
-class _Part(_Cells):
-    """Parts of a cell: rows of the whole are evaluated on their sets (N15).
+class _Said(NamedTuple):
+    """What rows say of numbers of a node, relative to the reference: they are within ``half`` of ``slopes p + middle``.
 
-    From node ``own`` on, rows of the part's own are passed back for what these leave open.
+    Attributes:
+        slopes: [m, R, d].
+        middle, half: [m, R].
+        lower, upper: [m, R] what the numbers are at least and at most.
     """
 
-    def __init__(self, whole: _Whole, images: ImageSets, memory: int, arithmetic: NetworkArithmetic, own: int) -> None:
-        self.whole, self.own = whole, own
-        self._columns: tuple[NDArray[np.float32], NDArray[np.float32]] | None = None
-        super().__init__(whole.network, images, "everywhere", memory, arithmetic)
+    slopes: Float64
+    middle: Float64
+    half: Float64
+    lower: Float64
+    upper: Float64
 
-    def _pictures(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """The sets as middles [n, m (d + 1)] and as radii and sizes [n, 2 m], relative to the whole's reference."""
-        if self._columns is None:
-            m, d = self.count, self.d
-            slopes, offsets = self.image.slopes.reshape(m, 2, -1, d), self.image.offsets.reshape(m, 2, -1)
-            moved = self.middle - self.whole.middle
-            a, b = slopes.mean(1), offsets.mean(1) + moved
-            radius = 0.5 * (offsets[:, 1] - offsets[:, 0]) + 0.5 * np.abs(slopes[:, 1] - slopes[:, 0]).sum(-1)
-            radius = np.maximum(radius, 0.0) + _ROOM * (
-                np.abs(offsets).max(1) + np.abs(slopes).max(1).sum(-1) + np.abs(self.middle) + np.abs(self.whole.middle)
-            )
-            size = np.abs(a).sum(-1) + np.abs(b)
-            middles = np.concatenate([a.transpose(1, 0, 2).reshape(-1, m * d), b.T], 1)
-            radii = np.concatenate([radius.T, size.T], 1)
-            self._columns = middles.astype(np.float32), radii.astype(np.float32)
-        return self._columns
 
-    def _evaluated(self, index: int) -> tuple[Int64, Float64, Float64, Float64, Float64]:
-        """What the whole's rows say here: (flat [R], slopes [m, R, d], middle, half, room [m, R]).
+class _Other(_Cells):
+    """Cells that are bounded by rows of another one (N15)."""
 
-        Each number is within ``half`` of ``slopes p + middle``.
+    def __init__(
+        self, first: _First, images: ImageSets, memory: int, arithmetic: NetworkArithmetic, fresh: bool
+    ) -> None:
+        self.first = first
+        self._last = max(first.lent, default=0) if fresh else None
+        self._columns: dict[int, tuple[NDArray[np.float32], NDArray[np.float32]]] = {}
+        super().__init__(first.network, images, "everywhere", memory, arithmetic)
+
+    def _about(self, middle: Float64) -> Float64:
+        # what rows gathered at maxima and products is relative to the first cell's reference
+        return np.repeat(self.first.middle, len(middle), axis=0)
+
+    def _lent(self, k: int) -> tuple[np.ndarray, np.ndarray]:
+        shape = self.network.shape(k)
+        return self.first.lines[k][0, 0].reshape(shape), self.first.lines[k][3, 0].reshape(shape)
+
+    def _column(self, at: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """What rows on the output of node ``at`` are multiplied by, [n, m k], and what their sizes are, [n, m l].
+
+        Columns of one kind stand together. Rows: slopes [d], middle, and of intervals alone; sizes: half and that of
+        intervals, on the image. Rows: slopes [d], middle and half; sizes: the same, at activations. Sizes: rounding, at
+        linear layers. The last column of sizes is that of all that is added up.
         """
+        if at not in self._columns:
+            m, d = self.count, self.d
+            signed: list[Float64] = []
+            if at == 0:
+                slopes, offsets = self.image.slopes.reshape(m, 2, -1, d), self.image.offsets.reshape(m, 2, -1)
+                half = 0.5 * (offsets[:, 1] - offsets[:, 0]) + 0.5 * np.abs(slopes[:, 1] - slopes[:, 0]).sum(-1)
+                half = np.maximum(half, 0.0) + _ROOM * (np.abs(offsets).max(1) + np.abs(slopes).max(1).sum(-1))
+                low, high = self.image.lower.reshape(m, -1), self.image.upper.reshape(m, -1)
+                box = 0.5 * (high - low) + _ROOM * (np.abs(low) + np.abs(high))
+                signed = [*np.moveaxis(slopes.mean(1), -1, 0), offsets.mean(1), 0.5 * (low + high)]
+                sized = [half, box]
+            elif at in self.offered:
+                offered = self.offered[at]
+                _, low, high, _, above, below = offered.lines.reshape(6, m, -1).astype(np.float64)
+                one, two = np.moveaxis(offered.tilts, 2, 1)
+                # a row a gathers (a + |a|) / 2 times what stands first and (a - |a|) / 2 times the other
+                pairs = [*zip(one, two, strict=True), (0.5 * (low + high), 0.5 * (above + below))]
+                half, least = 0.5 * (high - low), 0.5 * (above - below)
+                signed = [*(0.5 * (x + y) for x, y in pairs), 0.5 * (half - least)]
+                sized = [*(0.5 * (x - y) for x, y in pairs), 0.5 * (half + least)]
+            else:
+                sized = [self.noise[at].reshape(m, -1).numpy()]
+            sized = [*sized, np.sum([np.abs(v) for v in (*signed, *sized)], axis=0)]
+            found = [np.reshape(v, (-1, sized[0].shape[1])).T.astype(np.float32, order="C") for v in (signed, sized)]
+            self._columns[at] = found[0], found[1]
+        return self._columns[at]
+
+    def _said(self, index: int) -> _Said:
+        """What the first cell's rows say of node ``index`` here."""
         m, d = self.count, self.d
-        flat, rows, least, most = self.whole.known[index].joined()
-        middles, radii = self._pictures()
-        size = np.abs(rows)
-        moved, spread = (rows @ middles).astype(np.float64), (size @ radii).astype(np.float64)
-        n = rows.shape[1]
-        gamma = (n + 2) * _UNIT / (1.0 - (n + 2) * _UNIT)
-        tiny = n * _FLUSH * (1.0 + float(size.max(initial=0.0)))
-        spread = (spread + tiny) / (1.0 - gamma)
-        slopes, base = moved[:, : m * d].reshape(-1, m, d).transpose(1, 0, 2), moved[:, m * d :].T
-        middle = base + 0.5 * (least + most)
-        # what float32 sums lose is relative to the products' sizes
-        half = spread[:, :m].T + gamma * spread[:, m:].T + (d + 1) * tiny + 0.5 * (most - least)
-        room = _ROOM * (np.abs(least) + np.abs(most) + np.abs(base) + np.abs(slopes).sum(-1) + half)
-        return flat, slopes, middle, half + room, room
+        lent = self.first.lent[index]
+        count = len(lent.flat)
+        # what intervals alone say has no slopes but those of what is between an activation's offsets
+        signed, tilted = np.zeros((count, d + 2, m)), np.zeros((count, d + 1, m))
+        half, spread, lost = np.zeros((count, 2, m)), np.zeros((count, m)), np.zeros((count, m))
+        for at, rows in lent.rows.items():
+            n = rows.shape[1]
+            gamma = (n + 4) * _UNIT / (1.0 - (n + 4) * _UNIT)
+            one, two = self._column(at)
+            tiny = n * _FLUSH * (1.0 + float(np.abs(rows).max(initial=0.0)))
+            for first in range(0, count, _ROWS_AT_ONCE):
+                part, here = rows[first : first + _ROWS_AT_ONCE], slice(first, first + _ROWS_AT_ONCE)
+                sums, sizes = ((v @ w).reshape(len(part), -1, m) for v, w in ((part, one), (np.abs(part), two)))
+                if at == 0:
+                    signed[here] += sums
+                    half[here] += sizes[:, :2]
+                elif at in self.offered:
+                    tilted[here] += sums[:, :-1]
+                    tilted[here] += sizes[:, :-2]
+                    spread[here] += sums[:, -1]
+                    spread[here] += sizes[:, -2]
+                else:
+                    spread[here] += sizes[:, 0]
+                # what float32 sums lose is relative to the products' sizes
+                lost[here] += gamma / (1.0 - gamma) * sizes[:, -1]
+                lost[here] += tiny * (d + 5)
+        signed, tilted, half = (np.moveaxis(v, (1, 2), (0, 1)) for v in (signed, tilted, half))
+        spread, lost = spread.T, lost.T
+        tilts, gathered = tilted[:d], tilted[d]
+        slopes, middle, moved = signed[:d] + tilts, signed[d] + gathered, signed[d + 1] + gathered
+        low, high = lent.fixed.T
+        if index in self.noise:
+            # what a row gathers where it starts
+            lost += self.noise[index].reshape(m, -1).numpy()[:, lent.flat]
+        spread = spread + 0.5 * (high - low) + lost + self.flush[:, None]
+        middle, moved = middle + 0.5 * (low + high), moved + 0.5 * (low + high)
+        half, box = half[0] + spread, half[1] + spread + np.abs(tilts).sum(0)
+        for known, center in ((half, middle), (box, moved)):
+            known += _ROOM * (np.abs(low) + np.abs(high) + np.abs(center) + np.abs(slopes).sum(0) + known + lost)
+        np.maximum(half, 0.0, out=half)
+        reach = half + np.abs(slopes).sum(0)
+        reach += _ROOM * (reach + np.abs(middle))
+        lower, upper = np.maximum(middle - reach, moved - box), np.minimum(middle + reach, moved + box)
+        turned = lent.sign < 0.0
+        ends = np.where(turned, -upper, lower), np.where(turned, -lower, upper)
+        return _Said(np.moveaxis(slopes, 0, -1) * lent.sign[:, None], middle * lent.sign, half, *ends)
 
     def _known_better(
         self, index: int, form: _Form, open_: Tensor, apart: Tensor | None, layer: Activation | None = None
     ) -> _Form:
-        form = self._inherited(index, form)
-        if index < self.own:
-            return form
+        form = self._borrowed(index, form)
         if layer is not None:
             open_, apart = layer.open(*form.interval), layer.apart(*form.interval)
+        if index in self.first.lent and index != self._last:
+            # rows of the cell's own for what has none
+            known = torch.zeros(form.reference[0].numel(), dtype=torch.bool)
+            known[torch.from_numpy(self.first.lent[index].flat)] = True
+            open_, apart = open_ & ~known.reshape(form.reference.shape[1:]), None
         return super()._known_better(index, form, open_, apart, layer)
 
-    def _inherited(self, index: int, form: _Form) -> _Form:
-        """The form with what is known of the whole cell."""
-        if index not in self.whole.ranges:
+    def _borrowed(self, index: int, form: _Form) -> _Form:
+        """The form with what the first cell's rows say."""
+        if index not in self.first.lent:
             return form
-        low, high = self.whole.ranges[index]
-        room = _ROOM * (form.reference.abs() + low.abs() + high.abs())
-        form = self._within(form, low - form.reference - room, high - form.reference + room)
-        if index not in self.whole.known:
-            return form
+        flat, sign = self.first.lent[index].flat, self.first.lent[index].sign
+        slopes, middle, half, least, most = self._said(index)
         m, d, shape = self.count, self.d, form.reference.shape
-        flat, slopes, middle, half, room = self._evaluated(index)
-        reference = form.reference.reshape(m, -1).numpy()[:, flat]
-        middle = middle - reference
-        half = half + room + _ROOM * np.abs(reference)
-        reach = np.abs(slopes).sum(-1) * (1.0 + _ROOM) + half
         lower, upper, c, r = (np.array(v.reshape(m, -1).numpy()) for v in (form.lower, form.upper, form.c, form.r))
         a = np.array(form.a.reshape(m, d, -1).numpy())
-        # a number's first row, then its second one
-        _, first = np.unique(flat, return_index=True)
-        second = np.setdiff1d(np.arange(len(flat)), first)
-        for part in (first, second):
-            at = flat[part]
-            lower[:, at] = np.fmax(lower[:, at], (middle - reach)[:, part])
-            upper[:, at] = np.fmin(upper[:, at], (middle + reach)[:, part])
-            better = half[:, part] < r[:, at]
-            c[:, at] = np.where(better, middle[:, part], c[:, at])
-            r[:, at] = np.where(better, half[:, part], r[:, at])
-            a[:, :, at] = np.where(better[:, None], slopes[:, part].transpose(0, 2, 1), a[:, :, at])
+        order = np.argsort(flat, kind="stable")
+        twice = flat[order[1:]] == flat[order[:-1]]
+        one, two = order[:-1][twice], order[1:][twice]
+        below, above = np.where(sign[one] > 0.0, one, two), np.where(sign[one] > 0.0, two, one)
+        single = np.setdiff1d(np.arange(len(flat)), np.concatenate([one, two]))
+        low, high = middle - half, middle + half
+        # each row is best on one side
+        for first, other in ((single, single), (below, above)):
+            at, apart = flat[first], slopes[:, other] - slopes[:, first]
+            center, tilt = 0.5 * (low[:, first] + high[:, other]), 0.5 * (slopes[:, first] + slopes[:, other])
+            radius = 0.5 * (high[:, other] - low[:, first]) + 0.5 * np.abs(apart).sum(-1)
+            radius = np.maximum(radius, 0.0) + _ROOM * (
+                np.abs(low[:, first]) + np.abs(high[:, other]) + np.abs(tilt).sum(-1)
+            )
+            for side in (first, other):
+                lower[:, at] = np.fmax(lower[:, at], least[:, side])
+                upper[:, at] = np.fmin(upper[:, at], most[:, side])
+            better = radius < r[:, at]
+            c[:, at] = np.where(better, center, c[:, at])
+            r[:, at] = np.where(better, radius, r[:, at])
+            a[:, :, at] = np.where(better[:, None], tilt.transpose(0, 2, 1), a[:, :, at])
         found = _Form(
             form.reference,
             torch.from_numpy(c).reshape(shape),

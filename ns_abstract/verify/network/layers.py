@@ -379,6 +379,15 @@ class Activation:
         """Two parallel lines (N3): the same tensor is both slopes."""
         raise AssertionError
 
+    def offsets(self, slope: Tensor, lower: Tensor, upper: Tensor, band: Lines) -> tuple[Tensor, Tensor]:
+        """What the function less ``slope * z`` is at least and at most between, but for rounding.
+
+        ``band``: two parallel lines, of which it is taken.
+        """
+        apart = band.lower_slope - slope
+        ends = apart * lower, apart * upper
+        return torch.minimum(*ends) + band.lower_offset, torch.maximum(*ends) + band.upper_offset
+
     def __call__(self, inputs: Sequence[Tensor]) -> Tensor:
         return self.function(inputs[0])
 
@@ -398,6 +407,12 @@ class LeakyRelu(Activation):
 
     def open(self, lower: Tensor, upper: Tensor) -> Tensor:
         return (lower < 0.0) & (upper > 0.0)
+
+    def offsets(self, slope: Tensor, lower: Tensor, upper: Tensor, band: Lines) -> tuple[Tensor, Tensor]:
+        # convex: most at an end, least there or at the kink
+        ends = [torch.where(z >= 0.0, (1.0 - slope) * z, (self.alpha - slope) * z) for z in (lower, upper)]
+        least = torch.minimum(*ends)
+        return torch.where(self.open(lower, upper), least.clamp(max=0.0), least), torch.maximum(*ends)
 
     def _chord(self, lower: Tensor, upper: Tensor) -> tuple[Tensor, Tensor]:
         """Slope and offset of an upper line: the chord where open, the function itself elsewhere."""
