@@ -59,6 +59,8 @@ _MOTION_LINE, _MOTION = 0.08, 0.5
 _BLOCK_NUMBERS = 1 << 18
 #: Slanted parts of a cell at most, about: narrower cells need more of them in all.
 _MOST_SLANTED = 512
+#: What their sets may cost of the margin at first.
+_AIM_SLANTED = 0.32
 #: Cells of the first blocks: early results, of which a kill leaves the more.
 _FIRST_BLOCKS = (1, 1, 1, 1, 2, 2, 4, 4)
 #: Frames whose bounds a process keeps at hand.
@@ -402,7 +404,7 @@ class Certification:
             return found.box, found.feasible
 
         claim = self.claim(pictures, slanted.pose_set)
-        return Cover(slanted, self.model, self.model, claim, frame, most=_MOST_SLANTED, block=1)
+        return Cover(slanted, self.model, self.model, claim, frame, most=_MOST_SLANTED, block=1, aim=_AIM_SLANTED)
 
     def around(self, extra: SceneVariation) -> Certification:
         """The same with more scenes in the sets."""

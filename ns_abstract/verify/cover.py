@@ -41,7 +41,7 @@ _CUTS = 6
 #: of what is left more, or less, parts are made dearer for.
 _SPARE, _STEP = 0.35, 0.6
 #: How many margins a part may miss a proof by for rows of its own before the last activation to help.
-_NEAR = 1.0
+_NEAR = 0.5
 #: Room for rounding of the joined sets: a few operations on each term.
 _ROOM = 2.0**-44
 
