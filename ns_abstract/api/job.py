@@ -192,8 +192,9 @@ class Job:
         keep_leaves: bool = False,
         stopped: Callable[[], bool] = lambda: False,
         progress: Callable[[TracePoint, float], None] = lambda point, share: None,
+        known: FrameResult | None = None,
     ) -> PartResult:
-        """Refine some tiles of frame ``index``, or all of them.
+        """Refine some tiles of frame ``index``, or all of them; ``known`` is what was found of it before.
 
         Raises:
             AbandonedError: ``stopped`` was true, or the time was over, before a first picture was there.
@@ -208,7 +209,7 @@ class Job:
 
         refinement = Refinement(
             frame, index, goal, seed=self.seed, keep_leaves=keep_leaves, stopped=over, progress=progress,
-            members=frame.members(self.seed), tiles=tiles,
+            members=frame.members(self.seed), tiles=tiles, known=known,
         )  # fmt: skip
         return refinement.run_part()
 

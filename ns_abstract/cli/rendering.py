@@ -131,6 +131,7 @@ def _fill(report: Report, job: Job, order: Order, engine: Engine, stop: Stop, co
             results = bounding.bound_frames(
                 job, pending, engine=engine, budget=budget, target_ratio=order.target_ratio,
                 keep_leaves=order.save_cells or order.explain, stop=stop, on_progress=meter.told,
+                found_before=report.stored,
             )  # fmt: skip
             for done, result in enumerate(results, 1):
                 # first what was asked for: drawing loads matplotlib
