@@ -121,8 +121,8 @@ class Job:
             raise InputError(f"found {limit}", field="--memory-limit", fix="give a positive number of GiB")
         if self.base_memory > self.memory:
             raise InputError(
-                f"{self.method.content} at this size needs {self.base_memory / 2**30:.1f} GiB, "
-                f"{self.memory / 2**30:.1f} GiB may be used",
+                f"{self.method.content} at this size needs {self.base_memory / 2**30:.2g} GiB, "
+                f"{self.memory / 2**30:.2g} GiB may be used",
                 field="--memory-limit",
                 fix="raise it, or raise --downscale-factor",
             )

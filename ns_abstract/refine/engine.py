@@ -335,7 +335,7 @@ class Refinement:
         self.outer_lower[tiles], self.outer_upper[tiles] = _usable(self.outer_lower[tiles], self.outer_upper[tiles])
 
     def _intersect(self, tiles: np.ndarray) -> None:
-        """Take what was known before into the outer bound of ``tiles``: both hold."""
+        """Take what was known before into the outer bound of ``tiles``: both hold (design.md, R5)."""
         if self._known is not None:
             lower, upper = self._known
             low, high = self.outer_lower[..., :COLORS], self.outer_upper[..., :COLORS]
