@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import io
 import os
 import resource
@@ -277,6 +278,29 @@ if __name__ == "__main__":
     print(*engine.pids, flush=True)
     time.sleep(600)
 """
+
+
+UNGUARDED_CLUSTER = """
+from ns_abstract.execution.engines import connected
+from ns_abstract.io.errors import InputError
+try:
+    with connected(None, 1):
+        pass
+except InputError as error:
+    print(error)
+"""
+
+
+@pytest.mark.skipif(importlib.util.find_spec("distributed") is None, reason="dask is not installed")
+def test_a_cluster_without_a_guard_is_told_what_it_needs(tmp_path: Path) -> None:
+    script = tmp_path / "script.py"
+    script.write_text(UNGUARDED_CLUSTER)
+    process = subprocess.run(
+        [sys.executable, str(script)], stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True, env=environment(),
+        timeout=LONG, check=False,
+    )  # fmt: skip
+    (said,) = process.stdout.splitlines()
+    assert str(script) in said and 'if __name__ == "__main__":' in said
 
 
 UNGUARDED = """

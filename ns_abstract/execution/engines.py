@@ -213,13 +213,7 @@ class Processes:
         connection.close()
         worker.process.join()
         if not begun and (worker.process.exitcode or 0) > 0 and (script := _unguarded_script()):
-            raise InputError(
-                f"a worker process ended before it could work (code {worker.process.exitcode}): it imports the script "
-                "that was started once more, which has no guard",
-                file=script,
-                field="workers",
-                fix='put what the script does under `if __name__ == "__main__":`, or give workers=1',
-            )
+            raise _needs_guard(script)
         self._deaths[key] = self._deaths.get(key, 0) + 1
         if self._deaths[key] > _RETRIES:
             raise InputError(
@@ -269,6 +263,15 @@ def _unguarded_script() -> Path | None:
         return None if name is None or "__main__" in Path(name).read_text(encoding="utf-8") else Path(name)
     except (OSError, ValueError):
         return None
+
+
+def _needs_guard(script: Path) -> InputError:
+    return InputError(
+        "a worker process ended before it could work: it imports the started script again, which has no guard",
+        file=script,
+        field="workers",
+        fix='put what the script does under `if __name__ == "__main__":`, or give workers=1',
+    )
 
 
 def _serve(connection: Connection) -> None:
@@ -586,6 +589,12 @@ def connected(address: str | None, workers: int = 1, tls: Tls | None = None) -> 
             field="--scheduler-address",
             fix="start one with `dask scheduler` and workers with `dask worker HOST:PORT --nthreads 1`",
         ) from None
+    except RuntimeError:
+        # of a cluster on this machine: its workers cannot start
+        script = _unguarded_script() if address is None else None
+        if script is None:
+            raise
+        raise _needs_guard(script) from None
     try:
         yield client
     finally:
