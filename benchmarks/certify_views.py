@@ -27,11 +27,11 @@ import numpy as np
 import torch
 from objects import KINDS, RUNS, write_nerf, write_run
 from train_views import CONFIDENCE, NERF, target_of
-from views import write_json
 
 import ns_abstract as nsa
 from ns_abstract.api.certification import FramePictures, PropertySource, Question
 from ns_abstract.geometry.camera_path import load_camera_path
+from ns_abstract.io.atomic import write_json
 from ns_abstract.verify.model import NetworkModel
 
 NETWORKS = Path(__file__).resolve().parent / "networks"

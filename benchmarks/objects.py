@@ -9,7 +9,6 @@ NeRF. Classes have the numbers of VOC's, as the head of the detection property h
 from __future__ import annotations
 
 import argparse
-import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,6 +21,7 @@ from ns_abstract.demo.buoy import REACH, buoy
 from ns_abstract.demo.nerf_fit import NerfNetwork, fit_field
 from ns_abstract.demo.writing import TIMESTAMP
 from ns_abstract.geometry.views import View, around, look_at, path_json
+from ns_abstract.io.atomic import write_json
 from ns_abstract.methods.nerf.scene import NerfScene
 from ns_abstract.methods.nerf.write import write_nerf_run
 from ns_abstract.methods.splat.activate import SH_C0
@@ -204,9 +204,7 @@ _EYE, _FOV, _FAR, _STEPS = (2.0, -1.4, 1.0), 40.0, 4.0, 1000
 def _path(folder: Path, name: str, view: View, target: tuple[float, float, float]) -> Path:
     orbit = {"target": list(target), "axis": [0.0, 0.0, 1.0], "azimuth": [0.0, 2.0 * np.pi]}
     value = path_json([view], perturbation={"version": 1, "sweep": "keyframes", "orbit": orbit})
-    path = folder / f"{name}.json"
-    path.write_text(json.dumps(value, indent=1) + "\n", encoding="utf-8")
-    return path
+    return write_json(folder / f"{name}.json", value)
 
 
 def write_run(folder: Path, name: str) -> tuple[Path, Path]:

@@ -208,9 +208,10 @@ def left_over(session: int) -> int:
 def inputs(folder: Path, frames: int, parts: int) -> dict[str, list[str]]:
     """Commands of a render and of a certificate over a small scene."""
     from certifying import linear  # pyright: ignore[reportMissingImports]
-    from conftest import blob_scene, ring, write_json  # pyright: ignore[reportMissingImports]
+    from conftest import blob_scene, ring  # pyright: ignore[reportMissingImports]
 
     from ns_abstract.geometry.views import path_json
+    from ns_abstract.io.atomic import write_json
     from ns_abstract.methods.splat.write import write_splatfacto_run
 
     config = write_splatfacto_run(

@@ -5,7 +5,6 @@ Shared by `train_views.py`, `certify_views.py` and `nerf_certificate.py`.
 
 from __future__ import annotations
 
-import json
 import math
 import time
 from collections.abc import Callable
@@ -191,8 +190,3 @@ def fit(
         share = step / steps if steps is not None else (time.process_time() - started) / seconds
     model.eval()
     return step
-
-
-def write_json(file: Path, value: Any) -> Path:
-    file.write_text(json.dumps(value, indent=1) + "\n", encoding="utf-8")
-    return file

@@ -7,12 +7,12 @@ import itertools
 import json
 import shutil
 import subprocess
-import time
 import urllib.request
-from collections.abc import Callable
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
+
+from waiting import LONG, until
 
 NAMES = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
 _FLAGS = (
@@ -25,20 +25,6 @@ _FLAGS = (
 def chromium() -> str | None:
     """Path of the browser, or None."""
     return next((found for name in NAMES if (found := shutil.which(name))), None)
-
-
-#: Seconds after which something hangs; no verdict depends on how fast the machine is.
-HANG = 3600.0
-
-
-def until(question: Callable[[], Any], what: str, alive: Callable[[], bool] = lambda: True) -> Any:
-    """Ask until the answer is true; fails if what is waited for has ended (not ``alive``) or hangs."""
-    end = time.monotonic() + HANG
-    while not (answer := question()):
-        assert alive(), f"{what}: its process has ended"
-        assert time.monotonic() < end, f"{what}: hangs"
-        time.sleep(0.1)
-    return answer
 
 
 class Browser:
@@ -63,7 +49,7 @@ class Browser:
                 lambda: self.process.poll() is None,
             )
             port = note.read_text().split("\n")[0]
-            with urllib.request.urlopen(f"http://127.0.0.1:{port}/json/list", timeout=HANG) as answer:
+            with urllib.request.urlopen(f"http://127.0.0.1:{port}/json/list", timeout=LONG) as answer:
                 tab = next(entry for entry in json.load(answer) if entry["type"] == "page")
             self.socket = self.stack.enter_context(connect(tab["webSocketDebuggerUrl"], max_size=None))
             self.call("Page.navigate", url=self.url)
@@ -75,14 +61,14 @@ class Browser:
     def __exit__(self, *_: Any) -> None:
         self.stack.close()
         self.process.terminate()
-        self.process.wait(HANG)
+        self.process.wait(LONG)
 
     def call(self, method: str, **parameters: Any) -> dict[str, Any]:
         """One command of the protocol."""
         number = next(self.numbers)
         self.socket.send(json.dumps({"id": number, "method": method, "params": parameters}))
         while True:
-            message = json.loads(self.socket.recv(timeout=HANG))
+            message = json.loads(self.socket.recv(timeout=LONG))
             if message.get("id") == number:
                 assert "error" not in message, message
                 return message["result"]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import logging
 import os
 import signal
@@ -18,6 +17,7 @@ import pytest
 
 from ns_abstract.arithmetic.kernel_cache import store
 from ns_abstract.geometry.views import View, look_at, path_json
+from ns_abstract.io.atomic import write_json
 from ns_abstract.methods.splat.scene import SplatScene
 from ns_abstract.methods.splat.write import write_splatfacto_run
 
@@ -96,12 +96,6 @@ def ring(count: int = 3, size: int = 32) -> list[View]:
     """``count`` views of the origin from a quarter of a circle."""
     angles = np.linspace(0.0, 0.5 * np.pi, count)
     return [View(look_at((1.6 * np.cos(a), 1.6 * np.sin(a), 0.4), (0.0, 0.0, 0.0)), 45.0, size, size) for a in angles]
-
-
-def write_json(file: Path, value: Any) -> Path:
-    """Write ``value`` as JSON and return the file."""
-    file.write_text(json.dumps(value))
-    return file
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,6 @@ import signal
 import sqlite3
 import subprocess
 import sys
-import time
 from collections.abc import Callable
 from contextlib import closing
 from pathlib import Path
@@ -17,17 +16,7 @@ from typing import Any
 
 import pytest
 from conftest import InProcess, environment
-
-#: Seconds after which what is waited for is not going to come, on any machine.
-LONG = 1800.0
-
-
-def until(condition: Callable[[], bool], process: subprocess.Popen[str] | None = None) -> None:
-    """Wait for something that comes by itself, or for the end of the process that brings it."""
-    end = time.monotonic() + LONG
-    while not condition() and (process is None or process.poll() is None):
-        assert time.monotonic() < end, f"waited for {LONG:.0f} s"
-        time.sleep(0.02)
+from waiting import LONG
 
 
 def stored(folder: Path) -> int:

@@ -426,6 +426,21 @@ def test_near_plane_alone(order):
     case.check(order, parts=1, count=25)
 
 
+@pytest.mark.parametrize("antialiased", [False, True])
+@both_orders
+def test_what_passes_the_near_plane_is_projected(order, antialiased):
+    """One layer that is never in the picture, one that is: cells that straddle the plane are as tight as others."""
+    aside = {"mean": (1.0, 1.0, -0.02), "scale": (0.17, 0.02, 0.06), "opacity": 0.97}
+    seen = {"mean": (0.001, 0.0, -0.02), "scale": 0.004, "opacity": 0.9, "color": (0.2, 0.9, 0.1)}
+    for layer, most in ((aside, 1e-9), (seen, 0.05)):
+        case = Case(scene(layer, background=(0.4, 0.5, 0.6), antialiased=antialiased), moves(z=(-0.0101, -0.0099)))
+        assert case.poses.box.lower[0] < -0.01 < case.poses.box.upper[0]
+        for parts in (1, 3):
+            width, sampled = case.check(order, parts, count=31)
+            assert (width - sampled).max() < most
+        assert (sampled.max() > 0.2) == (layer is seen)
+
+
 @both_orders
 def test_behind(order):
     """A large layer behind the camera is not drawn, and in front of it is."""

@@ -11,9 +11,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from browser import Browser, chromium, until
+from browser import Browser, chromium
 from nerfstudio_runs import Server, free_port, needs_nerfstudio
 from PIL import Image
+from waiting import until
 
 from ns_abstract.demo.writing import write_demo
 from ns_abstract.methods.splat.activate import activate

@@ -24,9 +24,10 @@ import onnxruntime
 import pytest
 import torch
 from certifying import classifier, linear
-from conftest import InProcess, Inputs, environment, write_json
-from interrupting import LONG, check_ended_in_a_library_call, check_interrupted, interrupted_at, stored, until
+from conftest import InProcess, Inputs, environment
+from interrupting import check_ended_in_a_library_call, check_interrupted, interrupted_at, stored
 from PIL import Image
+from waiting import LONG, until
 
 from ns_abstract.api import certifying, showing
 from ns_abstract.api.certification import (
@@ -42,6 +43,7 @@ from ns_abstract.cli.certify import Certify, certify
 from ns_abstract.demo.writing import write_demo
 from ns_abstract.execution.engines import Here, Processes
 from ns_abstract.execution.opening import forget
+from ns_abstract.io.atomic import write_json
 from ns_abstract.io.errors import InputError
 from ns_abstract.methods.splat.method import SplatMethod
 from ns_abstract.methods.splat.reference import Reference
@@ -464,7 +466,7 @@ def test_killed_run_resumed_equals_an_uninterrupted_one(planted: Case, finished:
         process = start(planted.options(folder, resume=round_ > 0))
         known = stored(folder)
         # killed as soon as it has stored something new
-        until(lambda: stored(folder) > known, process)  # noqa: B023
+        until(lambda: stored(folder) > known or process.poll() is not None)  # noqa: B023
         if process.poll() is not None:
             assert process.returncode == 0, process.stderr and process.stderr.read()
             break
@@ -485,7 +487,7 @@ def test_killed_run_resumed_equals_an_uninterrupted_one(planted: Case, finished:
 def test_interrupt_leaves_what_is_finished(planted: Case, finished: Path, tmp_path: Path) -> None:
     folder = tmp_path / "out"
     process = start(planted.options(folder, workers=2))
-    until(lambda: stored(folder) >= 3, process)
+    until(lambda: stored(folder) >= 3 or process.poll() is not None)
     process.send_signal(signal.SIGINT)
     _, said = process.communicate(timeout=LONG)
     if process.returncode == 0:

@@ -10,12 +10,12 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from conftest import write_json
 
 from ns_abstract.api.certification import PropertySource
 from ns_abstract.geometry.camera_path import Camera
 from ns_abstract.geometry.poses import PoseSet
 from ns_abstract.geometry.views import look_at
+from ns_abstract.io.atomic import write_json
 from ns_abstract.io.errors import InputError
 from ns_abstract.perturbation.specification import parse_perturbation
 from ns_abstract.verify.network import OutputBounds

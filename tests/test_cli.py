@@ -18,14 +18,16 @@ from typing import Any
 
 import numpy as np
 import pytest
-from conftest import SHIFT, InProcess, Inputs, blob_scene, environment, ring, write_json
-from interrupting import LONG, check_ended_in_a_library_call, check_interrupted, interrupted_at, until
+from conftest import SHIFT, InProcess, Inputs, blob_scene, environment, ring
+from interrupting import check_ended_in_a_library_call, check_interrupted, interrupted_at
+from waiting import LONG, until
 
 from ns_abstract.api.files import Settings, open_job
 from ns_abstract.cli import demo as demo_command
 from ns_abstract.cli import render as render_command
 from ns_abstract.cli.common import complaint
 from ns_abstract.geometry.views import View, path_json
+from ns_abstract.io.atomic import write_json
 from ns_abstract.io.folder import MARK
 from ns_abstract.methods.splat.scene import SplatScene
 from ns_abstract.report.figures import listed
@@ -627,7 +629,7 @@ def test_signal_saves_what_is_finished(number: int, make_blobs: Callable[..., In
     command = [sys.executable, "-m", MODULE, *options]
     process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True, env=environment())
     try:
-        until((folder / "frame_00001.png").exists, process)
+        until((folder / "frame_00001.png").exists, alive=lambda: process.poll() is None)
         time.sleep(0.5)
         assert process.poll() is None
         process.send_signal(number)

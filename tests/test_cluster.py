@@ -18,9 +18,9 @@ from typing import Any
 
 import pytest
 from conftest import Inputs
-from interrupting import until
 from test_cli import call, environment, one_line  # noqa: F401
 from test_ending import alive
+from waiting import until
 
 from ns_abstract.execution import engines
 from ns_abstract.execution.engines import Cluster, Tls, connected

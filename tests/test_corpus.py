@@ -33,7 +33,7 @@ import onnx
 import pytest
 import torch
 from certifying import classifier
-from conftest import SHIFT, blob_scene, ring, write_json
+from conftest import SHIFT, blob_scene, ring
 from corpus import Bench, Row, check, row, rows_by_name
 from nerfs import tiny_scene
 
@@ -41,6 +41,7 @@ from ns_abstract.api.certification import CertifySettings, open_certification
 from ns_abstract.api.certifying import CertificateRun
 from ns_abstract.api.files import Settings, open_job
 from ns_abstract.geometry.views import path_json
+from ns_abstract.io.atomic import write_json
 from ns_abstract.io.folder import MARK, claim
 from ns_abstract.methods.nerf.occupancy import OccupancyGrid
 from ns_abstract.methods.nerf.write import write_nerf_run

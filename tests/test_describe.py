@@ -12,12 +12,13 @@ from typing import Any
 
 import numpy as np
 import pytest
-from conftest import TIMESTAMP, InProcess, Inputs, blob_scene, write_json
+from conftest import TIMESTAMP, InProcess, Inputs, blob_scene
 from nerfs import tiny_scene
 
 from ns_abstract.api.files import Settings, open_job
 from ns_abstract.cli import render as render_command
 from ns_abstract.geometry.camera_path import load_camera_path
+from ns_abstract.io.atomic import write_json
 from ns_abstract.io.errors import InputError
 from ns_abstract.methods.nerf.write import write_nerf_run
 

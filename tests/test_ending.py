@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import io
 import os
 import resource
@@ -16,11 +17,11 @@ from typing import Any
 
 import numpy as np
 import pytest
-from conftest import SHIFT, Inputs, environment, ring, write_json
-from interrupting import until
+from conftest import SHIFT, Inputs, environment, ring
 from nerfs import UNIFORM, images, poses, tiny_scene
 from test_certify_search import fill, open_store, search_of
 from test_cli import call, one_line  # noqa: F401
+from waiting import until
 
 from ns_abstract.api import bounding
 from ns_abstract.api import job as job_module
@@ -37,6 +38,7 @@ from ns_abstract.execution.ending import AbandonedError, abandoning, checkpoint
 from ns_abstract.execution.engines import Here, Machine, Processes
 from ns_abstract.execution.stopping import StopRequest
 from ns_abstract.geometry.views import path_json
+from ns_abstract.io.atomic import write_json
 from ns_abstract.io.errors import InputError
 from ns_abstract.methods.nerf.bounds import NerfBounds
 from ns_abstract.methods.nerf.frame import NerfFrame
@@ -276,6 +278,66 @@ if __name__ == "__main__":
     print(*engine.pids, flush=True)
     time.sleep(600)
 """
+
+
+UNGUARDED_CLUSTER = """
+from ns_abstract.execution.engines import connected
+from ns_abstract.io.errors import InputError
+try:
+    with connected(None, 1):
+        pass
+except InputError as error:
+    print(error)
+"""
+
+
+@pytest.mark.skipif(importlib.util.find_spec("distributed") is None, reason="dask is not installed")
+def test_a_cluster_without_a_guard_is_told_what_it_needs(tmp_path: Path) -> None:
+    script = tmp_path / "script.py"
+    script.write_text(UNGUARDED_CLUSTER)
+    process = subprocess.run(
+        [sys.executable, str(script)], stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True, env=environment(),
+        timeout=LONG, check=False,
+    )  # fmt: skip
+    (said,) = process.stdout.splitlines()
+    assert str(script) in said and 'if __name__ == "__main__":' in said
+
+
+UNGUARDED = """
+from ns_abstract.execution.engines import Processes
+from ns_abstract.io.errors import InputError
+from test_ending import square
+engine = Processes(2)
+try:
+    engine.submit(0, square, 3)
+    while not (found := engine.collect(1.0)):
+        pass
+    print(found)
+except InputError as error:
+    print(error)
+finally:
+    engine.close()
+"""
+
+
+@pytest.mark.parametrize("guarded", [False, True])
+def test_a_script_without_a_guard_is_told_what_it_needs(tmp_path: Path, guarded: bool) -> None:
+    """Fresh processes import the script, and would start processes of their own."""
+    script = tmp_path / "script.py"
+    guard = 'if __name__ == "__main__":\n    '
+    script.write_text(guard + UNGUARDED.replace("\n", "\n    ") if guarded else UNGUARDED)
+    variables = environment()
+    variables["PYTHONPATH"] += os.pathsep + str(Path(__file__).parent)
+    process = subprocess.run(
+        [sys.executable, str(script)], stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True, env=variables,
+        timeout=LONG, check=False,
+    )  # fmt: skip
+    (said,) = process.stdout.splitlines()
+    if guarded:
+        assert said == "[(0, 9)]"
+    else:
+        assert str(script) in said and 'if __name__ == "__main__":' in said and "workers=1" in said
+        assert "memory" not in said
 
 
 def alive(pid: int) -> bool:

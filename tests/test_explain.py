@@ -69,6 +69,25 @@ def test_gaussians_that_change_places(make_blobs: Make) -> None:
     assert "the order of depth (time" in "\n".join(found.lines())
 
 
+def test_other_layers_change_nothing(make_blobs: Make) -> None:
+    """Depths have other units, and where nothing is drawn none at all."""
+    balls = scene([[-0.1, 0.0, 0.0], [0.1, 0.001, 0.0]], [0.2, 0.2], plain([1.0, 0.0, 0.0], [0.0, 0.0, 1.0]))
+    inputs = make_blobs(scene=balls, views=FRONT, spec=TURN)
+    job, found = explained(inputs)
+    layered = open_job(Settings(inputs.config, inputs.path, inputs.spec, outputs=("rgb", "depth", "accumulation")))
+    assert layered.layers and job.layers == ()
+    assert explain(layered, 0, job.bound(0, Goal(1.0, 300.0, 2), keep_leaves=True)) == found
+
+
+def test_versions_without_tiles_to_miss_are_not_told_of_them(make_blobs: Make) -> None:
+    balls = scene([[0.0, 0.0, 0.0]], [0.2], plain([1.0, 0.0, 0.0]))
+    inputs = make_blobs(scene=balls, views=FRONT, spec=TURN)
+    for version, name in (("1.4.0", "the alpha threshold and tiles"), ("1.5.3", "the alpha threshold")):
+        job = open_job(Settings(inputs.config, inputs.path, inputs.spec, gsplat_version=version))
+        found = explain(job, 0, job.bound(0, Goal(1.0, 300.0, 2), keep_leaves=True))
+        assert [cause for cause in found.causes if "threshold" in cause] == [name]
+
+
 def test_colours_that_change_with_the_view(make_blobs: Make) -> None:
     """Its colour is 0 from one side and grows to the other."""
     colors = plain([0.0, 0.0, 0.0])
@@ -112,6 +131,11 @@ def test_command(make_blobs: Make, call: Callable[[list[str]], tuple[int, str, s
     options = ["--load-config", str(inputs.config), "--camera-path-filename", str(inputs.path), "--explain"]
     code, out, _ = call([*options, "--perturbation-filename", str(inputs.spec), "--time-budget", "2"])
     assert code == 0 and "frame 0: mean gap" in out and "the order of depth" in out
+    folder = tmp_path / "out"
+    shown = [*options, "--perturbation-filename", str(inputs.spec), "--time-budget", "2", "--output-dir", str(folder)]
+    code, _, err = call(shown)
+    told = json.loads((folder / "report.json").read_text())["frames"][0]["explanation"]
+    assert code == 0 and len(told) > 5 and set(told[1:]) <= set(err.splitlines())
     config = write_nerf_run(tiny_scene(), tmp_path, timestamp=TIMESTAMP, experiment_name="nerf")
     options[1] = str(config)
     code, _, err = call([*options, "--perturbation-filename", str(inputs.spec)])

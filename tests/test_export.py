@@ -14,7 +14,7 @@ import onnxruntime
 import pytest
 import torch
 from certifying import classifier
-from conftest import Inputs, blob_scene, write_json
+from conftest import Inputs, blob_scene
 from onnx import numpy_helper
 from PIL import Image
 from test_cli import call, one_line  # noqa: F401
@@ -22,6 +22,7 @@ from test_cli import call, one_line  # noqa: F401
 from ns_abstract.api.certification import Certification, CertifySettings, open_certification
 from ns_abstract.cli import export as export_command
 from ns_abstract.cli import render as render_command
+from ns_abstract.io.atomic import write_json
 from ns_abstract.io.errors import InputError
 from ns_abstract.methods.splat.load import load_scene
 from ns_abstract.methods.splat.ply import write_ply

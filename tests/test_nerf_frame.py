@@ -17,7 +17,8 @@ from ns_abstract.methods.nerf import frame as frame_module
 from ns_abstract.methods.nerf.bounds import Division, NerfBounds, RayBounds
 from ns_abstract.methods.nerf.frame import NerfFrame
 from ns_abstract.methods.nerf.scene import NerfScene
-from ns_abstract.refine.engine import Goal, Refinement
+from ns_abstract.refine.engine import Goal, Refinement, groups
+from ns_abstract.refine.result import FrameResult, joined
 from ns_abstract.verify.attack.falsify import falsify
 from ns_abstract.verify.attack.soundness import nerf_renderer
 
@@ -117,6 +118,42 @@ def test_the_whole_set_costs_nothing_and_rays_come_in_batches() -> None:
     frame.bound = lambda box, tiles, *rest: sizes.append(len(tiles)) or bound(box, tiles, *rest)  # type: ignore[method-assign]
     Refinement(frame, 0, Goal(ratio=1.0, seconds=60.0, cells=9)).run()
     assert sizes[0] == 12 and max(sizes[1:]) <= 5
+
+
+def unreached(result: FrameResult) -> int:
+    return int(((result.lower == 0.0) & (result.upper == 1.0)).all(axis=-1).sum())
+
+
+@pytest.mark.parametrize("parts", [1, 2])
+def test_what_is_known_is_not_begun_anew(parts: int) -> None:
+    """Rays that an earlier command has not reached come first, and nothing gets looser."""
+    scene, pose_set = tiny_scene(2, density=30.0), poses(SETS["yaw"])
+    frame = NerfFrame(scene, UNIFORM, pose_set)
+    frame.tiles_at_once = 2
+
+    def found(known: FrameResult | None) -> FrameResult:
+        goal = Goal(ratio=1.0, seconds=120.0, cells=12 // parts)
+        some = [Refinement(frame, 0, goal, tiles=tiles, known=known).run_part() for tiles in groups(frame, parts)]
+        return joined(some, frame.camera)
+
+    results = [found(None)]
+    assert 2 < unreached(results[0]) < 12
+    while unreached(results[-1]):
+        results.append(found(results[-1]))
+        before, now = results[-2:]
+        assert unreached(now) < unreached(before)
+        assert (before.lower <= now.lower).all() and (now.upper <= before.upper).all()
+        assert (now.witness_lower <= before.witness_lower).all() and (before.witness_upper <= now.witness_upper).all()
+        assert parts > 1 or now.trace[0].mpg <= before.trace[-1].mpg
+    for picture in images(scene, pose_set, pose_set.box.sample(50, np.random.default_rng(0))).reshape(-1, 3, 4, 3):
+        assert (results[-1].lower <= picture).all() and (picture <= results[-1].upper).all()
+
+
+def test_what_is_known_holds_of_a_frame_that_is_stopped_at_once() -> None:
+    frame = NerfFrame(tiny_scene(2), UNIFORM, poses(SETS["yaw"]))
+    before = Refinement(frame, 0, Goal(ratio=1.0, seconds=120.0, cells=12)).run()
+    now = Refinement(frame, 0, Goal(ratio=1.0, seconds=0.0), known=before).run()
+    assert now.bounded and np.array_equal(now.lower, before.lower) and np.array_equal(now.upper, before.upper)
 
 
 def test_children_skip_what_is_empty_and_stay_sound() -> None:

@@ -17,10 +17,10 @@ from typing import Any
 
 import numpy as np
 import pytest
-from browser import until
 from conftest import blob_scene, ring
 from nerfstudio_runs import BIN, Server, command, environment, free_port, lpips_cache, needs_nerfstudio
 from PIL import Image
+from waiting import until
 
 from ns_abstract.cli.viewer import Viewer
 from ns_abstract.geometry.camera_path import load_camera_path

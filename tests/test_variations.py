@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from conftest import SHIFT, Inputs, blob_scene, write_json
+from conftest import SHIFT, Inputs, blob_scene
 from scene_attacks import VariedAttack, attack_varied, check_varied, show_compiled, show_reference
 
 from ns_abstract.api.files import Settings, open_job
@@ -21,6 +21,7 @@ from ns_abstract.geometry.box import ParameterBox
 from ns_abstract.geometry.camera_path import Camera
 from ns_abstract.geometry.poses import PoseSet
 from ns_abstract.geometry.tiles import assemble
+from ns_abstract.io.atomic import write_json
 from ns_abstract.io.errors import InputError
 from ns_abstract.methods.splat import bounds as bounds_module
 from ns_abstract.methods.splat.activate import activate

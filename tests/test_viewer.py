@@ -14,11 +14,11 @@ from typing import Any
 
 import numpy as np
 import pytest
-from browser import until
 from conftest import Inputs, blob_scene, ring
 from nerfs import tiny_scene
 from nerfs import view as nerf_camera
 from test_cli import call, one_line  # noqa: F401
+from waiting import until
 
 from ns_abstract.cli import viewer as viewer_command
 from ns_abstract.geometry.camera_path import Camera

@@ -247,6 +247,14 @@ FORMS = (
         "test_engine.py::test_parts_without_poses_take_no_work_and_leave_nothing_open[True-0.0]",
     ),
     Fault(
+        "what is known of a frame is taken for other tiles",
+        _ENGINE,
+        "Refinement.__init__",
+        "in_tiles(picture, side)[self._numbers_of(None)]",
+        "in_tiles(picture, side)[: self._count]",
+        "test_nerf_frame.py::test_what_is_known_is_not_begun_anew[2]",
+    ),
+    Fault(
         "split leaves a gap",
         _BOX,
         "ParameterBox.split",

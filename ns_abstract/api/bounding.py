@@ -80,7 +80,12 @@ class Part(NamedTuple):
 
 
 def bound_part(
-    recipe: Recipe[Job], part: Part, goal: Goal, keep_leaves: bool, neighbours: int = 1
+    recipe: Recipe[Job],
+    part: Part,
+    goal: Goal,
+    keep_leaves: bool,
+    neighbours: int = 1,
+    known: FrameResult | None = None,
 ) -> PartResult | None:
     """One task on a worker, which opens the scene once and keeps it; None if the time was over before there was any.
 
@@ -90,6 +95,7 @@ def bound_part(
         goal: When to stop.
         keep_leaves: Whether the result carries linear sets.
         neighbours: Tasks that share this machine's cores.
+        known: What was found of the frame before, where that saves work.
 
     Raises:
         InputError: The worker reads other files under the same names than the command did.
@@ -98,7 +104,7 @@ def bound_part(
     job = opened(recipe)
     job.warm_up(part.index)
     try:
-        return job.bound_part(part.index, goal, part.tiles, keep_leaves=keep_leaves)
+        return job.bound_part(part.index, goal, part.tiles, keep_leaves=keep_leaves, known=known)
     except AbandonedError:
         return None
 
@@ -118,6 +124,7 @@ def bound_frames(
     keep_leaves: bool = False,
     stop: StopRequest | None = None,
     on_progress: Callable[[Progress], object] = lambda progress: None,
+    found_before: Callable[[int], FrameResult | None] = lambda index: None,
 ) -> Iterator[FrameResult]:
     """Frames as they are finished, each once, whatever workers come and go.
 
@@ -134,6 +141,8 @@ def bound_frames(
         keep_leaves: Whether results carry linear sets.
         stop: Asked between cells in this process, and twice a second while others work.
         on_progress: Told where the work of this process stands.
+        found_before: Gives what an earlier command found of a frame. Rays go on from there, those first of which least
+            is known.
 
     Raises:
         InputError: The scene does not fit into the memory as often as there are workers on a machine, or the time does
@@ -164,6 +173,11 @@ def bound_frames(
             # a look at costly rays is part of the work
             job.check_time(frames[0], budget)
 
+    def known(index: int) -> FrameResult | None:
+        # other scenes are covered anew as a whole; kept leaves are to be as tight as the result
+        before = found_before(index) if job.rays and not keep_leaves else None
+        return before if before is not None and before.bounded else None
+
     def here(part: Part, goal: Goal) -> PartResult | None:
         def told(point: TracePoint, covered: float) -> None:
             on_progress(
@@ -173,7 +187,10 @@ def bound_frames(
             )
 
         try:
-            return job.bound_part(part.index, goal, part.tiles, keep_leaves=keep_leaves, stopped=request, progress=told)
+            return job.bound_part(
+                part.index, goal, part.tiles, keep_leaves=keep_leaves, stopped=request, progress=told,
+                known=known(part.index),
+            )  # fmt: skip
         except AbandonedError:
             # over before there was anything to keep
             return None
@@ -195,7 +212,8 @@ def bound_frames(
             if recipe is None:
                 yield Task((number, part.index), here, (part, goal))
             else:
-                yield Task((number, part.index), bound_part, (recipe, part, goal, keep_leaves, machine.threads))
+                before = known(part.index)
+                yield Task((number, part.index), bound_part, (recipe, part, goal, keep_leaves, machine.threads, before))
 
     for results in work(engine, offer, request):
         for (_, index), result in results:

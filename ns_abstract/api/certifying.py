@@ -31,7 +31,7 @@ from ns_abstract.geometry.box import ParameterBox
 from ns_abstract.io.errors import InputError
 from ns_abstract.io.memory import available_memory
 from ns_abstract.report.cameras import Cameras, cameras_entry, cell_cameras, standing
-from ns_abstract.report.certificate import CertifiedRun, certificate_document, coverage, verdict, write_certificate
+from ns_abstract.report.certificate import CertifiedRun, LastReport, certificate_document, coverage, verdict
 from ns_abstract.report.certificate_page import Closer, certificate_page
 from ns_abstract.report.outside import Outside
 from ns_abstract.report.picture import preview, to_bytes
@@ -109,8 +109,7 @@ class CertificateRun:
         self.rows: dict[int, list[dict[str, Any]]] = {}
         self.closer: Closer | None = None
         self.cameras: Cameras | None = None
-        #: Content of the last report.json, and its cells by frame.
-        self.written: tuple[dict[str, Any], dict[int, list[dict[str, Any]]]] = {}, {}
+        self.last = LastReport(folder)
         #: When no more pictures are rendered for the report, and who may say so before.
         self.over = float("inf")
         self.stop: Callable[[], bool] = lambda: False
@@ -240,7 +239,7 @@ class CertificateRun:
             store = self.open(resume=resume)
             stack.callback(store.close)
             stack.enter_context(store.told())
-            stack.enter_context(stop.last_words(self.interrupted))
+            stack.enter_context(stop.last_words(self.last.interrupted))
             substitution = None
             # where every ray is costly, all that is done is
             self.over = begin + budget if rays else float("inf")
@@ -399,25 +398,16 @@ class CertificateRun:
             self.seen = {}
         ended = state in ("done", "budget")
         self.closer = look_closer(self.job, document["frames"], rows, self._kept_image, self._late) if ended else None
-        self.written = document, rows
-        self._write()
+        self.last.write(
+            document,
+            lambda: certificate_page(document, rows, self.shown, self.seen, self.cameras, self.closer),
+        )
         if ended:
             write_pictures(self.folder, document, rows, self.cameras)
         return document
 
     def _late(self) -> bool:
         return time.perf_counter() >= self.over or self.stop()
-
-    def interrupted(self) -> None:
-        """Say of the last report that it is one; nothing else is looked at."""
-        if self.written[0]:
-            self.written[0]["state"] = "interrupted"
-            self._write()
-
-    def _write(self) -> None:
-        document, rows = self.written
-        page = certificate_page(document, rows, self.shown, self.seen, self.cameras, self.closer)
-        write_certificate(self.folder, document, page)
 
     def _entry(self, tally: Any, rows: list[dict[str, Any]]) -> dict[str, Any]:
         shares = fractions(tally)

@@ -20,6 +20,7 @@ _ADVICE = {
     "rounding of float32": "--arithmetic real bounds the real-number picture, where that is what is asked for",
     "the order of depth": "time, a smaller set of rotations, or fewer Gaussians at nearly the same depth",
     "the stop where little light is left": "time, or fewer nearly opaque Gaussians behind one another",
+    "the alpha threshold": "time",
     "the alpha threshold and tiles": "time; --gsplat-version 1.5.3 and later have no tiles to miss",
     "colours that depend on the view": "a smaller set, or a run with a lower sh_degree",
     "variations of the scene": "smaller ranges in the perturbation file",
@@ -33,7 +34,7 @@ class Explanation:
 
     Attributes:
         index: Number of the frame.
-        gap, excess: Mean over pixels of the bounds' width, and what of it no render reached.
+        gap, excess: Mean over pixels and channels of the bounds' width, and what of it no render reached.
         leaves: Leaf cells (one tile each) that were bounded again.
         causes: Part of these leaves' excess that goes away without each, taken one at a time.
         regions: Share of the excess, first and past row, first and past column, of the tiles that hold most.
@@ -55,7 +56,8 @@ class Explanation:
 
     def lines(self) -> Iterator[str]:
         """It in words."""
-        yield f"frame {self.index}: mean gap {self.gap:.4f}, of which renders did not reach {self.excess:.4f}"
+        gap = f"mean gap of a channel {self.gap:.4f}"
+        yield f"frame {self.index}: {gap}, of which renders did not reach {self.excess:.4f}"
         if not self.leaves:
             yield "  nothing to explain"
             return
@@ -89,7 +91,8 @@ def explain(job: Job, index: int, result: FrameResult, seed: int = 0) -> Explana
         result: What was found, with its leaves.
         seed: Of the leaves that are looked at.
     """
-    leaves, frame = result.leaves, job.frame(index)
+    # of colours alone: other layers have units of their own
+    leaves, frame = result.leaves, job.method.frame(job.pose_sets[index])
     over = np.asarray(result.upper, np.float64) - result.lower
     over -= np.asarray(result.witness_upper, np.float64) - result.witness_lower
     tiles = [_mean(frame, over, tile) for tile in range(frame.tile_count)]

@@ -121,8 +121,8 @@ class Job:
             raise InputError(f"found {limit}", field="--memory-limit", fix="give a positive number of GiB")
         if self.base_memory > self.memory:
             raise InputError(
-                f"{self.method.content} at this size needs {self.base_memory / 2**30:.1f} GiB, "
-                f"{self.memory / 2**30:.1f} GiB may be used",
+                f"{self.method.content} at this size needs {self.base_memory / 2**30:.2g} GiB, "
+                f"{self.memory / 2**30:.2g} GiB may be used",
                 field="--memory-limit",
                 fix="raise it, or raise --downscale-factor",
             )
@@ -192,8 +192,9 @@ class Job:
         keep_leaves: bool = False,
         stopped: Callable[[], bool] = lambda: False,
         progress: Callable[[TracePoint, float], None] = lambda point, share: None,
+        known: FrameResult | None = None,
     ) -> PartResult:
-        """Refine some tiles of frame ``index``, or all of them.
+        """Refine some tiles of frame ``index``, or all of them; ``known`` is what was found of it before.
 
         Raises:
             AbandonedError: ``stopped`` was true, or the time was over, before a first picture was there.
@@ -208,7 +209,7 @@ class Job:
 
         refinement = Refinement(
             frame, index, goal, seed=self.seed, keep_leaves=keep_leaves, stopped=over, progress=progress,
-            members=frame.members(self.seed), tiles=tiles,
+            members=frame.members(self.seed), tiles=tiles, known=known,
         )  # fmt: skip
         return refinement.run_part()
 

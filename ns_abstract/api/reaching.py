@@ -40,7 +40,7 @@ from ns_abstract.reach.loop import Loop, load_loop, parse_loop
 from ns_abstract.reach.page import loop_page
 from ns_abstract.reach.search import QUESTIONS, LoopFindings, LoopSearch, Question, Run, pushes, simulate
 from ns_abstract.reach.tubes import Dependence, Pictures, Pilot, Reacher, Tube
-from ns_abstract.report.certificate import SCENE_MARGIN, now, write_certificate
+from ns_abstract.report.certificate import SCENE_MARGIN, LastReport, now
 from ns_abstract.report.outside import Outside
 from ns_abstract.report.record import file_stamp, guarantee_text, plain, versions
 from ns_abstract.verify.cells import Cell, Grid
@@ -288,8 +288,7 @@ class ReachRun:
         self._strips: list[tuple[int, bytes]] = []
         elements = job.job.method.elements()
         self._outside = None if elements is None else Outside(elements)
-        #: Content of the last report.json.
-        self.written: dict[str, Any] = {}
+        self.last = LastReport(folder)
 
     def run(
         self,
@@ -331,7 +330,7 @@ class ReachRun:
             store = Store(self.folder, job.fingerprint, parameters, fixed, resume=resume)
             stack.callback(store.close)
             stack.enter_context(store.told())
-            stack.enter_context(stop.last_words(self.interrupted))
+            stack.enter_context(stop.last_words(self.last.interrupted))
             try:
                 self._begin(store, box)
                 with stop.at_once():
@@ -553,19 +552,9 @@ class ReachRun:
 
     def report(self, store: Store, state: str) -> dict[str, Any]:
         """Write report.json and report.html; returns the former's content."""
-        self.written = self.document(store, state)
-        self._write()
-        return self.written
-
-    def interrupted(self) -> None:
-        """Say of the last report that it is one; nothing else is looked at."""
-        if self.written:
-            self.written["state"] = "interrupted"
-            self._write()
-
-    def _write(self) -> None:
-        page = loop_page(self.written, self.rows, self.job.loop, self._outside, self._strips)
-        write_certificate(self.folder, self.written, page)
+        document = self.document(store, state)
+        self.last.write(document, lambda: loop_page(document, self.rows, self.job.loop, self._outside, self._strips))
+        return document
 
 
 def verdict(entries: Mapping[str, Mapping[str, Any]]) -> str:

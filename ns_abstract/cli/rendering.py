@@ -131,6 +131,7 @@ def _fill(report: Report, job: Job, order: Order, engine: Engine, stop: Stop, co
             results = bounding.bound_frames(
                 job, pending, engine=engine, budget=budget, target_ratio=order.target_ratio,
                 keep_leaves=order.save_cells or order.explain, stop=stop, on_progress=meter.told,
+                found_before=report.stored,
             )  # fmt: skip
             for done, result in enumerate(results, 1):
                 # first what was asked for: drawing loads matplotlib
@@ -141,7 +142,8 @@ def _fill(report: Report, job: Job, order: Order, engine: Engine, stop: Stop, co
                     with stop.at_once():
                         lines = tuple(explain(job, result.index, result, order.settings.seed).lines())
                     report.explain(result.index, lines)
-                    console.print("\n".join(lines[1:]), markup=False, soft_wrap=True)
+                    for line in lines[1:]:
+                        console.print(line, markup=False, soft_wrap=True)
                 meter.finished(done)
     finally:
         # also after a failure: what is finished is written

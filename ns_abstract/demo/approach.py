@@ -8,7 +8,6 @@ by them.
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -17,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ns_abstract.geometry.views import look_at
-from ns_abstract.io.atomic import write_atomic
+from ns_abstract.io.atomic import write_atomic, write_json
 
 Float64 = NDArray[np.float64]
 
@@ -150,6 +149,4 @@ def write_approach(folder: Path, render: Callable[[Float64], NDArray[np.float32]
     images = np.stack([np.moveaxis(render(place), -1, 0).reshape(-1) for place in places]).astype(np.float64)
     network, loop = folder / "estimator.onnx", folder / "LOOP.json"
     write_network(network, fit(images, places[:, 1:]))
-    text = json.dumps(approach_loop(network.name), indent=1) + "\n"
-    write_atomic(loop, lambda stream: stream.write(text.encode()))
-    return loop
+    return write_json(loop, approach_loop(network.name))

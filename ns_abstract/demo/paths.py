@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +9,7 @@ import numpy as np
 
 from ns_abstract.demo.airfield import TARGET
 from ns_abstract.geometry.views import View, around, path_json, ring
-from ns_abstract.io.atomic import write_atomic
+from ns_abstract.io.atomic import write_json
 
 
 def airfield_views(size: int = 200) -> list[View]:
@@ -57,7 +56,4 @@ def write_airfield_paths(folder: str | Path) -> dict[str, Path]:
         "orbit": (folder / "camera_path_orbit.json", airfield_orbit()),
         "spec": (folder / "SPEC.json", airfield_perturbation()),
     }
-    for file, value in files.values():
-        text = json.dumps(value, indent=1) + "\n"
-        write_atomic(file, lambda stream, text=text: stream.write(text.encode()))
-    return {name: file for name, (file, _) in files.items()}
+    return {name: write_json(file, value) for name, (file, value) in files.items()}

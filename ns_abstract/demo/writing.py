@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable
 from pathlib import Path
 
@@ -16,8 +15,8 @@ from ns_abstract.demo.gate import gate
 from ns_abstract.demo.paths import dataset_views, write_airfield_paths
 from ns_abstract.geometry.camera_path import Camera, focal_length
 from ns_abstract.geometry.views import View
+from ns_abstract.io.atomic import write_json
 from ns_abstract.methods.nerf.write import write_nerf_run
-from ns_abstract.methods.run_writer import write_file
 from ns_abstract.methods.splat.activate import activate
 from ns_abstract.methods.splat.constants import GSPLAT_1_4_0
 from ns_abstract.methods.splat.render import Renderer
@@ -31,9 +30,7 @@ def write_nerf_demo(folder: Path) -> tuple[Path, Path]:
     """Fit and write the NeRF and its camera path; returns config.yml and the path."""
     scene = buoy_scene()
     config = write_nerf_run(scene, folder, timestamp=TIMESTAMP, experiment_name="buoy", views=buoy_views())
-    path = folder / "camera_path_buoy.json"
-    write_file(path, (json.dumps(buoy_path(), indent=1) + "\n").encode())
-    return config, path
+    return config, write_json(folder / "camera_path_buoy.json", buoy_path())
 
 
 def _picture(renderer: Renderer) -> Callable[[View], NDArray[np.float64]]:

@@ -11,6 +11,7 @@ import os
 import secrets
 import signal
 import ssl
+import sys
 import threading
 import time
 from collections import Counter
@@ -40,6 +41,8 @@ _GONE = 30.0
 _FETCH = 5.0
 #: Variables that make numerical libraries use one thread; read when they are imported.
 _THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
+#: A worker's first word: what it imports at its start is there.
+_BEGUN = None
 #: Makes torch give memory back and fault it in again for every cell, 1.6 times slower.
 _TRIM = "MALLOC_TRIM_THRESHOLD_"
 
@@ -144,6 +147,7 @@ class Processes:
         self._idle: list[_Worker] = []
         self._busy: dict[Connection, tuple[_Worker, int, Task]] = {}
         self._deaths: dict[int, int] = {}
+        self._begun: set[Connection] = set()
         self.starting = True
         self.capacity = count
         self._waiting: list[tuple[int, Task]] = []
@@ -204,8 +208,12 @@ class Processes:
 
     def _replace(self, connection: Connection) -> None:
         worker, key, task = self._busy.pop(connection)
+        begun = connection in self._begun
+        self._begun.discard(connection)
         connection.close()
         worker.process.join()
+        if not begun and (worker.process.exitcode or 0) > 0 and (script := _unguarded_script()):
+            raise _needs_guard(script)
         self._deaths[key] = self._deaths.get(key, 0) + 1
         if self._deaths[key] > _RETRIES:
             raise InputError(
@@ -219,10 +227,14 @@ class Processes:
         for connection in wait(list(self._busy), seconds):
             assert isinstance(connection, Connection)
             try:
-                good, value = connection.recv()
+                answer = connection.recv()
             except (EOFError, OSError):
                 self._replace(connection)
                 continue
+            if answer is _BEGUN:
+                self._begun.add(connection)
+                continue
+            good, value = answer
             worker, key, _ = self._busy.pop(connection)
             self._idle.append(worker)
             self.starting = False
@@ -235,11 +247,31 @@ class Processes:
     def close(self) -> None:
         workers = [*self._idle, *(worker for worker, _, _ in self._busy.values())]
         self._idle, self._busy, self._waiting = [], {}, []
+        self._begun.clear()
         for worker in workers:
             worker.process.terminate()
         for worker in workers:
             worker.process.join()
             worker.connection.close()
+
+
+def _unguarded_script() -> Path | None:
+    """The script that fresh processes import once more, if its work would begin again there."""
+    name = getattr(sys.modules.get("__main__"), "__file__", None)
+    try:
+        # how the guard is spelled does not matter
+        return None if name is None or "__main__" in Path(name).read_text(encoding="utf-8") else Path(name)
+    except (OSError, ValueError):
+        return None
+
+
+def _needs_guard(script: Path) -> InputError:
+    return InputError(
+        "a worker process ended before it could work: it imports the started script again, which has no guard",
+        file=script,
+        field="workers",
+        fix='put what the script does under `if __name__ == "__main__":`, or give workers=1',
+    )
 
 
 def _serve(connection: Connection) -> None:
@@ -251,6 +283,7 @@ def _serve(connection: Connection) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
     signal.signal(_GIVE_UP, lambda number, frame: asked.set())
+    connection.send(_BEGUN)
     while True:
         try:
             function, arguments = connection.recv()
@@ -556,6 +589,12 @@ def connected(address: str | None, workers: int = 1, tls: Tls | None = None) -> 
             field="--scheduler-address",
             fix="start one with `dask scheduler` and workers with `dask worker HOST:PORT --nthreads 1`",
         ) from None
+    except RuntimeError:
+        # of a cluster on this machine: its workers cannot start
+        script = _unguarded_script() if address is None else None
+        if script is None:
+            raise
+        raise _needs_guard(script) from None
     try:
         yield client
     finally:

@@ -12,6 +12,15 @@ def tile_grid(camera: Camera, side: int) -> tuple[int, int]:
     return -(-camera.width // side), -(-camera.height // side)
 
 
+def in_tiles(image: np.ndarray, side: int) -> np.ndarray:
+    """The tiles [T, side, side, ...] of an image [H, W, ...] in row-major order, with 0 beyond its edges."""
+    height, width, *rest = image.shape
+    down, across = -(-height // side), -(-width // side)
+    padded = np.zeros((down * side, across * side, *rest), image.dtype)
+    padded[:height, :width] = image
+    return padded.reshape(down, side, across, side, *rest).swapaxes(1, 2).reshape(-1, side, side, *rest)
+
+
 def assemble(tiles: np.ndarray, camera: Camera) -> np.ndarray:
     """The image [H, W, ...] from all its tiles [T, side, side, ...] in row-major order."""
     side = tiles.shape[1]

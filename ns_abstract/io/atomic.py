@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import json
 import os
 import secrets
 from collections.abc import Callable
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any, BinaryIO
 
 
 def write_atomic(
@@ -36,3 +37,15 @@ def write_atomic(
     except BaseException:
         temporary.unlink(missing_ok=True)
         raise
+
+
+def write_json(path: str | os.PathLike[str], value: Any) -> Path:
+    """Write a value as JSON that people can read, and return the file.
+
+    Raises:
+        OSError: As `write_atomic`.
+        TypeError: JSON has no such value.
+    """
+    text = json.dumps(value, indent=1) + "\n"
+    write_atomic(path, lambda stream: stream.write(text.encode()))
+    return Path(path)

@@ -21,6 +21,7 @@ import numpy as np
 
 from ns_abstract.execution.ending import AbandonedError, abandoning
 from ns_abstract.geometry.box import ParameterBox
+from ns_abstract.geometry.tiles import in_tiles
 from ns_abstract.refine.protocol import ACCUMULATION, COLORS, DEPTH, Bounds, Context, Frame, Render
 from ns_abstract.refine.result import FrameResult, Layer, Leaves, PartResult, TracePoint, Views, gap, joined
 
@@ -177,6 +178,8 @@ class Refinement:
             ``render``. They widen the inner bound; only poses are split.
         tiles: Numbers of the tiles that are looked at, ascending; None: all. Everything here counts tiles by
             their place in this list, and measures are those of its pixels (R6).
+        known: What was found of the same set before, with bounds: results are no looser, and work goes where it
+            leaves most open. Not for ``keep_leaves``: leaves are to be as tight as the result.
     """
 
     def __init__(
@@ -191,6 +194,7 @@ class Refinement:
         progress: Callable[[TracePoint, float], None] = lambda point, share: None,
         members: Iterator[Render] | None = None,
         tiles: np.ndarray | None = None,
+        known: FrameResult | None = None,
     ) -> None:
         self.members = iter(()) if members is None else members
         self.part = None if tiles is None else np.asarray(tiles, np.int64)
@@ -206,6 +210,13 @@ class Refinement:
         self.outer_lower, self.outer_upper = _usable(np.full(whole, np.nan, np.float32), np.zeros(whole, np.float32))
         self.witness_lower, self.witness_upper = np.full(whole, np.inf, np.float32), np.full(whole, -np.inf, np.float32)
         self.image = np.zeros(whole, np.float32)
+        self._known: tuple[np.ndarray, np.ndarray] | None = None
+        if known is not None:
+            pictures = known.witness_lower, known.witness_upper, known.lower, known.upper
+            least, most, lower, upper = (in_tiles(picture, side)[self._numbers_of(None)] for picture in pictures)
+            self.witness_lower[..., :COLORS], self.witness_upper[..., :COLORS] = least, most
+            self._known = lower, upper
+            self._intersect(np.arange(self._count))
         frame.watch(self._numbers_of(None), self.witness_lower, self.witness_upper)
         self.inside = _pixels_inside(frame)[self._numbers_of(None)]
         self.outer_lower[~self.inside] = 0.0
@@ -320,7 +331,15 @@ class Refinement:
         """Update the outer bound of ``tiles``, given what has changed since the round began."""
         for t in tiles:
             self.outer_lower[t], self.outer_upper[t] = self.tiles[t].outer(None if changes is None else changes[t])
+        self._intersect(tiles)
         self.outer_lower[tiles], self.outer_upper[tiles] = _usable(self.outer_lower[tiles], self.outer_upper[tiles])
+
+    def _intersect(self, tiles: np.ndarray) -> None:
+        """Take what was known before into the outer bound of ``tiles``: both hold (design.md, R5)."""
+        if self._known is not None:
+            lower, upper = self._known
+            low, high = self.outer_lower[..., :COLORS], self.outer_upper[..., :COLORS]
+            low[tiles], high[tiles] = np.maximum(low[tiles], lower[tiles]), np.minimum(high[tiles], upper[tiles])
 
     # --- measures ------------------------------------------------------------------------------
 
@@ -620,8 +639,11 @@ class Refinement:
             if tile.lower is None or tile.upper is None:
                 continue
             colors = np.s_[..., :COLORS]
-            beyond = np.maximum(0.0, self.witness_lower[t][colors] - tile.lower[colors])
-            beyond += np.maximum(0.0, tile.upper[colors] - self.witness_upper[t][colors])
+            lower, upper = tile.lower[colors], tile.upper[colors]
+            if self._known is not None:
+                lower, upper = np.maximum(lower, self._known[0][t]), np.minimum(upper, self._known[1][t])
+            beyond = np.maximum(0.0, self.witness_lower[t][colors] - lower)
+            beyond += np.maximum(0.0, upper - self.witness_upper[t][colors])
             amount = beyond[:, self.inside[t]].sum(axis=(1, 2), dtype=np.float64)
             done = (amount <= 0.0) | np.array([cell.narrow for cell in tile.cells])
             tile.close(done)
@@ -745,7 +767,7 @@ class Refinement:
             seconds=point.seconds,
             cells=self.cells,
             trace=tuple(self.trace),
-            bounded=self.covered,
+            bounded=self.covered or self._known is not None,
             shown=self.shown,
             floor=self.floor,
             leaves=self._leaves() if self.covered else None,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -182,6 +182,42 @@ def certificate_document(
             "updated": now(),
         }
     )
+
+
+class LastReport:
+    """What a search has reported last, so that a command which is ended where it is can say so.
+
+    Args:
+        folder: Of report.json and report.html.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+        self._document: dict[str, Any] = {}
+        self._page: Callable[[], str] = str
+
+    def write(self, document: dict[str, Any], page: Callable[[], str]) -> None:
+        """Write both.
+
+        Args:
+            document: Content of report.json; only its key ``state`` may change later.
+            page: Makes the content of report.html from it.
+
+        Raises:
+            InputError: The folder cannot be written.
+        """
+        self._document, self._page = document, page
+        write_certificate(self._folder, document, page())
+
+    def interrupted(self) -> None:
+        """Say of it that the search was interrupted; nothing else is looked at.
+
+        Raises:
+            InputError: The folder cannot be written.
+        """
+        if self._document:
+            self._document["state"] = "interrupted"
+            self.write(self._document, self._page)
 
 
 def write_certificate(folder: Path, document: Mapping[str, Any], page: str) -> None:

@@ -437,11 +437,9 @@ class Report:
         check_frame(result)
         index = result.index
         path = self.folder / frame_name(index, "npz")
-        # a file that others have changed since is replaced
-        known = self._digests.get(path.name)
-        if index in self._entries and path.exists() and file_stamp(path)["sha256"] == known:
+        stored = self.stored(index)
+        if stored is not None:
             seconds, cells, trace = self._before.get(index, (0.0, 0, ()))
-            stored = load_frame(path, leaves=False).result
             result = merged(replace(stored, seconds=seconds, cells=cells, trace=trace), result)
         if not result.bounded:
             status = "missing"
@@ -460,6 +458,16 @@ class Report:
             raise unwritable(self.folder, error) from None
         self._publish(page=time.monotonic() >= self._page_due)
         return self._entries[index]
+
+    def stored(self, index: int) -> FrameResult | None:
+        """A frame as this command or, if it is resumed, an earlier one has stored it, without leaves.
+
+        None: there is none, or others have changed its file since, which is then replaced.
+        """
+        path = self.folder / frame_name(index, "npz")
+        if index in self._entries and path.exists() and file_stamp(path)["sha256"] == self._digests.get(path.name):
+            return load_frame(path, leaves=False).result
+        return None
 
     def draw(self, index: int) -> None:
         """Draw the PNG of a frame that was added, unless it is drawn.

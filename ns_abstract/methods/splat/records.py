@@ -27,6 +27,8 @@ from ns_abstract.arithmetic.rounding import REGION, UNIT64, UP, Charges
 LANES = 32
 #: The squared compensation from which on its logarithm is used.
 _LEAST_SQUARE = 1e-60
+#: Part of the near plane's depth from which on a Gaussian is projected over all of a cell, also where it is not drawn.
+_IN_FRONT = 2.0**-4
 #: Relative error of a covariance, as its entries' errors tell, beyond which that of its factors is looked at.
 _FACTORS_MATTER = 2.0**-10
 
@@ -499,8 +501,10 @@ def _tile_ranges(s, n, rules, camera, charges):
         a, c = s[A + q], s[C + q]
         mean_x_low, mean_x_high, mean_y_low, mean_y_high = s[MXLO + q], s[MXHI + q], s[MYLO + q], s[MYHI + q]
         z_high = s[ZHIGH + q]
-        # in front of the camera; products of covariances that may overflow leave nothing known
-        front = (s[ZLOW + q] >= near * (1.0 + charges.near)) & (z_high < np.inf)
+        # well in front of the camera; products of covariances that may overflow leave nothing known
+        front = (s[ZLOW + q] >= near * _IN_FRONT) & (z_high < np.inf)
+        # at some pose the near or the far plane hides it
+        cut_off = (s[ZLOW + q] < near * (1.0 + charges.near)) | (z_high > far)
         front = front & (a * c < charges.overflow) & (s[TAME + q] < np.inf)
         largest = largest_extent(s, q)
         finite = (front | (largest * stretch < safe)) & (
@@ -538,7 +542,7 @@ def _tile_ranges(s, n, rules, camera, charges):
                 whole = whole & ellipse_is_met(sharpness, max(a, c), thinnest, s[ETA + q], span, charges)
         s[T4 + q] = np.floor(_within(left / side, across)) if sure else 0.0
         last = np.ceil(_within(right / side, across)) if sure else (across if whole else 0.0)
-        s[T5 + q] = s[T4 + q] if z_high > far else last
+        s[T5 + q] = s[T4 + q] if cut_off else last
         s[T6 + q] = np.floor(_within(top / side, down)) if sure else 0.0
         s[T7 + q] = np.ceil(_within(bottom / side, down)) if sure else (down if whole else 0.0)
         s[GONE + q], s[FINITE + q] = 1.0 if gone else 0.0, 1.0 if finite else 0.0
