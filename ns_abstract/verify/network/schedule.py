@@ -6,13 +6,23 @@ from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextvars import copy_context
 from functools import cached_property
-from typing import TypeVar
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 import torch
 
 from ns_abstract.verify.network.graph import Network
-from ns_abstract.verify.network.layers import Activation, Channels, Convolution, Linear, Matrix, Pad, Scale, Sum
+from ns_abstract.verify.network.layers import (
+    Activation,
+    Channels,
+    Convolution,
+    LeakyRelu,
+    Linear,
+    Matrix,
+    Pad,
+    Scale,
+    Sum,
+)
 from ns_abstract.verify.network.maps import Sparse, TransposedConvolution
 from ns_abstract.verify.network.maxima import MaxPool
 from ns_abstract.verify.network.products import Product
@@ -24,6 +34,8 @@ _PASSING = 40.0
 _DEEP = 2e12
 #: Products that rows for inner nodes may take in one cell of a deep network; about three minutes of one core.
 _ALLOWED = 5e12
+#: Products that rows may take in one cell of a network whose rows end by plan; about six minutes of one core.
+_PLANNED = 1.5e13
 #: Once such a part of them is taken, rows are given up where what was passed foretells so many times more.
 _SURE, _OVER = 0.05, 1.5
 #: Layers that forms pass well, as a rule.
@@ -40,6 +52,23 @@ _ENOUGH = 0.03
 _KEPT, _LOST = 0.9, 0.9
 #: Part of a node's numbers that have to be open for that to end all.
 _MOST = 0.5
+#: Plans that are compared; in the first, all that is allowed costs so much (a logarithm of widths). By how much rows
+#: have to be the better.
+_STEPS, _DEAREST, _CLOSE = 56, 2.0**14, 0.1
+#: Factor between the prices of two ways.
+_APART = 1.2
+#: Part of its inputs that an activation passes on.
+_ACTIVE = 0.5
+#: Width, as a part of a node's numbers, that is close enough.
+_FINE = 1e-3
+#: What an activation adds to bounds of its input relative to these and to numbers' sizes, and rows of themselves.
+_BENDS, _ROUNDS = 0.1, 5e-5
+#: Width of an image's numbers that is assumed where none is known; width past which nothing is foreseen.
+_USUAL, _HUGE = 1e-6, 1e100
+#: Width of bounds, as a part of numbers, past which nothing is worth any rows if it is foreseen.
+_HOPELESS = 1e3
+#: Ways that are tried, and numbers of a node that they are tried with.
+_TRIED, TRIALS = 6, 32
 #: Layers whose rows stay in their windows.
 _WINDOWED = (Activation, Channels, Pad, Product, Scale, Sum)
 
@@ -47,29 +76,121 @@ _WINDOWED = (Activation, Channels, Pad, Product, Scale, Sum)
 Found = TypeVar("Found")
 
 
+class Way(NamedTuple):
+    """How a row of one number of a node goes back.
+
+    Attributes:
+        cut: It passes through the nodes behind this one and ends on those up to it; 0: it ends on the image.
+        price: Products it takes.
+        rests: By node that it is on then: what its coefficients are together, about.
+        passed: The same of nodes before an activation or a product that it passes through.
+        maxima: The same of maxima that it passes through.
+    """
+
+    cut: int
+    price: float
+    rests: tuple[tuple[int, float], ...]
+    passed: tuple[tuple[int, float], ...]
+    maxima: tuple[tuple[int, float], ...]
+
+    def spread(self, known: list[float], size: float) -> float:
+        """How wide its bounds are, about, where those of earlier nodes are as wide as ``known``, of numbers ``size``."""
+        total = 0.0
+        for at, sum_ in self.rests:
+            total += sum_ * known[at]
+        for at, sum_ in self.passed:
+            total += sum_ * known[at] * (_BENDS * known[at] / size + _ROUNDS)
+        for at, sum_ in self.maxima:
+            # where numbers are as good as equal, nothing is known of the greatest but its bounds
+            total += sum_ * known[at]
+        return total
+
+
+class Plan(NamedTuple):
+    """Which rows a cell of a network is worth (N18).
+
+    Attributes:
+        ways: By node: how rows for all of its numbers go back.
+        products: What they take together.
+        widest: How wide bounds of a node are foreseen to be at most.
+        rate: What a product costs in logarithms of widths.
+    """
+
+    ways: dict[int, Way]
+    products: float
+    widest: float
+    rate: float
+
+
 class Costs:
     """Products that rows of one network take."""
 
     def __init__(self, network: Network) -> None:
         self.network = network
-        self._rows: dict[int, float] = {}
+        self._ways: dict[int, list[Way]] = {}
 
     def row(self, index: int) -> float:
         """Products that a row of one number of node ``index`` takes to the image."""
-        if index not in self._rows:
-            self._rows[index] = self._passed(index)
-        return self._rows[index]
+        return self.ways(index)[-1].price
 
-    def _passed(self, index: int) -> float:
+    def ways(self, index: int) -> list[Way]:
+        """How a row of one number of node ``index`` may go back, the shortest way first; the last is to the image."""
+        if index not in self._ways:
+            self._ways[index] = self._passed(index)
+        return self._ways[index]
+
+    @cached_property
+    def _ends(self) -> set[int]:
+        """Nodes that rows may be cut at: those that rows are for, and maxima."""
+        found = set()
+        for k, node in enumerate(self.network.nodes, 1):
+            if isinstance(node.layer, MaxPool):
+                found.add(k)
+            if isinstance(node.layer, (Activation, Product)):
+                found.update(node.inputs)
+        return found
+
+    @cached_property
+    def rests(self) -> set[int]:
+        """Nodes that rows of any node may rest on, but for the image."""
+        last = [0] * (len(self.network.nodes) + 1)
+        for k, node in enumerate(self.network.nodes, 1):
+            for source in node.inputs:
+                last[source] = k
+        found: set[int] = set()
+        for cut in self._ends:
+            found.update(k for k in range(1, cut + 1) if last[k] > cut)
+        return found
+
+    def _passed(self, index: int) -> list[Way]:
         """The same, window by window."""
-        windows, total = {index: (1, 1)}, 0.0
+        # rows and columns of a window, channels in use, and the coefficients' squares together
+        windows, total, ways = {index: (1, 1, 1.0, 1.0)}, 0.0, []
+        passed: list[tuple[int, float]] = []
+        maxima: list[tuple[int, float]] = []
         for at in range(index, 0, -1):
+            if at != index and at in self._ends:
+                way = self._way(at, windows, total, passed, maxima)
+                if not ways or way.price > _APART * ways[-1].price:
+                    ways.append(way)
             if at not in windows:
                 continue
-            h, w = windows.pop(at)
+            h, w, used, squares = windows.pop(at)
+            if at != index and at in self._ends:
+                chosen = maxima if isinstance(self.network.nodes[at - 1].layer, MaxPool) else passed
+                chosen.append((at, _together(h * w * used, squares)))
             node = self.network.nodes[at - 1]
             layer = node.layer
-            total += _PASSING * grid(self.network.shape(at))[0] * h * w
+            channels = grid(self.network.shape(at))[0]
+            total += _PASSING * channels * h * w
+            squares *= self._sizes[at][1]
+            if isinstance(layer, Convolution):
+                groups = layer.groups
+                used = min(groups, max(used, 1.0)) * (grid(layer.input_shapes[0])[0] / groups)
+            elif isinstance(layer, Activation):
+                used *= _ACTIVE
+            elif isinstance(layer, Linear) and layer.mixes:
+                used = float(max(grid(self.network.shape(source))[0] for source in node.inputs))
             whole = False
             if isinstance(layer, Convolution):
                 total += float(layer.weight.numel()) * h * w
@@ -96,9 +217,105 @@ class Costs:
             for source in node.inputs:
                 _, height, width = grid(self.network.shape(source))
                 size = (height, width) if whole or h * w >= height * width else (h, w)
-                known = windows.get(source, (0, 0))
-                windows[source] = max(known[0], size[0]), max(known[1], size[1])
-        return total + _PASSING * float(np.prod(self.network.input_shape))
+                known = windows.get(source, (0, 0, 0.0, 0.0))
+                windows[source] = (
+                    max(known[0], size[0]),
+                    max(known[1], size[1]),
+                    max(known[2], min(used, grid(self.network.shape(source))[0])),
+                    known[3] + squares,
+                )
+        ways.append(self._way(0, windows, total, passed, maxima))
+        return ways
+
+    def _way(
+        self,
+        cut: int,
+        windows: dict[int, tuple[int, int, float, float]],
+        total: float,
+        passed: list[tuple[int, float]],
+        maxima: list[tuple[int, float]],
+    ) -> Way:
+        """Rows that have got to ``windows``, and are bounded there."""
+        bounded = sum(grid(self.network.shape(at))[0] * h * w for at, (h, w, _, _) in windows.items())
+        sums = {at: _together(h * w * used, squares) for at, (h, w, used, squares) in windows.items()}
+        return Way(cut, total + _PASSING * bounded, tuple(sums.items()), tuple(passed), tuple(maxima))
+
+    @cached_property
+    def _sizes(self) -> list[tuple[float, float]]:
+        """By node: sums of the sizes and of the squares of what one number of it takes of others, on average."""
+        found = [(1.0, 1.0)]
+        for node in self.network.nodes:
+            layer = node.layer
+            if isinstance(layer, (Convolution, Matrix)):
+                weight, count = layer.weight, float(layer.weight.shape[0])
+            elif isinstance(layer, TransposedConvolution):
+                weight = layer.weight
+                count = float(np.prod(layer.shape)) / float(np.prod(layer.input_shapes[0][1:]))
+            elif isinstance(layer, Sparse):
+                weight, count = layer.weight, float(np.prod(layer.shape))
+            elif isinstance(layer, Scale):
+                weight, count = layer.factor, float(layer.factor.numel())
+            else:
+                part = _ACTIVE if isinstance(layer, Activation) else 1.0
+                found.append((part, part))
+                continue
+            found.append((float(weight.abs().sum()) / count, float(weight.square().sum()) / count))
+        return found
+
+    @cached_property
+    def bounded(self) -> dict[int, float]:
+        """By node before an activation or a product: how many of its numbers rows are for, about."""
+        found: dict[int, float] = {}
+        for node in self.network.nodes:
+            if isinstance(node.layer, (Activation, Product)):
+                # what is certainly cut off needs no rows
+                cut = isinstance(node.layer, LeakyRelu) and node.layer.alpha == 0.0
+                for source in node.inputs:
+                    if self.network.depth[source] > 1:
+                        size = float(np.prod(self.network.shape(source))) * (0.5 if cut else 1.0)
+                        found[source] = max(size, found.get(source, 0.0))
+        return found
+
+    def plan(self, allowed: float, known: list[float], size: float) -> Plan:
+        """The cheapest ways of rows that keep all bounds close enough, or else as close as they can be kept.
+
+        Args:
+            allowed: Products that they may take together.
+            known: How wide bounds of the first nodes are.
+            size: What numbers of nodes are about.
+        """
+        best = None
+        for step in range(_STEPS):
+            plan = self._plan(_DEAREST / allowed * 2.0 ** (-0.5 * step), known, size)
+            if best is None or (plan.products <= allowed and plan.widest < best.widest):
+                best = plan
+            if best.widest <= _FINE * size:
+                break
+        assert best is not None
+        return best
+
+    def _plan(self, rate: float, known: list[float], size: float) -> Plan:
+        """The plan in which every node takes the way that is best if a product costs ``rate``."""
+        spread, ways, total, widest = list(known), {}, 0.0, 0.0
+        for k in range(len(known), len(self.network.nodes) + 1):
+            node = self.network.nodes[k - 1]
+            near = max(spread[source] for source in node.inputs)
+            if isinstance(node.layer, Activation):
+                near *= 1.0 + _BENDS * near / size
+            near = min(near * self._sizes[k][0], _HUGE)
+            count = self.bounded.get(k)
+            if count is not None:
+                score = _log(near) - _CLOSE
+                for way in self.ways(k):
+                    found = way.spread(spread, size)
+                    value = _log(found) + rate * count * way.price
+                    if value < score:
+                        score, near, ways[k] = value, found, way
+                widest = max(widest, near)
+            if k in ways:
+                total += count * ways[k].price
+            spread.append(near)
+        return Plan(ways, total, widest, rate)
 
     @cached_property
     def nodes(self) -> list[tuple[int, float]]:
@@ -120,6 +337,11 @@ class Costs:
         """Whether rows are rationed (N13)."""
         return self.total > _DEEP
 
+    @property
+    def planned(self) -> bool:
+        """Whether rows for all numbers cost so much that each is passed back as far as it pays (N18)."""
+        return self.total > max(_DEEP, _OVER * _ALLOWED)
+
     def foreseen(self, part: float, deep: float) -> tuple[float, bool]:
         """Products that rows of one cell will take, and whether they are given up before the end (N13).
 
@@ -128,6 +350,9 @@ class Costs:
         """
         if not self.deep:
             return part * self.total, False
+        if self.planned:
+            plan = self.plan(_PLANNED, [_USUAL], 1.0)
+            return (0.0, True) if plan.widest > _HOPELESS else (plan.products, False)
         taken = passed = 0.0
         for index, products in self.nodes:
             passed += products
@@ -152,12 +377,51 @@ class Schedule:
         self.network = network
         self.costs = costs_of(network)
         self.deep = self.costs.deep
-        self.left = _ALLOWED
         self._taken = self._passed = 0.0
+        self.planned = self.costs.planned
+        self.left = _PLANNED if self.planned else _ALLOWED
+        self._spread: list[float] = []
+        self._size = 1.0
 
     def arrives(self, index: int) -> None:
         """The work is at node ``index``."""
         self._passed += float(np.prod(self.network.shape(index))) * self.costs.row(index)
+
+    @property
+    def rests(self) -> set[int]:
+        """Nodes whose bounds rows of later ones may end on."""
+        return self.costs.rests if self.planned else set()
+
+    def learns(self, index: int, radius: float, size: float) -> None:
+        """Bounds of node ``index``, the next or an earlier one, are so wide, and its numbers of this size."""
+        self._spread[index:] = [radius, *self._spread[index + 1 :]]
+        self._size = size or self._size
+
+    def ways(self, index: int, count: int) -> tuple[list[Way], float]:
+        """Ways of rows for ``count`` numbers of node ``index`` that are worth a trial, and what a product costs (N18).
+
+        None if its form is as good.
+        """
+        self.costs.bounded[index] = float(count)
+        plan = self.costs.plan(max(self.left, 1.0), self._spread[:index], self._size)
+        f = lambda w: w and (w.cut, f"{w.price*count:.1e}", f"{_log(w.spread(self._spread, self._size)):.2f}")
+        self.note = f"{plan.products:.2e} {plan.widest:.1e} rate {plan.rate:.2e} foreseen {f(plan.ways.get(index))}"
+        if plan.widest > _HOPELESS * self._size:
+            self.left = 0.0
+        if index not in plan.ways:
+            return [], plan.rate
+        ways = [way for way in self.costs.ways(index) if count * way.price <= self.left]
+        ways.sort(key=lambda way: _log(way.spread(self._spread, self._size)) + plan.rate * count * way.price)
+        return ways[:_TRIED], plan.rate
+
+    def nearest(self, index: int, count: int) -> Way:
+        """The way of a few rows of node ``index`` that keeps their bounds closest, of those that are cheap."""
+        ways = self.costs.ways(index)
+        best = ways[0]
+        for way in ways:
+            if count * way.price < _CHEAP * self.left:
+                best = way
+        return best
 
     def renews(self, part: float, products: float) -> bool:
         """Whether all numbers of a node are bounded by rows, for ``products``, if ``part`` of them is open."""
@@ -205,6 +469,16 @@ class Schedule:
         if given and part > _MOST:
             self.left = 0.0
         return given
+
+
+def _log(value: float) -> float:
+    """Its logarithm; of nothing a very small number's."""
+    return float(np.log(max(value, 2.0**-1000)))
+
+
+def _together(count: float, squares: float) -> float:
+    """Sizes of so many normally distributed numbers, of whose squares the sum is known, together."""
+    return float(np.sqrt(2.0 / np.pi * count * squares))
 
 
 def costs_of(network: Network) -> Costs:
