@@ -1,4 +1,4 @@
-"""Bounds of a network's outputs over sets of images (docs/design.md, N, N0-N2, N6, N12-N14, N16, N17)."""
+"""Bounds of a network's outputs over sets of images (docs/design.md, N, N0-N2, N6, N12-N14, N16-N18)."""
 
 from __future__ import annotations
 
@@ -360,7 +360,8 @@ class _Cells:
 
     def _forward(self) -> _Form:
         """Lines and rounding of every node; returns what is known of the last one."""
-        self.forms = forms = [self._image()]
+        forms: list[_Form | None] = [self._image()]
+        self.forms = forms
         if self.schedule.planned:
             self._learn(0, False)
         left = list(self.network.readers)
@@ -725,6 +726,8 @@ class _Cells:
         cut = 0
         if self.schedule.planned:
             way = self.schedule.nearest(source, len(pairs))
+            if way is None:
+                return apart
             cut = self._ready(way)
         elif self.schedule.deep and not self.schedule.takes(len(pairs) * self.schedule.costs.row(source)):
             return apart
@@ -789,8 +792,6 @@ class _Cells:
             return form
         if self.schedule.planned:
             return self._planned(index, form, open_, layer)
-        if self.schedule.deep:
-            self.schedule.arrives(index)
         if apart is not None:
             form, open_ = self._bent(index, form, open_, apart)
         if self.schedule.deep:
@@ -916,15 +917,12 @@ class _Cells:
         at = tuple(torch.from_numpy(some.T))
         # a row says enough of the other side of its number
         best, least = None, float(form.r.reshape(matters.shape)[at].mean().log())
-        tried = []
         for way in ways:
             found = self._bounded(index, form, some, None, True, self._ready(way))
             radius = float(found.r.reshape(matters.shape)[at].mean().log())
-            tried.append((way.cut, round(radius, 2), f"{len(chosen)*way.price:.1e}"))
             score = radius + rate * len(chosen) * way.price
             if score < least:
                 best, least = way, score
-        self.schedule.note += f" {tried}"
         if best is None:
             return form
         self.schedule.left -= len(chosen) * best.price
@@ -939,9 +937,7 @@ class _Cells:
         relu = isinstance(layer, LeakyRelu)
         return _Goal(part * size, relu, relu and layer.alpha == 0.0)
 
-    def _bounded(
-        self, index: int, form: _Form, where: Int64, goal: _Goal | None, decides: bool, cut: int = 0
-    ) -> _Form:
+    def _bounded(self, index: int, form: _Form, where: Int64, goal: _Goal | None, decides: bool, cut: int = 0) -> _Form:
         """The form with bounds by rows of the numbers ``where`` [R, (cell, channel, row, column)] of node ``index``.
 
         ``goal``: rows end where it is reached; ``decides``: the other side is not asked for where a sign is found out;
@@ -988,9 +984,7 @@ class _Cells:
 
     # ------------------------------------------------------------ backwards
 
-    def _one_hot(
-        self, index: int, where: Int64, sign: Float64, enough: _Enough | None, cut: int = 0
-    ) -> _Reached:
+    def _one_hot(self, index: int, where: Int64, sign: Float64, enough: _Enough | None, cut: int = 0) -> _Reached:
         """Bounds of ``sign`` [R] times single numbers [R, (cell, channel, row, column)] of node ``index``."""
         channels = grid(self.network.shape(index))[0]
         found = _Reached.unknown(len(where), self.d)

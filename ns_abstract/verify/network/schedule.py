@@ -1,4 +1,4 @@
-"""What rows cost, and how many of them a deep network is worth (docs/design.md, N13, N17)."""
+"""What rows cost, and how many of them a deep network is worth (docs/design.md, N13, N17, N18)."""
 
 from __future__ import annotations
 
@@ -36,8 +36,8 @@ _DEEP = 2e12
 _ALLOWED = 5e12
 #: Products that rows may take in one cell of a network whose rows end by plan; about six minutes of one core.
 _PLANNED = 1.5e13
-#: Once such a part of them is taken, rows are given up where what was passed foretells so many times more.
-_SURE, _OVER = 0.05, 1.5
+#: Where rows for all numbers take so many times more than is allowed, they end by plan.
+_OVER = 1.5
 #: Layers that forms pass well, as a rule.
 _TIGHT = 4
 #: Part of a node's numbers past which all of them are bounded by rows.
@@ -94,7 +94,7 @@ class Way(NamedTuple):
     maxima: tuple[tuple[int, float], ...]
 
     def spread(self, known: list[float], size: float) -> float:
-        """How wide its bounds are, about, where those of earlier nodes are as wide as ``known``, of numbers ``size``."""
+        """How wide its bounds are, about, if those of earlier nodes are as wide as ``known``, of numbers ``size``."""
         total = 0.0
         for at, sum_ in self.rests:
             total += sum_ * known[at]
@@ -276,17 +276,18 @@ class Costs:
                         found[source] = max(size, found.get(source, 0.0))
         return found
 
-    def plan(self, allowed: float, known: list[float], size: float) -> Plan:
+    def plan(self, allowed: float, known: list[float], size: float, bounded: dict[int, float] | None = None) -> Plan:
         """The cheapest ways of rows that keep all bounds close enough, or else as close as they can be kept.
 
         Args:
             allowed: Products that they may take together.
             known: How wide bounds of the first nodes are.
             size: What numbers of nodes are about.
+            bounded: `Costs.bounded`, as far as it is known better.
         """
-        best = None
+        best, bounded = None, bounded or self.bounded
         for step in range(_STEPS):
-            plan = self._plan(_DEAREST / allowed * 2.0 ** (-0.5 * step), known, size)
+            plan = self._plan(_DEAREST / allowed * 2.0 ** (-0.5 * step), known, size, bounded)
             if best is None or (plan.products <= allowed and plan.widest < best.widest):
                 best = plan
             if best.widest <= _FINE * size:
@@ -294,7 +295,7 @@ class Costs:
         assert best is not None
         return best
 
-    def _plan(self, rate: float, known: list[float], size: float) -> Plan:
+    def _plan(self, rate: float, known: list[float], size: float, bounded: dict[int, float]) -> Plan:
         """The plan in which every node takes the way that is best if a product costs ``rate``."""
         spread, ways, total, widest = list(known), {}, 0.0, 0.0
         for k in range(len(known), len(self.network.nodes) + 1):
@@ -303,7 +304,7 @@ class Costs:
             if isinstance(node.layer, Activation):
                 near *= 1.0 + _BENDS * near / size
             near = min(near * self._sizes[k][0], _HUGE)
-            count = self.bounded.get(k)
+            count = bounded.get(k)
             if count is not None:
                 score = _log(near) - _CLOSE
                 for way in self.ways(k):
@@ -353,21 +354,8 @@ class Costs:
         if self.planned:
             plan = self.plan(_PLANNED, [_USUAL], 1.0)
             return (0.0, True) if plan.widest > _HOPELESS else (plan.products, False)
-        taken = passed = 0.0
-        for index, products in self.nodes:
-            passed += products
-            if self.network.depth[index] <= _TIGHT:
-                continue
-            # where most of a node is open, rows bound all of it
-            if _in_vain(taken + products, passed, self.total):
-                return taken, True
-            taken += deep * products
+        taken = sum(deep * products for index, products in self.nodes if self.network.depth[index] > _TIGHT)
         return min(taken, _ALLOWED), False
-
-
-def _in_vain(taken: float, passed: float, total: float) -> bool:
-    """Whether rows would end on the way: ``taken`` of what all rows take up to a node, ``passed``, and to the end."""
-    return taken > _SURE * _ALLOWED and taken * total > _OVER * _ALLOWED * passed
 
 
 class Schedule:
@@ -377,15 +365,11 @@ class Schedule:
         self.network = network
         self.costs = costs_of(network)
         self.deep = self.costs.deep
-        self._taken = self._passed = 0.0
         self.planned = self.costs.planned
         self.left = _PLANNED if self.planned else _ALLOWED
+        self._bounded = dict(self.costs.bounded) if self.planned else {}
         self._spread: list[float] = []
         self._size = 1.0
-
-    def arrives(self, index: int) -> None:
-        """The work is at node ``index``."""
-        self._passed += float(np.prod(self.network.shape(index))) * self.costs.row(index)
 
     @property
     def rests(self) -> set[int]:
@@ -393,19 +377,17 @@ class Schedule:
         return self.costs.rests if self.planned else set()
 
     def learns(self, index: int, radius: float, size: float) -> None:
-        """Bounds of node ``index``, the next or an earlier one, are so wide, and its numbers of this size."""
+        """Forms of node ``index``, the next or an earlier one, are so loose (N1), and its numbers of this size."""
         self._spread[index:] = [radius, *self._spread[index + 1 :]]
         self._size = size or self._size
 
     def ways(self, index: int, count: int) -> tuple[list[Way], float]:
         """Ways of rows for ``count`` numbers of node ``index`` that are worth a trial, and what a product costs (N18).
 
-        None if its form is as good.
+        There are none if its form is as good, or nothing will be known in the end.
         """
-        self.costs.bounded[index] = float(count)
-        plan = self.costs.plan(max(self.left, 1.0), self._spread[:index], self._size)
-        f = lambda w: w and (w.cut, f"{w.price*count:.1e}", f"{_log(w.spread(self._spread, self._size)):.2f}")
-        self.note = f"{plan.products:.2e} {plan.widest:.1e} rate {plan.rate:.2e} foreseen {f(plan.ways.get(index))}"
+        self._bounded[index] = float(count)
+        plan = self.costs.plan(max(self.left, 1.0), self._spread[:index], self._size, self._bounded)
         if plan.widest > _HOPELESS * self._size:
             self.left = 0.0
         if index not in plan.ways:
@@ -414,13 +396,14 @@ class Schedule:
         ways.sort(key=lambda way: _log(way.spread(self._spread, self._size)) + plan.rate * count * way.price)
         return ways[:_TRIED], plan.rate
 
-    def nearest(self, index: int, count: int) -> Way:
-        """The way of a few rows of node ``index`` that keeps their bounds closest, of those that are cheap."""
-        ways = self.costs.ways(index)
-        best = ways[0]
-        for way in ways:
+    def nearest(self, index: int, count: int) -> Way | None:
+        """The longest way of ``count`` rows of node ``index``, of those that are cheap; what it takes is taken."""
+        best = None
+        for way in self.costs.ways(index):
             if count * way.price < _CHEAP * self.left:
                 best = way
+        if best is not None:
+            self.left -= count * best.price
         return best
 
     def renews(self, part: float, products: float) -> bool:
@@ -437,24 +420,15 @@ class Schedule:
         return 0.0 if products < self._cheap else _ENOUGH
 
     def takes(self, products: float) -> bool:
-        """Whether so many products are left; they are taken then.
-
-        Where rows would end on the way, what they are worth before is lost behind, so they are given up early.
-        """
-        taken = self._taken + products
+        """Whether so many products are left; they are taken then."""
         if products > self.left:
             return False
-        if _in_vain(taken, self._passed, self.costs.total):
-            self.left = 0.0
-            return False
         self.left -= products
-        self._taken = taken
         return True
 
     def spares(self, products: float) -> None:
         """So many products were not taken after all."""
         self.left += products
-        self._taken -= products
 
     def gains(self, kept: float, part: float) -> bool:
         """Whether rows for all numbers are worth it that leave so large a part of widths, if ``part`` is open."""
