@@ -52,9 +52,9 @@ _ENOUGH = 0.03
 _KEPT, _LOST = 0.9, 0.9
 #: Part of a node's numbers that have to be open for that to end all.
 _MOST = 0.5
-#: Plans that are compared; in the first, all that is allowed costs so much (a logarithm of widths). By how much rows
-#: have to be the better.
-_STEPS, _DEAREST, _CLOSE = 56, 2.0**14, 0.1
+#: Plans that are compared at first, and to either side of one made before; in the first of them rows for all numbers
+#: cost so much (a logarithm of widths). By how much rows have to be the better.
+_STEPS, _LIKE, _DEAREST, _CLOSE = 64, 6, 2.0**18, 0.1
 #: Factor between the prices of two ways.
 _APART = 1.2
 #: Part of its inputs that an activation passes on.
@@ -63,8 +63,8 @@ _ACTIVE = 0.5
 _FINE = 1e-3
 #: What an activation adds to bounds of its input relative to these and to numbers' sizes, and rows of themselves.
 _BENDS, _ROUNDS = 0.1, 5e-5
-#: Width of an image's numbers that is assumed where none is known; width past which nothing is foreseen.
-_USUAL, _HUGE = 1e-6, 1e100
+#: How loose an image's form is taken to be where nothing is known; past the other nothing is foreseen.
+_USUAL, _HUGE = 1e-8, 1e100
 #: Width of bounds, as a part of numbers, past which nothing is worth any rows if it is foreseen.
 _HOPELESS = 1e3
 #: Ways that are tried, and numbers of a node that they are tried with.
@@ -114,12 +114,14 @@ class Plan(NamedTuple):
         products: What they take together.
         widest: How wide bounds of a node are foreseen to be at most.
         rate: What a product costs in logarithms of widths.
+        step: Which of the plans compared it is.
     """
 
     ways: dict[int, Way]
     products: float
     widest: float
     rate: float
+    step: int
 
 
 class Costs:
@@ -276,7 +278,14 @@ class Costs:
                         found[source] = max(size, found.get(source, 0.0))
         return found
 
-    def plan(self, allowed: float, known: list[float], size: float, bounded: dict[int, float] | None = None) -> Plan:
+    def plan(
+        self,
+        allowed: float,
+        known: list[float],
+        size: float,
+        bounded: dict[int, float] | None = None,
+        near: int | None = None,
+    ) -> Plan:
         """The cheapest ways of rows that keep all bounds close enough, or else as close as they can be kept.
 
         Args:
@@ -284,10 +293,12 @@ class Costs:
             known: How wide bounds of the first nodes are.
             size: What numbers of nodes are about.
             bounded: `Costs.bounded`, as far as it is known better.
+            near: `Plan.step` of a plan that was made before; only plans like it are compared.
         """
         best, bounded = None, bounded or self.bounded
-        for step in range(_STEPS):
-            plan = self._plan(_DEAREST / allowed * 2.0 ** (-0.5 * step), known, size, bounded)
+        first, past = (0, _STEPS) if near is None else (max(0, near - _LIKE), min(_STEPS, near + _LIKE + 1))
+        for step in range(first, past):
+            plan = self._plan(step, known, size, bounded)
             if best is None or (plan.products <= allowed and plan.widest < best.widest):
                 best = plan
             if best.widest <= _FINE * size:
@@ -295,9 +306,10 @@ class Costs:
         assert best is not None
         return best
 
-    def _plan(self, rate: float, known: list[float], size: float, bounded: dict[int, float]) -> Plan:
-        """The plan in which every node takes the way that is best if a product costs ``rate``."""
+    def _plan(self, step: int, known: list[float], size: float, bounded: dict[int, float]) -> Plan:
+        """The plan in which every node takes the way that is best for what a product costs."""
         spread, ways, total, widest = list(known), {}, 0.0, 0.0
+        rate = _DEAREST / self.total * 2.0 ** (-0.5 * step)
         for k in range(len(known), len(self.network.nodes) + 1):
             node = self.network.nodes[k - 1]
             near = max(spread[source] for source in node.inputs)
@@ -316,7 +328,7 @@ class Costs:
             if k in ways:
                 total += count * ways[k].price
             spread.append(near)
-        return Plan(ways, total, widest, rate)
+        return Plan(ways, total, widest, rate, step)
 
     @cached_property
     def nodes(self) -> list[tuple[int, float]]:
@@ -370,6 +382,7 @@ class Schedule:
         self._bounded = dict(self.costs.bounded) if self.planned else {}
         self._spread: list[float] = []
         self._size = 1.0
+        self._step: int | None = None
 
     @property
     def rests(self) -> set[int]:
@@ -387,7 +400,8 @@ class Schedule:
         There are none if its form is as good, or nothing will be known in the end.
         """
         self._bounded[index] = float(count)
-        plan = self.costs.plan(max(self.left, 1.0), self._spread[:index], self._size, self._bounded)
+        plan = self.costs.plan(max(self.left, 1.0), self._spread[:index], self._size, self._bounded, self._step)
+        self._step = plan.step
         if plan.widest > _HOPELESS * self._size:
             self.left = 0.0
         if index not in plan.ways:
