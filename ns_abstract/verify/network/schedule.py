@@ -60,7 +60,7 @@ _APART = 1.2
 #: Part of its inputs that an activation passes on.
 _ACTIVE = 0.5
 #: Width, as a part of a node's numbers, that is close enough.
-_FINE = 1e-3
+_FINE = 1e-4
 #: What an activation adds to bounds of its input relative to these and to numbers' sizes, and rows of themselves.
 _BENDS, _ROUNDS = 0.1, 5e-5
 #: How loose an image's form is taken to be where nothing is known; past the other nothing is foreseen.
