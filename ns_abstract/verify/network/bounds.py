@@ -1,4 +1,4 @@
-"""Bounds of a network's outputs over sets of images (docs/design.md, N, N0-N2, N6, N12-N14, N16, N17)."""
+"""Bounds of a network's outputs over sets of images (docs/design.md, N, N0-N2, N6, N12-N14, N16-N18)."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ from ns_abstract.verify.network.rows import (
     pass_activation,
     pass_maximum,
 )
-from ns_abstract.verify.network.schedule import Schedule, on_threads
+from ns_abstract.verify.network.schedule import TRIALS, Schedule, Way, on_threads
 from ns_abstract.verify.network.slopes import Ascent, Chosen, Held, OpenUnits, derivatives
 
 Float64 = NDArray[np.float64]
@@ -283,6 +283,8 @@ class _Cells:
         self.folded: set[int] = set()
         #: what rows may stop at
         self.stops: dict[int, Columns] = {}
+        #: what is known of nodes, while other nodes read them
+        self.forms: list[_Form | None] = []
         #: products that rows have not taken because they ended on the way
         self.spared = 0.0
         #: part of the latest ReLU's inputs whose signs have not been found out
@@ -369,6 +371,9 @@ class _Cells:
     def _forward(self) -> _Form:
         """Lines and rounding of every node; returns what is known of the last one."""
         forms: list[_Form | None] = [self._image()]
+        self.forms = forms
+        if self.schedule.planned:
+            self._learn(0, False)
         left = list(self.network.readers)
         last = len(self.network.nodes)
         for k, node in enumerate(self.network.nodes, 1):
@@ -399,13 +404,35 @@ class _Cells:
                 forms.append(self._maximum(k, node.inputs[0], node.layer, inputs[0]))
             else:
                 forms.append(self._combine(k, node.inputs, node.layer, inputs))
+            if self.schedule.planned:
+                for index in node.inputs:
+                    self._learn(index, isinstance(node.layer, LeakyRelu) and node.layer.alpha == 0.0)
+                self._learn(k, False)
             for index in node.inputs:
                 left[index] -= 1
                 if not left[index] and index != last:
-                    forms[index] = None
+                    self._leave(index)
         end = forms[last]
         assert end is not None
+        self.forms = []
         return end
+
+    def _learn(self, index: int, cut: bool) -> None:
+        """Tell the schedule how wide bounds of node ``index`` are; ``cut``: those of numbers that are not cut off."""
+        form = self.forms[index]
+        assert form is not None
+        r = form.r
+        if cut:
+            above = form.interval.upper > 0.0
+            r = r[above] if bool(above.any()) else r
+        self.schedule.learns(index, float(r.mean()), float(form.reference.abs().mean()))
+
+    def _leave(self, index: int) -> None:
+        """Node ``index`` has been read; rows of later ones may end there (N18)."""
+        form, self.forms[index] = self.forms[index], None
+        if index in self.schedule.rests and index not in self.stops:
+            assert form is not None
+            self.stops[index] = self._stop(index, form)
 
     def _assume(self, source: int, z: _Form) -> _Form:
         """What is known of node ``source`` where its numbers have the signs that are assumed (N16)."""
@@ -721,22 +748,28 @@ class _Cells:
         # (window, number, number)
         window, number = rivals().nonzero()
         pairs = np.stack([window, winner[window], number], 1)
-        if self.schedule.deep and not self.schedule.takes(len(pairs) * self.schedule.costs.row(source)):
+        cut = 0
+        if self.schedule.planned:
+            way = self.schedule.nearest(source, len(pairs))
+            if way is None:
+                return apart
+            cut = self._ready(way)
+        elif self.schedule.deep and not self.schedule.takes(len(pairs) * self.schedule.costs.row(source)):
             return apart
         if len(pairs) > _SOME:
             first = np.arange(0, len(pairs), len(pairs) // _SOME)
-            if self._differences(source, layer, where.numpy(), known, pairs[first], apart) < _CLOSES * len(first):
+            if self._differences(source, layer, where.numpy(), known, pairs[first], apart, cut) < _CLOSES * len(first):
                 return apart
             pairs = np.delete(pairs, first, 0)
-        self._differences(source, layer, where.numpy(), known, pairs, apart)
+        self._differences(source, layer, where.numpy(), known, pairs, apart, cut)
         # what may be above the winner, among itself
         left = rivals()
         both = np.triu(left[:, :, None] & left[:, None, :], 1)
-        self._differences(source, layer, where.numpy(), known, np.argwhere(both), apart)
+        self._differences(source, layer, where.numpy(), known, np.argwhere(both), apart, cut)
         return apart
 
     def _differences(
-        self, source: int, layer: MaxPool, where: Int64, known: Candidates, pairs: Int64, apart: Tensor
+        self, source: int, layer: MaxPool, where: Int64, known: Candidates, pairs: Int64, apart: Tensor, cut: int
     ) -> int:
         """Bound differences of (window, number, number) by rows, in ``apart``; how many second ones are never above."""
         channels = self.network.shape(source)[0]
@@ -759,7 +792,7 @@ class _Cells:
             room = 2.0**-50 * (near[0].abs() + near[1].abs()).numpy()
             rows = Rows(value, y * layer.stride[0] - layer.pads[0], x * layer.stride[1] - layer.pads[1])
             enough = _Enough(_Goal(), room - ahead, np.zeros(len(part), bool))
-            found = self._backward(source, rows, np.ascontiguousarray(cell), enough)
+            found = self._backward(source, rows, np.ascontiguousarray(cell), enough, None, cut)
             above, below = torch.from_numpy(room - ahead - found.lower), torch.from_numpy(room + ahead + found.upper)
             apart[window, other, one] = torch.minimum(apart[window, other, one], above)
             apart[window, one, other] = torch.minimum(apart[window, one, other], below)
@@ -782,8 +815,8 @@ class _Cells:
         """The form of node ``index`` with better bounds of what is open before an activation or a product (None)."""
         if self.network.depth[index] < 2:
             return form
-        if self.schedule.deep:
-            self.schedule.arrives(index)
+        if self.schedule.planned:
+            return self._planned(index, form, open_, layer)
         if apart is not None:
             form, open_ = self._bent(index, form, open_, apart)
         if self.schedule.deep:
@@ -886,6 +919,40 @@ class _Cells:
         self.schedule.spares((self.spared - spared) * (1.0 if decides else 0.5))
         return found
 
+    def _ready(self, way: Way) -> int:
+        """Where rows of a way end, when all is known that they end on."""
+        for at, _ in way.rests:
+            if at and at not in self.stops:
+                form = self.forms[at]
+                assert form is not None
+                self.stops[at] = self._stop(at, form)
+        return way.cut
+
+    def _planned(self, index: int, form: _Form, open_: Tensor, layer: Activation | None) -> _Form:
+        """Better bounds of all numbers of a node that matter, by rows as long as the network is worth (N18)."""
+        shape = grid(self.network.shape(index))
+        matters = torch.from_numpy(self.good).reshape(-1, 1, 1, 1) & torch.ones((self.count, *shape), dtype=torch.bool)
+        if isinstance(layer, LeakyRelu) and layer.alpha == 0.0:
+            matters &= form.interval.upper.reshape(matters.shape) > 0.0
+        chosen = matters.nonzero().numpy()
+        ways, rate = self.schedule.ways(index, len(chosen)) if len(chosen) else ([], 0.0)
+        if not ways:
+            return form
+        some = chosen[:: -(-len(chosen) // TRIALS)]
+        at = tuple(torch.from_numpy(some.T))
+        # a row says enough of the other side of its number
+        best, least = None, float(form.r.reshape(matters.shape)[at].mean().log())
+        for way in ways:
+            found = self._bounded(index, form, some, None, True, self._ready(way))
+            radius = float(found.r.reshape(matters.shape)[at].mean().log())
+            score = radius + rate * len(chosen) * way.price
+            if score < least:
+                best, least = way, score
+        if best is None:
+            return form
+        self.schedule.left -= len(chosen) * best.price
+        return self._bounded(index, form, chosen, None, True, best.cut)
+
     def _goal(self, form: _Form, products: float, layer: Activation | None) -> _Goal | None:
         """What rows for all numbers of a node, which take so many products to the image, are to find out (N17)."""
         part = self.schedule.suffices(products)
@@ -895,10 +962,11 @@ class _Cells:
         relu = isinstance(layer, LeakyRelu)
         return _Goal(part * size, relu, relu and layer.alpha == 0.0)
 
-    def _bounded(self, index: int, form: _Form, where: Int64, goal: _Goal | None, decides: bool) -> _Form:
+    def _bounded(self, index: int, form: _Form, where: Int64, goal: _Goal | None, decides: bool, cut: int = 0) -> _Form:
         """The form with bounds by rows of the numbers ``where`` [R, (cell, channel, row, column)] of node ``index``.
 
-        ``goal``: rows end where it is reached; ``decides``: the other side is not asked for where a sign is found out.
+        ``goal``: rows end where it is reached; ``decides``: the other side is not asked for where a sign is found out;
+        ``cut``: all rows end on the nodes up to it (N18).
         """
         item = self.network.shape(index)
         cell, flat = where[:, 0], np.ravel_multi_index(tuple(where[:, 1:].T), grid(item))
@@ -910,13 +978,13 @@ class _Cells:
         def enough(part: Int64, sign: Float64) -> _Enough | None:
             return None if goal is None else _Enough(goal, -sign * reference[part], sign < 0.0)
 
-        found = self._one_hot(index, where, sign, enough(np.arange(len(where)), sign))
+        found = self._one_hot(index, where, sign, enough(np.arange(len(where)), sign), cut)
         found.turn(sign < 0.0)
         lower, upper = form.lower.flatten(1).clone(), form.upper.flatten(1).clone()
         low = np.maximum(lower[at].numpy(), found.lower) + reference
         high = np.minimum(upper[at].numpy(), found.upper) + reference
         left = np.flatnonzero((low < 0.0) & (high > 0.0)) if decides else np.arange(len(where))
-        again = self._one_hot(index, where[left], -sign[left], enough(left, -sign[left]))
+        again = self._one_hot(index, where[left], -sign[left], enough(left, -sign[left]), cut)
         again.turn(sign[left] > 0.0)
         found.meet(left, again, sign[left] < 0.0)
         c, r = form.c.flatten(1).clone(), form.r.flatten(1).clone()
@@ -941,7 +1009,7 @@ class _Cells:
 
     # ------------------------------------------------------------ backwards
 
-    def _one_hot(self, index: int, where: Int64, sign: Float64, enough: _Enough | None) -> _Reached:
+    def _one_hot(self, index: int, where: Int64, sign: Float64, enough: _Enough | None, cut: int = 0) -> _Reached:
         """Bounds of ``sign`` [R] times single numbers [R, (cell, channel, row, column)] of node ``index``."""
         channels = grid(self.network.shape(index))[0]
         found = _Reached.unknown(len(where), self.d)
@@ -957,7 +1025,8 @@ class _Cells:
             value = np.zeros((len(cell), channels, 1, 1), np.float32)
             value[np.arange(len(cell)), channel, 0, 0] = sign[number]
             trace = Trace(len(cell)) if self.keeps else None
-            part = self._backward(index, Rows(value, y, x), cell, None if enough is None else enough[number], trace)
+            asked = None if enough is None else enough[number]
+            part = self._backward(index, Rows(value, y, x), cell, asked, trace, cut)
             return number, part, trace
 
         for number, part, trace in on_threads(bound, range(0, len(where), step), threads):
@@ -979,28 +1048,32 @@ class _Cells:
         cell: Int64,
         enough: _Enough | None = None,
         trace: Trace | None = None,
+        cut: int = 0,
     ) -> _Reached:
         """Bounds of rows on node ``index``, relative to the reference.
 
-        Those of which ``enough`` is known may stop before the image; ``trace`` takes in what rows are on the way.
+        Those of which ``enough`` is known may stop before the image; ``trace`` takes in what rows are on the way. All of
+        them end on the nodes up to ``cut`` (N18).
         """
         found = _Reached.unknown(len(cell), self.d)
         batch = _Batch({index: rows}, cell, np.zeros((len(cell), 2)), np.arange(len(cell)))
         batch.trace = trace
-        self._descend(index, index, batch, found, enough)
+        self._descend(index, index, batch, found, enough, cut)
         return found
 
-    def _descend(self, start: int, at: int, batch: _Batch, found: _Reached, enough: _Enough | None) -> None:
-        """Pass a batch from node ``at`` on to the image."""
+    def _descend(
+        self, start: int, at: int, batch: _Batch, found: _Reached, enough: _Enough | None, cut: int = 0
+    ) -> None:
+        """Pass a batch from node ``at`` on to the image, or to the nodes up to ``cut``."""
         checkpoint()
-        while at > 0:
+        while at > cut:
             if at not in batch.waiting:
                 at -= 1
                 continue
             if batch.bytes > min(_ROWS_AT_ONCE, self.memory // 16) and len(batch.cell) > 1:
                 half = len(batch.cell) // 2
                 for part in (slice(0, half), slice(half, None)):
-                    self._descend(start, at, batch[part], found, enough)
+                    self._descend(start, at, batch[part], found, enough, cut)
                 return
             ends = enough is not None and (batch.trace is None or self.schedule.deep)
             if enough is not None and ends and at != start and at in self.stops and len(batch.waiting) == 1:
@@ -1049,6 +1122,9 @@ class _Cells:
                 known = batch.waiting.get(source)
                 shape = self.network.shape(source)
                 batch.waiting[source] = full(part, shape) if known is None else join(known, part, shape)
+        if cut:
+            self._rest_rows(batch, found)
+            return
         if batch.chosen is not None and 0 in batch.waiting:
             whole = full(batch.waiting[0], self.network.input_shape, force=True)
             batch.chosen.keep(0, whole.value, batch.number, len(found.lower))
@@ -1073,6 +1149,25 @@ class _Cells:
         else:
             concretize(rows.value, rows.y, rows.x, batch.cell, known, batch.total, plane, box)
         lost = self.flush[batch.cell][:, None] * np.array([-1.0, 1.0])
+        plane[:, :, -1] += lost
+        box += lost
+        found.improve(batch.number, plane, box)
+
+    def _rest_rows(self, batch: _Batch, found: _Reached) -> None:
+        """Bounds of a batch whose rows rest on several nodes, of which forms are known (N18)."""
+        count, total = len(batch.cell), batch.total
+        plane, box = np.zeros((count, 2, self.d + 1)), np.zeros((count, 2))
+        sizes = np.zeros(count)
+        for at, rows in batch.waiting.items():
+            known = self.stops[at] if at else self.columns
+            one, two = np.zeros_like(plane), np.zeros_like(box)
+            concretize(rows.value, rows.y, rows.x, batch.cell, known, total, one, two)
+            plane += one
+            box += two
+            sizes += np.abs(one).sum((1, 2)) + np.abs(two).sum(1)
+            total = np.zeros_like(total)
+        lost = self.flush[batch.cell] + 2.0**-52 * len(batch.waiting) * sizes
+        lost = lost[:, None] * np.array([-1.0, 1.0])
         plane[:, :, -1] += lost
         box += lost
         found.improve(batch.number, plane, box)

@@ -15,8 +15,9 @@ from ns_abstract.verify.network.schedule import costs_of
 _NUMBERS = 8
 #: Bytes of rows under way and of weights in other orders: of a network whose rows are few, and of a deep one.
 _FEW_ROWS, _MANY_ROWS = 128 << 20, 420 << 20
-#: Products a second of one core: of forms in float64, and of rows in float32, few at a time and many; measured.
-_FORMS_SPEED, _FEW_SPEED, _MANY_SPEED = 1.5e9, 2.5e9, 2.5e10
+#: Products a second of one core: of forms in float64, and of rows in float32, few at a time, many, and many that end
+#: by plan; measured.
+_FORMS_SPEED, _FEW_SPEED, _MANY_SPEED, _PLANNED_SPEED = 1.5e9, 2.5e9, 2.5e10, 4e10
 #: Part of all units that rows are passed back for, in sets that are worth a proof; of a deep network most.
 _OPEN, _DEEP_OPEN = 0.1, 0.4
 
@@ -45,7 +46,7 @@ def estimate(network: Network, dimensions: int) -> tuple[float, float, bool]:
     rows, given_up = costs.foreseen(_OPEN, _DEEP_OPEN)
     many = costs.deep and not given_up
     memory = sum(sizes) * 8 * (3 * dimensions + _NUMBERS) + (_MANY_ROWS if many else _FEW_ROWS)
-    speed = _MANY_SPEED if costs.deep else _FEW_SPEED
+    speed = _PLANNED_SPEED if costs.planned else _MANY_SPEED if costs.deep else _FEW_SPEED
     return memory, forwards / _FORMS_SPEED + rows / speed, given_up
 
 
@@ -67,5 +68,9 @@ def explain(network: Network, dimensions: int = 2) -> Sequence[str]:
     )
     if given_up:
         lines.append("deep: rows for its units cost more than they may, so they are given up and bounds are wide")
+    elif costs_of(network).planned:
+        lines.append(
+            "deep: rows end on the way; of sets for which that leaves nothing known they are given up after seconds"
+        )
     lines += [f"covered: {line}" for line in network.guarantee()]
     return lines

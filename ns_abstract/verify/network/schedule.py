@@ -1,4 +1,4 @@
-"""What rows cost, and how many of them a deep network is worth (docs/design.md, N13, N17)."""
+"""What rows cost, and how many of them a deep network is worth (docs/design.md, N13, N17, N18)."""
 
 from __future__ import annotations
 
@@ -6,13 +6,23 @@ from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextvars import copy_context
 from functools import cached_property
-from typing import TypeVar
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 import torch
 
 from ns_abstract.verify.network.graph import Network
-from ns_abstract.verify.network.layers import Activation, Channels, Convolution, Linear, Matrix, Pad, Scale, Sum
+from ns_abstract.verify.network.layers import (
+    Activation,
+    Channels,
+    Convolution,
+    LeakyRelu,
+    Linear,
+    Matrix,
+    Pad,
+    Scale,
+    Sum,
+)
 from ns_abstract.verify.network.maps import Sparse, TransposedConvolution
 from ns_abstract.verify.network.maxima import MaxPool
 from ns_abstract.verify.network.products import Product
@@ -24,8 +34,10 @@ _PASSING = 40.0
 _DEEP = 2e12
 #: Products that rows for inner nodes may take in one cell of a deep network; about three minutes of one core.
 _ALLOWED = 5e12
-#: Once such a part of them is taken, rows are given up where what was passed foretells so many times more.
-_SURE, _OVER = 0.05, 1.5
+#: Products that rows may take in one cell of a network whose rows end by plan; about six minutes of one core.
+_PLANNED = 1.5e13
+#: Where rows for all numbers take so many times more than is allowed, they end by plan.
+_OVER = 1.5
 #: Layers that forms pass well, as a rule.
 _TIGHT = 4
 #: Part of a node's numbers past which all of them are bounded by rows.
@@ -40,6 +52,23 @@ _ENOUGH = 0.03
 _KEPT, _LOST = 0.9, 0.9
 #: Part of a node's numbers that have to be open for that to end all.
 _MOST = 0.5
+#: Plans that are compared at first, and to either side of one made before; in the first of them rows for all numbers
+#: cost so much (a logarithm of widths). By how much rows have to be the better.
+_STEPS, _LIKE, _DEAREST, _CLOSE = 64, 6, 2.0**18, 0.1
+#: Factor between the prices of two ways.
+_APART = 1.2
+#: Part of its inputs that an activation passes on.
+_ACTIVE = 0.5
+#: Width, as a part of a node's numbers, that is close enough.
+_FINE = 1e-4
+#: What an activation adds to bounds of its input relative to these and to numbers' sizes, and rows of themselves.
+_BENDS, _ROUNDS = 0.1, 5e-5
+#: How loose an image's form is taken to be where nothing is known; past the other nothing is foreseen.
+_USUAL, _HUGE = 1e-8, 1e100
+#: Width of bounds, as a part of numbers, past which nothing is worth any rows if it is foreseen.
+_HOPELESS = 1e3
+#: Ways that are tried, and numbers of a node that they are tried with.
+_TRIED, TRIALS = 6, 32
 #: Layers whose rows stay in their windows.
 _WINDOWED = (Activation, Channels, Pad, Product, Scale, Sum)
 
@@ -47,29 +76,123 @@ _WINDOWED = (Activation, Channels, Pad, Product, Scale, Sum)
 Found = TypeVar("Found")
 
 
+class Way(NamedTuple):
+    """How a row of one number of a node goes back.
+
+    Attributes:
+        cut: It passes through the nodes behind this one and ends on those up to it; 0: it ends on the image.
+        price: Products it takes.
+        rests: By node that it is on then: what its coefficients are together, about.
+        passed: The same of nodes before an activation or a product that it passes through.
+        maxima: The same of maxima that it passes through.
+    """
+
+    cut: int
+    price: float
+    rests: tuple[tuple[int, float], ...]
+    passed: tuple[tuple[int, float], ...]
+    maxima: tuple[tuple[int, float], ...]
+
+    def spread(self, known: list[float], size: float) -> float:
+        """How wide its bounds are, about, if those of earlier nodes are as wide as ``known``, of numbers ``size``."""
+        total = 0.0
+        for at, sum_ in self.rests:
+            total += sum_ * known[at]
+        for at, sum_ in self.passed:
+            total += sum_ * known[at] * (_BENDS * known[at] / size + _ROUNDS)
+        for at, sum_ in self.maxima:
+            # where numbers are as good as equal, nothing is known of the greatest but its bounds
+            total += sum_ * known[at]
+        return total
+
+
+class Plan(NamedTuple):
+    """Which rows a cell of a network is worth (N18).
+
+    Attributes:
+        ways: By node: how rows for all of its numbers go back.
+        products: What they take together.
+        widest: How wide bounds of a node are foreseen to be at most.
+        rate: What a product costs in logarithms of widths.
+        step: Which of the plans compared it is.
+    """
+
+    ways: dict[int, Way]
+    products: float
+    widest: float
+    rate: float
+    step: int
+
+
 class Costs:
     """Products that rows of one network take."""
 
     def __init__(self, network: Network) -> None:
         self.network = network
-        self._rows: dict[int, float] = {}
+        self._ways: dict[int, list[Way]] = {}
 
     def row(self, index: int) -> float:
         """Products that a row of one number of node ``index`` takes to the image."""
-        if index not in self._rows:
-            self._rows[index] = self._passed(index)
-        return self._rows[index]
+        return self.ways(index)[-1].price
 
-    def _passed(self, index: int) -> float:
+    def ways(self, index: int) -> list[Way]:
+        """How a row of one number of node ``index`` may go back, the shortest way first; the last is to the image."""
+        if index not in self._ways:
+            self._ways[index] = self._passed(index)
+        return self._ways[index]
+
+    @cached_property
+    def _ends(self) -> set[int]:
+        """Nodes that rows may be cut at: those that rows are for, and maxima."""
+        found = set()
+        for k, node in enumerate(self.network.nodes, 1):
+            if isinstance(node.layer, MaxPool):
+                found.add(k)
+            if isinstance(node.layer, (Activation, Product)):
+                found.update(node.inputs)
+        return found
+
+    @cached_property
+    def rests(self) -> set[int]:
+        """Nodes that rows of any node may rest on, but for the image."""
+        last = [0] * (len(self.network.nodes) + 1)
+        for k, node in enumerate(self.network.nodes, 1):
+            for source in node.inputs:
+                last[source] = k
+        found: set[int] = set()
+        for cut in self._ends:
+            found.update(k for k in range(1, cut + 1) if last[k] > cut)
+        return found
+
+    def _passed(self, index: int) -> list[Way]:
         """The same, window by window."""
-        windows, total = {index: (1, 1)}, 0.0
+        # rows and columns of a window, channels in use, and the coefficients' squares together
+        windows, total, ways = {index: (1, 1, 1.0, 1.0)}, 0.0, []
+        passed: list[tuple[int, float]] = []
+        maxima: list[tuple[int, float]] = []
         for at in range(index, 0, -1):
+            if at != index and at in self._ends:
+                way = self._way(at, windows, total, passed, maxima)
+                if not ways or way.price > _APART * ways[-1].price:
+                    ways.append(way)
             if at not in windows:
                 continue
-            h, w = windows.pop(at)
+            h, w, used, squares = windows.pop(at)
+            if at != index and at in self._ends:
+                chosen = maxima if isinstance(self.network.nodes[at - 1].layer, MaxPool) else passed
+                chosen.append((at, _together(h * w * used, squares)))
             node = self.network.nodes[at - 1]
             layer = node.layer
-            total += _PASSING * grid(self.network.shape(at))[0] * h * w
+            channels = grid(self.network.shape(at))[0]
+            total += _PASSING * channels * h * w
+            squares *= self._sizes[at][1]
+            if isinstance(layer, Convolution):
+                groups = layer.groups
+                used = min(groups, max(used, 1.0)) * (grid(layer.input_shapes[0])[0] / groups)
+            elif isinstance(layer, Activation):
+                used *= _ACTIVE
+            elif isinstance(layer, Linear) and layer.mixes:
+                used = float(max(grid(self.network.shape(source))[0] for source in node.inputs))
             whole = False
             if isinstance(layer, Convolution):
                 total += float(layer.weight.numel()) * h * w
@@ -96,9 +219,116 @@ class Costs:
             for source in node.inputs:
                 _, height, width = grid(self.network.shape(source))
                 size = (height, width) if whole or h * w >= height * width else (h, w)
-                known = windows.get(source, (0, 0))
-                windows[source] = max(known[0], size[0]), max(known[1], size[1])
-        return total + _PASSING * float(np.prod(self.network.input_shape))
+                known = windows.get(source, (0, 0, 0.0, 0.0))
+                windows[source] = (
+                    max(known[0], size[0]),
+                    max(known[1], size[1]),
+                    max(known[2], min(used, grid(self.network.shape(source))[0])),
+                    known[3] + squares,
+                )
+        ways.append(self._way(0, windows, total, passed, maxima))
+        return ways
+
+    def _way(
+        self,
+        cut: int,
+        windows: dict[int, tuple[int, int, float, float]],
+        total: float,
+        passed: list[tuple[int, float]],
+        maxima: list[tuple[int, float]],
+    ) -> Way:
+        """Rows that have got to ``windows``, and are bounded there."""
+        bounded = sum(grid(self.network.shape(at))[0] * h * w for at, (h, w, _, _) in windows.items())
+        sums = {at: _together(h * w * used, squares) for at, (h, w, used, squares) in windows.items()}
+        return Way(cut, total + _PASSING * bounded, tuple(sums.items()), tuple(passed), tuple(maxima))
+
+    @cached_property
+    def _sizes(self) -> list[tuple[float, float]]:
+        """By node: sums of the sizes and of the squares of what one number of it takes of others, on average."""
+        found = [(1.0, 1.0)]
+        for node in self.network.nodes:
+            layer = node.layer
+            if isinstance(layer, (Convolution, Matrix)):
+                weight, count = layer.weight, float(layer.weight.shape[0])
+            elif isinstance(layer, TransposedConvolution):
+                weight = layer.weight
+                count = float(np.prod(layer.shape)) / float(np.prod(layer.input_shapes[0][1:]))
+            elif isinstance(layer, Sparse):
+                weight, count = layer.weight, float(np.prod(layer.shape))
+            elif isinstance(layer, Scale):
+                weight, count = layer.factor, float(layer.factor.numel())
+            else:
+                part = _ACTIVE if isinstance(layer, Activation) else 1.0
+                found.append((part, part))
+                continue
+            found.append((float(weight.abs().sum()) / count, float(weight.square().sum()) / count))
+        return found
+
+    @cached_property
+    def bounded(self) -> dict[int, float]:
+        """By node before an activation or a product: how many of its numbers rows are for, about."""
+        found: dict[int, float] = {}
+        for node in self.network.nodes:
+            if isinstance(node.layer, (Activation, Product)):
+                # what is certainly cut off needs no rows
+                cut = isinstance(node.layer, LeakyRelu) and node.layer.alpha == 0.0
+                for source in node.inputs:
+                    if self.network.depth[source] > 1:
+                        size = float(np.prod(self.network.shape(source))) * (0.5 if cut else 1.0)
+                        found[source] = max(size, found.get(source, 0.0))
+        return found
+
+    def plan(
+        self,
+        allowed: float,
+        known: list[float],
+        size: float,
+        bounded: dict[int, float] | None = None,
+        near: int | None = None,
+    ) -> Plan:
+        """The cheapest ways of rows that keep all bounds close enough, or else as close as they can be kept.
+
+        Args:
+            allowed: Products that they may take together.
+            known: How wide bounds of the first nodes are.
+            size: What numbers of nodes are about.
+            bounded: `Costs.bounded`, as far as it is known better.
+            near: `Plan.step` of a plan that was made before; only plans like it are compared.
+        """
+        best, bounded = None, bounded or self.bounded
+        first, past = (0, _STEPS) if near is None else (max(0, near - _LIKE), min(_STEPS, near + _LIKE + 1))
+        for step in range(first, past):
+            plan = self._plan(step, known, size, bounded)
+            if best is None or (plan.products <= allowed and plan.widest < best.widest):
+                best = plan
+            if best.widest <= _FINE * size:
+                break
+        assert best is not None
+        return best
+
+    def _plan(self, step: int, known: list[float], size: float, bounded: dict[int, float]) -> Plan:
+        """The plan in which every node takes the way that is best for what a product costs."""
+        spread, ways, total, widest = list(known), {}, 0.0, 0.0
+        rate = _DEAREST / self.total * 2.0 ** (-0.5 * step)
+        for k in range(len(known), len(self.network.nodes) + 1):
+            node = self.network.nodes[k - 1]
+            near = max(spread[source] for source in node.inputs)
+            if isinstance(node.layer, Activation):
+                near *= 1.0 + _BENDS * near / size
+            near = min(near * self._sizes[k][0], _HUGE)
+            count = bounded.get(k)
+            if count is not None:
+                score = _log(near) - _CLOSE
+                for way in self.ways(k):
+                    found = way.spread(spread, size)
+                    value = _log(found) + rate * count * way.price
+                    if value < score:
+                        score, near, ways[k] = value, found, way
+                widest = max(widest, near)
+            if k in ways:
+                total += count * ways[k].price
+            spread.append(near)
+        return Plan(ways, total, widest, rate, step)
 
     @cached_property
     def nodes(self) -> list[tuple[int, float]]:
@@ -120,6 +350,11 @@ class Costs:
         """Whether rows are rationed (N13)."""
         return self.total > _DEEP
 
+    @property
+    def planned(self) -> bool:
+        """Whether rows for all numbers cost so much that each is passed back as far as it pays (N18)."""
+        return self.total > max(_DEEP, _OVER * _ALLOWED)
+
     def foreseen(self, part: float, deep: float) -> tuple[float, bool]:
         """Products that rows of one cell will take, and whether they are given up before the end (N13).
 
@@ -128,21 +363,11 @@ class Costs:
         """
         if not self.deep:
             return part * self.total, False
-        taken = passed = 0.0
-        for index, products in self.nodes:
-            passed += products
-            if self.network.depth[index] <= _TIGHT:
-                continue
-            # where most of a node is open, rows bound all of it
-            if _in_vain(taken + products, passed, self.total):
-                return taken, True
-            taken += deep * products
+        if self.planned:
+            plan = self.plan(_PLANNED, [_USUAL], 1.0)
+            return (0.0, True) if plan.widest > _HOPELESS else (plan.products, False)
+        taken = sum(deep * products for index, products in self.nodes if self.network.depth[index] > _TIGHT)
         return min(taken, _ALLOWED), False
-
-
-def _in_vain(taken: float, passed: float, total: float) -> bool:
-    """Whether rows would end on the way: ``taken`` of what all rows take up to a node, ``passed``, and to the end."""
-    return taken > _SURE * _ALLOWED and taken * total > _OVER * _ALLOWED * passed
 
 
 class Schedule:
@@ -152,12 +377,48 @@ class Schedule:
         self.network = network
         self.costs = costs_of(network)
         self.deep = self.costs.deep
-        self.left = _ALLOWED
-        self._taken = self._passed = 0.0
+        self.planned = self.costs.planned
+        self.left = _PLANNED if self.planned else _ALLOWED
+        self._bounded = dict(self.costs.bounded) if self.planned else {}
+        self._spread: list[float] = []
+        self._size = 1.0
+        self._step: int | None = None
 
-    def arrives(self, index: int) -> None:
-        """The work is at node ``index``."""
-        self._passed += float(np.prod(self.network.shape(index))) * self.costs.row(index)
+    @property
+    def rests(self) -> set[int]:
+        """Nodes whose bounds rows of later ones may end on."""
+        return self.costs.rests if self.planned else set()
+
+    def learns(self, index: int, radius: float, size: float) -> None:
+        """Forms of node ``index``, the next or an earlier one, are so loose (N1), and its numbers of this size."""
+        self._spread[index:] = [radius, *self._spread[index + 1 :]]
+        self._size = size or self._size
+
+    def ways(self, index: int, count: int) -> tuple[list[Way], float]:
+        """Ways of rows for ``count`` numbers of node ``index`` that are worth a trial, and what a product costs (N18).
+
+        There are none if its form is as good, or nothing will be known in the end.
+        """
+        self._bounded[index] = float(count)
+        plan = self.costs.plan(max(self.left, 1.0), self._spread[:index], self._size, self._bounded, self._step)
+        self._step = plan.step
+        if plan.widest > _HOPELESS * self._size:
+            self.left = 0.0
+        if index not in plan.ways:
+            return [], plan.rate
+        ways = [way for way in self.costs.ways(index) if count * way.price <= self.left]
+        ways.sort(key=lambda way: _log(way.spread(self._spread, self._size)) + plan.rate * count * way.price)
+        return ways[:_TRIED], plan.rate
+
+    def nearest(self, index: int, count: int) -> Way | None:
+        """The longest way of ``count`` rows of node ``index``, of those that are cheap; what it takes is taken."""
+        best = None
+        for way in self.costs.ways(index):
+            if count * way.price < _CHEAP * self.left:
+                best = way
+        if best is not None:
+            self.left -= count * best.price
+        return best
 
     def renews(self, part: float, products: float) -> bool:
         """Whether all numbers of a node are bounded by rows, for ``products``, if ``part`` of them is open."""
@@ -173,24 +434,15 @@ class Schedule:
         return 0.0 if products < self._cheap else _ENOUGH
 
     def takes(self, products: float) -> bool:
-        """Whether so many products are left; they are taken then.
-
-        Where rows would end on the way, what they are worth before is lost behind, so they are given up early.
-        """
-        taken = self._taken + products
+        """Whether so many products are left; they are taken then."""
         if products > self.left:
             return False
-        if _in_vain(taken, self._passed, self.costs.total):
-            self.left = 0.0
-            return False
         self.left -= products
-        self._taken = taken
         return True
 
     def spares(self, products: float) -> None:
         """So many products were not taken after all."""
         self.left += products
-        self._taken -= products
 
     def gains(self, kept: float, part: float) -> bool:
         """Whether rows for all numbers are worth it that leave so large a part of widths, if ``part`` is open."""
@@ -205,6 +457,16 @@ class Schedule:
         if given and part > _MOST:
             self.left = 0.0
         return given
+
+
+def _log(value: float) -> float:
+    """Its logarithm; of nothing a very small number's."""
+    return float(np.log(max(value, 2.0**-1000)))
+
+
+def _together(count: float, squares: float) -> float:
+    """Sizes of so many normally distributed numbers, of whose squares the sum is known, together."""
+    return float(np.sqrt(2.0 / np.pi * count * squares))
 
 
 def costs_of(network: Network) -> Costs:
