@@ -1052,8 +1052,8 @@ class _Cells:
     ) -> _Reached:
         """Bounds of rows on node ``index``, relative to the reference.
 
-        Those of which ``enough`` is known may stop before the image; ``trace`` takes in what rows are on the way. All of
-        them end on the nodes up to ``cut`` (N18).
+        Those of which ``enough`` is known may stop before the image; ``trace`` takes in what rows are on the way.
+        All of them end on the nodes up to ``cut`` (N18).
         """
         found = _Reached.unknown(len(cell), self.d)
         batch = _Batch({index: rows}, cell, np.zeros((len(cell), 2)), np.arange(len(cell)))
