@@ -23,6 +23,7 @@ from ns_abstract.geometry.poses import PoseSet
 from ns_abstract.verify.cells import Grid
 from ns_abstract.verify.cover import Cover, PictureSets, Weights, divisions, joined
 from ns_abstract.verify.network import Family, ImageSets, Network, bound_outputs, lends_anywhere, load_network
+from ns_abstract.verify.network.bounds import _Cells
 from ns_abstract.verify.network.family import _Other, _Said
 from ns_abstract.verify.properties import Query
 from ns_abstract.verify.search import Search
@@ -30,8 +31,8 @@ from ns_abstract.verify.search import Search
 SHAPE = (2, 6, 6)
 
 
-def network(folder: Path, seed: int, product: bool = False) -> tuple[Network, Callable[[np.ndarray], np.ndarray]]:
-    """Convolutions with a branch, maybe a product of two nodes, a sum before an activation, two linear layers."""
+def network(folder: Path, seed: int, local: str = "") -> tuple[Network, Callable[[np.ndarray], np.ndarray]]:
+    """Convolutions with a branch, a sum before an activation, two linear layers; a product of two nodes, or maxima."""
     f = OnnxFile(SHAPE, seed)
     f.conv(2, 4, pads=[1, 1, 1, 1], strides=[2, 2])
     one = f.node("Relu")
@@ -40,11 +41,13 @@ def network(folder: Path, seed: int, product: bool = False) -> tuple[Network, Ca
     # what two nodes read has a charge of its own
     f.node("Add", two, before)
     f.node("Add", f.last, one)
+    if local == "maximum":
+        f.node("MaxPool", kernel_shape=[3, 3], pads=[1, 1, 1, 1])
     f.conv(4, 4, pads=[1, 1, 1, 1])
     three = f.node("Relu")
     f.conv(4, 4, 1)
     four = f.node("Sigmoid")
-    f.node("Mul" if product else "Add", three, four)
+    f.node("Mul" if local == "product" else "Add", three, four)
     f.node("Flatten")
     f.gemm(36, 8)
     f.node("LeakyRelu", alpha=0.1)
@@ -85,25 +88,23 @@ def moved(images: ImageSets, by: float, seed: int) -> ImageSets:
     )  # fmt: skip
 
 
-def others(images: ImageSets, product: bool) -> ImageSets:
+def others(images: ImageSets, local: str) -> ImageSets:
     """Parts of a cell, and neighbours nearby and far away where rows serve for these."""
-    cells = [halved(images)] if product else [halved(images), *(moved(images, by, 3) for by in (0.02, 0.2, 1.0))]
+    cells = [halved(images)] if local else [halved(images), *(moved(images, by, 3) for by in (0.02, 0.2, 1.0))]
     fields = ImageSets.__dataclass_fields__
     return ImageSets(*(np.concatenate([getattr(cell, name) for cell in cells]) for name in fields))
 
 
-@pytest.mark.parametrize("product", [False, True])
+@pytest.mark.parametrize("local", ["", "product", "maximum"])
 @pytest.mark.parametrize("fresh", [False, True])
 @pytest.mark.parametrize(("radius", "slack"), [(0.02, 0.02), (0.1, 0.05), (1e-6, 1e-6)])
-def test_rows_of_one_cell_hold_for_others(
-    radius: float, slack: float, fresh: bool, product: bool, tmp_path: Path
-) -> None:
+def test_rows_of_one_cell_hold_for_others(radius: float, slack: float, fresh: bool, local: str, tmp_path: Path) -> None:
     for seed in range(2):
-        net, run = network(tmp_path, seed, product)
-        assert lends_anywhere(net) is not product
+        net, run = network(tmp_path, seed, local)
+        assert lends_anywhere(net) is not bool(local)
         images = image_sets(SHAPE, 1, 2, radius, slack, seed)
         rows = np.random.default_rng(seed).normal(size=(4, 3))
-        family, cells = Family(net, images), others(images, product)
+        family, cells = Family(net, images), others(images, local)
         found = family.others(cells, rows, np.zeros(4), fresh=fresh)
         assert np.isfinite(found.lower).all()
         for cell in range(cells.count):
@@ -112,8 +113,8 @@ def test_rows_of_one_cell_hold_for_others(
             assert (found.lower[cell] <= least).all()
 
 
-@pytest.mark.parametrize("product", [False, True])
-def test_rows_of_one_cell_hold_every_value(product: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("local", ["", "product", "maximum"])
+def test_rows_of_one_cell_hold_every_value(local: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """What the first cell's rows say of every number, against the exact network on images of each other one."""
     found: dict[int, tuple[_Said, np.ndarray]] = {}
     borrowed = _Other._borrowed
@@ -126,9 +127,9 @@ def test_rows_of_one_cell_hold_every_value(product: bool, tmp_path: Path, monkey
 
     monkeypatch.setattr(_Other, "_borrowed", watched)
     for seed in range(2):
-        net, _ = network(tmp_path, seed, product)
+        net, _ = network(tmp_path, seed, local)
         images = image_sets(SHAPE, 1, 2, 0.2, 1e-3, seed)
-        family, cells = Family(net, images, arithmetic="real"), others(images, product)
+        family, cells = Family(net, images, arithmetic="real"), others(images, local)
         found.clear()
         family.others(cells, np.eye(3), np.zeros(3))
         lent = family._first.lent
@@ -148,12 +149,12 @@ def test_rows_of_one_cell_hold_every_value(product: bool, tmp_path: Path, monkey
                 assert (np.abs(number - plane) <= said.half[cell]).all()
 
 
-@pytest.mark.parametrize("product", [False, True])
-def test_products_of_rows_are_charged(product: bool, tmp_path: Path) -> None:
+@pytest.mark.parametrize("local", ["", "product", "maximum"])
+def test_products_of_rows_are_charged(local: str, tmp_path: Path) -> None:
     """Beside the same sums in float64, for whatever products of float32 lose."""
-    net, _ = network(tmp_path, 0, product)
+    net, _ = network(tmp_path, 0, local)
     images = image_sets(SHAPE, 1, 2, 0.3, 1e-4)
-    family, cells = Family(net, images, arithmetic="real"), others(images, product)
+    family, cells = Family(net, images, arithmetic="real"), others(images, local)
     other = _Other(family._first, cells, 1 << 30, "real", False)
     m, off = cells.count, []
     slopes, offsets = other.image.slopes.reshape(m, 2, -1, 2), other.image.offsets.reshape(m, 2, -1)
@@ -188,6 +189,19 @@ def test_products_of_rows_are_charged(product: bool, tmp_path: Path) -> None:
     assert max(off) > 0.0
 
 
+def test_parts_have_the_references_and_winners_of_the_whole(tmp_path: Path) -> None:
+    """What rows gathered at maxima is relative to them; by themselves parts would follow others."""
+    net, _ = network(tmp_path, 0, "maximum")
+    images = image_sets(SHAPE, 1, 2, 2.0, 1e-3)
+    family, parts = Family(net, images, arithmetic="real"), halved(images)
+    part = _Other(family._first, parts, 1 << 30, "real", False)
+    alone = _Cells(net, parts, "everywhere", 1 << 30, "real")
+    (at,) = family._first.maxima
+    assert (part.maxima[at].winner == family._first.maxima[at].winner).all()
+    assert (alone.maxima[at].winner != family._first.maxima[at].winner).any()
+    assert torch.equal(part.last.reference, family._first.last.reference.expand_as(part.last.reference))
+
+
 def test_rows_of_a_cell_say_as_much_of_it_as_its_bounds(tmp_path: Path) -> None:
     """Of itself nothing is lost but rounding; of neighbours not much."""
     near = []
@@ -210,10 +224,11 @@ def test_rows_of_a_cell_say_as_much_of_it_as_its_bounds(tmp_path: Path) -> None:
     assert np.mean(near, axis=0)[0] < 1.5 and np.mean(near, axis=0)[1] < 1.4
 
 
-def test_rows_of_a_whole_serve_its_parts_behind_products(tmp_path: Path) -> None:
+@pytest.mark.parametrize("local", ["product", "maximum"])
+def test_rows_of_a_whole_serve_its_parts_behind_products_and_maxima(local: str, tmp_path: Path) -> None:
     gains = []
     for seed in range(2):
-        net, _ = network(tmp_path, seed, True)
+        net, _ = network(tmp_path, seed, local)
         images = image_sets(SHAPE, 1, 2, 0.1, 0.02, seed)
         rows, offset = np.random.default_rng(seed).normal(size=(4, 3)), np.zeros(4)
         family, parts = Family(net, images), halved(images)

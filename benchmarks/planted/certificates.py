@@ -36,41 +36,47 @@ _SHARED = "test_cover.py::test_rows_of_one_cell_hold_every_value"
 CERTIFICATES = (
     Fault(
         "families: parts are taken about their own reference",
-        _FAMILY, "_Other._about", "np.repeat(self.first.middle, len(middle), axis=0)", "middle", _SHARED + "[True]",
+        _FAMILY, "_Other._about", "np.repeat(self.first.middle, len(middle), axis=0)", "middle", _SHARED + "[product]",
+    ),
+    Fault(
+        "families: parts follow their own winners of windows",
+        _FAMILY, "_Other._winner", "self.first.winners[k].expand_as(winner).contiguous()", "winner",
+        "test_cover.py::test_parts_have_the_references_and_winners_of_the_whole",
     ),
     Fault(
         "families: rows that were passed back with a negative sign keep it",
-        _FAMILY, "_Other._said", "middle * lent.sign", "middle", _SHARED + "[False]",
+        _FAMILY, "_Other._said", "middle * lent.sign", "middle", _SHARED + "[]",
     ),
     Fault(
         "families: the cell's own width is left out",
-        _FAMILY, "_Other._said", "half[0] + spread", "0.0 * half[0] + spread", _SHARED + "[False]",
+        _FAMILY, "_Other._said", "half[0] + spread", "0.0 * half[0] + spread", _SHARED + "[]",
     ),
     Fault(
         "families: activations are taken to follow the first cell's slopes",
         _FAMILY, "_Other._said", "spread[here] += sizes[:, -2]", "spread[here] += 0.0 * sizes[:, -2]",
-        _SHARED + "[False]",
+        _SHARED + "[]",
     ),
     Fault(
         "families: what rows gathered at products is forgotten",
-        _FAMILY, "_Other._said", "middle + 0.5 * (low + high)", "middle", _SHARED + "[True]",
+        _FAMILY, "_Other._said", "middle + 0.5 * (low + high)", "middle",
+        "test_cover.py::test_products_of_rows_are_charged[product]",
     ),
     Fault(
         "families: what float32 products lose is not charged",
         _FAMILY, "_Other._said", "gamma / (1.0 - gamma)", "0.0",
-        "test_cover.py::test_products_of_rows_are_charged[False]",
+        "test_cover.py::test_products_of_rows_are_charged[]",
     ),
     Fault(
         "families: an activation's range forgets the kink",
-        "verify/network/layers.py", "LeakyRelu.offsets", "least.clamp(max=0.0)", "least", _SHARED + "[False]",
+        "verify/network/layers.py", "LeakyRelu.offsets", "least.clamp(max=0.0)", "least", _SHARED + "[]",
     ),
     Fault(
         "families: what follows the parameters has no width",
-        "verify/network/bounds.py", "_tilted", "z.r * (1.0 + 2.0**-40)", "0.0 * z.r", _SHARED + "[False]",
+        "verify/network/bounds.py", "_tilted", "z.r * (1.0 + 2.0**-40)", "0.0 * z.r", _SHARED + "[]",
     ),
     Fault(
         "families: what is between the offsets does not follow the parameters",
-        "verify/network/bounds.py", "_tilted", "t[:, None] * z.a", "0.0 * t[:, None] * z.a", _SHARED + "[False]",
+        "verify/network/bounds.py", "_tilted", "t[:, None] * z.a", "0.0 * t[:, None] * z.a", _SHARED + "[]",
     ),
     Fault(
         "parts: joined sets forget that slopes differ",

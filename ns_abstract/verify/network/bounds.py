@@ -308,6 +308,14 @@ class _Cells:
         """[m, n] pictures that all is relative to, for the sets' middles: any will do."""
         return middle
 
+    def _reference(self, k: int, reference: Tensor) -> Tensor:
+        """[m, *shape] what is relative to at node ``k``: that of its inputs passed on with float64's rounding."""
+        return reference
+
+    def _winner(self, k: int, winner: Tensor) -> Tensor:
+        """[m, C, 1, W] numbers of windows that are followed from below at node ``k``: any will do."""
+        return winner
+
     def _planes(self, fields: list[np.ndarray], substitution: Substitution) -> None:
         """Image sets as rows want them, relative to the reference."""
         shape = grid(self.network.input_shape)
@@ -462,7 +470,7 @@ class _Cells:
     def _combine(self, k: int, sources: tuple[int, ...], layer: Linear, inputs: list[_Form]) -> _Form:
         """A linear layer (N1, N2)."""
         m, d = self.count, self.d
-        reference = layer([f.reference for f in inputs])
+        reference = self._reference(k, layer([f.reference for f in inputs]))
         stacks = [torch.cat([f.c[:, None], f.a], 1).flatten(0, 1) for f in inputs]
         moved = layer.apply(stacks).reshape(m, 1 + d, *layer.shape)
         # float64's rounding is relative to forms and references, float32's of rows to distances from
@@ -542,7 +550,7 @@ class _Cells:
         """An activation (N3, N4)."""
         lower, upper = z.interval
         size = z.interval.size
-        reference = layer.function(z.reference)
+        reference = self._reference(k, layer.function(z.reference))
         room = layer.room + 2.0**-48 * reference.abs()
         if self.single:
             room = room + layer.error(lower, upper)
@@ -613,7 +621,7 @@ class _Cells:
         """A product of two nodes (N9)."""
         m, first, second = self.count, x.interval, y.interval
         size = first.size * second.size
-        reference = x.reference * y.reference
+        reference = self._reference(k, x.reference * y.reference)
         plane = layer.plane(first, second)
         alpha, beta = plane.first, plane.second
         base = alpha * x.reference + beta * y.reference - reference
@@ -652,7 +660,7 @@ class _Cells:
         m, shape = self.count, layer.shape
         interval = x.interval
         lower, upper = (layer.taps(v, -torch.inf) for v in interval)
-        winner = layer.taps(x.reference + x.c, -torch.inf).argmax(2, keepdim=True)
+        winner = self._winner(k, layer.taps(x.reference + x.c, -torch.inf).argmax(2, keepdim=True))
 
         def chosen(v: Tensor) -> Tensor:
             return layer.taps(v, 0.0).gather(2, winner)[:, :, 0]

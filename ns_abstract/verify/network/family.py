@@ -36,7 +36,6 @@ _ROWS_SHARE = 0.25
 _ROOM = 2.0**-46
 #: Rows that are multiplied at a time: their absolute values should stay in a processor's cache.
 _ROWS_AT_ONCE = 256
-
 #: Part of a number's width by which it may miss being open for the first cell to pass back a row for it.
 _NEARLY = 0.25
 
@@ -135,7 +134,18 @@ class _First(_Cells):
         self.lent: dict[int, _Lent] = {}
         self._left = _ROWS_SHARE * memory
         self.keeps = images.lower.shape[1] <= _MOST_NUMBERS
+        #: what all is relative to, by node, and what is followed at maxima
+        self.references: dict[int, Tensor] = {}
+        self.winners: dict[int, Tensor] = {}
         super().__init__(network, images, "everywhere", memory, arithmetic)
+
+    def _reference(self, k: int, reference: Tensor) -> Tensor:
+        self.references[k] = reference
+        return reference
+
+    def _winner(self, k: int, winner: Tensor) -> Tensor:
+        self.winners[k] = winner
+        return winner
 
     def _known_better(
         self, index: int, form: _Form, open_: Tensor, apart: Tensor | None, layer: Activation | None = None
@@ -190,8 +200,14 @@ class _Other(_Cells):
         super().__init__(first.network, images, "everywhere", memory, arithmetic)
 
     def _about(self, middle: Float64) -> Float64:
-        # what rows gathered at maxima and products is relative to the first cell's reference
+        # what rows gathered at maxima and products is relative to the first cell's references
         return np.repeat(self.first.middle, len(middle), axis=0)
+
+    def _reference(self, k: int, reference: Tensor) -> Tensor:
+        return self.first.references[k].expand_as(reference)
+
+    def _winner(self, k: int, winner: Tensor) -> Tensor:
+        return self.first.winners[k].expand_as(winner).contiguous()
 
     def _lent(self, k: int) -> tuple[np.ndarray, np.ndarray]:
         shape = self.network.shape(k)
