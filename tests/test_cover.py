@@ -23,6 +23,7 @@ from ns_abstract.geometry.poses import PoseSet
 from ns_abstract.verify.cells import Grid
 from ns_abstract.verify.cover import Cover, PictureSets, Weights, divisions, joined
 from ns_abstract.verify.network import Family, ImageSets, Network, bound_outputs, lends_anywhere, load_network
+from ns_abstract.verify.network import family as family_module
 from ns_abstract.verify.network.bounds import _Cells
 from ns_abstract.verify.network.family import _Other, _Said
 from ns_abstract.verify.properties import Query
@@ -95,10 +96,14 @@ def others(images: ImageSets, local: str) -> ImageSets:
     return ImageSets(*(np.concatenate([getattr(cell, name) for cell in cells]) for name in fields))
 
 
-@pytest.mark.parametrize("local", ["", "product", "maximum"])
+@pytest.mark.parametrize("local", ["", "product", "maximum", "short"])
 @pytest.mark.parametrize("fresh", [False, True])
 @pytest.mark.parametrize(("radius", "slack"), [(0.02, 0.02), (0.1, 0.05), (1e-6, 1e-6)])
-def test_rows_of_one_cell_hold_for_others(radius: float, slack: float, fresh: bool, local: str, tmp_path: Path) -> None:
+def test_rows_of_one_cell_hold_for_others(
+    radius: float, slack: float, fresh: bool, local: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    if local == "short":
+        monkeypatch.setattr(family_module, "_MOST_TRACED", 100)
     for seed in range(2):
         net, run = network(tmp_path, seed, local)
         assert lends_anywhere(net) is not bool(local)
@@ -113,10 +118,12 @@ def test_rows_of_one_cell_hold_for_others(radius: float, slack: float, fresh: bo
             assert (found.lower[cell] <= least).all()
 
 
-@pytest.mark.parametrize("local", ["", "product", "maximum"])
+@pytest.mark.parametrize("local", ["", "product", "maximum", "short"])
 def test_rows_of_one_cell_hold_every_value(local: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """What the first cell's rows say of every number, against the exact network on images of each other one."""
     found: dict[int, tuple[_Said, np.ndarray]] = {}
+    if local == "short":
+        monkeypatch.setattr(family_module, "_MOST_TRACED", 100)
     borrowed = _Other._borrowed
 
     def watched(self: _Other, index: int, form: Any) -> Any:

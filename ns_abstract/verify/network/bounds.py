@@ -238,8 +238,8 @@ class _Form:
 class _Cells:
     """Bounds of one network over some cells."""
 
-    #: Whether rows are handed to `_keep` when they have reached the image, and whether they may end before.
-    keeps = False
+    #: Most rows that are passed back together.
+    most_rows = 1 << 30
 
     def __init__(
         self,
@@ -1021,7 +1021,7 @@ class _Cells:
         """Bounds of ``sign`` [R] times single numbers [R, (cell, channel, row, column)] of node ``index``."""
         channels = grid(self.network.shape(index))[0]
         found = _Reached.unknown(len(where), self.d)
-        step = max(1, _ROWS_AT_ONCE // (16 * channels))
+        step = min(self.most_rows, max(1, _ROWS_AT_ONCE // (16 * channels)))
         threads = torch.get_num_threads() if self.schedule.deep else 1
         if threads > 1:
             # as many rows as stay together to the image
@@ -1032,7 +1032,7 @@ class _Cells:
             cell, channel, y, x = (np.ascontiguousarray(v) for v in where[number].T)
             value = np.zeros((len(cell), channels, 1, 1), np.float32)
             value[np.arange(len(cell)), channel, 0, 0] = sign[number]
-            trace = Trace(len(cell)) if self.keeps else None
+            trace = self._trace(len(cell))
             asked = None if enough is None else enough[number]
             part = self._backward(index, Rows(value, y, x), cell, asked, trace, cut)
             return number, part, trace
@@ -1045,6 +1045,10 @@ class _Cells:
             if trace is not None:
                 self._keep(index, where[number], sign[number], trace)
         return found
+
+    def _trace(self, count: int) -> Trace | None:
+        """A place for so many rows that are to be kept (N15)."""
+        return None
 
     def _keep(self, index: int, where: Int64, sign: Float64, trace: Trace) -> None:
         """Take notice of rows of ``sign`` times single numbers of node ``index``."""
@@ -1103,7 +1107,7 @@ class _Cells:
                 here = full(here, node.layer.shape, force=True)
                 batch.chosen.keep(at, here.value, batch.number, len(found.lower))
             gathered = batch.total.copy() if batch.trace is not None else batch.total
-            if batch.trace is not None and self._depends(start, at):
+            if batch.trace is not None and not batch.trace.short and self._depends(start, at):
                 batch.trace.keep(at, here, node.layer.shape, batch.number)
             if isinstance(node.layer, Activation):
                 lines, which = self.lines[at], batch.cell
@@ -1124,7 +1128,7 @@ class _Cells:
                     noise = self.noise[at].reshape(self.count, *shape).contiguous().numpy()
                     charge(here.value, here.y, here.x, batch.cell, noise, batch.total)
                 parts = node.layer.backward(here)
-            if batch.trace is not None and isinstance(node.layer, (MaxPool, Product)):
+            if batch.trace is not None and (batch.trace.short or isinstance(node.layer, (MaxPool, Product))):
                 batch.trace.fixed[batch.number] += batch.total - gathered
             for source, part in zip(node.inputs, parts, strict=True):
                 known = batch.waiting.get(source)
@@ -1407,15 +1411,17 @@ class Trace:
 
     Args:
         count: Rows R.
+        short: Whether only what they are on the image is kept.
 
     Attributes:
         rows: By node: [R, n] float32 rows on outputs of nodes at which they gather what depends on the cell's ranges,
             and on the image (0).
-        fixed: [R, 2] what they gather at other nodes but the first, at least and at most.
+        fixed: [R, 2] what they gather at nodes of which they are not kept, at least and at most.
         reached: [R] which of them reach the image.
     """
 
-    def __init__(self, count: int) -> None:
+    def __init__(self, count: int, short: bool) -> None:
+        self.short = short
         self.rows: dict[int, NDArray[np.float32]] = {}
         self.fixed = np.zeros((count, 2))
         self.reached = np.zeros(count, bool)

@@ -28,8 +28,9 @@ from ns_abstract.verify.network.rows import grid
 
 #: Unit roundoff of the products of rows and columns, and the smallest normal number of float32.
 _UNIT, _FLUSH = 2.0**-24, 2.0**-126
-#: Largest images of which rows are kept: their sums' rounding must stay small.
-_MOST_NUMBERS = 1 << 19
+#: Largest images of which rows are kept: their sums' rounding must stay small. Most numbers of all nodes together for
+#: rows to be kept on the way; bytes of rows that are passed back together.
+_MOST_NUMBERS, _MOST_TRACED, _TOGETHER = 1 << 19, 1 << 16, 16 << 20
 #: Part of the memory that rows may take.
 _ROWS_SHARE = 0.25
 #: Room for rounding of a few sums in float64.
@@ -43,9 +44,16 @@ _NEARLY = 0.25
 def lends_anywhere(network: Network) -> bool:
     """Whether rows of a cell serve for others that are no parts of it.
 
-    At maxima and products they gather what holds for the cell alone.
+    At maxima and products they gather what holds for the cell alone, and where what they are on the way is too much to
+    be kept.
     """
-    return not any(isinstance(node.layer, (MaxPool, Product)) for node in network.nodes)
+    local = any(isinstance(node.layer, (MaxPool, Product)) for node in network.nodes)
+    return not local and _numbers(network) <= _MOST_TRACED
+
+
+def _numbers(network: Network) -> int:
+    """Numbers of all nodes."""
+    return sum(int(np.prod(network.shape(k))) for k in range(len(network.nodes) + 1))
 
 
 class Family:
@@ -83,8 +91,7 @@ class Family:
         offset = np.asarray(offset, np.float64)
         if not self._first.good[0]:
             return bound_outputs(self.network, images, rows, offset, memory=self.memory, arithmetic=self.arithmetic)
-        shapes = [self.network.shape(k) for k in range(len(self.network.nodes) + 1)]
-        by_cell = sum(int(np.prod(shape)) for shape in shapes) * 8 * (3 * images.dimensions + 18)
+        by_cell = _numbers(self.network) * 8 * (3 * images.dimensions + 18)
         step = max(1, int(0.25 * self.memory) // by_cell)
         found = []
         for first in range(0, images.count, step):
@@ -133,7 +140,12 @@ class _First(_Cells):
         #: by node
         self.lent: dict[int, _Lent] = {}
         self._left = _ROWS_SHARE * memory
-        self.keeps = images.lower.shape[1] <= _MOST_NUMBERS
+        size, numbers = images.lower.shape[1], _numbers(network)
+        self._short = numbers > _MOST_TRACED
+        self._by_row = 4 * (size if self._short else numbers)
+        self._keeps = size <= _MOST_NUMBERS
+        if self._keeps:
+            self.most_rows = max(16, _TOGETHER // self._by_row)
         #: what all is relative to, by node, and what is followed at maxima
         self.references: dict[int, Tensor] = {}
         self.winners: dict[int, Tensor] = {}
@@ -157,9 +169,12 @@ class _First(_Cells):
             open_ = (lower < near) & (upper > -near)
         return super()._known_better(index, form, open_, apart, layer)
 
+    def _trace(self, count: int) -> Trace | None:
+        return Trace(count, self._short) if self._keeps and count * self._by_row <= self._left else None
+
     def _keep(self, index: int, where: Int64, sign: Float64, trace: Trace) -> None:
         size = sum(rows.nbytes for rows in trace.rows.values())
-        if size > self._left or not trace.reached.any():
+        if not trace.reached.any():
             return
         self._left -= size
         flat = np.array(np.ravel_multi_index(tuple(where[:, 1:].T), grid(self.network.shape(index))), np.int64)
