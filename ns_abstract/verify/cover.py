@@ -29,8 +29,8 @@ _POWER = 1.6
 _OPENING = 42.0
 #: What a box may cost is foreseen by so small a part of it: wide ones show nothing.
 _PROBE = 4
-#: Most parts that are bounded together.
-_GROUP = 64
+#: Most parts that are bounded together, where rows serve for neighbours and where they do not.
+_GROUP, _JOINED = 64, 8
 #: Times what parts are cut for from which on the network is not asked.
 _ALONE = 1.8
 #: How often parts are cut again, and how many times more parts there may be than a cell should take.
@@ -266,7 +266,7 @@ class Cover:
             _StoppedError: It takes too many, or one cannot be proved.
         """
         counts = divisions(node.effects, node.cost, work.aim, self.most)
-        if math.prod(counts) > _GROUP:
+        if math.prod(counts) > (_GROUP if self.sharing.lends_anywhere else _JOINED):
             for half in node.parts(int(np.argmax(counts)), 2):
                 self._all(work, half)
             return
