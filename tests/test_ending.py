@@ -227,7 +227,7 @@ def test_a_frame_ends_with_its_time_while_the_first_picture_is_rendered(
     assert list(bound_frames(job, [0], engine=Here(), budget=0.5)) == [] and shown
     assert bound_part(job.recipe, Part(0, None), Goal(1.05, 0.5), False) is None
     with pytest.raises(InputError, match="before one picture") as caught:
-        bound(load_scene(nerf.load_config), PoseSet(job.pose_sets[0].camera, {"x": 0.01}), time_budget=0.5)
+        bound(load_scene(nerf.load_config), PoseSet(job.pose_sets[0].camera, {"x": 0.01}), time_budget=3.0)
     assert caught.value.field == "time_budget"
 
 
