@@ -165,7 +165,7 @@ class Job:
             camera = frame.camera
             raise InputError(
                 f"{self.method.content}: one picture of {camera.width} x {camera.height} pixels takes about "
-                f"{least:,.0f} s to render, {seconds:,.0f} s given",
+                f"{least:,.1f} s to render, {seconds:,.1f} s given",
                 file=self.source.file,
                 field="--time-budget",
                 fix="give more, raise --downscale-factor, or take fewer samples",
