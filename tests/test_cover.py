@@ -209,6 +209,24 @@ def test_parts_have_the_references_and_winners_of_the_whole(tmp_path: Path) -> N
     assert torch.equal(part.last.reference, family._first.last.reference.expand_as(part.last.reference))
 
 
+def test_rounding_is_charged_by_all_parts_at_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """At least what each by itself is charged with, and of neighbours hardly more than the one with most."""
+    net, _ = network(tmp_path, 0)
+    images = image_sets(SHAPE, 1, 2, 0.3, 1e-3)
+    family, cells = Family(net, images), halved(images)
+    together = _Other(family._first, cells, 1 << 30, "float32", False)
+    monkeypatch.setattr(_Other, "_sized", lambda self, form: form)
+    alone = _Other(family._first, cells, 1 << 30, "float32", False)
+    assert len(together.noise) > 3
+    for k, noise in together.noise.items():
+        each = alone.noise[k]
+        assert (noise != each).any()
+        # what rounding leaves is read again, further on
+        assert (noise >= (1.0 - 1e-5) * each).all()
+        assert noise[0].sum() < 1.2 * each.amax(0).sum()
+    assert (together.flush >= (1.0 - 1e-5) * alone.flush).all()
+
+
 def test_rows_of_a_cell_say_as_much_of_it_as_its_bounds(tmp_path: Path) -> None:
     """Of itself nothing is lost but rounding; of neighbours not much."""
     near = []

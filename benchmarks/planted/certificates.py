@@ -53,7 +53,7 @@ CERTIFICATES = (
     ),
     Fault(
         "families: activations are taken to follow the first cell's slopes",
-        _FAMILY, "_Other._said", "spread[here] += sizes[:, -2]", "spread[here] += 0.0 * sizes[:, -2]",
+        _FAMILY, "_Other._said", "spread[here] += sizes[:, -1]", "spread[here] += 0.0 * sizes[:, -1]",
         _SHARED + "[]",
     ),
     Fault(
@@ -65,6 +65,11 @@ CERTIFICATES = (
         "families: what float32 products lose is not charged",
         _FAMILY, "_Other._said", "gamma / (1.0 - gamma)", "0.0",
         "test_cover.py::test_products_of_rows_are_charged[]",
+    ),
+    Fault(
+        "families: rounding is charged by the first part's sizes",
+        _FAMILY, "_Other._sized", "form.upper.amax(0, keepdim=True)", "form.upper[:1]",
+        "test_cover.py::test_rounding_is_charged_by_all_parts_at_once",
     ),
     Fault(
         "families: an activation's range forgets the kink",

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal, NamedTuple
 
@@ -308,9 +308,13 @@ class _Cells:
         """[m, n] pictures that all is relative to, for the sets' middles: any will do."""
         return middle
 
-    def _reference(self, k: int, reference: Tensor) -> Tensor:
+    def _reference(self, k: int, passed_on: Callable[[], Tensor]) -> Tensor:
         """[m, *shape] what is relative to at node ``k``: that of its inputs passed on with float64's rounding."""
-        return reference
+        return passed_on()
+
+    def _sized(self, form: _Form) -> _Form:
+        """The form, or one of more cells, by which rounding is charged: sizes are all that is read of it."""
+        return form
 
     def _winner(self, k: int, winner: Tensor) -> Tensor:
         """[m, C, 1, W] numbers of windows that are followed from below at node ``k``: any will do."""
@@ -470,19 +474,21 @@ class _Cells:
     def _combine(self, k: int, sources: tuple[int, ...], layer: Linear, inputs: list[_Form]) -> _Form:
         """A linear layer (N1, N2)."""
         m, d = self.count, self.d
-        reference = self._reference(k, layer([f.reference for f in inputs]))
+        reference = self._reference(k, lambda: layer([f.reference for f in inputs]))
         stacks = [torch.cat([f.c[:, None], f.a], 1).flatten(0, 1) for f in inputs]
         moved = layer.apply(stacks).reshape(m, 1 + d, *layer.shape)
         # float64's rounding is relative to forms and references, float32's of rows to distances from
         # references, that of the network to its values
         own = (layer.terms + len(inputs) + 8) * 2.0**-52
+        known = [self._sized(f) for f in inputs]
         radii, sizes = [], []
-        for f in inputs:
+        for f, sized in zip(inputs, known, strict=True):
             # at least what an input may be on one side of zero and on the other together
-            size = torch.maximum(f.interval.spread, f.reference.abs())
+            size = torch.maximum(sized.interval.spread, sized.reference.abs())
             sizes.append(size)
-            radii.append(torch.cat([f.r + own * (f.c.abs() + f.a.abs().sum(1)), f.width, size]))
-        radius, width, size = layer.magnitude(radii).reshape(3, m, *layer.shape) * (1.0 + 2.0**-28)
+            radii.append(torch.cat([f.r + own * (f.c.abs() + f.a.abs().sum(1)), sized.width, size]))
+        found = layer.magnitude(radii) * (1.0 + 2.0**-28)
+        radius, width, size = found.split([m, *[len(sizes[0])] * 2])
         if layer.bias is not None:
             size = size + layer.bias.abs()
         moves = own * size + (layer.terms + 1) * _FLUSH
@@ -492,17 +498,17 @@ class _Cells:
             if layer.bias is not None:
                 active = active | (layer.bias != 0.0)
         elif self.single:
-            count = self._roundings(sources, layer, inputs)
+            count = self._roundings(sources, layer, known)
             self.terms[k] = count
-            moves = moves + self._rounding(sources, layer, inputs, count, size) + layer.spare(sizes)
+            moves = moves + self._rounding(sources, layer, known, count, size) + layer.spare(sizes)
         rows = _gamma(layer.row_terms + _SPARE + max(self.network.readers[i] for i in sources))
-        noise = (moves + rows * width) * (1.0 + 2.0**-40)
+        noise = ((moves + rows * width) * (1.0 + 2.0**-40)).expand(m, *layer.shape)
         form = _Form.ranged(reference, moved[:, 0], moved[:, 1:], radius + moves, active)
         if float(size.amax()) >= _OVERFLOW:
-            self.good &= (size.reshape(m, -1).amax(1) < _OVERFLOW).numpy()
-        for f, shape in zip(inputs, layer.input_shapes, strict=True):
+            self.good &= (size.flatten(1).amax(1) < _OVERFLOW).numpy()
+        for sized, shape in zip(known, layer.input_shapes, strict=True):
             lost = int(np.prod(shape)) * (layer.row_terms + 2) * _FLUSH
-            self.flush += lost * f.width.reshape(m, -1).amax(1).numpy()
+            self.flush += lost * sized.width.flatten(1).amax(1).numpy()
         if isinstance(layer, Sum):
             # one charge instead of several
             for source in sources:
@@ -550,7 +556,7 @@ class _Cells:
         """An activation (N3, N4)."""
         lower, upper = z.interval
         size = z.interval.size
-        reference = self._reference(k, layer.function(z.reference))
+        reference = self._reference(k, lambda: layer.function(z.reference))
         room = layer.room + 2.0**-48 * reference.abs()
         if self.single:
             room = room + layer.error(lower, upper)
@@ -621,7 +627,7 @@ class _Cells:
         """A product of two nodes (N9)."""
         m, first, second = self.count, x.interval, y.interval
         size = first.size * second.size
-        reference = self._reference(k, x.reference * y.reference)
+        reference = self._reference(k, lambda: x.reference * y.reference)
         plane = layer.plane(first, second)
         alpha, beta = plane.first, plane.second
         base = alpha * x.reference + beta * y.reference - reference

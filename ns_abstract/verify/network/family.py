@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -151,9 +152,9 @@ class _First(_Cells):
         self.winners: dict[int, Tensor] = {}
         super().__init__(network, images, "everywhere", memory, arithmetic)
 
-    def _reference(self, k: int, reference: Tensor) -> Tensor:
-        self.references[k] = reference
-        return reference
+    def _reference(self, k: int, passed_on: Callable[[], Tensor]) -> Tensor:
+        self.references[k] = passed_on()
+        return self.references[k]
 
     def _winner(self, k: int, winner: Tensor) -> Tensor:
         self.winners[k] = winner
@@ -218,8 +219,15 @@ class _Other(_Cells):
         # what rows gathered at maxima and products is relative to the first cell's references
         return np.repeat(self.first.middle, len(middle), axis=0)
 
-    def _reference(self, k: int, reference: Tensor) -> Tensor:
-        return self.first.references[k].expand_as(reference)
+    def _reference(self, k: int, passed_on: Callable[[], Tensor]) -> Tensor:
+        reference = self.first.references[k]
+        return reference.expand(self.count, *reference.shape[1:])
+
+    def _sized(self, form: _Form) -> _Form:
+        # neighbours are of one size: rounding is charged by all of them at once
+        ends = form.lower.amin(0, keepdim=True), form.upper.amax(0, keepdim=True)
+        active = form.active.any(0, keepdim=True)
+        return _Form(form.reference[:1], form.c[:1], form.a[:1], form.r[:1], *ends, active)
 
     def _winner(self, k: int, winner: Tensor) -> Tensor:
         return self.first.winners[k].expand_as(winner).contiguous()
@@ -229,11 +237,11 @@ class _Other(_Cells):
         return self.first.lines[k][0, 0].reshape(shape), self.first.lines[k][3, 0].reshape(shape)
 
     def _column(self, at: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """What rows on the output of node ``at`` are multiplied by, [n, m k], and what their sizes are, [n, m l].
+        """What rows on the output of node ``at`` are multiplied by, [n, m k], and what their sizes are, [n, m l + 1].
 
         Columns of one kind stand together. Rows: slopes [d], middle, and of intervals alone; sizes: half and that of
         intervals, on the image. Rows: slopes [d], middle and half; sizes: the same, at activations. Sizes: rounding, at
-        linear layers. The last column of sizes is that of all that is added up.
+        linear layers. The last column of sizes is that of all that is added up, in any cell.
         """
         if at not in self._columns:
             m, d = self.count, self.d
@@ -257,9 +265,11 @@ class _Other(_Cells):
                 sized = [*(0.5 * (x - y) for x, y in pairs), 0.5 * (half + least)]
             else:
                 sized = [self.noise[at].reshape(m, -1).numpy()]
-            sized = [*sized, np.sum([np.abs(v) for v in (*signed, *sized)], axis=0)]
-            found = [np.reshape(v, (-1, sized[0].shape[1])).T.astype(np.float32, order="C") for v in (signed, sized)]
-            self._columns[at] = found[0], found[1]
+            most = np.sum([np.abs(v) for v in (*signed, *sized)], axis=0).max(axis=0)
+            n = len(most)
+            one, two = (np.reshape(v, (-1, n)).T for v in (signed, sized))
+            two = np.concatenate([two, most[:, None]], axis=1)
+            self._columns[at] = one.astype(np.float32, order="C"), two.astype(np.float32, order="C")
         return self._columns[at]
 
     def _said(self, index: int) -> _Said:
@@ -277,19 +287,21 @@ class _Other(_Cells):
             tiny = n * _FLUSH * (1.0 + float(np.abs(rows).max(initial=0.0)))
             for first in range(0, count, _ROWS_AT_ONCE):
                 part, here = rows[first : first + _ROWS_AT_ONCE], slice(first, first + _ROWS_AT_ONCE)
-                sums, sizes = ((v @ w).reshape(len(part), -1, m) for v, w in ((part, one), (np.abs(part), two)))
+                sums, sizes = part @ one, np.abs(part) @ two
+                most, sizes = sizes[:, -1:], sizes[:, :-1].reshape(len(part), -1, m)
+                sums = sums.reshape(len(part), -1, m)
                 if at == 0:
                     signed[here] += sums
-                    half[here] += sizes[:, :2]
+                    half[here] += sizes
                 elif at in self.offered:
                     tilted[here] += sums[:, :-1]
-                    tilted[here] += sizes[:, :-2]
+                    tilted[here] += sizes[:, :-1]
                     spread[here] += sums[:, -1]
-                    spread[here] += sizes[:, -2]
+                    spread[here] += sizes[:, -1]
                 else:
                     spread[here] += sizes[:, 0]
                 # what float32 sums lose is relative to the products' sizes
-                lost[here] += gamma / (1.0 - gamma) * sizes[:, -1]
+                lost[here] += gamma / (1.0 - gamma) * most
                 lost[here] += tiny * (d + 5)
         signed, tilted, half = (np.moveaxis(v, (1, 2), (0, 1)) for v in (signed, tilted, half))
         spread, lost = spread.T, lost.T
