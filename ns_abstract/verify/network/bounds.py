@@ -1624,8 +1624,9 @@ class _Reached:
         self.upper[number] = np.fmin(self.upper[number], most)
 
 
-def _gamma(count: Any, unit: float = UNIT) -> Any:
+def _gamma(count: Any, unit: float | None = None) -> Any:
     """What ``count`` roundings, in float32 unless said otherwise, may change, relatively."""
+    unit = UNIT if unit is None else unit
     return count * unit / (1.0 - count * unit)
 
 
