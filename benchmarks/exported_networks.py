@@ -1,7 +1,8 @@
 """Which exported networks are read, and what one cell of them costs: both exporters of torch, random weights.
 
 Each network is exported, loaded, bounded over one set of images, and attacked by float32 runs of onnxruntime in
-the set and at its corners, in a process of its own. Run ``python benchmarks/exported_networks.py --help``.
+the set and at its corners, drawn and along derivatives, in a process of its own.
+Run ``python benchmarks/exported_networks.py --help``.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ import sys
 import tempfile
 import time
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -25,7 +26,7 @@ from torch import nn
 from torch.nn import functional
 
 if TYPE_CHECKING:
-    from ns_abstract.verify.network import NetworkArithmetic
+    from ns_abstract.verify.network import ImageSets, Network, NetworkArithmetic
 
 ROWS = 10
 
@@ -468,7 +469,7 @@ def measure(name: str, exporter: str, runs: int, width: float, arithmetic: Netwo
     import onnxruntime
 
     from ns_abstract.io.errors import InputError
-    from ns_abstract.verify.network import ImageSets, bound_outputs, load_network
+    from ns_abstract.verify.network import bound_outputs, load_network
 
     torch.set_num_threads(1)
     with tempfile.TemporaryDirectory() as folder:
@@ -489,14 +490,7 @@ def measure(name: str, exporter: str, runs: int, width: float, arithmetic: Netwo
         print(json.dumps(found), flush=True)
         if not runs:
             return found
-        rng = np.random.default_rng(0)
-        n, d = network.input_size, 2
-        c = np.repeat(np.repeat(rng.normal(size=(3, 4, 4)), -(-shape[1] // 4), 1), -(-shape[2] // 4), 2)
-        c = c[:, : shape[1], : shape[2]].reshape(1, n)
-        a = width * rng.normal(size=(1, n, d))
-        slack = 0.1 * width
-        reach = np.abs(a).sum(-1) + slack
-        images = ImageSets(a, c - slack, a, c + slack, c - reach, c + reach)
+        images, middle, a, slack = image_set(shape, width)
         k = min(ROWS, network.output_size)
         rows = np.concatenate([np.eye(k, network.output_size), -np.eye(k, network.output_size)])
         # the process's peak from here on
@@ -508,32 +502,80 @@ def measure(name: str, exporter: str, runs: int, width: float, arithmetic: Netwo
         found["GiB"] = round(int(peak.split()[1]) / 2**20, 2)
         lower = bounds.lower[0]
         found["bounded"] = bool(np.isfinite(lower).all())
+        found["width"] = float(f"{-np.median(lower[:k] + lower[k:]):.3g}")
         if exporter == "pt2":
             found["runs"] = 0
             return found
+        print(json.dumps(found), flush=True)
         session = onnxruntime.InferenceSession(str(file), providers=["CPUExecutionProvider"])
         entry = session.get_inputs()[0].name
-        outside, least, done = 0, np.full(2 * k, np.inf), 0
-        ends = [np.float32(np.nextafter(np.float32(v), np.float32(0))) for v in (slack,)]
-        while done < runs:
-            p = rng.uniform(-1, 1, d) if done % 2 else rng.choice([-1.0, 1.0], d)
-            t = rng.uniform(-1, 1, n) if done % 3 else rng.choice([-1.0, 1.0], n)
-            middle = a[0] @ p + c[0]
-            x = middle + 0.999 * float(ends[0]) * t
-            done += 1
+
+        def output(x: np.ndarray) -> np.ndarray:
             if arithmetic == "real":
-                y = rows @ network(torch.from_numpy(x).reshape(1, *shape))[0].numpy()
-            else:
-                outputs = session.run(None, {entry: x.astype(np.float32).reshape(1, *shape)})
-                y = rows @ np.concatenate([np.asarray(v).reshape(-1) for v in outputs]).astype(np.float64)
-            least = np.minimum(least, y)
-            outside += int((y < lower).sum() + (y < bounds.a[0] @ p + bounds.b[0]).sum())
-        spread = (least[:k] + least[k:]) * -0.5
-        found.update(runs=done, outside=outside, width=float(f"{-np.median(lower[:k] + lower[k:]):.3g}"))
-        moves = spread > 0.0
-        if moves.any():
-            found["ratio"] = round(float(np.median(((lower[:k] + lower[k:]) * -0.5)[moves] / spread[moves])), 2)
+                return network(torch.from_numpy(x).reshape(1, *shape))[0].numpy()
+            outputs = session.run(None, {entry: x.astype(np.float32).reshape(1, *shape)})
+            return np.concatenate([np.asarray(v).reshape(-1) for v in outputs]).astype(np.float64)
+
+        ranges = {}
+        for kind, chosen in (
+            ("random", random_runs(runs, d=a.shape[1], n=network.input_size)),
+            ("searched", searched_runs(network, shape, middle, a, rows)),
+        ):
+            outside, least, done = 0, np.full(2 * k, np.inf), 0
+            for p, t in chosen:
+                # a hair inside: of what float32 makes of the image
+                y = rows @ output(a @ p + middle + 0.999 * slack * t)
+                least, done = np.minimum(least, y), done + 1
+                outside += int((y < lower).sum() + (y < bounds.a[0] @ p + bounds.b[0]).sum())
+            ranges[kind] = (least[:k] + least[k:]) * -0.5
+            found[kind] = {"runs": done, "outside": outside}
+            moves = ranges[kind] > 0.0
+            if moves.any():
+                ratios = ((lower[:k] + lower[k:]) * -0.5)[moves] / ranges[kind][moves]
+                found[kind]["ratio"] = float(f"{np.median(ratios):.3g}")
         return found
+
+
+def image_set(shape: tuple[int, ...], width: float) -> tuple[ImageSets, np.ndarray, np.ndarray, float]:
+    """A set of images of blocks of one colour in two parameters.
+
+    Returns:
+        The set, its middle [n], slopes [n, 2] and how far each number moves alone.
+    """
+    from ns_abstract.verify.network import ImageSets
+
+    rng = np.random.default_rng(0)
+    n, d = int(np.prod(shape)), 2
+    c = np.repeat(np.repeat(rng.normal(size=(3, 4, 4)), -(-shape[1] // 4), 1), -(-shape[2] // 4), 2)
+    c = c[:, : shape[1], : shape[2]].reshape(1, n)
+    a = width * rng.normal(size=(1, n, d))
+    slack = 0.1 * width
+    reach = np.abs(a).sum(-1) + slack
+    return ImageSets(a, c - slack, a, c + slack, c - reach, c + reach), c[0], a[0], slack
+
+
+#: Parameters [d] and what every number moves by alone [n], both in [-1, 1].
+Run = tuple[np.ndarray, np.ndarray]
+
+
+def random_runs(runs: int, d: int, n: int) -> Iterator[Run]:
+    """Places in the set and corners of it, drawn."""
+    rng = np.random.default_rng(1)
+    for i in range(runs):
+        p = rng.uniform(-1, 1, d) if i % 2 else rng.choice([-1.0, 1.0], d)
+        yield p, rng.uniform(-1, 1, n) if i % 3 else 2.0 * rng.integers(0, 2, n) - 1.0
+
+
+def searched_runs(
+    network: Network, shape: tuple[int, ...], middle: np.ndarray, a: np.ndarray, rows: np.ndarray
+) -> Iterator[Run]:
+    """By row: the corner at which it is least, as its derivative in the middle has it."""
+    for row in rows:
+        x = torch.from_numpy(middle).reshape(1, *shape).requires_grad_()
+        (network(x)[0] @ torch.from_numpy(row)).backward()
+        assert x.grad is not None
+        slope = x.grad.numpy().reshape(-1)
+        yield -np.sign(slope @ a), -np.sign(slope)
 
 
 def main() -> None:

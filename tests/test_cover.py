@@ -169,8 +169,8 @@ def test_products_of_rows_are_charged(local: str, tmp_path: Path) -> None:
         said = other._said(index)
         tilt, noise = np.zeros((m, len(lent.flat), 2)), other.flush[:, None]
         low, high = (np.repeat(v[None], m, 0) for v in lent.fixed.T)
-        if index in other.noise:
-            noise = noise + other.noise[index].reshape(m, -1).numpy()[:, lent.flat]
+        if index in other.passages[0].noise:
+            noise = noise + other.passages[0].noise[index].reshape(m, -1).numpy()[:, lent.flat]
         for at, rows in lent.rows.items():
             values = rows.astype(np.float64)
             one, two = np.maximum(values, 0.0), np.minimum(values, 0.0)
@@ -186,7 +186,7 @@ def test_products_of_rows_are_charged(local: str, tmp_path: Path) -> None:
                 tilt = tilt + one @ np.moveaxis(offered.tilts[0], 1, 2) + two @ np.moveaxis(offered.tilts[1], 1, 2)
                 low, high = low + below @ one.T + top @ two.T, high + above @ one.T + bottom @ two.T
             else:
-                noise = noise + other.noise[at].reshape(m, -1).numpy() @ np.abs(values).T
+                noise = noise + other.passages[0].noise[at].reshape(m, -1).numpy() @ np.abs(values).T
         charged = said.half - 0.5 * (high - low) - noise
         for p in ((1.0, 1.0), (-1.0, 1.0), (0.0, 0.0)):
             exactly = (tilt @ p + 0.5 * (low + high)) * lent.sign
@@ -203,9 +203,9 @@ def test_parts_have_the_references_and_winners_of_the_whole(tmp_path: Path) -> N
     family, parts = Family(net, images, arithmetic="real"), halved(images)
     part = _Other(family._first, parts, 1 << 30, "real", False)
     alone = _Cells(net, parts, "everywhere", 1 << 30, "real")
-    (at,) = family._first.maxima
-    assert (part.maxima[at].winner == family._first.maxima[at].winner).all()
-    assert (alone.maxima[at].winner != family._first.maxima[at].winner).any()
+    (at,) = family._first.passages[0].maxima
+    assert (part.passages[0].maxima[at].winner == family._first.passages[0].maxima[at].winner).all()
+    assert (alone.passages[0].maxima[at].winner != family._first.passages[0].maxima[at].winner).any()
     assert torch.equal(part.last.reference, family._first.last.reference.expand_as(part.last.reference))
 
 
@@ -217,9 +217,10 @@ def test_rounding_is_charged_by_all_parts_at_once(tmp_path: Path, monkeypatch: p
     together = _Other(family._first, cells, 1 << 30, "float32", False)
     monkeypatch.setattr(_Other, "_sized", lambda self, form: form)
     alone = _Other(family._first, cells, 1 << 30, "float32", False)
-    assert len(together.noise) > 3
-    for k, noise in together.noise.items():
-        each = alone.noise[k]
+    charged, singly = together.passages[0].noise, alone.passages[0].noise
+    assert len(charged) > 3
+    for k, noise in charged.items():
+        each = singly[k]
         assert (noise != each).any()
         # what rounding leaves is read again, further on
         assert (noise >= (1.0 - 1e-5) * each).all()

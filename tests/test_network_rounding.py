@@ -13,6 +13,7 @@ import torch
 from onnx_files import OnnxFile, image_sets, session
 
 from ns_abstract.verify.network import ImageSets, Network, bound_outputs, load_network
+from ns_abstract.verify.network.bounds import _Cells
 
 Layers = list[tuple[np.ndarray, np.ndarray]]
 #: A product that is lost when it is added to 1 in float32, and 1 stays.
@@ -288,8 +289,9 @@ def test_units_that_may_be_on_are_terms(tmp_path: Path) -> None:
     assert (found.a[0, :, 0] + found.b[0] <= -y).all()
 
 
-def test_rounding_of_rows_over_sets(tmp_path: Path) -> None:
-    """Of a linear network, the least value in exact arithmetic is not exceeded."""
+@pytest.mark.parametrize("double", [False, True])
+def test_rounding_of_rows_over_sets(double: bool, tmp_path: Path) -> None:
+    """Of a linear network, the least value in exact arithmetic is not exceeded, whatever rows of outputs are."""
     for seed in range(3):
         layers = random_layers((10, 30, 30, 5), seed)
         network, _ = network_of(layers, tmp_path, relu=False)
@@ -298,7 +300,10 @@ def test_rounding_of_rows_over_sets(tmp_path: Path) -> None:
         reach = np.abs(a).sum(-1)
         images = ImageSets(a, b, a, b, np.nextafter(-reach, -np.inf), np.nextafter(reach, np.inf))
         for sign in (1.0, -1.0):
-            found = bound_outputs(network, images, sign * np.eye(5), np.zeros(5), arithmetic="real")
+            cells = _Cells(network, images, "everywhere", 1 << 30, "real")
+            if not double:
+                cells.passages.pop()
+            found = cells.outputs(sign * np.eye(5), np.zeros(5))
             corners = [np.array(p) for p in itertools.product([-1.0, 1.0], repeat=3)]
             for k in range(5):
                 least = []
@@ -309,3 +314,40 @@ def test_rounding_of_rows_over_sets(tmp_path: Path) -> None:
                     ]
                     least.append(Fraction(sign) * exact(layers, np.array(x, object), relu=False)[k])
                 assert Fraction(float(found.lower[0, k])) <= min(least)
+
+
+def test_rows_of_outputs_take_float64_weights(tmp_path: Path) -> None:
+    """Means of 61 numbers: one by 61 as float32 has it is less by nearly half a unit."""
+    f = OnnxFile((1, 1, 61))
+    f.node("AveragePool", kernel_shape=[1, 61])
+    f.node("Flatten")
+    network = load_network(f.write(tmp_path / "mean.onnx"))
+    a = np.ones((1, 61, 1))
+    b = np.zeros((1, 61))
+    images = ImageSets(a, b, a, b, b - 1.0, b + 1.0)
+    found = bound_outputs(network, images, np.eye(1), np.zeros(1), arithmetic="real")
+    # what the sums of columns are charged
+    assert -1.0 - 2.0**-24 < found.lower[0, 0] <= -1.0
+
+
+@pytest.mark.parametrize("blocks", [1, 3])
+def test_rows_of_outputs_in_float64_are_tighter(blocks: int, tmp_path: Path) -> None:
+    """Over small sets float32 rows lose more than the images move; no run in float64 is outside."""
+    network = load_network(residual(tmp_path, blocks))
+    images = image_sets((3, 8, 8), 1, 2, 1e-9, 1e-12, 1)
+    rows = np.concatenate([np.eye(3), -np.eye(3)])
+    widths = []
+    for double in (False, True):
+        cells = _Cells(network, images, "everywhere", 1 << 30, "real")
+        if not double:
+            cells.passages.pop()
+        found = cells.outputs(rows, np.zeros(6))
+        rng = np.random.default_rng(0)
+        for p in rng.choice([-1.0, 1.0], (50, 2)):
+            x = 0.5 * ((images.a_lower[0] + images.a_upper[0]) @ p + images.b_lower[0] + images.b_upper[0])
+            y = rows @ network(torch.from_numpy(x).reshape(1, 3, 8, 8))[0].numpy()
+            # a float64 run's own rounding
+            room = 2.0**-44 * (1.0 + np.abs(y))
+            assert (found.lower[0] <= y + room).all() and (found.a[0] @ p + found.b[0] <= y + room).all()
+        widths.append(-(found.lower[0, :3] + found.lower[0, 3:]).mean())
+    assert widths[1] < widths[0]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
@@ -37,8 +37,10 @@ Float64 = NDArray[np.float64]
 Int64 = NDArray[np.int64]
 Substitution = Literal["everywhere", "end", "box"]
 
-#: Unit roundoff of float32: of the bounded evaluation, and of rows.
+#: Unit roundoff of float32: of the bounded evaluation, and of most rows.
 UNIT = 2.0**-24
+#: Unit roundoff of float64: of sums of offsets, and of rows of outputs in real arithmetic.
+_DOUBLE_UNIT = 2.0**-53
 #: Roundings of rows beside those of their sums: stored weights and slopes, products with them.
 _SPARE = 24
 #: Roundings of the network beside those of a layer's sums: a batch normalisation's factor (sum, root, quotient),
@@ -163,9 +165,8 @@ def bound_outputs(
         raise ValueError(f"images of {network.input_size} numbers expected, got {images.a_lower.shape[1]}")
     if rows.shape != (offset.shape[0], network.output_size):
         raise ValueError(f"rows {(offset.shape[0], network.output_size)} expected, got {rows.shape}")
-    by_cell = (
-        sum(int(np.prod(network.shape(k))) for k in range(len(network.nodes) + 1)) * 8 * (3 * images.dimensions + 14)
-    )
+    numbers = 3 * images.dimensions + 14 + (7 if arithmetic == "real" else 0)
+    by_cell = sum(int(np.prod(network.shape(k))) for k in range(len(network.nodes) + 1)) * 8 * numbers
     step = max(1, int(0.5 * memory) // by_cell)
     parts = []
     for first in range(0, images.count, step):
@@ -268,15 +269,16 @@ class _Cells:
         self.flush = np.zeros(self.count)
         fields = self._fields(images)
         self._planes(fields, substitution)
-        self.lines: dict[int, np.ndarray] = {}
-        #: the same with slopes of another cell's rows
+        #: what rows take on their way; rows of outputs take the last, the others the first
+        self.passages = [_Passage(torch.float32, UNIT)]
+        if not self.single:
+            # beside the rounding of a float32 network that of rows is little
+            self.passages.append(_Passage(torch.float64, _DOUBLE_UNIT))
+        #: what sums of offsets in float64 lose: every number is passed by a few times at most
+        numbers = sum(int(np.prod(network.shape(k))) for k in range(len(network.nodes) + 1))
+        self.sums = 4.0 * _DOUBLE_UNIT * (numbers + len(network.nodes))
+        #: lines with slopes of another cell's rows
         self.offered: dict[int, _Offered] = {}
-        #: what rows on a product become on its first and its second factor
-        self.products: dict[int, tuple[np.ndarray, ...]] = {}
-        #: what rows on a maximum become on the numbers of its windows
-        self.maxima: dict[int, _Maxima] = {}
-        #: rounding of the network and of rows
-        self.noise: dict[int, Tensor] = {}
         #: roundings of sums
         self.terms: dict[int, Tensor | int] = {}
         #: nodes whose rounding is in that of their only reader
@@ -466,8 +468,8 @@ class _Cells:
             lower[cell, at] = torch.where(positive, torch.minimum(torch.maximum(low, zero), high), low)
             upper[cell, at] = torch.where(positive, high, torch.maximum(torch.minimum(high, zero), low))
             noise = UNIT * (_SPARE + self.network.readers[source]) * width[cell, flat]
-            if source in self.noise:
-                noise = noise + self.noise[source].flatten(1).numpy()[cell, flat]
+            if self._rounds(source):
+                noise = noise + self.passages[0].noise[source].flatten(1).numpy()[cell, flat]
             self.held[cell][source] = Held(flat, side, -zero.numpy(), noise)
         return replace(z, lower=lower.reshape(z.lower.shape), upper=upper.reshape(z.upper.shape))
 
@@ -501,22 +503,27 @@ class _Cells:
             count = self._roundings(sources, layer, known)
             self.terms[k] = count
             moves = moves + self._rounding(sources, layer, known, count, size) + layer.spare(sizes)
-        rows = _gamma(layer.row_terms + _SPARE + max(self.network.readers[i] for i in sources))
-        noise = ((moves + rows * width) * (1.0 + 2.0**-40)).expand(m, *layer.shape)
+        roundings = layer.row_terms + _SPARE + max(self.network.readers[i] for i in sources)
         form = _Form.ranged(reference, moved[:, 0], moved[:, 1:], radius + moves, active)
         if float(size.amax()) >= _OVERFLOW:
             self.good &= (size.flatten(1).amax(1) < _OVERFLOW).numpy()
         for sized, shape in zip(known, layer.input_shapes, strict=True):
             lost = int(np.prod(shape)) * (layer.row_terms + 2) * _FLUSH
             self.flush += lost * sized.width.flatten(1).amax(1).numpy()
-        if isinstance(layer, Sum):
-            # one charge instead of several
-            for source in sources:
-                if source in self.noise and self.network.readers[source] == 1:
-                    noise = noise + self.noise[source]
-                    self.folded.add(source)
-        self.noise[k] = noise * (1.0 + 2.0**-40)
+        folded = [i for i in sources if isinstance(layer, Sum) and self._rounds(i) and self.network.readers[i] == 1]
+        self.folded.update(folded)
+        for passage in self.passages:
+            rows = _gamma(roundings, passage.unit)
+            noise = ((moves + rows * width) * (1.0 + 2.0**-40)).expand(m, *layer.shape)
+            for source in folded:
+                # one charge instead of several
+                noise = noise + passage.noise[source]
+            passage.noise[k] = noise * (1.0 + 2.0**-40 + self.sums)
         return self._within(form, form.lower, form.upper)
+
+    def _rounds(self, source: int) -> bool:
+        """Whether rows are charged on node ``source``."""
+        return source in self.passages[0].noise
 
     def _rounding(
         self, sources: tuple[int, ...], layer: Linear, inputs: list[_Form], count: Tensor | int, size: Tensor
@@ -572,29 +579,32 @@ class _Cells:
         if isinstance(layer, LeakyRelu) and layer.alpha == 0.0:
             form.active = upper > 0.0
         lines = layer.lines(lower, upper)
-        # the slope as stored, rows' products with it and sums where branches meet
-        unit = (_SPARE + self.network.readers[source]) * UNIT
-        fold = source in self.noise and self.network.readers[source] == 1
+        fold = self._rounds(source) and self.network.readers[source] == 1
 
-        def stored(chosen: Sequence[tuple[Tensor, Tensor, Tensor]]) -> np.ndarray:
+        def stored(chosen: Sequence[tuple[Tensor, Tensor, Tensor]], passage: _Passage) -> np.ndarray:
             """As `pass_activation` wants slope, lower and upper offset for rows of either sign."""
-            found = []
+            # the slope as stored, rows' products with it and sums where branches meet
+            found, unit = [], (_SPARE + self.network.readers[source]) * passage.unit
             for (slope, low, high), side in zip(chosen, (-1.0, 1.0), strict=True):
-                rounded = slope.float().double()
+                rounded = slope.to(passage.dtype).double()
                 base, apart = slope * z.reference - reference, band.lower_slope - slope
                 give = ((rounded - slope).abs() + unit * slope.abs()) * z.width + 2.0**-48 * apart.abs() * size + room
                 give = give + 2.0**-48 * (low.abs() + high.abs() + slope.abs() * z.reference.abs())
                 if fold:
-                    give = give + rounded.abs() * self.noise[source]
-                ends = _outward(low + base - give, -1.0), _outward(high + base + give, 1.0)
-                found += [rounded.float(), *(ends if side < 0.0 else reversed(ends))]
+                    give = give + rounded.abs() * passage.noise[source]
+                ends = (
+                    self._outward(low + base - give, -1.0, passage),
+                    self._outward(high + base + give, 1.0, passage),
+                )
+                found += [rounded.to(passage.dtype), *(ends if side < 0.0 else reversed(ends))]
             return torch.stack(found).reshape(6, self.count, *grid(layer.shape)).numpy()
 
         # the other sides of lines with these slopes are the band's
         above = layer.offsets(lines.lower_slope, lower, upper, band)[1]
         below = layer.offsets(lines.upper_slope, lower, upper, band)[0]
         own = (lines.lower_slope, lines.lower_offset, above), (lines.upper_slope, below, lines.upper_offset)
-        self.lines[k] = stored(own)
+        for passage in self.passages:
+            passage.lines[k] = stored(own, passage)
         lent = self._lent(k)
         if lent is not None:
             slopes = [torch.from_numpy(v).double().expand(self.count, *layer.shape) for v in lent]
@@ -606,11 +616,12 @@ class _Cells:
             for slope, ends, (low, high, tilt), use in zip(slopes, plain, tilted, better, strict=True):
                 offsets.append((slope, torch.where(use, low, ends[0]), torch.where(use, high, ends[1])))
                 tilts.append(torch.where(use[:, None], tilt, torch.zeros_like(tilt)))
-            self.offered[k] = _Offered(stored(offsets), torch.stack(tilts).flatten(3).numpy())
+            self.offered[k] = _Offered(stored(offsets, self.passages[0]), torch.stack(tilts).flatten(3).numpy())
         if fold:
             self.folded.add(source)
         if self.slope_steps and isinstance(layer, LeakyRelu):
-            loose = unit * z.width + (self.noise[source] if fold else 0.0)
+            loose = (_SPARE + self.network.readers[source]) * UNIT * z.width
+            loose = loose + (self.passages[0].noise[source] if fold else 0.0)
             given = (lower, upper, z.reference, reference, loose, room + torch.zeros_like(lower))
             self.open[k] = _open_units(layer, given)
         lost = int(np.prod(layer.shape)) * 2 * _FLUSH
@@ -618,6 +629,13 @@ class _Cells:
         ends = layer.range(lower, upper)
         room = room + 2.0**-48 * (ends[0].abs() + ends[1].abs())
         return self._within(form, ends[0] - reference - room, ends[1] - reference + room)
+
+    def _outward(self, value: Tensor, side: float, passage: _Passage) -> Tensor:
+        """An offset as rows take it, farther out by what their sums of offsets may lose."""
+        if passage.dtype == torch.float32:
+            # half a unit of float32 is more than that, up to 2^26 numbers
+            return _outward(value, side)
+        return value + side * self.sums * value.abs()
 
     def _lent(self, k: int) -> tuple[np.ndarray, np.ndarray] | None:
         """Slopes [1, *shape] of rows of another cell on node ``k``, not negative and negative ones."""
@@ -636,16 +654,18 @@ class _Cells:
         room = 2.0**-48 * (own + plane.low.abs() + plane.high.abs()) + 2 * _FLUSH
         if self.single:
             room = room + 2 * UNIT * size
-        # rows' products with the slopes and sums where branches meet
-        unit = (_SPARE + max(self.network.readers[i] for i in sources)) * UNIT
-        give = room + unit * (alpha.abs() * x.width + beta.abs() * y.width)
-        low, high = _outward(plane.low + base - give, -1.0), _outward(plane.high + base + give, 1.0)
-        none = torch.zeros_like(low)
         shape = (6, m, *grid(layer.shape))
-        self.products[k] = tuple(
-            torch.stack([slope, *ends, slope, *reversed(ends)]).reshape(shape).numpy()
-            for slope, ends in ((alpha.float(), (low, high)), (beta.float(), (none, none)))
-        )
+        for passage in self.passages:
+            # rows' products with the slopes, which are float32 numbers, and sums where branches meet
+            unit = (_SPARE + max(self.network.readers[i] for i in sources)) * passage.unit
+            give = room + unit * (alpha.abs() * x.width + beta.abs() * y.width)
+            low = self._outward(plane.low + base - give, -1.0, passage)
+            high = self._outward(plane.high + base + give, 1.0, passage)
+            none = torch.zeros_like(low)
+            passage.products[k] = tuple(
+                torch.stack([slope, *ends, slope, *reversed(ends)]).reshape(shape).numpy()
+                for slope, ends in ((alpha.to(passage.dtype), (low, high)), (beta.to(passage.dtype), (none, none)))
+            )
         middle, half = 0.5 * (plane.low + plane.high) + base, 0.5 * (plane.high - plane.low)
         moved = alpha.abs() * (x.c.abs() + x.a.abs().sum(1)) + beta.abs() * (y.c.abs() + y.a.abs().sum(1))
         half = half + room + 2.0**-50 * middle.abs() + 2.0**-44 * moved
@@ -674,14 +694,14 @@ class _Cells:
         reference, c, r, width = (chosen(v) for v in (x.reference, x.c, x.r, x.width))
         a = torch.stack([chosen(x.a[:, i]) for i in range(self.d)], 1)
         # sums of rows where windows overlap
-        unit = (_SPARE + layer.overlaps + self.network.readers[source]) * UNIT
-        give = unit * width
-        offsets = torch.stack([-give, give, give, -give], 0)
+        units = [(_SPARE + layer.overlaps + self.network.readers[source]) * passage.unit for passage in self.passages]
+        gives = [unit * width for unit in units]
+        offsets = [torch.stack([-give, give, give, -give], 0) for give in gives]
         rivals = upper.scatter(2, winner, -torch.inf).amax(2)
         most, own_upper = upper.amax(2), chosen(interval.upper)
         where = (rivals > chosen(interval.lower)).nonzero()
         which = torch.full(reference.shape, -1, dtype=torch.int64)
-        slopes = []
+        slopes: list[Tensor] = []
         step = max(1, _ROWS_AT_ONCE // (8 * len(layer.steps) ** 2 * 4))
         for part in where.split(step):
             cell, channel, window = part.T
@@ -712,17 +732,18 @@ class _Cells:
             at, top = tuple(v[left] for v in at), top[left]
             planes = upper_planes(known, apart)
             which[at] = torch.arange(len(top)) + sum(map(len, slopes))
-            stored = planes.slopes.float()
             base = (planes.slopes * known.reference).sum(1) - reference[at]
             near = gathered(x.width)[left]
-            lost = ((stored.double() - planes.slopes).abs() * near + unit * planes.slopes * near).sum(1)
-            lost = lost + _REFERENCES * ((planes.slopes * known.reference.abs()).sum(1) + reference[at].abs())
-            offsets[1][at] = give[at] + top
-            offsets[2][at] = planes.high + base + lost
-            offsets[3][at] = planes.low + base - lost
-            slopes.append(stored)
+            room = _REFERENCES * ((planes.slopes * known.reference.abs()).sum(1) + reference[at].abs())
+            for passage, unit, give, offset in zip(self.passages, units, gives, offsets, strict=True):
+                rounded = (planes.slopes.to(passage.dtype).double() - planes.slopes).abs()
+                lost = (rounded * near + unit * planes.slopes * near).sum(1) + room
+                offset[1][at] = give[at] + top
+                offset[2][at] = planes.high + base + lost
+                offset[3][at] = planes.low + base - lost
+            slopes.append(planes.slopes)
             # the form between the planes, or the winner and what may be above it
-            low, high = planes.low + base - lost, planes.high + base + lost
+            low, high = planes.low + base - room, planes.high + base + room
             middle = (planes.slopes * known.middle).sum(1) + 0.5 * (low + high)
             radius = (planes.slopes * known.radius).sum(1) + 0.5 * (high - low)
             radius = (radius + _REFERENCES * (planes.slopes * known.size).sum(1)) * (1.0 + 2.0**-40)
@@ -735,13 +756,16 @@ class _Cells:
             a[cells, :, channels, windows] = torch.where(better[:, None], tilted, a[cells, :, channels, windows])
             most[at] = torch.minimum(most[at], own_upper[at] + top)
         grown = (m, *shape)
-        outward = [_outward(v, side) for v, side in zip(offsets, (-1.0, 1.0, 1.0, -1.0), strict=True)]
-        self.maxima[k] = _Maxima(
-            winner[:, :, 0].reshape(grown).numpy().astype(np.int16),
-            which.reshape(grown).numpy().astype(np.int32),
-            (torch.cat(slopes) if slopes else torch.zeros((0, len(layer.steps)))).numpy(),
-            torch.stack(outward).reshape(4, *grown).numpy(),
-        )
+        chosen_slopes = torch.cat(slopes) if slopes else torch.zeros((0, len(layer.steps)))
+        for passage, offset in zip(self.passages, offsets, strict=True):
+            sides = zip(offset, (-1.0, 1.0, 1.0, -1.0), strict=True)
+            outward = [self._outward(v, side, passage) for v, side in sides]
+            passage.maxima[k] = _Maxima(
+                winner[:, :, 0].reshape(grown).numpy().astype(np.int16),
+                which.reshape(grown).numpy().astype(np.int32),
+                chosen_slopes.to(passage.dtype).numpy(),
+                torch.stack(outward).reshape(4, *grown).numpy(),
+            )
         active = (layer.taps(x.active.double(), 0.0).amax(2) > 0.0).reshape(grown)
         reference, c, r = (v.reshape(grown) for v in (reference, c, r))
         form = _Form.ranged(reference, c, a.reshape(m, self.d, *shape), r, active)
@@ -1074,7 +1098,8 @@ class _Cells:
         All of them end on the nodes up to ``cut`` (N18).
         """
         found = _Reached.unknown(len(cell), self.d)
-        batch = _Batch({index: rows}, cell, np.zeros((len(cell), 2)), np.arange(len(cell)))
+        passage = next(passage for passage in self.passages if passage.takes(rows))
+        batch = _Batch({index: rows}, cell, np.zeros((len(cell), 2)), np.arange(len(cell)), passage)
         batch.trace = trace
         self._descend(index, index, batch, found, enough, cut)
         return found
@@ -1116,22 +1141,22 @@ class _Cells:
             if batch.trace is not None and not batch.trace.short and self._depends(start, at):
                 batch.trace.keep(at, here, node.layer.shape, batch.number)
             if isinstance(node.layer, Activation):
-                lines, which = self.lines[at], batch.cell
+                lines, which = batch.passage.lines[at], batch.cell
                 if batch.chosen is not None and at in batch.chosen.lines:
                     lines, which = batch.chosen.lines[at], batch.number
                 pass_activation(here.value, here.y, here.x, which, lines, batch.total)
                 parts = [here]
             elif isinstance(node.layer, MaxPool):
-                parts = [self.maxima[at].backward(here, node.layer, batch)]
+                parts = [batch.passage.maxima[at].backward(here, node.layer, batch)]
             elif isinstance(node.layer, Product):
                 # every reader changes its rows in place
                 parts = [here, Rows(here.value.copy(), here.y, here.x)]
-                for part, lines in zip(parts, self.products[at], strict=True):
+                for part, lines in zip(parts, batch.passage.products[at], strict=True):
                     pass_activation(part.value, part.y, part.x, batch.cell, lines, batch.total)
             else:
                 if at == start or at not in self.folded:
                     shape = grid(node.layer.shape)
-                    noise = self.noise[at].reshape(self.count, *shape).contiguous().numpy()
+                    noise = batch.passage.noise[at].reshape(self.count, *shape).contiguous().numpy()
                     charge(here.value, here.y, here.x, batch.cell, noise, batch.total)
                 parts = node.layer.backward(here)
             if batch.trace is not None and (batch.trace.short or isinstance(node.layer, (MaxPool, Product))):
@@ -1199,25 +1224,28 @@ class _Cells:
         loosest = np.full((len(cell), 2), -1, np.int64)
         if not self.slope_steps:
             return self._backward(index, rows, cell), loosest
-        start = Rows(rows.value.copy(), rows.y, rows.x)
-        best = self._backward(index, rows, cell)
+        # slopes are chosen in float32
+        start = Rows(rows.value.astype(np.float32), rows.y, rows.x)
+        best, lines = self._backward(index, rows, cell), self.passages[0].lines
         for k in np.unique(cell):
             units = {at: opened.of(k) for at, opened in self.open.items()}
             units = {at: opened for at, opened in units.items() if len(opened.flat)}
             own, held = np.flatnonzero(cell == k), self.held[k]
             if not (units or held) or not self.good[k]:
                 continue
-            first = {at: self.lines[at][0, k].reshape(-1)[opened.flat] for at, opened in units.items()}
+            first = {at: lines[at][0, k].reshape(-1)[opened.flat] for at, opened in units.items()}
             ascent = Ascent(units, first, len(own), held)
             for _ in range(self.slope_steps + 1):
                 if self.assumed is not None and bool((best.lower[own] > need[own]).all()):
                     break
-                chosen = ascent.lines(self.lines, k)
+                chosen = ascent.lines(lines, k)
                 found = _Reached.unknown(len(own), self.d)
                 # rows are changed in place
                 part = Rows(start.value[own], start.y[own], start.x[own])
                 total, number = np.zeros((len(own), 2)), np.arange(len(own))
-                self._descend(index, index, _Batch({index: part}, cell[own], total, number, chosen), found, None)
+                self._descend(
+                    index, index, _Batch({index: part}, cell[own], total, number, self.passages[0], chosen), found, None
+                )
                 better = found.lower > best.lower[own]
                 best.lower[own[better]], best.plane[own[better]] = found.lower[better], found.plane[better]
                 slopes, forces = self._derivatives(k, chosen, found, units)
@@ -1261,15 +1289,15 @@ class _Cells:
         ends = np.einsum("schwd,rd->srchw", planes.slopes[cell], p) + planes.offsets[cell][:, None]
         image = np.where(rows >= 0.0, ends[0], ends[1]).astype(np.float32)
         others: dict[int, Any] = {}
-        for k, (one, two) in self.products.items():
+        for k, (one, two) in self.passages[0].products.items():
             others[k] = functools.partial(_product, torch.from_numpy(one[:, cell]), torch.from_numpy(two[:, cell]))
-        for k, maxima in self.maxima.items():
+        for k, maxima in self.passages[0].maxima.items():
             layer = self.network.nodes[k - 1].layer
             assert isinstance(layer, MaxPool)
             others[k] = functools.partial(maxima.forward, layer, cell)
 
         def lines(k: int) -> np.ndarray:
-            return chosen.lines[k] if k in chosen.lines else self.lines[k][:, cell : cell + 1]
+            return chosen.lines[k] if k in chosen.lines else self.passages[0].lines[k][:, cell : cell + 1]
 
         shaped = torch.from_numpy(image).reshape(-1, *self.network.input_shape)
         return derivatives(self.network, shaped, chosen.trace, lines, units, others, held)
@@ -1282,16 +1310,16 @@ class _Cells:
         loosest = np.zeros((m, k, 2), np.int64)
         shape = grid(self.network.shape(index))
         dense = np.asarray(rows.toarray() if hasattr(rows, "toarray") else rows, np.float64)
-        single = dense.astype(np.float32)
+        stored = dense.astype(self.passages[-1].number)
         size = self.last.width.reshape(m, -1).numpy()
         reference = self.last.reference.reshape(m, -1).numpy()
-        missing = size @ np.abs(dense - single).T
+        missing = size @ np.abs(dense - stored).T
         missing += 2.0**-52 * (dense.shape[1] + 2) * (np.abs(reference) @ np.abs(dense).T)
         offset = reference @ dense.T + offset
         need = -offset + _SURE * (1.0 + np.abs(offset))
-        for top, left, height, width, number in _windows(single.reshape(k, *shape)):
-            part = single.reshape(k, *shape)[:, :, top : top + height, left : left + width]
-            step = max(1, _ROWS_AT_ONCE // (4 * shape[0] * height * width))
+        for top, left, height, width, number in _windows(stored.reshape(k, *shape)):
+            part = stored.reshape(k, *shape)[:, :, top : top + height, left : left + width]
+            step = max(1, _ROWS_AT_ONCE // (stored.itemsize * shape[0] * height * width))
             for first in range(0, m * len(number), step):
                 which = np.arange(first, min(m * len(number), first + step))
                 cell, row = which // len(number), number[which % len(number)]
@@ -1361,14 +1389,44 @@ class _Planes(NamedTuple):
     upper: Float64
 
 
+@dataclass
+class _Passage:
+    """What rows of one type take on their way through the nodes, with what they lose themselves (N2).
+
+    Attributes:
+        dtype: Of rows, slopes and offsets.
+        unit: Its unit roundoff.
+        lines: By activation, [6, m, C, H, W] as `pass_activation` takes them.
+        products: By product: the same for its first and its second factor.
+        maxima: By maximum.
+        noise: By linear layer: rounding of the network and of rows, [m, *shape] float64.
+    """
+
+    dtype: torch.dtype
+    unit: float
+    lines: dict[int, np.ndarray] = field(default_factory=dict)
+    products: dict[int, tuple[np.ndarray, ...]] = field(default_factory=dict)
+    maxima: dict[int, _Maxima] = field(default_factory=dict)
+    noise: dict[int, Tensor] = field(default_factory=dict)
+
+    @property
+    def number(self) -> type[np.floating[Any]]:
+        """The type as numpy has it."""
+        return np.float32 if self.dtype == torch.float32 else np.float64
+
+    def takes(self, rows: Rows) -> bool:
+        """Whether rows are of this type."""
+        return rows.value.dtype == self.number
+
+
 class _Maxima(NamedTuple):
     """Planes of a maximum's windows, as rows want them (N12).
 
     Attributes:
         winner: [m, C, H, W] int16, the number that the lower plane follows.
         which: [m, C, H, W] int32, rows of ``slopes``; -1 where the winner is the maximum.
-        slopes: [U, K] float32 of upper planes.
-        offsets: [4, m, C, H, W] float32: lower and upper for coefficients that are not negative, upper and lower
+        slopes: [U, K] of upper planes; of the rows' type, as offsets are.
+        offsets: [4, m, C, H, W]: lower and upper for coefficients that are not negative, upper and lower
             for negative ones.
     """
 
@@ -1395,7 +1453,7 @@ class _Maxima(NamedTuple):
         height, width = rows.value.shape[2:]
         (down, right), extent = layer.stride, layer.steps.max(0) + 1
         size = (height - 1) * down + int(extent[0]), (width - 1) * right + int(extent[1])
-        target = np.zeros((*rows.value.shape[:2], *size), np.float32)
+        target = np.zeros((*rows.value.shape[:2], *size), rows.value.dtype)
         pass_maximum(rows.value, rows.y, rows.x, batch.cell, *self, layer.steps, layer.stride, batch.total, target)
         return Rows(target, rows.y * down - layer.pads[0], rows.x * right - layer.pads[1])
 
@@ -1449,6 +1507,7 @@ class _Batch:
         cell: [R] of every row.
         total: [R, 2] what rows gathered so far, at least and at most.
         number: [R] positions in the result.
+        passage: What they take.
         chosen: Lines of rows' own, and a place for what rows are on the way.
         trace: A place for what rows are on the way.
     """
@@ -1457,12 +1516,15 @@ class _Batch:
     cell: Int64
     total: Float64
     number: Int64
+    passage: _Passage
     chosen: Chosen | None = None
     trace: Trace | None = None
 
     def __getitem__(self, part: Any) -> _Batch:
         waiting = {k: rows[part] for k, rows in self.waiting.items()}
-        return _Batch(waiting, self.cell[part], self.total[part], self.number[part], self.chosen, self.trace)
+        return _Batch(
+            waiting, self.cell[part], self.total[part], self.number[part], self.passage, self.chosen, self.trace
+        )
 
     @property
     def bytes(self) -> int:
@@ -1568,12 +1630,13 @@ class _Reached:
         self.upper[number] = np.fmin(self.upper[number], most)
 
 
-def _gamma(count: Any) -> Any:
-    """What ``count`` roundings in float32 may change, relatively."""
-    return count * UNIT / (1.0 - count * UNIT)
+def _gamma(count: Any, unit: float | None = None) -> Any:
+    """What ``count`` roundings, in float32 unless said otherwise, may change, relatively."""
+    unit = UNIT if unit is None else unit
+    return count * unit / (1.0 - count * unit)
 
 
 def _outward(value: Tensor, side: float) -> Tensor:
-    """The float32 neighbour on one side; zero stays."""
+    """The float32 neighbour on one side, half a unit away at least; zero stays."""
     near = value.float()
     return torch.where(value == 0.0, near, torch.nextafter(near, torch.full_like(near, side * torch.inf)))

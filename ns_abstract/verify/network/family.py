@@ -234,7 +234,8 @@ class _Other(_Cells):
 
     def _lent(self, k: int) -> tuple[np.ndarray, np.ndarray]:
         shape = self.network.shape(k)
-        return self.first.lines[k][0, 0].reshape(shape), self.first.lines[k][3, 0].reshape(shape)
+        lines = self.first.passages[0].lines[k]
+        return lines[0, 0].reshape(shape), lines[3, 0].reshape(shape)
 
     def _column(self, at: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """What rows on the output of node ``at`` are multiplied by, [n, m k], and what their sizes are, [n, m l + 1].
@@ -264,7 +265,7 @@ class _Other(_Cells):
                 signed = [*(0.5 * (x + y) for x, y in pairs), 0.5 * (half - least)]
                 sized = [*(0.5 * (x - y) for x, y in pairs), 0.5 * (half + least)]
             else:
-                sized = [self.noise[at].reshape(m, -1).numpy()]
+                sized = [self.passages[0].noise[at].reshape(m, -1).numpy()]
             most = np.sum([np.abs(v) for v in (*signed, *sized)], axis=0).max(axis=0)
             n = len(most)
             one, two = (np.reshape(v, (-1, n)).T for v in (signed, sized))
@@ -308,9 +309,9 @@ class _Other(_Cells):
         tilts, gathered = tilted[:d], tilted[d]
         slopes, middle, moved = signed[:d] + tilts, signed[d] + gathered, signed[d + 1] + gathered
         low, high = lent.fixed.T
-        if index in self.noise:
+        if self._rounds(index):
             # what a row gathers where it starts
-            lost += self.noise[index].reshape(m, -1).numpy()[:, lent.flat]
+            lost += self.passages[0].noise[index].reshape(m, -1).numpy()[:, lent.flat]
         spread = spread + 0.5 * (high - low) + lost + self.flush[:, None]
         middle, moved = middle + 0.5 * (low + high), moved + 0.5 * (low + high)
         half, box = half[0] + spread, half[1] + spread + np.abs(tilts).sum(0)

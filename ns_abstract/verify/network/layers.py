@@ -107,6 +107,9 @@ class Convolution(Linear):
 
     @cached_property
     def _phases(self) -> Tensor | None:
+        return self._parts(self._single)
+
+    def _parts(self, weight: Tensor) -> Tensor | None:
         """Weights [s t Cin, Cout, kh', kw'] of the s x t parts of a transposed stride, or None where it has none.
 
         Row ``s i + a`` of the result is row i of part a: a convolution with every s-th row of the weights, which
@@ -115,28 +118,31 @@ class Convolution(Linear):
         (s, t), (kh, kw) = self.stride, self.weight.shape[2:]
         if (s, t) == (1, 1) or self.groups > 1 or self.dilation != (1, 1):
             return None
-        whole = functional.pad(self._single, (0, -kw % t, 0, -kh % s))
+        whole = functional.pad(weight, (0, -kw % t, 0, -kh % s))
         out, into, high, wide = whole.shape
         parts = whole.reshape(out, into, high // s, s, wide // t, t).permute(3, 5, 1, 0, 2, 4)
         return parts.reshape(s * t * into, out, high // s, wide // t).flip(2, 3).contiguous()
 
     def _transposed(self, value: Tensor) -> Tensor:
         """[R, Cout, h, w] back to [R, Cin, (h - 1) s + kh, (w - 1) t + kw]."""
-        phases = self._phases
+        single = value.dtype == torch.float32
+        weight = self._single if single else self.weight
+        phases = self._phases if single else self._parts(weight)
         if phases is None:
             return functional.conv_transpose2d(
-                value, self._single, stride=self.stride, groups=self.groups, dilation=self.dilation
+                value, weight, stride=self.stride, groups=self.groups, dilation=self.dilation
             )
         (s, t), (kh, kw) = self.stride, self.weight.shape[2:]
         if kh == kw == 1:
-            near = functional.conv2d(value, self._single.transpose(0, 1))
-            found = torch.zeros((*near.shape[:2], (near.shape[2] - 1) * s + 1, (near.shape[3] - 1) * t + 1))
+            near = functional.conv2d(value, weight.transpose(0, 1))
+            size = (near.shape[2] - 1) * s + 1, (near.shape[3] - 1) * t + 1
+            found = torch.zeros((*near.shape[:2], *size), dtype=value.dtype)
             found[:, :, ::s, ::t] = near
             return found
         high, wide = phases.shape[2:]
         found = functional.conv2d(value, phases, padding=(high - 1, wide - 1)).numpy()
         size = (value.shape[2] - 1) * s + kh, (value.shape[3] - 1) * t + kw
-        whole = np.empty((len(value), self.weight.shape[1], *size), np.float32)
+        whole = np.empty((len(value), self.weight.shape[1], *size), found.dtype)
         interleave(found, s, t, whole)
         return torch.from_numpy(whole)
 
@@ -171,9 +177,10 @@ class Convolution(Linear):
     def backward(self, rows: Rows) -> list[Rows]:
         if self._trims and rows.covers(self.shape):
             # nothing outside of the map is computed
+            value = torch.from_numpy(rows.value)
             whole = functional.conv_transpose2d(
-                torch.from_numpy(rows.value),
-                self._single,
+                value,
+                self._single if value.dtype == torch.float32 else self.weight,
                 padding=(self.pads[0], self.pads[1]),
                 groups=self.groups,
                 dilation=self.dilation,
@@ -212,7 +219,8 @@ class Matrix(Linear):
     def backward(self, rows: Rows) -> list[Rows]:
         whole = full(rows, self.shape, force=True)
         count = whole.value.shape[0]
-        value = torch.from_numpy(whole.value).reshape(count, *self.shape) @ self._single
+        value = torch.from_numpy(whole.value).reshape(count, *self.shape)
+        value = value @ (self._single if value.dtype == torch.float32 else self.weight)
         return [Rows.whole(value.numpy().reshape(count, *grid(self.input_shapes[0])))]
 
 
@@ -234,7 +242,8 @@ class Scale(Linear):
         return inputs[0] * self.factor.abs().to(inputs[0].dtype)
 
     def backward(self, rows: Rows) -> list[Rows]:
-        rows.scale(self.factor.float().expand(self.shape).reshape(grid(self.shape)).numpy())
+        factor = self.factor.expand(self.shape).reshape(grid(self.shape)).numpy()
+        rows.scale(factor.astype(rows.value.dtype))
         return [rows]
 
 
@@ -259,7 +268,7 @@ class Sum(Linear):
 
     def backward(self, rows: Rows) -> list[Rows]:
         # rows are changed in place further on, so every input gets its own
-        copies = [Rows(rows.value * np.float32(sign), rows.y, rows.x) for sign in self.signs[1:]]
+        copies = [Rows(rows.value * rows.value.dtype.type(sign), rows.y, rows.x) for sign in self.signs[1:]]
         if self.signs[0] < 0:
             np.negative(rows.value, out=rows.value)
         return [rows, *copies]
@@ -327,9 +336,10 @@ class Gather(Linear):
     def backward(self, rows: Rows) -> list[Rows]:
         whole = full(rows, self.shape, force=True)
         count = whole.value.shape[0]
-        value = torch.zeros((count, int(np.prod(self.input_shapes[0]))), dtype=torch.float32)
+        given = torch.from_numpy(whole.value).reshape(count, -1)
+        value = torch.zeros((count, int(np.prod(self.input_shapes[0]))), dtype=given.dtype)
         kept = self.index >= 0
-        value.index_add_(1, self.index[kept], torch.from_numpy(whole.value).reshape(count, -1)[:, kept])
+        value.index_add_(1, self.index[kept], given[:, kept])
         return [Rows.whole(value.numpy().reshape(count, *grid(self.input_shapes[0])))]
 
 

@@ -61,6 +61,11 @@ class Sparse(Linear):
         """[in, out] float32, for rows."""
         return self._matrix.t().float().coalesce()
 
+    def _rows(self, value: Tensor) -> Tensor:
+        """Rows [R, in] for ``value`` [R, out]."""
+        matrix = self._single if value.dtype == torch.float32 else self._matrix.t()
+        return torch.sparse.mm(matrix, value.T).T
+
     @cached_property
     def _absolute(self) -> Tensor:
         matrix = self._matrix
@@ -75,7 +80,7 @@ class Sparse(Linear):
     def backward(self, rows: Rows) -> list[Rows]:
         whole = full(rows, self.shape, force=True)
         count = whole.value.shape[0]
-        value = torch.sparse.mm(self._single, torch.from_numpy(whole.value).reshape(count, -1).T).T
+        value = self._rows(torch.from_numpy(whole.value).reshape(count, -1))
         return [Rows.whole(value.contiguous().numpy().reshape(count, *grid(self.input_shapes[0])))]
 
 
@@ -96,7 +101,7 @@ class Variance(Sparse):
     def backward(self, rows: Rows) -> list[Rows]:
         found = super().backward(rows)
         shape = (found[0].value.shape[0], *grid(self.input_shapes[1]))
-        return [*found, Rows.whole(np.zeros(shape, np.float32))]
+        return [*found, Rows.whole(np.zeros(shape, rows.value.dtype))]
 
 
 @dataclass(frozen=True, eq=False)
@@ -156,5 +161,6 @@ class TransposedConvolution(Linear):
         bottom, right = need[0] - top - value.shape[2], need[1] - left - value.shape[3]
         # negative pads cut what no input reaches
         value = functional.pad(value, (left, right, top, bottom))
-        found = functional.conv2d(value, self._single, None, self.stride, 0, self.dilation, self.groups)
+        weight = self._single if value.dtype == torch.float32 else self.weight
+        found = functional.conv2d(value, weight, None, self.stride, 0, self.dilation, self.groups)
         return [Rows.whole(found.numpy())]

@@ -1,8 +1,8 @@
 """Rows of coefficients on windows of a map: what passes backwards through a network (design.md, N5).
 
 A row is one linear function of the numbers at a node. In a convolutional network it depends on a window of
-the map only, its receptive field, so that is what is stored: ``value`` [R, C, h, w] float32 and the window's
-first row and column ``y``, ``x`` [R], which may lie outside the map. Coefficients outside mean nothing and
+the map only, its receptive field, so that is what is stored: ``value`` [R, C, h, w], float32 or float64, and the
+window's first row and column ``y``, ``x`` [R], which may lie outside the map. Coefficients outside mean nothing and
 are set to zero by whatever passes next.
 """
 
@@ -20,9 +20,10 @@ from ns_abstract.arithmetic.elementary import fma
 from ns_abstract.arithmetic.simd.intrinsics import advanced, pointer
 from ns_abstract.arithmetic.simd.lanes import load8, store, where
 
-Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
 Int64 = NDArray[np.int64]
+#: Rows are of either; kernels are compiled for both.
+Floats = NDArray[np.floating[Any]]
 
 
 def grid(shape: tuple[int, ...]) -> tuple[int, int, int]:
@@ -36,7 +37,7 @@ def grid(shape: tuple[int, ...]) -> tuple[int, int, int]:
 class Rows:
     """Windows of rows; see the module."""
 
-    value: Float32
+    value: Floats
     y: Int64
     x: Int64
 
@@ -48,7 +49,7 @@ class Rows:
         return Rows(self.value[chosen], self.y[chosen], self.x[chosen])
 
     @staticmethod
-    def whole(value: Float32) -> Rows:
+    def whole(value: Floats) -> Rows:
         """Rows that cover their map [R, C, H, W]."""
         zero = np.zeros(value.shape[0], np.int64)
         return Rows(np.ascontiguousarray(value), zero, zero)
@@ -57,8 +58,8 @@ class Rows:
         """Whether the rows are those of the whole map of ``shape``."""
         return self.value.shape[1:] == grid(shape) and not (self.y.any() or self.x.any())
 
-    def scale(self, factor: Float32) -> None:
-        """Multiply by ``factor`` [C, H, W] in place."""
+    def scale(self, factor: Floats) -> None:
+        """Multiply by ``factor`` [C, H, W], of the rows' type, in place."""
         _scale(self.value, self.y, self.x, factor)
 
 
@@ -76,7 +77,7 @@ def join(one: Rows, two: Rows, shape: tuple[int, ...]) -> Rows:
     height, width = max(h, int(dy[0]) + h2) - top, max(w, int(dx[0]) + w2) - left
     target = one.value
     if (height, width) != (h, w):
-        target = np.zeros((*one.value.shape[:2], height, width), np.float32)
+        target = np.zeros((*one.value.shape[:2], height, width), one.value.dtype)
         target[:, :, -top : h - top, -left : w - left] = one.value
     row, column = int(dy[0]) - top, int(dx[0]) - left
     target[:, :, row : row + h2, column : column + w2] += two.value
@@ -85,7 +86,7 @@ def join(one: Rows, two: Rows, shape: tuple[int, ...]) -> Rows:
 
 def shifted(rows: Rows, height: int, width: int) -> Rows:
     """The same rows on the whole map."""
-    value = np.zeros((*rows.value.shape[:2], height, width), np.float32)
+    value = np.zeros((*rows.value.shape[:2], height, width), rows.value.dtype)
     _place(rows.value, rows.y, rows.x, value)
     return Rows.whole(value)
 
@@ -198,7 +199,7 @@ def pass_activation(value, y, x, cell, lines, total):
 
     Args:
         value, y, x, cell: Rows and which cell each belongs to [R].
-        lines: [6, m, C, H, W] float32: slope, lower and upper offset for coefficients that are not negative;
+        lines: [6, m, C, H, W] of the rows' type: slope, lower and upper offset for coefficients that are not negative;
             slope, upper and lower offset for negative ones.
         total: [R, 2] gathers what the rows are at least and at most.
     """
