@@ -14,8 +14,9 @@ from onnx_files import OnnxFile, attack, image_sets, session
 
 from ns_abstract.verify.network import bound_outputs, load_network
 from ns_abstract.verify.network import curves as curve_module
-from ns_abstract.verify.network.maps import Sparse, TransposedConvolution
+from ns_abstract.verify.network.maps import Differences, Sparse, TransposedConvolution
 from ns_abstract.verify.network.products import Plane, Product
+from ns_abstract.verify.network.rows import Rows, grid
 
 SHAPE = (3, 6, 6)
 Build = Callable[[OnnxFile], object]
@@ -332,6 +333,30 @@ def test_attack_catches(mutant: str, tmp_path: Path, monkeypatch: pytest.MonkeyP
     assert hold()
     mutate(monkeypatch)
     assert not hold()
+
+
+@pytest.mark.parametrize(("shape", "axis"), [((4,), 0), ((3, 2), 0), ((3, 2), 1), ((2, 3, 4), 1), ((5, 1), 1)])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_differences_are_those_of_the_matrix(shape: tuple[int, ...], axis: int, dtype: torch.dtype) -> None:
+    count, size = shape[axis], int(np.prod(shape))
+    layer = Differences((shape,), (*shape, count), count + 4, 2 * count, axis)
+    # by the definition, entry by entry
+    matrix = np.zeros((size * count, size))
+    for place in np.ndindex(*shape):
+        for j in range(count):
+            other = (*place[:axis], j, *place[axis + 1 :])
+            row = np.ravel_multi_index((*place, j), (*shape, count))
+            matrix[row, np.ravel_multi_index(other, shape)] += 1.0
+            matrix[row, np.ravel_multi_index(place, shape)] -= 1.0
+    rng = np.random.default_rng(0)
+    # small whole numbers: sums are exact
+    x = torch.from_numpy(rng.integers(-9, 9, (2, *shape)).astype(np.float64))
+    value = rng.integers(-9, 9, (3, size * count)).astype(np.float32 if dtype == torch.float32 else np.float64)
+    assert (layer.apply([x]).flatten(1).numpy() == x.flatten(1).numpy() @ matrix.T).all()
+    assert (layer.magnitude([x.abs()]).flatten(1).numpy() == x.abs().flatten(1).numpy() @ np.abs(matrix).T).all()
+    (found,) = layer.backward(Rows.whole(value.reshape(3, *grid(layer.shape))))
+    assert found.value.dtype == value.dtype
+    assert (found.value.reshape(3, -1) == value @ matrix).all()
 
 
 def test_two_outputs_stand_one_after_the_other(tmp_path: Path) -> None:

@@ -25,7 +25,7 @@ from ns_abstract.verify.network.layers import (
     Sum,
     Tanh,
 )
-from ns_abstract.verify.network.maps import Sparse, TransposedConvolution, Variance
+from ns_abstract.verify.network.maps import Differences, Sparse, TransposedConvolution, Variance
 from ns_abstract.verify.network.maxima import MaxPool
 from ns_abstract.verify.network.products import Product
 
@@ -477,26 +477,8 @@ class Composer(Builder):
         """``1 / sum_j exp(x_j - x_i)`` along an axis of the item, or its logarithm (N11)."""
         shape = self.shape(x)
         count = shape[axis]
-        self._check_size((*shape, count))
-        self.reserve(8.0 * float(np.prod(shape)) * count)
-        positions = np.arange(int(np.prod(shape))).reshape(shape)
-        own = np.broadcast_to(positions[..., None], (*shape, count))
-        others = np.broadcast_to(
-            np.moveaxis(positions, axis, -1)[..., None, :], (*np.moveaxis(positions, axis, -1).shape, count)
-        )
-        others = np.moveaxis(others, -2, axis)
-        to = np.arange(own.size).reshape(own.shape)
-        apart = own != others
-        layer = Sparse(
-            (shape,),
-            (*shape, count),
-            # a program subtracts the greatest first
-            count + 4,
-            2 * count,
-            torch.from_numpy(np.concatenate([to[apart], to[apart]])),
-            torch.from_numpy(np.concatenate([others[apart], own[apart]])),
-            torch.cat([torch.ones(int(apart.sum())), -torch.ones(int(apart.sum()))]).double(),
-        )
+        # a program subtracts the greatest first
+        layer = Differences((shape,), (*shape, count), count + 4, 2 * count, axis % len(shape))
         powers = self.curve(self._add(layer, x), curves.Exp)
         total = self.reduce(powers, [len(shape)], False, False)
         if logarithm:

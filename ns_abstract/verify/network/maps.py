@@ -1,6 +1,6 @@
-"""Linear layers beside those of `ns_abstract.verify.network.layers`: sparse matrices, transposed convolutions.
+"""Linear layers of few numbers: sparse matrices, differences, transposed convolutions.
 
-See docs/design.md, N11.
+See docs/design.md, N11; the plain ones are in `ns_abstract.verify.network.layers`.
 """
 
 from __future__ import annotations
@@ -102,6 +102,46 @@ class Variance(Sparse):
         found = super().backward(rows)
         shape = (found[0].value.shape[0], *grid(self.input_shapes[1]))
         return [*found, Rows.whole(np.zeros(shape, rows.value.dtype))]
+
+
+@dataclass(frozen=True, eq=False)
+class Differences(Linear):
+    """``x_j - x_i`` for all i and j along an axis of the item: j is a new last axis; zero where they are the same.
+
+    As a sparse matrix they would take some hundred bytes each.
+
+    Attributes:
+        axis: The axis of the item.
+    """
+
+    axis: int = 0
+    mixes: ClassVar[bool] = True
+
+    @cached_property
+    def _apart(self) -> Tensor:
+        """[*shape] 0 where i and j are the same, else 1; a view of few numbers."""
+        ones = [1] * len(self.input_shapes[0])
+        count = ones[self.axis] = self.shape[-1]
+        return (1.0 - torch.eye(count, dtype=torch.float64)).reshape(*ones, count)
+
+    def _others(self, x: Tensor) -> Tensor:
+        """x_j at i and j."""
+        last = x.movedim(self.axis + 1, -1)
+        return last[..., None, :].expand(*last.shape, last.shape[-1]).movedim(-2, self.axis + 1)
+
+    def apply(self, inputs: Sequence[Tensor]) -> Tensor:
+        return self._others(inputs[0]) - inputs[0][..., None]
+
+    def magnitude(self, inputs: Sequence[Tensor]) -> Tensor:
+        return (self._others(inputs[0]) + inputs[0][..., None]) * self._apart.to(inputs[0].dtype)
+
+    def backward(self, rows: Rows) -> list[Rows]:
+        whole = full(rows, self.shape, force=True)
+        count = whole.value.shape[0]
+        value = torch.from_numpy(whole.value).reshape(count, *self.shape)
+        value = value * self._apart.to(value.dtype)
+        found = value.sum(self.axis + 1).movedim(-1, self.axis + 1) - value.sum(-1)
+        return [Rows.whole(found.contiguous().numpy().reshape(count, *grid(self.input_shapes[0])))]
 
 
 @dataclass(frozen=True, eq=False)

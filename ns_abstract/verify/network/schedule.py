@@ -23,7 +23,7 @@ from ns_abstract.verify.network.layers import (
     Scale,
     Sum,
 )
-from ns_abstract.verify.network.maps import Sparse, TransposedConvolution
+from ns_abstract.verify.network.maps import Differences, Sparse, TransposedConvolution
 from ns_abstract.verify.network.maxima import MaxPool
 from ns_abstract.verify.network.products import Product
 from ns_abstract.verify.network.rows import grid
@@ -210,8 +210,9 @@ class Costs:
             elif isinstance(layer, TransposedConvolution):
                 total += float(np.prod(layer.input_shapes[0])) * float(np.prod(layer.weight.shape[1:]))
                 whole = True
-            elif isinstance(layer, Sparse):
-                total += _PASSING * float(layer.weight.numel())
+            elif isinstance(layer, (Sparse, Differences)):
+                entries = layer.weight.numel() if isinstance(layer, Sparse) else 2 * int(np.prod(layer.shape))
+                total += _PASSING * float(entries)
                 whole = True
             elif not isinstance(layer, _WINDOWED):
                 assert isinstance(layer, Linear)
@@ -257,6 +258,9 @@ class Costs:
                 weight, count = layer.weight, float(np.prod(layer.shape))
             elif isinstance(layer, Scale):
                 weight, count = layer.factor, float(layer.factor.numel())
+            elif isinstance(layer, Differences):
+                found.append((2.0, 2.0))
+                continue
             else:
                 part = _ACTIVE if isinstance(layer, Activation) else 1.0
                 found.append((part, part))
