@@ -85,8 +85,8 @@ VERDICTS = (
         "network: rounding is charged at the middle of a set alone",
         _NETWORK,
         "_Cells._combine",
-        "torch.maximum(f.interval.spread, f.reference.abs())",
-        "f.reference.abs() + 0.0 * f.interval.spread",
+        "torch.maximum(sized.interval.spread, sized.reference.abs())",
+        "sized.reference.abs() + 0.0 * sized.interval.spread",
         "test_network_rounding.py::test_rounding_counts_the_largest_image_of_a_set",
     ),
     Fault(
