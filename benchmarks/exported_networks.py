@@ -516,7 +516,6 @@ def measure(name: str, exporter: str, runs: int, width: float, arithmetic: Netwo
             outputs = session.run(None, {entry: x.astype(np.float32).reshape(1, *shape)})
             return np.concatenate([np.asarray(v).reshape(-1) for v in outputs]).astype(np.float64)
 
-        ranges = {}
         for kind, chosen in (
             ("random", random_runs(runs, d=a.shape[1], n=network.input_size)),
             ("searched", searched_runs(network, shape, middle, a, rows)),
@@ -527,11 +526,11 @@ def measure(name: str, exporter: str, runs: int, width: float, arithmetic: Netwo
                 y = rows @ output(a @ p + middle + 0.999 * slack * t)
                 least, done = np.minimum(least, y), done + 1
                 outside += int((y < lower).sum() + (y < bounds.a[0] @ p + bounds.b[0]).sum())
-            ranges[kind] = (least[:k] + least[k:]) * -0.5
             found[kind] = {"runs": done, "outside": outside}
-            moves = ranges[kind] > 0.0
+            spread = (least[:k] + least[k:]) * -0.5
+            moves = spread > 0.0
             if moves.any():
-                ratios = ((lower[:k] + lower[k:]) * -0.5)[moves] / ranges[kind][moves]
+                ratios = ((lower[:k] + lower[k:]) * -0.5)[moves] / spread[moves]
                 found[kind]["ratio"] = float(f"{np.median(ratios):.3g}")
         return found
 

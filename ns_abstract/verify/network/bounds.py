@@ -620,8 +620,9 @@ class _Cells:
         if fold:
             self.folded.add(source)
         if self.slope_steps and isinstance(layer, LeakyRelu):
-            loose = (_SPARE + self.network.readers[source]) * UNIT * z.width
-            loose = loose + (self.passages[0].noise[source] if fold else 0.0)
+            first = self.passages[0]
+            loose = (_SPARE + self.network.readers[source]) * first.unit * z.width
+            loose = loose + (first.noise[source] if fold else 0.0)
             given = (lower, upper, z.reference, reference, loose, room + torch.zeros_like(lower))
             self.open[k] = _open_units(layer, given)
         lost = int(np.prod(layer.shape)) * 2 * _FLUSH
@@ -757,12 +758,14 @@ class _Cells:
             most[at] = torch.minimum(most[at], own_upper[at] + top)
         grown = (m, *shape)
         chosen_slopes = torch.cat(slopes) if slopes else torch.zeros((0, len(layer.steps)))
+        followed = winner[:, :, 0].reshape(grown).numpy().astype(np.int16)
+        rows_of_slopes = which.reshape(grown).numpy().astype(np.int32)
         for passage, offset in zip(self.passages, offsets, strict=True):
             sides = zip(offset, (-1.0, 1.0, 1.0, -1.0), strict=True)
             outward = [self._outward(v, side, passage) for v, side in sides]
             passage.maxima[k] = _Maxima(
-                winner[:, :, 0].reshape(grown).numpy().astype(np.int16),
-                which.reshape(grown).numpy().astype(np.int32),
+                followed,
+                rows_of_slopes,
                 chosen_slopes.to(passage.dtype).numpy(),
                 torch.stack(outward).reshape(4, *grown).numpy(),
             )
