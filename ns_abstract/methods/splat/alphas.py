@@ -1,7 +1,8 @@
 """Alphas as forms: one Gaussian on some pixels of a block, eight at a time (design.md, B1-B4).
 
 The exponent is half the sum of two squares, y1 = P ax - Q ay - W1 and y2 = S ay - W2, and K where opacity is
-compensated, of forms that the Gaussian's record holds. For one parameter the forms have order 2, else 1.
+compensated, of forms that the Gaussian's record holds. For one parameter its forms have order 2, else 1;
+alpha's have order 2 always (B10).
 """
 
 from __future__ import annotations
@@ -48,7 +49,13 @@ class _Limits(NamedTuple):
 
 
 class _Exponent(NamedTuple):
-    """Exponents of eight pixels: bounds, the form's centre and radius, sums of its absolute coefficients by order."""
+    """Exponents of eight pixels.
+
+    Attributes:
+        low, high: Bounds.
+        center, radius: Of the form.
+        slope, bend: Sizes of its linear and quadratic parts.
+    """
 
     low: Any
     high: Any
@@ -61,7 +68,7 @@ class _Exponent(NamedTuple):
 class _Alpha(NamedTuple):
     """Alphas of eight pixels: bounds, the form's centre and radius.
 
-    The form's coefficients are ``weight`` times the exponent's; order 2 adds ``curve`` times its linear part squared.
+    The form's coefficients are ``weight`` times the exponent's, and ``curve`` times those of its linear part squared.
     """
 
     low: Any
@@ -168,7 +175,7 @@ def _quadratic_alphas(record, begin, n, given, block, limits, charges, antialias
             # alpha stays below the threshold
             continue
         high = minimum(high, s0 + top + radius + rounding)
-        alpha = _fitted_exponential(_Exponent(low, high, s0, radius, slope, bend), limits, charges, 1.0)
+        alpha = _fitted_exponential(_Exponent(low, high, s0, radius, slope, bend), limits, charges)
         bent = fma(alpha.weight, quadratic, alpha.curve * (linear * linear))
         # the columns between alpha's bounds and its form are set later
         store_columns(
@@ -212,14 +219,36 @@ def _affine_forms(record, m, antialiased):
 
 
 @njit(cache=True, error_model="numpy", forceinline=True)
-def _affine_exponent(record, f, ax, ay, rows, m, antialiased):
-    """The `_Exponent` of pixels at offsets ``ax``, ``ay`` (design.md, B1-B2); ``rows`` [., 8] receives its slopes."""
-    stride = m + 1
+def _store_fragments(rows, alpha, values, at, width, m):
+    """Write eight fragments from their ``alpha``; ``rows`` [., 8] hold the exponent's slopes and alpha's curvature."""
+    store(rows, 8 * ALPHA_LOW, alpha.low)
+    store(rows, 8 * ALPHA_HIGH, alpha.high)
+    store(rows, 8 * FORM, alpha.center)
+    store(rows, 8 * (FORM + m), alpha.radius)
+    for k in range(FORM + 1, FORM + m):
+        store(rows, 8 * k, alpha.weight * load8(rows, 8 * k))
+    for k in range(0, width, 8):
+        row = 8 * k
+        store_columns(
+            values, at + k, width,
+            (
+                load8(rows, row), load8(rows, row + 8), load8(rows, row + 16), load8(rows, row + 24),
+                load8(rows, row + 32), load8(rows, row + 40), load8(rows, row + 48), load8(rows, row + 56),
+            ),
+        )  # fmt: skip
+
+
+@njit(cache=True, error_model="numpy", forceinline=True)
+def _exponent_of_several(record, f, ax, ay, rows, scratch, m, antialiased):
+    """The `_Exponent` of pixels at offsets ``ax``, ``ay`` (design.md, B1-B2, B10).
+
+    ``rows`` [., 8] receives its slopes and behind the radius its curvature; ``scratch`` is the first that is free.
+    """
+    stride, bends = m + 1, 8 * (FORM + m + 1)
     c1 = fma(f.p, ax, -fma(f.q, ay, f.w1))
     c2 = fma(f.s, ay, -f.w2)
     l1 = 0.0 * ax
-    l2 = 0.0 * ax
-    sl = 0.0 * ax
+    l2, sl, bend = l1, l1, l1
     for k in range(1, m):
         g1 = fma(record[FORMS + k], ax, -fma(record[FORMS + stride + k], ay, record[FORMS + 3 * stride + k]))
         g2 = fma(record[FORMS + 2 * stride + k], ay, -record[FORMS + 4 * stride + k])
@@ -227,67 +256,72 @@ def _affine_exponent(record, f, ax, ay, rows, m, antialiased):
         if antialiased:
             slope = slope + record[FORMS + 5 * stride + k]
         store(rows, 8 * (FORM + k), slope)
+        store(rows, scratch + 16 * k, g1)
+        store(rows, scratch + 16 * k + 8, g2)
         l1 = l1 + abs(g1)
         l2 = l2 + abs(g2)
         sl = sl + abs(slope)
+    for j in range(1, m):
+        g1, g2 = load8(rows, scratch + 16 * j), load8(rows, scratch + 16 * j + 8)
+        for k in range(j, m):
+            curve = fma(g1, load8(rows, scratch + 16 * k), g2 * load8(rows, scratch + 16 * k + 8))
+            if j == k:
+                curve = 0.5 * curve
+            store(rows, bends, curve)
+            bend = bend + abs(curve)
+            bends += 8
     c1 = abs(c1)
     c2 = abs(c2)
     r1 = f.p_radius * abs(ax) + f.q_radius * abs(ay) + f.w1_radius + FRAGMENT_ROUNDING * l1
     r2 = f.s_radius * abs(ay) + f.w2_radius + FRAGMENT_ROUNDING * l2
     s0 = 0.5 * (c1 * c1 + c2 * c2)
-    # (g.p)^2 / 2 lies in [0, l^2 / 2]: half centre, half radius
-    curve = 0.25 * (l1 * l1 + l2 * l2)
+    bend = bend * UP
     e1 = l1 + r1
     e2 = l2 + r2
-    center = s0 + curve + f.k
+    center = s0 + f.k
     first = fma(c1, r1, r1 * (l1 + 0.5 * r1))
     second = fma(c2, r2, r2 * (l2 + 0.5 * r2))
-    size = fma(c1, e1, fma(c2, e2, s0)) + f.k_high
-    radius = (first + second + (curve + fma(FRAGMENT_ROUNDING, size, f.k_radius))) * UP
+    size = fma(c1, e1, fma(c2, e2, s0)) + f.k_high + bend
+    radius = (first + second + fma(FRAGMENT_ROUNDING, size, f.k_radius)) * UP
     low, high = _square_sum_range(c1, c2, e1, e2, f.k_low, f.k_high)
-    spread = (sl + radius + FRAGMENT_ROUNDING * center) * UP
-    return _Exponent(maximum(low, center - spread), minimum(high, center + spread), center, radius, sl, 0.0 * sl)
+    # half a sum of squares is not negative
+    spread = (sl + radius + FRAGMENT_ROUNDING * (center + bend)) * UP
+    return _Exponent(
+        maximum(low, center - spread), minimum(high, center + (spread + bend) * UP), center, radius, sl, bend
+    )
 
 
 @njit(cache=True, error_model="numpy", forceinline=True)
-def _affine_alphas(record, begin, n, given, block, limits, charges, antialiased, m):
-    """`alphas` for order 1 and any number of parameters."""
+def _alphas_of_several(record, begin, n, given, block, limits, charges, antialiased, m):
+    """`alphas` for several parameters, or none: curvature of forms of order 1 (design.md, B10)."""
     batch, rows, values, width = block.batch, block.batch.rows, block.fragments.values, block.fragments.width
     forms = _affine_forms(record, m, antialiased)
     found = 0
     for q in range(0, n, 8):
         ax = load8(batch.offset_x, begin + q)
         ay = load8(batch.offset_y, begin + q)
-        exponent = _affine_exponent(record, forms, ax, ay, rows, m, antialiased)
-        alpha = _fitted_exponential(exponent, limits, charges, 0.0)
+        exponent = _exponent_of_several(record, forms, ax, ay, rows, 8 * width, m, antialiased)
+        alpha = _fitted_exponential(exponent, limits, charges)
         reached = _ALL - bits(alpha.high < limits.alpha_min)
         if reached == 0:
             continue
         found |= reached << q
-        store(rows, 8 * ALPHA_LOW, alpha.low)
-        store(rows, 8 * ALPHA_HIGH, alpha.high)
-        store(rows, 8 * FORM, alpha.center)
-        store(rows, 8 * (FORM + m), alpha.radius)
-        for k in range(FORM + 1, FORM + m):
-            store(rows, 8 * k, alpha.weight * load8(rows, 8 * k))
-        for k in range(0, width, 8):
-            at = 8 * k
-            store_columns(
-                values, given + q * width + k, width,
-                (
-                    load8(rows, at), load8(rows, at + 8), load8(rows, at + 16), load8(rows, at + 24),
-                    load8(rows, at + 32), load8(rows, at + 40), load8(rows, at + 48), load8(rows, at + 56),
-                ),
-            )  # fmt: skip
+        at = 8 * (FORM + m + 1)
+        for j in range(1, m):
+            slope = alpha.curve * load8(rows, 8 * (FORM + j))
+            for k in range(j, m):
+                square = slope * load8(rows, 8 * (FORM + k))
+                if j < k:
+                    square = 2.0 * square
+                store(rows, at, fma(alpha.weight, load8(rows, at), square))
+                at += 8
+        _store_fragments(rows, alpha, values, given + q * width, width, m)
     return found
 
 
 @njit(cache=True, error_model="numpy", forceinline=True)
-def _fitted_exponential(sigma, limits, charges, quadratic):
-    """The `_Alpha` opacity exp(-sigma) of an `_Exponent`, with its thresholds (design.md, B3-B4).
-
-    ``quadratic`` is 1 for forms of order 2, else 0.
-    """
+def _fitted_exponential(sigma, limits, charges):
+    """The `_Alpha` opacity exp(-sigma) of an `_Exponent`, with its thresholds (design.md, B3-B4)."""
     opacity_low, opacity_high, kappa, alpha_max = (
         limits.opacity_low, limits.opacity_high, limits.kappa, limits.alpha_max,
     )  # fmt: skip
@@ -307,7 +341,7 @@ def _fitted_exponential(sigma, limits, charges, quadratic):
     slack = slack + 4.0 * EXP_RELATIVE_ERROR
     a_high = opacity_high * e_low * (1.0 + slack)
     a_low = fits * (opacity_low * e_low * (e_half * e_half) * (1.0 - slack))
-    # exp(-t) = k0 - k1 t + k2 t^2 +- fit over |t| <= half (design.md, B3)
+    # exp(-t) = k0 - k1 t + j2 t^2 +- fit over |t| <= half (design.md, B3)
     h = 0.5 * half
     x = h * h
     x2 = x * x
@@ -315,18 +349,17 @@ def _fitted_exponential(sigma, limits, charges, quadratic):
     k1 = fma(x, fma(x, fma(x, fma(x, 1.0 / 2880.0, 1.0 / 144.0), 1.0 / 12.0), 0.5), 1.0)
     j2 = fma(x, fma(x, fma(x, fma(x, 1.0 / 17280.0, 1.0 / 720.0), 1.0 / 48.0), 1.0 / 6.0), 0.5)
     fit = (h * x) * (1.0 / 3.0) * fma(x, fma(x, 1.0 / 24.0, 0.25), 1.0) * fma(x, 1.0 / 15.0, fma(h, 0.25, 1.0))
-    fit = fma(1.2e-4 * x, x2 * x2, fma(1.0 - quadratic, 2.0 * x * j2, fit))
-    k0 = i0 - quadratic * (2.0 * x * j2)
-    k2 = quadratic * j2
+    fit = fma(1.2e-4 * x, x2 * x2, fit)
+    k0 = i0 - 2.0 * x * j2
     t0 = sigma.center - (low + half)
     scale = opacity * (e_low * e_half)
-    weight = fma(2.0 * k2, t0, -k1)
+    weight = fma(2.0 * j2, t0, -k1)
     spread = sr + l + b
     size = fma(abs(t0), 4.0 + abs(t0), fma(spread, 1.0 + spread, 4.0))
     bent = fma(b, fma(2.0, l, b), sr * fma(2.0, l + b, sr))
-    error = fma(abs(weight), sr, fma(k2, bent, fma(FRAGMENT_ROUNDING + 2.0 * EXP_RELATIVE_ERROR, size, fit)))
+    error = fma(abs(weight), sr, fma(j2, bent, fma(FRAGMENT_ROUNDING + 2.0 * EXP_RELATIVE_ERROR, size, fit)))
     radius = fma(scale, error, 1.01 * e_low * fma(opacity_high, slack, opacity_spread))
-    center = scale * fma(t0, fma(k2, t0, -k1), k0)
+    center = scale * fma(t0, fma(j2, t0, -k1), k0)
     # alpha_max
     excess = maximum(0.0, a_high - alpha_max)
     a_high = minimum(a_high, alpha_max * (1.0 + charges.threshold))
@@ -345,7 +378,7 @@ def _fitted_exponential(sigma, limits, charges, quadratic):
     keep = where(radius < flat, fits * limits.sure, 0.0)
     center = where(keep == 1.0, center, 0.5 * (a_high + a_low))
     radius = where(keep == 1.0, radius, flat * UP)
-    return _Alpha(a_low, a_high, center, radius, keep * (scale * weight), keep * (scale * k2))
+    return _Alpha(a_low, a_high, center, radius, keep * (scale * weight), keep * (scale * j2))
 
 
 @njit(cache=True, error_model="numpy", forceinline=True)
@@ -363,7 +396,7 @@ def alphas(record, begin, n, given, sure, block, inputs):
         high = min(record[OPACITY_HIGH], rules.alpha_max) * (1.0 + charges.threshold)
         if high >= alpha_min:
             for q in range(n):
-                set_unknown(block.fragments.values, given + q * block.fragments.width, high, shape.monomials)
+                set_unknown(block.fragments, given + q * block.fragments.width, high, shape.monomials)
             found = -1
     else:
         # G12: what may miss its tile by rounding is hardly above the threshold
@@ -376,6 +409,8 @@ def alphas(record, begin, n, given, sure, block, inputs):
         if shape.order == 2:
             found = _quadratic_alphas(record, begin, n, given, block, limits, charges, rules.antialiased)
         else:
-            found = _affine_alphas(record, begin, n, given, block, limits, charges, rules.antialiased, shape.monomials)
+            found = _alphas_of_several(
+                record, begin, n, given, block, limits, charges, rules.antialiased, shape.monomials
+            )
     # not the lanes in excess
     return signed(found & ((2 << (int(n) - 1)) - 1))

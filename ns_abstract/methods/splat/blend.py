@@ -267,57 +267,100 @@ def blend_quadratic(begin, end, fragments, palette, moves, t):
 
 
 @njit(cache=True, error_model="numpy", forceinline=True)
-def _step_affine(r, at, key, fragments, palette, t, m):
-    """One fragment over the polynomials ``t`` [m, 4] of order 1 and radius ``r`` (design.md, B7); the new radius."""
+def _step_of_several(r, at, key, fragments, palette, t, u, m):
+    """One fragment over polynomials and radii ``r``; returns the new radii (design.md, B7, B10).
+
+    ``t`` [m + bends, 4] holds the coefficients of order 0 and 1, then those of products of two parameters; ``u`` [m, 4]
+    is scratch.
+    """
     values, colors, forms = fragments.values, palette.values, palette.forms
     moving = forms > 1
-    a0 = values[at + FORM]
+    form = advanced(values, at + FORM)
+    bends = advanced(form, m + 1)
+    a0 = form[0]
     p0 = load4(t, 0)
     value = load4(colors, key) - p0
-    middle = fma(a0, value, p0)
     steep = 0.0
     change_size = 0.0 * p0
-    curves = 0.0 * p0
     for k in range(1, m):
         slope = load4(t, 4 * k)
-        alpha = values[at + FORM + k]
         change = -slope
         if moving:
             change = load4(colors, key + 4 * k) - slope
-        # half of a product of two slopes goes to the centre, half to the radius
-        curve = 0.5 * (alpha * change)
-        store(t, 4 * k, fma(a0, change, fma(alpha, value, slope)))
-        middle = middle + curve
-        curves = curves + abs(curve)
-        steep += abs(alpha)
+        store(u, 4 * k, change)
+        store(t, 4 * k, fma(a0, change, fma(form[k], value, slope)))
+        steep += abs(form[k])
         change_size = change_size + abs(change)
+    middle = fma(a0, value, p0)
     store(t, 0, middle)
-    size = abs(value) + change_size
-    added = fma(values[at + ALPHA_HIGH], load4(colors, key + 4 * forms), fma(steep, change_size, -curves))
-    added = fma(values[at + FORM + m], size, fma(FRAGMENT_ROUNDING, fma(1.0 + steep, size, abs(middle)), added))
+    curved = 0.0 * p0
+    bent = 0.0
+    pair = 0
+    for j in range(1, m):
+        change, a = load4(u, 4 * j), form[j]
+        for k in range(j, m):
+            curve = load4(t, 4 * (m + pair))
+            product = a * load4(u, 4 * k)
+            if j < k:
+                product = fma(form[k], change, product)
+            store(t, 4 * (m + pair), fma(-a0, curve, fma(bends[pair], value, curve + product)))
+            curved = curved + abs(curve)
+            bent += abs(bends[pair])
+            pair += 1
+    size = abs(value) + change_size + curved
+    dropped = fma(steep, curved, bent * (change_size + curved))
+    added = fma(values[at + ALPHA_HIGH], load4(colors, key + 4 * forms), dropped)
+    added = fma(form[m], size, fma(FRAGMENT_ROUNDING, fma(1.0 + steep + bent, size, abs(middle)), added))
     return fma(1.0 - values[at + ALPHA_LOW], r, added)
 
 
 @njit(cache=True, error_model="numpy", forceinline=True)
-def blend_affine(begin, end, fragments, palette, moves, t, m):
-    """`blend_quadratic` for order 1 and any number of parameters."""
+def _flattened(t, r, m):
+    """Put the range of the curvature behind the polynomials ``t`` into their centres and the radii ``r`` (B10)."""
+    low = 0.0 * r
+    high, size = low, low
+    for j in range(1, m):
+        own, shared = 0.0 * r, 0.0 * r
+        pair = m
+        for i in range(1, m):
+            for k in range(i, m):
+                if i == j and k == j:
+                    own = load4(t, 4 * pair)
+                elif i == j or k == j:
+                    # |p_i p_k| is at most half the sum of their squares
+                    shared = shared + 0.5 * abs(load4(t, 4 * pair))
+                pair += 1
+        low = low + minimum(0.0, own - shared)
+        high = high + maximum(0.0, own + shared)
+        size = size + abs(own) + shared
+    store(t, 0, load4(t, 0) + 0.5 * (low + high))
+    return r + 0.5 * (high - low) + 2.0 * FRAGMENT_ROUNDING * (abs(load4(t, 0)) + size)
+
+
+@njit(cache=True, error_model="numpy", forceinline=True)
+def blend_several(begin, end, fragments, palette, moves, t, m):
+    """`blend_quadratic` for several parameters, or none (design.md, B10).
+
+    ``t`` [m + bends, 4] receives the polynomials; the range of their curvature is part of centres and radii.
+    """
     values, colors, forms = fragments.values, palette.values, palette.forms
     p0 = load4(palette.background, 0)
     r = 0.0 * p0
     store(t, 0, p0)
-    for k in range(1, m):
+    u = advanced(t, 4 * (m + fragments.bends))
+    for k in range(1, m + fragments.bends):
         store(t, 4 * k, r)
     ends = _Ends(p0, p0, p0, p0)
     for entry in range(end - 1, begin - 1, -1):
         at, key, move = listed_fragment(fragments, entry, forms)
-        r = _step_affine(r, at, key, fragments, palette, t, m)
+        r = _step_of_several(r, at, key, fragments, palette, t, u, m)
         ends = _blend_interval(ends, values, at, colors, key + color_ends(forms))
         if move != 0:
             falls, rises = load4(moves, move), load4(moves, move + 4)
             store(t, 0, load4(t, 0) + 0.5 * (rises - falls))
             r = r + 0.5 * (rises + falls)
             ends = _Ends(ends.low - falls, ends.high + rises, ends.darkest, ends.brightest)
-    return r, ends
+    return _flattened(t, r, m), ends
 
 
 @njit(cache=True, error_model="numpy", forceinline=True)
@@ -378,8 +421,8 @@ def shade(left, above, reordered, block, inputs, bounds):
     lower, upper, linear, slopes = bounds.lower, bounds.upper, bounds.linear, bounds.slopes
     d, order, m = inputs.shape.dimensions, inputs.shape.order, inputs.shape.monomials
     # behind the polynomials: scratch, then sums of absolute linear coefficients
-    u = advanced(t, 4 * m)
-    sums = advanced(t, 4 * m + 16)
+    u = advanced(t, 4 * (m + fragments.bends))
+    sums = advanced(u, 4 * m + 16)
     scratch = _Scratch(u, block.entries.depth_radius, block.entries.first)
     for k in range(d):
         store(sums, 4 * k, 0.0 * load4(palette.background, 0))
@@ -389,7 +432,7 @@ def shade(left, above, reordered, block, inputs, bounds):
         if order == 2:
             r, ends = blend_quadratic(begin, end, fragments, palette, moves, t)
         else:
-            r, ends = blend_affine(begin, end, fragments, palette, moves, t, m)
+            r, ends = blend_several(begin, end, fragments, palette, moves, t, m)
         # the radius' own rounding: three for every fragment
         r = r * (UP + 4.0 * UNIT64 * fragments.lengths[q])
         form_low, form_high = form_range(t, r, order, m)

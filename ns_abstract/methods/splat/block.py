@@ -32,7 +32,7 @@ BATCH = 8
 TLO, THI, LAST, RHO, LOST, OPEN, HIDDEN, NUMBERS = range(0, 8 * PIXELS, PIXELS)
 ROWS = 8
 #: Columns of a fragment: bounds of alpha, transmittance behind it at its least and before it at its most, alpha's
-#: coefficients and then its radius.
+#: coefficients and then its radius; where curvature is kept (B10), coefficients of products of two parameters follow.
 ALPHA_LOW, ALPHA_HIGH, LEFT, LIGHT, FORM = range(5)
 #: Columns of an entry of a pixel's list: the fragment's number, its list position, its row of moves; one is spare.
 LISTED = 4
@@ -57,8 +57,10 @@ class Fragments(NamedTuple):
     """The fragments of a block's pixels.
 
     Attributes:
-        values: [PIXELS capacity, width] fragments; the columns are ALPHA_LOW .. FORM + m.
+        values: [PIXELS capacity, width] fragments; the columns are ALPHA_LOW .. FORM + m, and
+            ``bends`` more.
         width: Numbers of a fragment.
+        bends: Coefficients of products of two parameters that are kept beside forms of order 1.
         lists: [PIXELS, capacity, LISTED] each pixel's fragments, nearest first.
         lengths: [PIXELS] of the lists.
         capacity: Fragments that each list has room for.
@@ -67,6 +69,7 @@ class Fragments(NamedTuple):
 
     values: np.ndarray
     width: int
+    bends: int
     lists: np.ndarray
     lengths: np.ndarray
     capacity: int
@@ -140,7 +143,7 @@ class Batch(NamedTuple):
         pixels: [BATCH PIXELS] numbers of the pixels.
         begins: [BATCH + 1] where the pixels of each begin.
         found: [BATCH] the set of those of its pixels on which alpha may reach the threshold.
-        rows: [width, 8] columns of eight fragments.
+        rows: [width + 2 m, 8] columns of eight fragments, then scratch.
     """
 
     offset_x: np.ndarray
@@ -156,7 +159,7 @@ class Block(NamedTuple):
 
     Attributes:
         shifted: Depths of one pixel's list against its own reference (see `depths`).
-        sums: [2 m + 4, 4] scratch by channel: polynomials, then what `blend` needs beside them.
+        sums: [3 m + bends + 4, 4] scratch by channel: polynomials, then what `blend` and `depths` need beside them.
         ray: [3] the block's central ray at the cell's middle, world axes, of unit depth.
     """
 
@@ -197,9 +200,15 @@ class Buffers(NamedTuple):
 
 
 @njit(cache=True, error_model="numpy")
-def fragment_width(m):
-    """Numbers of a fragment of ``m`` coefficients: whole cache lines."""
-    return -(-(FORM + m + 1) // 8) * 8
+def bends_of(shape):
+    """Coefficients of products of two parameters that pixels keep beside the Gaussians' forms (design.md, B10)."""
+    return 0 if shape.order == 2 else shape.dimensions * (shape.dimensions + 1) // 2
+
+
+@njit(cache=True, error_model="numpy")
+def fragment_width(shape):
+    """Numbers of a fragment of forms of ``shape``: whole cache lines."""
+    return -(-(FORM + shape.monomials + 1 + bends_of(shape)) // 8) * 8
 
 
 @njit(cache=True, error_model="numpy")
@@ -211,24 +220,24 @@ def _aligned(size):
 
 
 @njit(cache=True, error_model="numpy")
-def new_buffers(m, forms, pair_limit, background):
-    """Memory for fragments of ``m`` coefficients, colours of ``forms`` and ``pair_limit`` pairs."""
+def new_buffers(shape, forms, pair_limit, background):
+    """Memory for fragments of ``shape``, colours of ``forms`` coefficients and ``pair_limit`` pairs."""
     per_pixel = np.zeros(ROWS * PIXELS)
     per_pixel[NUMBERS : NUMBERS + BLOCK] = np.arange(BLOCK)
     behind = np.zeros(4)
     behind[:3] = background
-    width = fragment_width(m)
+    m, width = shape.monomials, fragment_width(shape)
     return Buffers(
         per_pixel=per_pixel,
         offsets=np.zeros((2, BATCH * PIXELS + 8)),
         pixels=np.empty(BATCH * PIXELS, np.uint8),
         batch=np.empty((2, BATCH + 1), np.int64),
-        rows=np.zeros((width, 8)),
+        rows=np.zeros((width + 2 * m, 8)),
         lengths=np.empty(PIXELS, np.uint32),
         background=behind,
         nothing=np.zeros(4),
         unseen=np.zeros(8),
-        sums=np.zeros(4 * (2 * m + 4)),
+        sums=np.zeros(4 * (3 * m + 4 + bends_of(shape))),
         ray=np.empty(3),
         positions=np.empty((7, _POSITIONS), np.int64),
         depths=np.empty((2, _POSITIONS)),
@@ -244,7 +253,7 @@ def new_buffers(m, forms, pair_limit, background):
 
 
 @njit(cache=True, error_model="numpy")
-def resized(old, positions, capacity, m, forms):
+def resized(old, positions, capacity, shape, forms):
     """``old`` buffers with room for lists of ``positions`` and ``capacity`` fragments by pixel, where that is more."""
     places, depths, palette, shifted = old.positions, old.depths, old.palette, old.shifted
     if positions > places.shape[1]:
@@ -253,7 +262,7 @@ def resized(old, positions, capacity, m, forms):
         shifted = np.zeros(positions * color_size(forms))
     values, lists, drawn, of_slots, moves = old.values, old.lists, old.drawn, old.places, old.moves
     if capacity > lists.shape[1]:
-        values = _aligned(capacity * PIXELS * fragment_width(m))
+        values = _aligned(capacity * PIXELS * fragment_width(shape))
         lists = np.empty((PIXELS, capacity, LISTED), np.uint32)
         drawn = np.empty(2 * capacity, np.int64)
         of_slots = np.empty((2 * capacity, PIXELS), np.uint32)
@@ -284,12 +293,13 @@ def resized(old, positions, capacity, m, forms):
 
 
 @njit(cache=True, error_model="numpy")
-def block_of(buffers, m, forms):
+def block_of(buffers, shape, forms):
     """The block that lies in ``buffers``, which the caller keeps alive for as long as it is used."""
     positions, depths = buffers.positions, buffers.depths
     fragments = Fragments(
         pointer(buffers.values),
-        fragment_width(m),
+        fragment_width(shape),
+        bends_of(shape),
         pointer(buffers.lists),
         pointer(buffers.lengths),
         buffers.lists.shape[1],
@@ -350,8 +360,11 @@ def longest_list(lengths):
 
 
 @njit(cache=True, error_model="numpy", forceinline=True)
-def set_unknown(values, at, high, m):
+def set_unknown(fragments, at, high, m):
     """Let the fragment at ``at`` have any alpha from 0 to ``high``."""
+    values = fragments.values
+    for k in range(FORM + m + 1, FORM + m + 1 + fragments.bends):
+        values[at + k] = 0.0
     values[at + ALPHA_LOW] = 0.0
     values[at + ALPHA_HIGH] = high
     values[at + FORM] = 0.5 * high

@@ -15,7 +15,7 @@ from numba import njit
 from ns_abstract.arithmetic.rounding import FRAGMENT_ROUNDING, UNIT64, UP
 from ns_abstract.arithmetic.simd.intrinsics import advanced
 from ns_abstract.arithmetic.simd.lanes import maximum, minimum, store
-from ns_abstract.methods.splat.blend import blend_affine, blend_quadratic, form_range
+from ns_abstract.methods.splat.blend import blend_quadratic, blend_several, form_range
 from ns_abstract.methods.splat.block import (
     ALPHA_HIGH,
     FORM,
@@ -151,10 +151,10 @@ def shade_layers(left, above, block, inputs, bounds):
     per_pixel, charges, cutoffs = fragments.per_pixel, inputs.charges, inputs.cutoffs
     order, m = inputs.shape.order, inputs.shape.monomials
     common, unseen = inputs.colors.common, block.palette.unseen
-    # behind the polynomials: ends and radii by lane, the reference, two polynomials of the result
-    by_lane = advanced(t, 4 * m)
-    reference = advanced(t, 4 * m + 16)
-    result = advanced(t, 5 * m + 16)
+    # behind what blending takes: ends and radii by lane, the reference, two polynomials of the result
+    by_lane = advanced(t, 4 * (2 * m + fragments.bends))
+    reference = advanced(by_lane, 16)
+    result = advanced(reference, m)
     # a fragment that is drawn has this alpha at least
     least = inputs.rules.alpha_min * (1.0 - 2.0 * charges.threshold)
     for q in range(PIXELS):
@@ -165,7 +165,7 @@ def shade_layers(left, above, block, inputs, bounds):
         if order == 2:
             r, ends = blend_quadratic(begin, end, fragments, block.shifted, moves, t)
         else:
-            r, ends = blend_affine(begin, end, fragments, block.shifted, moves, t, m)
+            r, ends = blend_several(begin, end, fragments, block.shifted, moves, t, m)
         r = r * (UP + 4.0 * UNIT64 * n)
         bottom, top = form_range(t, r, order, m)
         store(by_lane, 0, maximum(ends.low, bottom))

@@ -400,7 +400,7 @@ def _keep_alone(found, pixels, number, k, fragments, stop, live, dim, m):
             # LOST is the most that any stop so far may leave of the light
             per_pixel[LOST + q] = max(per_pixel[LOST + q], min(before, stop.high / (1.0 - high)))
             if per_pixel[LOST + q] >= before:
-                set_unknown(values, at, high, m)
+                set_unknown(fragments, at, high, m)
             else:
                 per_pixel[RHO + q] = per_pixel[LOST + q]
         _append(number + lane, q, k, t_low, t_high, fragments)
@@ -683,13 +683,13 @@ def apply_stops(slots, block, inputs):
             lost = min(light, stop_high / (1.0 - high))
             if t_high <= stop_low:
                 per_pixel[HIDDEN + q] = max(per_pixel[HIDDEN + q], lost)
-                set_unknown(values, at, 0.0, m)
+                set_unknown(fragments, at, 0.0, m)
             elif lost < light:
                 # kept; what the stop may leave of the light is added at the end
                 per_pixel[RHO + q] = max(per_pixel[RHO + q], lost, per_pixel[LOST + q])
             else:
                 per_pixel[HIDDEN + q] = max(per_pixel[HIDDEN + q], lost)
-                set_unknown(values, at, high, m)
+                set_unknown(fragments, at, high, m)
     # a stop at a dropped or weakened fragment also hides the kept fragments behind it
     for q in range(PIXELS):
         if per_pixel[RHO + q] > 0.0:

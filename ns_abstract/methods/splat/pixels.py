@@ -116,13 +116,13 @@ def _pixel_worker(share, lists, gaussians, axes, intrinsics, colors, rules, char
     """One thread's tiles; see `Share` and `pixel_stage`."""
     sequence, counter = borrowed(share.sequence), pointer(share.counter)
     inputs = _borrowed_inputs(gaussians, axes, intrinsics, colors, rules, charges, cutoffs, shape)
-    camera, m = inputs.intrinsics, inputs.shape.monomials
+    camera = inputs.intrinsics
     side = bounds.lower.shape[1]
     tiles_x = int(math.ceil(camera.width / side))
     blocks = side // BLOCK
     forms = max(inputs.colors.values.shape[1] // inputs.colors.channels - 1, 1)
-    buffers = new_buffers(m, forms, inputs.cutoffs.pairs, inputs.colors.background)
-    block = block_of(buffers, m, forms)
+    buffers = new_buffers(inputs.shape, forms, inputs.cutoffs.pairs, inputs.colors.background)
+    block = block_of(buffers, inputs.shape, forms)
     block_offsets = np.empty(blocks * blocks + 1, np.int64)
     block_entries = np.empty(4096, np.uint32)
     while True:
@@ -144,11 +144,11 @@ def _pixel_worker(share, lists, gaussians, axes, intrinsics, colors, rules, char
                 continue
             numbers = block_entries[block_offsets[b] : block_offsets[b + 1]]
             if numbers.size >= buffers.depths.shape[1]:
-                buffers = resized(buffers, 2 * numbers.size, buffers.lists.shape[1], m, forms)
-                block = block_of(buffers, m, forms)
+                buffers = resized(buffers, 2 * numbers.size, buffers.lists.shape[1], inputs.shape, forms)
+                block = block_of(buffers, inputs.shape, forms)
             while not _bound_block(borrowed(numbers), place, inputs, block, of_tile):
-                buffers = resized(buffers, buffers.depths.shape[1], 2 * buffers.lists.shape[1], m, forms)
-                block = block_of(buffers, m, forms)
+                buffers = resized(buffers, buffers.depths.shape[1], 2 * buffers.lists.shape[1], inputs.shape, forms)
+                block = block_of(buffers, inputs.shape, forms)
     # the owner of the block's memory lives to here
     return len(buffers)
 
