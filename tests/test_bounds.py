@@ -6,6 +6,7 @@ dense line (one parameter) or corners and random poses (more), at tolerance zero
 
 from __future__ import annotations
 
+import itertools
 import math
 from dataclasses import replace
 
@@ -684,8 +685,16 @@ def test_float32_is_wider(order):
 
 @pytest.mark.parametrize(
     "parameters, order",
-    [(moves(x=0.05), 1), (moves(x=0.05), 2), (moves(yaw=0.02), 1), (moves(yaw=0.02), 2), (moves(x=0.02, roll=0.05), 1)],
-    ids=["x-1", "x-2", "yaw-1", "yaw-2", "two-1"],
+    [
+        (moves(x=0.05), 1),
+        (moves(x=0.05), 2),
+        (moves(yaw=0.02), 1),
+        (moves(yaw=0.02), 2),
+        (moves(x=0.02, roll=0.05), 1),
+        (moves(x=0.05, y=0.04), 1),
+        (moves(x=0.02, y=0.02, z=0.04, yaw=0.01, pitch=0.01, roll=0.02), 1),
+    ],
+    ids=["x-1", "x-2", "yaw-1", "yaw-2", "two-1", "shifts-1", "six-1"],
 )
 def test_linear(parameters, order):
     """The linear sets hold the picture before it is clamped, colours above 1 included."""
@@ -711,6 +720,35 @@ def test_linear(parameters, order):
         error = np.abs(linear[..., :-1] @ point - image)
         assert (error <= linear[..., -1] + 1e-14).all()
     assert brightest > 1.5
+
+
+@pytest.mark.parametrize("antialiased", [False, True], ids=["classic", "antialiased"])
+@pytest.mark.parametrize(
+    "parameters, most",
+    [
+        (moves(x=0.04, y=0.04), 1.6),
+        (moves(x=0.03, y=0.03, z=0.05), 1.7),
+        (moves(**dict.fromkeys("xyz", 0.01), yaw=0.004, pitch=0.004, roll=0.01), 3.0),
+    ],
+    ids=["two", "three", "six"],
+)
+def test_curvature_of_several_parameters(parameters, most, antialiased):
+    """Linear sets are not much wider than what the pictures differ from linear functions by (design.md, B10)."""
+    layers = scene(
+        {"mean": (-0.3, 0.0, -5.0), "scale": 0.8, "opacity": 0.9, "color": (0.9, 0.1, 0.0)},
+        {"mean": (0.3, 0.1, -6.0), "scale": 0.9, "opacity": 0.7, "color": (0.0, 0.9, 0.5)},
+        {"mean": (0.0, -0.2, -7.0), "scale": 1.5, "opacity": 0.8, "color": (0.2, 0.2, 0.9)},
+    )
+    case = Case(replace(layers, antialiased=antialiased), parameters, camera(8, 8, 16.0))
+    box = case.poses.box
+    linear = assemble(case.bounds(box, 1, REAL, keep_linear=True).linear, case.camera)
+    generator = np.random.default_rng(2)
+    places = [*itertools.product((-1.0, 1.0), repeat=box.dimensions), *generator.uniform(-1, 1, (60, box.dimensions))]
+    images = np.stack([case.image(box.at(np.array(place))) for place in places])
+    polynomials = np.column_stack([np.ones(len(places)), places])
+    off = images - np.einsum("pk,...k->p...", polynomials, linear[..., :-1])
+    assert (np.abs(off) <= linear[..., -1] + 1e-14).all()
+    assert 2.0 * linear[..., -1].mean() < most * (off.max(axis=0) - off.min(axis=0)).mean()
 
 
 def test_wanted_tiles():
