@@ -381,7 +381,9 @@ def test_divisions_aim_at_what_parts_may_cost() -> None:
 
 
 class Rounded(Threshold):
-    """A network whose bounds lose ten times what the sets leave open, and that can be shared."""
+    """A network whose bounds lose ``loss`` times, and then once, what the sets leave open, and that can be shared."""
+
+    loss = 9.0
 
     def __init__(self, threshold: float, lends_anywhere: bool = True) -> None:
         super().__init__(threshold)
@@ -395,7 +397,7 @@ class Rounded(Threshold):
     def _lost(self, images: ImageSets, query: Query) -> Any:
         found = super().bound(images, query)
         gap = (images.b_upper - images.b_lower + np.abs(images.a_upper - images.a_lower).sum(-1)).mean(1)[:, None]
-        return replace(found, lower=found.lower - 9.0 * gap, b=found.b - 9.0 * gap)
+        return replace(found, lower=found.lower - self.loss * gap, b=found.b - self.loss * gap)
 
     def family(self, images: ImageSets) -> Any:
         return Shared(self, images)
@@ -423,6 +425,10 @@ class Curved(Ramp):
         return super().sets(box)
 
 
+#: A gradient that is the same at every pixel, and a margin.
+EVEN = Weights(np.full((2, 2, 3), 0.5 / 12.0), 0.4)
+
+
 def covered(threshold: float, lends_anywhere: bool = True, **settings: Any) -> tuple[Search, Rounded]:
     scene, model = Curved(2), Rounded(threshold, lends_anywhere)
     pictures: Any = scene
@@ -447,11 +453,28 @@ def test_verdicts_of_covered_cells_are_the_truth(threshold: float, lends_anywher
         assert volume(leaves, "certified") == search.grid.volume
 
 
+def test_what_width_costs_is_found_about_the_middle() -> None:
+    """Networks that bear wide sets have wide parts; the figure does not depend on cells."""
+    found = []
+    for loss in (30.0, 9.0, 0.1):
+        search, model = covered(0.1)
+        model.loss = loss
+        assert search.cover is not None
+        again = replace(search.cover)
+        search.cover.prove(search.grid.box_of(search.grid.roots()[-1]), np.array([0.5, 0.1]), EVEN)
+        assert search.cover.opening == again.opening
+        found.append(again.opening)
+    assert found[0] == 42.0 > found[1] > 2.0 * found[2]
+    # nothing is proved at the middle
+    cover = covered(0.6)[0].cover
+    assert cover is not None and cover.opening == 42.0
+
+
 def test_one_part_without_a_proof_leaves_the_cell_without() -> None:
     """Whatever bounds say of the other parts."""
     search, _ = covered(0.1, most=64)
     cell = search.grid.box_of(search.grid.roots()[0])
-    weights = Weights(np.full((2, 2, 3), 0.5 / 12.0), 0.4)
+    weights = EVEN
     assert search.cover is not None
     good = search.cover.prove(cell, np.array([0.5, 0.1]), weights)
     assert good.margin is not None and good.margin > 0.0
@@ -473,7 +496,7 @@ def test_one_part_without_a_proof_leaves_the_cell_without() -> None:
 def test_bad_bounds_of_parts_certify_nothing(bad: float) -> None:
     search, _ = covered(0.1)
     cell = search.grid.box_of(search.grid.roots()[0])
-    weights = Weights(np.full((2, 2, 3), 0.5 / 12.0), 0.4)
+    weights = EVEN
 
     class Bad(Curved):
         def sets(self, box: ParameterBox) -> Any:

@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
@@ -25,8 +26,10 @@ if TYPE_CHECKING:
 
 #: The power of the width that sets cost.
 _POWER = 1.6
-#: What the mean width of pixels costs, however little the margin's gradient says: signs of units become open by it.
+#: What the mean width of pixels costs at most, however little the margin's gradient says: signs of units become open by
+#: it. Networks that bear more are told by boxes about the set's middle, of which the least is so small a part of it.
 _OPENING = 42.0
+_LEAST = 2.0**-9
 #: What a box may cost is foreseen by so small a part of it: wide ones show nothing.
 _PROBE = 4
 #: Most parts that are bounded together, where rows serve for neighbours and where they do not.
@@ -105,9 +108,9 @@ class Weights:
         """What the sets may take from the margin, by it, to first order (V6)."""
         return 0.5 * float(np.abs(self.slopes * sets.widths).sum()) + float(np.abs(self._moved(sets)).sum())
 
-    def loss(self, sets: PictureSets) -> float:
-        """The same, or what their width alone says."""
-        return max(self.cost(sets), _OPENING * float(sets.widths.mean()))
+    def loss(self, sets: PictureSets, opening: float) -> float:
+        """The same, or what their mean width alone says, which costs ``opening`` times as much."""
+        return max(self.cost(sets), opening * float(sets.widths.mean()))
 
     def _moved(self, sets: PictureSets) -> np.ndarray:
         middle = 0.5 * (sets.linear[0].astype(np.float64) + sets.linear[2])
@@ -239,7 +242,7 @@ class Cover:
         found = self._sets(inner)
         if found is None:
             return Covered(None, self._cuts(cell, root, None, 1.0), 0)
-        cost, effects = weights.loss(found) * _PROBE**_POWER, weights.effects(found) * _PROBE
+        cost, effects = weights.loss(found, self.opening) * _PROBE**_POWER, weights.effects(found) * _PROBE
         if math.prod(divisions(effects, cost, self.aim, self.most)) > self.most:
             return Covered(None, self._cuts(cell, root, effects, cost), 0)
         work = _Work(feasible, weights, self.claim.query(outputs[None]), self.aim)
@@ -252,6 +255,32 @@ class Cover:
         if not margin > 0.0:
             return Covered(None, self._cuts(cell, root, effects, cost, always=True), work.parts)
         return Covered(margin, (), work.parts)
+
+    @cached_property
+    def opening(self) -> float:
+        """What the mean width of pixels costs, in margins: the same wherever it is asked for (V15).
+
+        Boxes about the set's middle grow until own rows leave a smaller part of its margin than they should.
+        """
+        whole, most = self.scene.box, _OPENING
+        outputs = self.model.outputs(self.scene.image(np.array(whole.middle))[None])
+        query, first, share = self.claim.query(outputs), math.nan, _LEAST
+        while share <= 1.0:
+            box = whole
+            for axis, middle in enumerate(whole.middle.tolist()):
+                half = 0.5 * share * (whole.upper[axis] - whole.lower[axis])
+                box = box.replace(axis, max(middle - half, whole.lower[axis]), min(middle + half, whole.upper[axis]))
+            sets = self._sets(box)
+            if sets is None:
+                break
+            rows = self.sharing.family(self._images([sets]))
+            margin = float(self._proved(query, rows.first(query), [sets])[0])
+            first = margin if share == _LEAST else first
+            if not (first > 0.0 and margin > _SPARE * first):
+                break
+            most = min(most, self.aim / max(float(sets.widths.mean()), 1e-300))
+            share *= 2.0
+        return most
 
     def _sets(self, box: ParameterBox) -> PictureSets | None:
         checkpoint()
@@ -296,7 +325,7 @@ class Cover:
         if not nodes:
             return
         parts = self._bounded(work, nodes)
-        costs = np.array([work.weights.loss(sets) for sets in parts])
+        costs = np.array([work.weights.loss(sets, self.opening) for sets in parts])
         margins = np.full(len(parts), -np.inf)
         asked = np.flatnonzero(costs < _ALONE * work.aim).tolist()
         if asked:
@@ -325,7 +354,7 @@ class Cover:
             at = middles[left] / size
             chosen = int(left[np.abs(at - at.mean(axis=0)).sum(axis=1).argmin()])
             rows = self.sharing.family(self._images([parts[chosen]]))
-            margins[chosen] = self._proved(work, rows.first(work.query), [parts[chosen]])[0]
+            margins[chosen] = self._proved(work.query, rows.first(work.query), [parts[chosen]])[0]
             work.learn(float(costs[chosen]), float(margins[chosen]))
             if not margins[chosen] > 0.0:
                 break
@@ -341,13 +370,15 @@ class Cover:
             left = np.flatnonzero(~(margins > 0.0) & near).tolist()
             if left:
                 chosen = [parts[k] for k in left]
-                margins[left] = self._proved(work, rows.others(self._images(chosen), work.query, fresh=fresh), chosen)
+                margins[left] = self._proved(
+                    work.query, rows.others(self._images(chosen), work.query, fresh=fresh), chosen
+                )
 
     def _joined(self, work: _Work, parts: Sequence[PictureSets], costs: np.ndarray) -> np.ndarray:
         """[m] margins of parts, by rows of sets that hold all of them."""
         whole = joined(parts)
         rows = self.sharing.family(self._images([whole]))
-        margins = np.full(len(parts), self._proved(work, rows.first(work.query), [whole])[0])
+        margins = np.full(len(parts), self._proved(work.query, rows.first(work.query), [whole])[0])
         work.learn(float(costs.mean()), float(margins[0]))
         self._lent(work, rows, parts, margins)
         return margins
@@ -388,9 +419,9 @@ class Cover:
         lower, upper = (np.stack([getattr(sets, name) for sets in parts]) for name in ("lower", "upper"))
         return self.model.input_sets(tuple(linear), lower, upper)
 
-    def _proved(self, work: _Work, bounds: OutputBounds, parts: Sequence[PictureSets]) -> np.ndarray:
+    def _proved(self, query: Query, bounds: OutputBounds, parts: Sequence[PictureSets]) -> np.ndarray:
         """[m] margins; what is no finite number proves nothing."""
-        found = np.asarray(self.claim.proved(work.query, bounds, [sets.box for sets in parts]), np.float64)
+        found = np.asarray(self.claim.proved(query, bounds, [sets.box for sets in parts]), np.float64)
         return np.where(np.isfinite(found), found, -np.inf)
 
     def _cuts(
