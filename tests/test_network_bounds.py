@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import itertools
+import subprocess
+import sys
 from dataclasses import replace
 from fractions import Fraction
 from pathlib import Path
@@ -385,6 +387,57 @@ def test_short_rows_keep_deep_networks_bounded(tmp_path: Path, monkeypatch: pyte
     print(gaps, [way.cut for way in used])
     assert max(gaps[:2]) < 10.0 * min(gaps[:2]) and 100.0 * gaps[1] < gaps[3]
     assert gaps[2] < gaps[3]
+
+
+_MEASURED = """
+import sys
+from pathlib import Path
+import numpy as np, torch
+from onnx_files import image_sets
+from ns_abstract.verify.network import bound_outputs, load_network, schedule
+from ns_abstract.verify.network.explain import estimate
+torch.set_num_threads(1)
+schedule._DEEP = schedule._OVER = 0.0
+
+def peak(name):
+    line = next(v for v in Path("/proc/self/status").read_text().splitlines() if v.startswith(name))
+    return int(line.split()[1]) << 10
+
+network = load_network(Path(sys.argv[1]))
+images = image_sets(network.input_shape, 1, 2, 1e-4, 1e-4)
+small = image_sets(network.input_shape, 1, 2, 1e-30, 1e-31)
+rows = np.eye(3)
+schedule._PLANNED = 0.0
+bound_outputs(network, small, rows, np.zeros(3), arithmetic="real")
+schedule._PLANNED = float(sys.argv[3])
+before = peak("VmRSS")
+Path("/proc/self/clear_refs").write_text("5")
+found = bound_outputs(network, images, rows, np.zeros(3), memory=int(sys.argv[2]), arithmetic="real")
+print(peak("VmHWM") - before, estimate(network, 2)[0], np.isfinite(found.lower).all())
+"""
+
+
+def test_rows_that_end_by_plan_keep_within_memory(tmp_path: Path) -> None:
+    """Wide maps whose rows would take gigabytes together stay within what is allowed, and near the estimate."""
+    f = OnnxFile((3, 24, 24), 5)
+    for k in range(6):
+        f.conv(24 if k else 3, 24, pads=[1, 1, 1, 1])
+        f.node("Relu")
+    f.node("GlobalAveragePool")
+    f.node("Flatten")
+    f.gemm(24, 3)
+    file, memory = f.write(tmp_path / "net.onnx"), 208 << 20
+    words = subprocess.run(
+        [sys.executable, "-c", _MEASURED, str(file), str(memory), "1e13"],
+        cwd=Path(__file__).parent,
+        capture_output=True,
+        text=True,
+        check=True,
+    ).stdout.split()
+    taken, foreseen = float(words[0]), float(words[1])
+    print(f"{taken / 2**20:.0f} MiB taken, {foreseen / 2**20:.0f} foreseen")
+    assert words[2] == "True"
+    assert 4 << 20 < taken <= memory and taken <= 1.5 * foreseen
 
 
 def test_plans_keep_to_what_is_allowed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

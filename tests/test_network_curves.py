@@ -48,6 +48,7 @@ CURVES: dict[str, tuple[Curve, Exact, tuple[float, float]]] = {
     "root": (curves.Root((1,)), lambda z: z.sqrt(), (1e-6, 50)),
     "inverse root": (curves.Root((1,), inverse=True), lambda z: z.rsqrt(), (1e-5, 50)),
     "exp": (curves.Exp((1,)), lambda z: z.exp(), (-30, 30)),
+    "capped exp": (curves.CappedExp((1,)), lambda z: z.min(arb(curves.CAP)).exp(), (-30, 40)),
     "log": (curves.Log((1,)), lambda z: z.log(), (1e-4, 50)),
     "softplus": (curves.Softplus((1,)), lambda z: (1 + z.exp()).log(), (-40, 40)),
     "elu": (curves.Elu((1,), alpha=1.5), lambda z: _elu(z, 1.5, 1, 1), (-20, 20)),

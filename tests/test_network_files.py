@@ -18,6 +18,7 @@ from onnx_files import OnnxFile, attack, image_sets, session
 
 from ns_abstract.io.errors import InputError
 from ns_abstract.verify.network import bound_outputs, load_network
+from ns_abstract.verify.network.explain import check_cell
 
 SHAPE = (2, 4, 4)
 
@@ -47,13 +48,27 @@ def _weight(f: OnnxFile, value: float) -> None:
 
 BAD: dict[str, tuple[Callable[[OnnxFile], object], tuple[str, ...]]] = {
     "operator": (lambda f: f.node("ArgMax", axis=1), ("ArgMax_v2", "ArgMax", "leave it out")),
-    "activation": (lambda f: f.node("Softsign"), ("Softsign_v2", "not supported", "use Tanh")),
+    "activation": (lambda f: f.node("Shrink"), ("Shrink_v2", "not supported", "nearest by name")),
+    "mask of all": (
+        lambda f: f.node("Softmax", f.node("Add", f.last, f.constant(np.full((1, 2, 1, 1), -np.inf))), axis=1),
+        ("Softmax", "all numbers of a row"),
+    ),
+    "mask without a softmax": (
+        lambda f: f.node("Relu", f.node("Add", f.last, f.constant(-np.inf))),
+        ("Relu", "minus infinity", "Softmax"),
+    ),
+    "infinite factor": (lambda f: f.node("Mul", f.last, f.constant(-np.inf)), ("minus infinity", "Softmax")),
+    "einsum of a diagonal": (lambda f: f.node("Einsum", equation="aabc->abc"), ("equation = aabc->abc", "once")),
+    "einsum of three": (
+        lambda f: f.node("Einsum", f.last, f.constant(1.0), f.constant(1.0), equation="abcd,,->abcd"),
+        ("one or two values",),
+    ),
     "softmax over the batch": (lambda f: f.node("Softmax", axis=0), ("axis = 0", "batch")),
     "power": (lambda f: f.node("Pow", f.last, f.constant(1.7)), ("exponent 1.7", "0.5")),
     "half precision": (lambda f: f.node("Cast", to=TensorProto.FLOAT16), ("to = FLOAT16", "float32")),
     "cubic": (
-        lambda f: f.node("Resize", f.last, "", f.constant([1, 1, 2, 2]), mode="cubic"),
-        ("mode = cubic", "linear"),
+        lambda f: f.node("Resize", f.last, "", f.constant([1, 1, 2, 2]), mode="cubic", exclude_outside=1),
+        ("exclude_outside = 1", "only 0"),
     ),
     "indices": (lambda f: f.node("Gather", f.last, f.constant([5], np.int64), axis=1), ("indices", "axis 1")),
     "huge constant": (
@@ -295,6 +310,19 @@ def test_a_network_is_explained_before_any_work(
     text = capsys.readouterr().out
     assert end.value.code == 0
     assert "Convolution" in text and "LeakyRelu" in text and "GiB" in text and "Conv_v0" in text
+
+
+def test_cells_that_need_too_much_memory_are_refused_by_an_estimate(tmp_path: Path) -> None:
+    f = OnnxFile((3, 256, 256))
+    f.node("Unsqueeze", f.last, f.constant([2], np.int64))
+    f.node("Expand", f.last, f.constant([1, 3, 64, 256, 256], np.int64))
+    f.node("Exp")
+    f.node("Flatten")
+    f.node("ReduceMean", axes=[1])
+    network = load_network(f.write(tmp_path / "net.onnx"))
+    check_cell(network, 2, 16 << 30)
+    with pytest.raises(InputError, match=r"net.onnx: needs about \d.*GiB.*numbers.*--memory-limit"):
+        check_cell(network, 2, 1 << 30)
 
 
 def test_sizes_are_refused_before_they_are_allocated(tmp_path: Path) -> None:

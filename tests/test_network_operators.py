@@ -9,10 +9,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from flint import arb
 from onnx import helper
 from onnx_files import OnnxFile, attack, image_sets, session
 
-from ns_abstract.verify.network import bound_outputs, load_network
+from ns_abstract.verify.network import ImageSets, bound_outputs, load_network
 from ns_abstract.verify.network import curves as curve_module
 from ns_abstract.verify.network.maps import Differences, Sparse, TransposedConvolution
 from ns_abstract.verify.network.products import Plane, Product
@@ -197,6 +198,88 @@ def _token(f: OnnxFile) -> None:
     f.gemm(12, 3)
 
 
+def _masked(f: OnnxFile, mask: np.ndarray, scale: float = 1.0) -> None:
+    """Attention of four tokens of which some see others only."""
+    f.batch = 1
+    f.conv(3, 4, k=2, strides=[3, 3])
+    f.node("Reshape", f.last, f.constant([1, 4, -1], np.int64))
+    x = f.node("Transpose", perm=[0, 2, 1])
+    q, k, v = (f.node("MatMul", x, f.weights(4, 4, scale=scale)) for _ in range(3))
+    f.node("MatMul", q, f.node("Transpose", k, perm=[0, 2, 1]))
+    f.node("Add", f.last, f.constant(mask))
+    shares = f.node("Softmax", axis=-1)
+    f.node("Where", f.node("IsNaN"), f.constant(0.0), shares)
+    f.node("Add", x, f.node("MatMul", f.last, v))
+    f.node("Gather", f.last, f.constant(2, np.int64), axis=1)
+
+
+_CAUSAL = np.triu(np.ones((4, 4), np.float32), 1)
+
+
+def _masked_by_infinity(f: OnnxFile) -> None:
+    _masked(f, np.where(_CAUSAL, -np.inf, 0.25 * _CAUSAL.T), scale=4.0)
+
+
+def _masked_by_the_least_number(f: OnnxFile) -> None:
+    _masked(f, np.where(_CAUSAL.T, np.finfo(np.float32).min, 0.0)[::-1])
+
+
+def _masked_by_a_hundred(f: OnnxFile) -> None:
+    _masked(f, -100.0 * np.array([[0, 1, 1, 0], [1, 0, 0, 1], [1, 0, 0, 0], [0, 1, 1, 1]]))
+
+
+def _sharp(f: OnnxFile) -> None:
+    _masked(f, np.zeros((4, 4)), scale=6.0)
+
+
+def _einsum(f: OnnxFile) -> None:
+    f.batch = 1
+    x = f.conv(3, 4, k=2, strides=[2, 2])
+    f.node("Einsum", x, f.weights(4, 3), equation="bchw,cd->bhdw")
+    f.node("Einsum", f.last, f.weights(3, 2, 3), equation="bhdw,hkd->bkw")
+    f.node("Einsum", x, f.last, equation="bchw,bkw->bkcw")
+    f.node("Relu")
+    f.node("Einsum", f.last, equation="bkcw -> bck")
+    f.node("Einsum", f.weights(5, 2), f.last, equation="ak,bck->bac")
+    f.node("Relu")
+    f.node("Flatten")
+    f.gemm(20, 3)
+
+
+def _line(f: OnnxFile) -> None:
+    f.conv(3, 4)
+    f.node("Reshape", f.last, f.constant([0, 4, -1], np.int64))
+    f.node("Conv", f.last, f.weights(6, 2, 3), f.weights(6), group=2, pads=[1, 0], strides=[2], dilations=[2])
+    f.node("Relu")
+    f.node("AveragePool", kernel_shape=[3], strides=[2], pads=[1, 1])
+    f.node("ConvTranspose", f.last, f.weights(6, 3, 2), strides=[2], output_padding=[1])
+    f.node("MaxPool", kernel_shape=[2], ceil_mode=1, strides=[2])
+    f.node("Conv", f.last, f.weights(2, 3, 2), auto_pad="SAME_UPPER")
+    f.node("GlobalAveragePool")
+
+
+def _taken(f: OnnxFile) -> None:
+    f.batch, f.opset = 1, 19
+    x = f.conv(3, 3)
+    f.node("Relu")
+    f.node("GatherND", f.last, f.constant([[0, 2], [0, -1], [-1, 0]], np.int64))
+    f.node("Unsqueeze", f.last, f.constant([0], np.int64))
+    f.node("Pad", f.last, f.constant([0, 0, 2, 1, 0, 1, 0, 3], np.int64), mode="wrap")
+    f.node("Resize", f.last, "", "", f.constant([1, 4, 7, 9], np.int64), mode="cubic", cubic_coeff_a=-0.5)
+    f.conv(4, 2)
+    f.node("Add", f.last, f.node("ReduceL1", x, f.constant([1, 2, 3], np.int64)))
+
+
+def _normalised(f: OnnxFile) -> None:
+    f.conv(3, 4)
+    x = f.node("ReduceMean", axes=[2, 3], keepdims=0)
+    norm = f.node("Clip", f.node("ReduceL2", axes=[1], keepdims=1), f.constant(1e-12))
+    f.node("Div", x, norm)
+    f.node("Add", f.last, f.node("ReduceSumSquare", x, axes=[1]))
+    f.node("Softsign")
+    f.gemm(4, 3)
+
+
 CASES: dict[str, Build] = {
     "clip": _between(-0.5, 0.7, op="Clip"),
     "clip below": _between(-0.5, op="Clip"),
@@ -214,7 +297,7 @@ CASES: dict[str, Build] = {
         name[1:].replace("_", " "): build
         for name, build in list(globals().items())
         if name.startswith("_")
-        and name != "_between"
+        and name not in ("_between", "_masked")
         and callable(build)
         and getattr(build, "__module__", "") == __name__
     },
@@ -357,6 +440,48 @@ def test_differences_are_those_of_the_matrix(shape: tuple[int, ...], axis: int, 
     (found,) = layer.backward(Rows.whole(value.reshape(3, *grid(layer.shape))))
     assert found.value.dtype == value.dtype
     assert (found.value.reshape(3, -1) == value @ matrix).all()
+
+
+@pytest.mark.parametrize("gap", [29.5, 31.0, 60.0, 200.0])
+def test_shares_past_the_cap_are_charged(gap: float, tmp_path: Path) -> None:
+    """The share of a number far below the others is not lost, in real arithmetic either."""
+    f = OnnxFile((3,))
+    f.node("Add", f.last, f.constant([gap, 0.0, 1.0]))
+    f.node("Softmax", axis=1)
+    network = load_network(f.write(tmp_path / "net.onnx"))
+    b = np.zeros((1, 3))
+    images = ImageSets(np.zeros((1, 3, 1)), b, np.zeros((1, 3, 1)), b, b, b)
+    rows = np.concatenate([np.eye(3), -np.eye(3)])
+    found = bound_outputs(network, images, rows, np.zeros(6), arithmetic="real").lower[0]
+    values = [arb(v).exp() for v in (float(np.float32(gap)), 0, 1)]
+    shares = [v / sum(values, arb(0)) for v in values]
+    for k, share in enumerate(shares):
+        assert arb(found[k]) <= share and arb(found[3 + k]) <= -share
+        assert float((share - arb(found[k])).upper()) < 2e-12 and float((-share - arb(found[3 + k])).upper()) < 2e-12
+    # what the layers compute without their roundings, from the side of the smallest number
+    cap, gaps = curve_module.CAP, torch.tensor([gap, 0.0, 1.0], dtype=torch.float64)
+    total = curve_module.CappedExp((1,)).function(gaps).sum().clamp(max=float(np.exp(cap)))
+    layer = curve_module.Share((1,))
+    off = abs(arb(float(layer.function(total))) - shares[1])
+    assert off <= float(torch.as_tensor(layer.missing(total, total))) + 2.0**-50 * float(layer.function(total))
+
+
+def test_positions_of_resized_maps_are_charged(tmp_path: Path) -> None:
+    """Positions that are computed in float32 give weights to numbers that real ones do not reach."""
+    f = OnnxFile((1, 1, 4), batch=1)
+    size = f.constant([1, 1, 1, 10], np.int64)
+    f.node("Resize", f.last, "", "", size, mode="linear", coordinate_transformation_mode="align_corners")
+    network = load_network(f.write(tmp_path / "net.onnx"))
+    x = np.array([[1.0, 0.0, 1.0, 0.0]])
+    images = ImageSets(np.zeros((1, 4, 1)), x, np.zeros((1, 4, 1)), x, x, x)
+    found = bound_outputs(network, images, np.concatenate([np.eye(10), -np.eye(10)]), np.zeros(20)).lower[0]
+    for step in (np.float32(1.0 / 3.0), np.nextafter(np.float32(1.0 / 3.0), np.float32(0.0))):
+        place = (np.arange(10, dtype=np.float32) * step).astype(np.float32)
+        low = np.minimum(np.floor(place), 2).astype(int)
+        part = place - low.astype(np.float32)
+        y = ((1 - part) * x[0, low].astype(np.float32) + part * x[0, low + 1].astype(np.float32)).astype(np.float64)
+        assert (found[:10] <= y).all() and (found[10:] <= -y).all()
+    assert (-found[10:] - found[:10]).max() < 1e-5
 
 
 def test_two_outputs_stand_one_after_the_other(tmp_path: Path) -> None:

@@ -40,6 +40,7 @@ from ns_abstract.report.verdict_picture import clear_pictures, write_pictures
 from ns_abstract.verify.cells import Grid
 from ns_abstract.verify.eight_bit import Picture
 from ns_abstract.verify.network import NetworkArithmetic
+from ns_abstract.verify.network.explain import check_cell
 from ns_abstract.verify.scene_margin import CAMERA_KINDS, KINDS, PLACES, SceneMargin, check_scenes
 from ns_abstract.verify.search import Findings
 from ns_abstract.verify.store import IMAGES, Block, Store, fractions
@@ -56,14 +57,27 @@ _SEEN, _SEEN_PIXELS = 64, 96
 _COMPARED, _COMPARE_SHARE, _COMPARE_LEAST = 5, 0.03, 1.0
 
 
-def network_memory(limit: float | None, workers: int) -> int:
-    """Bytes for the network's bounds of one of ``workers`` processes; ``limit`` in GiB for all, or None."""
+def _allowed(limit: float | None, workers: int) -> float:
+    """Bytes that one of ``workers`` processes may take; ``limit`` in GiB for all, or None."""
     free = available_memory()
     whole = 0.8 * free if free is not None else 8 << 30
-    if limit:
-        whole = min(limit, MOST_MEMORY) * 2**30
+    return (min(limit, MOST_MEMORY) * 2**30 if limit else whole) / workers
+
+
+def network_memory(limit: float | None, workers: int) -> int:
+    """Bytes for the network's bounds of one of ``workers`` processes; ``limit`` in GiB for all, or None."""
     # half: images and torch need room beside the bounds; a power of two, so that it hardly depends on the moment
-    return min(MEMORY, 1 << int(np.log2(max(2.0, 0.5 * whole / workers))))
+    return min(MEMORY, 1 << int(np.log2(max(2.0, 0.5 * _allowed(limit, workers)))))
+
+
+def check_network_memory(found: Certification, limit: float | None, workers: int) -> None:
+    """Refuse a network one cell of which takes more memory than a process may.
+
+    Raises:
+        InputError: It does, about.
+    """
+    dimensions = max(1, len(found.parameters))
+    check_cell(found.network, dimensions, _allowed(limit, 1 if found.job.rays else workers))
 
 
 @dataclass(frozen=True)
@@ -709,6 +723,7 @@ def certify(
     memory = network_memory(memory_limit, workers)
     job = Job(scene, drawn, arithmetic=arithmetic, workers=workers)
     found = Certification(job, question, memory, network_arithmetic=network_arithmetic, picture=picture)
+    check_network_memory(found, memory_limit, workers)
     settings = {
         "time_budget": time_budget,
         "arithmetic": arithmetic,

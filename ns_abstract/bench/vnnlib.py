@@ -20,6 +20,7 @@ from ns_abstract.io.errors import InputError
 from ns_abstract.io.jsonio import file_beside, file_size, read_text
 from ns_abstract.verify.boxes import Answer, decide
 from ns_abstract.verify.network import Network, NetworkArithmetic, load_network
+from ns_abstract.verify.network.explain import check_cell
 from ns_abstract.verify.network.load import onnx_runner
 from ns_abstract.verify.vnnlib import load_regions
 
@@ -168,6 +169,7 @@ def run_folder(
             ready, answer, why = start, None, ""
             try:
                 network, run = networks.load(_stored(folder, one.network))
+                check_cell(network, 1, memory)
                 regions = load_regions(*_property(folder, one.property, network))
                 ready = time.perf_counter()
                 end = ready + limit

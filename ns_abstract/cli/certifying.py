@@ -14,7 +14,7 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from ns_abstract.api.certification import Certification, CertifySettings, open_certification
-from ns_abstract.api.certifying import CertificateRun, CertifyProgress, network_memory
+from ns_abstract.api.certifying import CertificateRun, CertifyProgress, check_network_memory, network_memory
 from ns_abstract.api.compiling import compile_beside
 from ns_abstract.api.job import check_frames
 from ns_abstract.cli.common import Stop, plain_console
@@ -90,6 +90,7 @@ def certify_path(order: Order, stop: Stop) -> bool:
     memory = network_memory(order.memory_limit, workers)
     with stop.at_once():
         job = open_certification(dataclasses.replace(order.settings, memory=memory))
+        check_network_memory(job, order.memory_limit, workers)
         frames = check_frames(order.frames, job.job.frame_count)
         run = CertificateRun(job, frames, order.output_dir, order.options, ("ns-abstract-certify", *sys.argv[1:]))
     _introduce(console, job, run)

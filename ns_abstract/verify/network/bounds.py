@@ -564,7 +564,7 @@ class _Cells:
         lower, upper = z.interval
         size = z.interval.size
         reference = self._reference(k, lambda: layer.function(z.reference))
-        room = layer.room + 2.0**-48 * reference.abs()
+        room = layer.missing(lower, upper) + 2.0**-48 * reference.abs()
         if self.single:
             room = room + layer.error(lower, upper)
         band = layer.band(lower, upper)

@@ -292,8 +292,8 @@ class Builder:
     def pad(self, x: int, before: Sequence[int], after: Sequence[int], mode: str, value: float) -> int:
         """Numbers around the item."""
         shape = self.shape(x)
-        if mode not in ("constant", "reflect", "edge"):
-            raise InputError(f"attribute mode = {mode} is not supported", fix="use constant, reflect or edge")
+        if mode not in ("constant", "reflect", "edge", "wrap"):
+            raise InputError(f"attribute mode = {mode} is not supported", fix="use constant, reflect, edge or wrap")
         if not np.isfinite(value):
             raise InputError(f"pads with {value}", fix="use a finite number")
         if not any(before) and not any(after):
@@ -307,6 +307,8 @@ class Builder:
             raise InputError("negative pads are not supported here", fix="slice instead")
         if mode == "reflect" and any(max(a, b) >= n for n, a, b in zip(shape, before, after, strict=True)):
             raise InputError("reflected pads are larger than the item", fix="use smaller pads")
+        if mode == "wrap" and any(max(a, b) > n for n, a, b in zip(shape, before, after, strict=True)):
+            raise InputError("wrapped pads are larger than the item", fix="use smaller pads")
         index = np.arange(int(np.prod(shape))).reshape(shape)
         widths = list(zip(before, after, strict=True))
         if mode == "constant":

@@ -1,10 +1,11 @@
-"""Layers of networks that are made of several rules of the table (docs/design.md, N11)."""
+"""Layers of networks that are made of several rules of the table (docs/design.md, N11, N19)."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from typing import Any
+from functools import partial
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -25,7 +26,7 @@ from ns_abstract.verify.network.layers import (
     Sum,
     Tanh,
 )
-from ns_abstract.verify.network.maps import Differences, Sparse, TransposedConvolution, Variance
+from ns_abstract.verify.network.maps import Differences, Resized, Sparse, TransposedConvolution, Variance
 from ns_abstract.verify.network.maxima import MaxPool
 from ns_abstract.verify.network.products import Product
 
@@ -36,6 +37,10 @@ _NEAR = 2.0**-22
 _ONES = (1, 1)
 #: Entries of a matrix that takes means away; where it would have more, the mean is a layer of its own.
 _CENTRED_AT_ONCE = 1 << 16
+#: Roundings of a position in a map that is resized: four of float32, relative to it and one.
+_POSITION = 4.0 * 2.0**-24
+#: What float32 makes of a cubic weight: about 112 roundings of 1, of a t^3 - 5 a t^2 + 8 a t - 4 a with t up to 2.
+_POLYNOMIAL = 2.0**-17
 
 
 class Composer(Builder):
@@ -149,6 +154,11 @@ class Composer(Builder):
             return self.curve(node.inputs[0], curves.Root, floor=node.layer.floor, inverse=True)
         return self.curve(x, curves.Reciprocal, floor=self._above(x))
 
+    def softsign(self, x: int) -> int:
+        """``x / (1 + |x|)``."""
+        size = self.scale(self.curve(x, curves.Abs), np.ones(()), np.ones(()))
+        return self.product(x, self.reciprocal(size))
+
     def logarithm(self, x: int) -> int:
         """The natural logarithm."""
         return self.curve(x, curves.Log, floor=self._above(x))
@@ -253,14 +263,21 @@ class Composer(Builder):
     # ------------------------------------------------------------ sparse maps
 
     def _sparse(
-        self, x: int, shape: Shape, to: np.ndarray, source: np.ndarray, weight: Any, terms: int | None = None
+        self,
+        x: int,
+        shape: Shape,
+        to: np.ndarray,
+        source: np.ndarray,
+        weight: Any,
+        terms: int | None = None,
+        kind: Callable[..., Sparse] = Sparse,
     ) -> int:
         """A sparse matrix; positions of equal shape, weights broadcast."""
         to, source = to.reshape(-1).astype(np.int64), source.reshape(-1).astype(np.int64)
         weight = np.broadcast_to(np.asarray(weight, np.float64), to.shape)
         forwards = int(np.bincount(to, minlength=1).max())
         backwards = int(np.bincount(source, minlength=1).max())
-        layer = Sparse(
+        layer = kind(
             (self.shape(x),),
             tuple(shape),
             forwards + 2 if terms is None else terms,
@@ -409,11 +426,12 @@ class Composer(Builder):
         )
         return self._add(layer, x)
 
-    def resize(self, x: int, maps: Sequence[np.ndarray]) -> int:
+    def resize(self, x: int, axes: Sequence[Axis]) -> int:
         """Rows and columns mapped by matrices [out, in] each; whole factors of nearest ones by repetition."""
         shape = self.shape(x)
         if len(shape) != 3:
             raise InputError(f"input {item(shape)}", fix="only maps of rows and columns are resized")
+        maps = [axis.weight for axis in axes]
         factors = [m.shape[0] // m.shape[1] for m in maps]
         if all(
             f >= 1 and m.shape[0] == f * m.shape[1] and np.array_equal(m, np.repeat(np.eye(m.shape[1]), f, 0))
@@ -430,8 +448,13 @@ class Composer(Builder):
         source = (c * shape[1] + i[None, :, None]) * shape[2] + j[None, None, :]
         weight = np.broadcast_to(maps[0][h, i][:, None] * maps[1][w, j][None, :], to.shape).reshape(-1)
         exact = bool((weight == 1.0).all()) and len(h) == height and len(w) == width
-        # positions between numbers are computed in float32, too
-        return self._sparse(x, (channels, height, width), to, source, weight, 0 if exact else 32)
+        doubts = [axis.doubt for axis in axes]
+        if exact or not any(doubt.any() for doubt in doubts):
+            # weights of places that are known are exact, but for their products
+            return self._sparse(x, (channels, height, width), to, source, weight, 0 if exact else None)
+        sides = [as_double(np.stack([np.abs(m), doubt])) for m, doubt in zip(maps, doubts, strict=True)]
+        kind = partial(Resized, rows=sides[0], columns=sides[1])
+        return self._sparse(x, (channels, height, width), to, source, weight, 32, kind)
 
     # ------------------------------------------------------------ normalisation and attention
 
@@ -473,17 +496,36 @@ class Composer(Builder):
         inverse = self.curve(root, curves.Root, floor=epsilon * (1.0 - 2.0**-16), inverse=True)
         return self.product(centred, self.spread(inverse, shape))
 
-    def softmax(self, x: int, axis: int, logarithm: bool = False) -> int:
-        """``1 / sum_j exp(x_j - x_i)`` along an axis of the item, or its logarithm (N11)."""
+    def softmax(self, x: int, axis: int, logarithm: bool = False, dropped: np.ndarray | None = None) -> int:
+        """``1 / sum_j exp(x_j - x_i)`` along an axis of the item, or its logarithm (N11).
+
+        ``dropped``: which numbers of the item a mask takes out; not all of any row.
+        """
         shape = self.shape(x)
         count = shape[axis]
         # a program subtracts the greatest first
         layer = Differences((shape,), (*shape, count), count + 4, 2 * count, axis % len(shape))
-        powers = self.curve(self._add(layer, x), curves.Exp)
-        total = self.reduce(powers, [len(shape)], False, False)
+        apart = self._add(layer, x)
         if logarithm:
+            total = self.reduce(self.curve(apart, curves.Exp), [len(shape)], False, False)
             return self.scale(self.curve(total, curves.Log, floor=_ONE_AND_MORE), -np.ones(()), None)
-        return self.curve(total, curves.Reciprocal, floor=_ONE_AND_MORE)
+        powers = self.curve(apart, curves.CappedExp)
+        if dropped is not None:
+            if bool(dropped.all(axis).any()):
+                raise InputError("a mask takes out all numbers of a row", fix="leave one, at least")
+            self.reserve(2.0 * count * dropped.size)
+            others = np.moveaxis(dropped, axis, -1)[..., None, :].repeat(count, -2)
+            # its own term keeps the sum of a number that is taken out away from zero
+            powers = self._selected(powers, np.moveaxis(~others | np.eye(count, dtype=bool), -2, axis))
+        total = self.reduce(powers, [len(shape)], False, False)
+        total = self.curve(total, curves.Clip, least=0.0, most=math.exp(curves.CAP))
+        shares = self.curve(total, curves.Share, floor=_ONE_AND_MORE)
+        return shares if dropped is None else self._selected(shares, ~dropped)
+
+    def _selected(self, x: int, kept: np.ndarray) -> int:
+        """The item with zeros where numbers are not kept; nothing is rounded."""
+        self.reserve(float(kept.size))
+        return self._add(Scale((kept.shape,), kept.shape, 0, 1, as_double(kept), None), x)
 
     def matmul(self, a: int, b: int) -> int:
         """A product of matrices that both depend on the image, with leading axes alike."""
@@ -507,24 +549,39 @@ class Composer(Builder):
         return self.transpose(self.matrix(self.transpose(x, order), weight, None), order)
 
 
-def interpolation(size: int, out: int, mode: str, coordinates: str, nearest: str, scale: float | None) -> np.ndarray:
-    """[out, size] matrix of ONNX's Resize along one axis."""
+class Axis(NamedTuple):
+    """How rows or columns of a map are resized.
+
+    Attributes:
+        weight: [out, size].
+        doubt: [out, size] what a weight may be off in float32, for positions are computed in it, too.
+    """
+
+    weight: np.ndarray
+    doubt: np.ndarray
+
+
+def interpolation(
+    size: int, out: int, mode: str, coordinates: str, nearest: str, scale: float | None, bend: float = -0.75
+) -> Axis:
+    """ONNX's Resize along one axis; ``bend`` is `cubic_coeff_a`."""
     k = np.arange(out, dtype=np.float64)
     ratio = out / size if scale is None else scale
     if coordinates == "align_corners":
-        place = k * (size - 1) / (out - 1) if out > 1 else 0.0 * k
+        step = (size - 1) / (out - 1) if out > 1 else 0.0
+        place = k * step
     elif coordinates == "asymmetric":
-        place = k / ratio
+        step, place = ratio, k / ratio
     elif coordinates == "pytorch_half_pixel" and out == 1:
-        place = 0.0 * k
+        step, place = 0.0, 0.0 * k
     elif coordinates in ("half_pixel", "pytorch_half_pixel"):
-        place = (k + 0.5) / ratio - 0.5
+        step, place = ratio, (k + 0.5) / ratio - 0.5
     else:
         raise InputError(
             f"attribute coordinate_transformation_mode = {coordinates} is not supported",
             fix="use half_pixel, asymmetric or align_corners",
         )
-    matrix = np.zeros((out, size))
+    matrix, doubt = np.zeros((out, size)), np.zeros((out, size))
     rows = np.arange(out)
     if mode == "nearest":
         rounded = {
@@ -536,10 +593,30 @@ def interpolation(size: int, out: int, mode: str, coordinates: str, nearest: str
         if nearest not in rounded:
             raise InputError(f"attribute nearest_mode = {nearest} is not supported", fix="use floor")
         matrix[rows, np.clip(rounded[nearest], 0, size - 1).astype(np.int64)] = 1.0
-        return matrix
-    place = np.clip(place, 0.0, size - 1.0)
+        return Axis(matrix, doubt)
+    cubic = mode == "cubic"
+    if cubic and not abs(bend) <= 1.0:
+        raise InputError(f"attribute cubic_coeff_a = {bend} is not supported", fix="between -1 and 1")
+    if not cubic:
+        place = np.clip(place, 0.0, size - 1.0)
     low = np.floor(place).astype(np.int64)
     part = place - low
-    np.add.at(matrix, (rows, low), 1.0 - part)
-    np.add.at(matrix, (rows, np.minimum(low + 1, size - 1)), part)
-    return matrix
+    taps, weights = (0, 1), (1.0 - part, part)
+    if cubic:
+        far, near, across, beyond = (np.abs(part - tap) for tap in (-1, 0, 1, 2))
+        inner = [(bend + 2.0) * t**3 - (bend + 3.0) * t**2 + 1.0 for t in (near, across)]
+        outer = [bend * (t**3 - 5.0 * t**2 + 8.0 * t - 4.0) for t in (far, beyond)]
+        taps, weights = (-1, 0, 1, 2), (outer[0], *inner, outer[1])
+    for tap, weight in zip(taps, weights, strict=True):
+        np.add.at(matrix, (rows, np.clip(low + tap, 0, size - 1)), weight)
+    # scale, quotient or product of a reciprocal, difference; exact where the scale is a power of two
+    moved = np.zeros(out) if np.frexp(step)[0] in (0.0, 0.5) else _POSITION * (np.abs(place) + 1.0)
+    steepest = 2.0 if cubic else 1.0
+    # weights of a known place are exact but for the polynomials'
+    own = _POLYNOMIAL if cubic else 0.0
+    for tap in range(min(taps) - 1, max(taps) + 2):
+        # one beside those of a place counts where the place may be past a number
+        inside = min(taps) <= tap <= max(taps)
+        reached = inside | (part <= moved if tap < 0 else 1.0 - part <= moved)
+        np.add.at(doubt, (rows, np.clip(low + tap, 0, size - 1)), np.where(reached, steepest * moved + own, 0.0))
+    return Axis(matrix, doubt)

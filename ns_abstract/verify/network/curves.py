@@ -20,6 +20,8 @@ from ns_abstract.verify.network.layers import Activation, Lines
 
 #: Intervals worked on at a time.
 _TOGETHER = 1 << 13
+#: A softmax's terms, relative to one of them, and their sum are cut off at exp(this).
+CAP = 30.0
 #: Even parts of an interval where a function bends.
 _PARTS = 16
 #: Steps towards the best slope; any slope is sound.
@@ -352,6 +354,14 @@ class Reciprocal(Curve):
         return 2.0**-22 / torch.minimum(lower.abs(), upper.abs()) + 2.0**-126
 
 
+class Share(Reciprocal):
+    """The reciprocal of a sum of capped exponentials: a softmax (N11)."""
+
+    def missing(self, lower: Tensor, upper: Tensor) -> Tensor | float:
+        # the share and this are both less than exp(-CAP) and its roundings there
+        return torch.where(upper > math.exp(CAP) * (1.0 - 2.0**-10), 2.0**-43, 0.0)
+
+
 def _unknown(lower: Tensor, upper: Tensor, where: Tensor) -> tuple[Tensor, Tensor]:
     """Intervals where nothing is known are not numbers: such a cell is given up."""
     nan = torch.full_like(lower, math.nan)
@@ -407,6 +417,31 @@ class Exp(Assumed):
     def error(self, lower: Tensor, upper: Tensor) -> Tensor | float:
         # past this float32 may overflow
         return torch.where(upper < 80.0, 2.0 * _ASSUMED * upper.exp() + 2.0**-126, torch.full_like(upper, math.nan))
+
+
+class CappedExp(Exp):
+    """``min(exp(z), exp(cap))``: of terms of a softmax, whose sums are as good as infinite past that (N11)."""
+
+    cap: ClassVar[float] = CAP
+
+    @property
+    def breaks(self) -> tuple[float, ...]:
+        return (self.cap,)
+
+    @property
+    def bends(self) -> tuple[int, ...]:
+        return 1, 0
+
+    def function(self, z: Tensor) -> Tensor:
+        return z.clamp(max=self.cap).exp()
+
+    def slope(self, z: Tensor) -> Tensor:
+        return z.clamp(max=self.cap).exp()
+
+    def error(self, lower: Tensor, upper: Tensor) -> Tensor | float:
+        # the smaller of a number and the cap is the cap where any evaluation is past it
+        known = lower > self.cap + 1.0
+        return torch.where(known, 0.0, 2.0 * _ASSUMED * upper.clamp(max=self.cap).exp() + 2.0**-126)
 
 
 @dataclass(frozen=True, eq=False)

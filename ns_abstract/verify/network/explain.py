@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from ns_abstract.io.errors import InputError
 from ns_abstract.verify.network.graph import Network, item
 from ns_abstract.verify.network.layers import Convolution, Linear, Matrix
 from ns_abstract.verify.network.maps import Sparse, TransposedConvolution
@@ -48,6 +49,23 @@ def estimate(network: Network, dimensions: int) -> tuple[float, float, bool]:
     memory = sum(sizes) * 8 * (3 * dimensions + _NUMBERS) + (_MANY_ROWS if many else _FEW_ROWS)
     speed = _PLANNED_SPEED if costs.planned else _MANY_SPEED if costs.deep else _FEW_SPEED
     return memory, forwards / _FORMS_SPEED + rows / speed, given_up
+
+
+def check_cell(network: Network, dimensions: int, allowed: float) -> None:
+    """Refuse a network one cell of which takes more than ``allowed`` bytes, before any is bounded.
+
+    Raises:
+        InputError: It does, about.
+    """
+    needed, _, _ = estimate(network, dimensions)
+    if needed > allowed:
+        numbers = sum(float(np.prod(network.shape(k))) for k in range(len(network.nodes) + 1))
+        raise InputError(
+            f"needs about {needed / 2**30:.1f} GiB for a cell in {dimensions} parameters ({numbers:,.0f} numbers), "
+            f"{allowed / 2**30:.1f} GiB are allowed",
+            file=network.source,
+            fix="give a larger --memory-limit, fewer --workers, or a smaller network or image",
+        )
 
 
 def explain(network: Network, dimensions: int = 2) -> Sequence[str]:

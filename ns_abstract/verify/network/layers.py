@@ -365,6 +365,10 @@ class Activation:
         """How far a float32 evaluation may be from the function of a number between."""
         return 0.0
 
+    def missing(self, lower: Tensor, upper: Tensor) -> Tensor | float:
+        """How far what the network computes, in real numbers, too, may be from `function`."""
+        return self.room
+
     def range(self, lower: Tensor, upper: Tensor) -> tuple[Tensor, Tensor]:
         """Least and greatest value; a monotone function's are those of the ends."""
         return self.function(lower), self.function(upper)

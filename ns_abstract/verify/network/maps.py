@@ -1,6 +1,6 @@
 """Linear layers of few numbers: sparse matrices, differences, transposed convolutions.
 
-See docs/design.md, N11; the plain ones are in `ns_abstract.verify.network.layers`.
+See docs/design.md, N11, N19; the plain ones are in `ns_abstract.verify.network.layers`.
 """
 
 from __future__ import annotations
@@ -102,6 +102,22 @@ class Variance(Sparse):
         found = super().backward(rows)
         shape = (found[0].value.shape[0], *grid(self.input_shapes[1]))
         return [*found, Rows.whole(np.zeros(shape, rows.value.dtype))]
+
+
+@dataclass(frozen=True, eq=False)
+class Resized(Sparse):
+    """A map whose rows and columns lie between those of another; positions are computed in float32, too.
+
+    Attributes:
+        rows, columns: [2, out, in] sizes of the weights along an axis, and what they may be off.
+    """
+
+    rows: Tensor = field(default_factory=_none)
+    columns: Tensor = field(default_factory=_none)
+
+    def spare(self, sizes: Sequence[Tensor]) -> Tensor | float:
+        (own, off), (across, apart) = self.rows, self.columns
+        return off @ sizes[0] @ (across + apart).T + own @ sizes[0] @ apart.T
 
 
 @dataclass(frozen=True, eq=False)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import difflib
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -41,22 +42,35 @@ def operator_set(model: onnx.ModelProto, path: Path) -> int:
 _INSTEAD = {
     "ArgMax": "leave it out: properties compare the scores themselves",
     "ArgMin": "leave it out: properties compare the scores themselves",
-    "Celu": "use Elu",
+    "Atan": "use Tanh",
+    "Ceil": "leave rounding out",
+    "Col2Im": "use ConvTranspose, or DepthToSpace where blocks do not overlap",
     "Cos": "only constants may pass it",
+    "CumSum": "use MatMul with a triangular matrix",
+    "Equal": "only constants may be compared",
     "Floor": "leave rounding out",
+    "GatherElements": "use Gather with constant indices",
+    "GridSample": "use Resize",
     "If": "export without branches",
+    "Less": "use Max, Min or Clip instead of a choice",
     "Loop": "export with fixed sizes",
     "LRN": "use BatchNormalization",
+    "LpPool": "use AveragePool",
     "LSTM": "use convolutions or attention",
     "GRU": "use convolutions or attention",
+    "MaxRoiPool": "export without post-processing",
     "NonMaxSuppression": "export without post-processing",
     "NonZero": "export without post-processing",
     "QuantizeLinear": "export before quantisation",
     "DequantizeLinear": "export before quantisation",
+    "RNN": "use convolutions or attention",
+    "ReduceProd": "use ReduceSum of logarithms",
+    "RoiAlign": "export without post-processing",
     "Round": "leave rounding out",
     "Scan": "export with fixed sizes",
+    "ScatterND": "use Concat of slices",
+    "Sign": "use Clip or Tanh",
     "Sin": "only constants may pass it",
-    "Softsign": "use Tanh",
     "TopK": "export without post-processing",
 }
 
@@ -96,6 +110,8 @@ class Reader:
         self.values: dict[str, Value] = {self.input_name: image}
         #: whether a value is above a number: what the exporter makes of softplus
         self.above: dict[str, tuple[Value, float]] = {}
+        #: numbers of a value that a mask has set to minus infinity, in its whole shape; they stand as they were before
+        self.dropped: dict[str, np.ndarray] = {}
 
     def _fail(self, node: onnx.NodeProto, problem: str, fix: str | None = None) -> InputError:
         name = node.name or (node.output[0] if node.output else "")
@@ -153,9 +169,9 @@ class Reader:
             return
         rule = self.rules.get(kind)
         if rule is None:
-            instead = _INSTEAD.get(kind)
-            known = ", ".join(sorted(self.rules))
-            raise InputError("operator is not supported", fix=instead or f"use a supported layer: {known}")
+            near = difflib.get_close_matches(kind, self.rules, 5, 0.0)
+            known = f"{len(self.rules)} operators are, the nearest by name {', '.join(near)}"
+            raise InputError("operator is not supported", fix=_INSTEAD.get(kind, known))
         attributes = Attributes(self, node)
         rule(self, node, attributes)
         attributes.done()
@@ -165,6 +181,8 @@ class Reader:
     def value(self, node: onnx.NodeProto, position: int = 0) -> Value:
         """What makes input ``position``, which must depend on the image."""
         name = node.input[position] if position < len(node.input) else ""
+        if name in self.dropped and node.op_type != "Softmax":
+            raise InputError("reads what a mask has set to minus infinity", fix="mask right before a Softmax")
         if name in self.values:
             return self.values[name]
         if name in self.constants:
@@ -189,7 +207,10 @@ class Reader:
             return default
         if name not in self.constants:
             raise InputError(f"input {position} ({name}) is not a constant", fix="fold constants when exporting")
-        return self.constants[name]
+        found = self.constants[name]
+        if found.dtype.kind == "f" and node.op_type != "Add" and np.isneginf(found).any():
+            raise InputError(f"input {position} ({name}) holds minus infinity", fix="mask right before a Softmax")
+        return found
 
     def weight(self, node: onnx.NodeProto, position: int) -> np.ndarray:
         found = self.constant(node, position)

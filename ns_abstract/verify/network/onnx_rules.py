@@ -16,14 +16,25 @@ from ns_abstract.verify.network.graph import item
 from ns_abstract.verify.network.layers import Shape
 from ns_abstract.verify.network.onnx_graph import Attributes, Reader, Rule, Value
 
+#: A mask that adds less than this takes a number out of a softmax: in float32 its exponential is zero.
+_DROPPED = -3e38
 
-def _pads(a: Attributes, size: tuple[int, int], kernel: Any, stride: Any, dilation: Any) -> tuple[int, int, int, int]:
+
+def _ints(a: Attributes, name: str, line: bool, default: int | None = None, beside: int = 1) -> Any:
+    """Two numbers of a window operator; of one along a line ``beside`` is the other."""
+    found = a.ints(name, 1 if line else 2, default)
+    return (*found, beside) if line and found is not None else found
+
+
+def _pads(
+    a: Attributes, size: Sequence[int], kernel: Any, stride: Any, dilation: Any, line: bool
+) -> tuple[int, int, int, int]:
     """Pads top, left, bottom, right of a window operator."""
     auto = a.get("auto_pad", "NOTSET")
-    explicit = a.ints("pads", 4, 0)
+    explicit = a.ints("pads", 2 if line else 4, 0)
     assert explicit is not None
     if auto == "NOTSET":
-        return explicit  # type: ignore[return-value]
+        return (explicit[0], 0, explicit[1], 0) if line else explicit  # type: ignore[return-value]
     if auto == "VALID":
         return 0, 0, 0, 0
     if auto not in ("SAME_UPPER", "SAME_LOWER"):
@@ -38,56 +49,69 @@ def _pads(a: Attributes, size: tuple[int, int], kernel: Any, stride: Any, dilati
     return ends[0][0], ends[1][0], ends[0][1], ends[1][1]
 
 
+def _map(r: Reader, x: int) -> tuple[int, bool]:
+    """An item as a map of rows and columns; one of channels along a line [C, L] is a map [C, L, 1]."""
+    shape = r.builder.shape(x)
+    if len(shape) == 2:
+        return r.builder.reshape(x, (*shape, 1)), True
+    return x, False
+
+
+def _mapped(r: Reader, node: onnx.NodeProto, index: int, line: bool) -> None:
+    """Name the result of a window operator."""
+    shape = r.builder.shape(index)
+    r.result(node, r.builder.reshape(index, shape[:2]) if line else index)
+
+
 def _conv(r: Reader, node: onnx.NodeProto, a: Attributes) -> None:
     x, weight, bias = r.source(node), r.weight(node, 1), r.constant(node, 2)
     shape = r.builder.shape(x)
-    if weight.ndim != 4 or len(shape) != 3:
-        raise InputError(
-            f"weights {item(weight.shape)} on {item(shape)}", fix="only two-dimensional convolutions are read"
-        )
-    kernel = a.ints("kernel_shape", 2) or weight.shape[2:]
+    if (weight.ndim, len(shape)) not in ((4, 3), (3, 2)):
+        problem = f"weights {item(weight.shape)} on {item(shape)}"
+        raise InputError(problem, fix="only one- and two-dimensional convolutions are read")
+    x, line = _map(r, x)
+    weight = weight.reshape(*weight.shape, *[1] * line)
+    kernel = _ints(a, "kernel_shape", line) or weight.shape[2:]
     if tuple(kernel) != weight.shape[2:]:
         raise InputError(f"attribute kernel_shape = {list(kernel)}, weights are {item(weight.shape)}")
-    stride, dilation = a.ints("strides", 2, 1) or (1, 1), a.ints("dilations", 2, 1) or (1, 1)
-    pads = _pads(a, shape[1:], kernel, stride, dilation)
-    r.result(node, r.builder.convolution(x, weight, bias, stride, dilation, pads, int(a.get("group", 1))))
+    stride, dilation = _ints(a, "strides", line, 1), _ints(a, "dilations", line, 1)
+    pads = _pads(a, r.builder.shape(x)[1:], kernel, stride, dilation, line)
+    index = r.builder.convolution(x, weight, bias, stride, dilation, pads, int(a.get("group", 1)))
+    _mapped(r, node, index, line)
 
 
 def _pool_window(r: Reader, node: onnx.NodeProto, a: Attributes):
-    x = r.source(node)
+    x, line = _map(r, r.source(node))
     shape = r.builder.shape(x)
     if len(shape) != 3:
-        raise InputError(f"input {item(shape)}", fix="only two-dimensional pooling is read")
-    kernel = a.ints("kernel_shape", 2)
+        raise InputError(f"input {item(shape)}", fix="only one- and two-dimensional pooling is read")
+    kernel = _ints(a, "kernel_shape", line)
     if kernel is None:
         raise InputError("attribute kernel_shape is missing")
-    stride, dilation = a.ints("strides", 2, 1) or (1, 1), a.ints("dilations", 2, 1) or (1, 1)
-    pads = _pads(a, shape[1:], kernel, stride, dilation)
+    stride, dilation = _ints(a, "strides", line, 1), _ints(a, "dilations", line, 1)
+    pads = _pads(a, shape[1:], kernel, stride, dilation, line)
     more = r.builder.rounded_up(x, kernel, stride, dilation, pads) if a.get("ceil_mode", 0) else (0, 0)
-    return x, kernel, stride, dilation, pads, more
+    return x, kernel, stride, dilation, pads, more, line
 
 
 def _average_pool(r: Reader, node: onnx.NodeProto, a: Attributes) -> None:
-    x, kernel, stride, dilation, pads, more = _pool_window(r, node, a)
+    x, kernel, stride, dilation, pads, more, line = _pool_window(r, node, a)
     if dilation != (1, 1):
         raise InputError(f"attribute dilations = {list(dilation)} is not supported", fix="only 1 is")
     counted = bool(a.get("count_include_pad", 0))
-    r.result(node, r.builder.average_windows(x, kernel, stride, pads, more, counted))
+    _mapped(r, node, r.builder.average_windows(x, kernel, stride, pads, more, counted), line)
 
 
 def _max_pool(r: Reader, node: onnx.NodeProto, a: Attributes) -> None:
-    x, kernel, stride, dilation, pads, more = _pool_window(r, node, a)
+    x, kernel, stride, dilation, pads, more, line = _pool_window(r, node, a)
     a.ignore("storage_order")  # of the second output, which is refused
     pads = (*pads[:2], pads[2] + more[0], pads[3] + more[1])
-    r.result(node, r.builder.max_pool(x, kernel, stride, dilation, pads))
+    _mapped(r, node, r.builder.max_pool(x, kernel, stride, dilation, pads), line)
 
 
 def _global_average(r: Reader, node: onnx.NodeProto, a: Attributes) -> None:
     x = r.source(node)
-    shape = r.builder.shape(x)
-    if len(shape) != 3:
-        raise InputError(f"input {item(shape)}", fix="only two-dimensional pooling is read")
-    r.result(node, r.builder.average_pool(x, shape[1:], (1, 1), (0, 0, 0, 0), True))
+    r.result(node, r.builder.reduce(x, list(range(1, len(r.builder.shape(x)))), True, True))
 
 
 def _gemm(r: Reader, node: onnx.NodeProto, a: Attributes) -> None:
@@ -246,7 +270,10 @@ def _binary(r: Reader, node: onnx.NodeProto, a: Attributes) -> None:
             raise InputError("divides by zero", fix="check the constant")
         factor = 1.0 / constant
     elif kind == "Add":
-        offset = constant
+        dropped = constant <= _DROPPED
+        if dropped.any():
+            r.dropped[node.output[0]] = np.broadcast_to(dropped, whole)
+        offset = np.where(dropped, 0.0, constant)
     else:
         factor = np.ones(()) if isinstance(one, Value) else -np.ones(())
         offset = -constant if isinstance(one, Value) else constant
@@ -333,6 +360,11 @@ def _greater(r: Reader, node: onnx.NodeProto, a: Attributes) -> None:
     r.above[node.output[0]] = r.value(node), float(limit.reshape(-1)[0])
 
 
+def _is_nan(r: Reader, node: onnx.NodeProto, a: Attributes) -> None:
+    # a cell in which a number may not be finite is unknown
+    r.fold(node, np.zeros(r.value(node).whole, bool))
+
+
 def _where(r: Reader, node: onnx.NodeProto, a: Attributes) -> None:
     if node.input[0] in r.above:
         value, limit = r.above[node.input[0]]
@@ -388,6 +420,71 @@ def _matrix(constant: Any) -> Any:
     if found.ndim < 2 or math.prod(found.shape[:-2]) != 1:
         raise InputError(f"weights {item(found.shape)}", fix="a matrix expected")
     return found.reshape(found.shape[-2:])
+
+
+def _einsum(r: Reader, node: onnx.NodeProto, a: Attributes) -> None:
+    """Sums of products of one or two operands, as products of matrices."""
+    equation = str(a.get("equation", "")).replace(" ", "")
+    left, arrow, out = equation.partition("->")
+    names = left.split(",")
+    operands = [_operand(r, node, k) for k in range(len(node.input))]
+    if not arrow:
+        out = "".join(sorted(v for v in set(left) - {","} if left.count(v) == 1))
+    letters = [*names, out]
+    if len(names) != len(operands) or not 1 <= len(names) <= 2 or not all(v.isalpha() or not v for v in letters):
+        raise InputError(f"attribute equation = {equation} is not supported", fix="name all axes of one or two values")
+    if any(len(set(v)) != len(v) for v in letters) or not set(out) <= set(left):
+        raise InputError(f"attribute equation = {equation} is not supported", fix="name every axis of a value once")
+    sizes: dict[str, int] = {}
+    for name, operand in zip(names, operands, strict=True):
+        shape = operand.whole if isinstance(operand, Value) else operand.shape
+        if len(name) != len(shape) or any(sizes.setdefault(v, n) != n for v, n in zip(name, shape, strict=True)):
+            raise InputError(f"attribute equation = {equation} on {item(shape)}", fix="check the sizes")
+    first = names[0]
+    second = names[1] if len(names) == 2 else ""
+    both = [v for v in first if v in second]
+    lead, inner = [v for v in both if v in out], [v for v in both if v not in out]
+    rows, columns = ([v for v in name if v not in both and v in out] for name in (first, second))
+    one = _axes_of(r, operands[0], first, lead, rows, inner, sizes)
+    if len(operands) == 1:
+        index, order = one, rows
+    else:
+        two = _axes_of(r, operands[1], second, lead, columns, inner, sizes)
+        index, order = _matrices(r.builder, one, two), [*lead, *rows, *columns]
+    assert isinstance(index, int)
+    b = r.builder
+    index = b.transpose(b.reshape(index, tuple(sizes[v] for v in order) or (1,)), [order.index(v) for v in out] or [0])
+    r.result(node, index, tuple(sizes[v] for v in out))
+
+
+def _axes_of(
+    r: Reader, operand: Value | np.ndarray, name: str, lead: list[str], own: list[str], inner: list[str], sizes: Any
+) -> int | np.ndarray:
+    """An operand of an einsum as matrices [lead, own, inner]; what no one else names is summed up."""
+    alone = [k for k, v in enumerate(name) if v not in (*lead, *own, *inner)]
+    rest = [v for v in name if v in (*lead, *own, *inner)]
+    order = [rest.index(v) for v in (*lead, *own, *inner)]
+    shape = tuple(math.prod(sizes[v] for v in part) for part in (lead, own, inner))
+    if not isinstance(operand, Value):
+        return np.asarray(operand, np.float64).sum(tuple(alone)).transpose(order).reshape(shape)
+    b = r.builder
+    index = b.reduce(b.reshape(operand.index, operand.whole), alone, False, False)
+    return b.reshape(b.transpose(index, order) if rest else index, shape)
+
+
+def _matrices(b: Composer, one: int | np.ndarray, two: int | np.ndarray) -> int:
+    """``one two^T`` of matrices [N, R, K] and [N, C, K], as [N, R, C]."""
+    if isinstance(one, int) and isinstance(two, int):
+        return b.matmul(one, b.transpose(two, (0, 2, 1)))
+    if not isinstance(one, int):
+        assert isinstance(two, int)
+        return b.transpose(_matrices(b, two, one), (0, 2, 1))
+    assert not isinstance(two, int)
+    n, rows, k = b.shape(one)
+    if n == 1:
+        return b.matrix(one, two[0], None)
+    spread = b.spread(b.reshape(one, (n, rows, 1, k)), (n, rows, two.shape[1], k))
+    return b.reduce(b.scale(spread, two[:, None], None), [3], False, False)
 
 
 # ---------------------------------------------------------------- shapes
@@ -607,6 +704,19 @@ def _gather(r: Reader, node: onnx.NodeProto, a: Attributes) -> None:
     _moved(r, node, x, np.take(_places(r, x), indices, axis))
 
 
+def _gather_nd(r: Reader, node: onnx.NodeProto, a: Attributes) -> None:
+    x, indices = r.value(node), np.asarray(r.weight(node, 1))
+    a.only("batch_dims", 0)
+    count = indices.shape[-1] if indices.ndim else 0
+    if not 1 <= count <= len(x.whole) or indices.dtype.kind not in "iu" or not indices.size:
+        raise InputError(f"indices {item(indices.shape)} of {item(x.whole)}", fix="check the indices")
+    sizes = np.array(x.whole[:count])
+    if not bool(((-sizes <= indices) & (indices < sizes)).all()):
+        raise InputError(f"indices do not lie in {item(x.whole[:count])}", fix="check the indices")
+    r.builder.reserve(float(indices.size // count) * math.prod(x.whole[count:]))
+    _moved(r, node, x, _places(r, x)[tuple(np.moveaxis(indices, -1, 0))])
+
+
 def _expand(r: Reader, node: onnx.NodeProto, a: Attributes) -> None:
     x, shape = r.value(node), [int(v) for v in np.atleast_1d(r.weight(node, 1))]
     index, whole = _spread(r.builder, x, shape)
@@ -649,9 +759,13 @@ def _resize(r: Reader, node: onnx.NodeProto, a: Attributes) -> None:
     mode = a.get("mode", "nearest")
     a.only("antialias", 0)
     a.only("keep_aspect_ratio_policy", "stretch")
-    a.ignore("cubic_coeff_a", "exclude_outside", "extrapolation_value")
-    if mode not in ("nearest", "linear", "bilinear"):
-        raise InputError(f"attribute mode = {mode} is not supported", fix="use nearest or linear")
+    a.ignore("extrapolation_value")
+    if mode not in ("nearest", "linear", "bilinear", "cubic"):
+        raise InputError(f"attribute mode = {mode} is not supported", fix="use nearest, linear or cubic")
+    if mode == "cubic":
+        a.only("exclude_outside", 0)
+    bend = float(a.get("cubic_coeff_a", -0.75))
+    a.ignore("exclude_outside")
     axes = [int(v) % 4 for v in a.get("axes", range(4))]
     old = node.op_type == "Upsample" or r.opset < 11
     scales = a.get("scales")
@@ -676,7 +790,7 @@ def _resize(r: Reader, node: onnx.NodeProto, a: Attributes) -> None:
     if out[:2] != whole[:2] or min(out) < 1:
         raise InputError(f"resizes {item(whole)} to {item(out)}", fix="only rows and columns may change")
     r.builder.reserve(float(math.prod(out)) * 4.0)
-    maps = [interpolation(whole[k], out[k], mode, coordinates, nearest, ratio[k]) for k in (2, 3)]
+    maps = [interpolation(whole[k], out[k], mode, coordinates, nearest, ratio[k], bend) for k in (2, 3)]
     r.result(node, r.builder.resize(x, maps))
 
 
@@ -684,15 +798,33 @@ def _resize(r: Reader, node: onnx.NodeProto, a: Attributes) -> None:
 
 
 def _conv_transpose(r: Reader, node: onnx.NodeProto, a: Attributes) -> None:
-    x, weight, bias = r.source(node), r.weight(node, 1), r.constant(node, 2)
+    (x, line), weight, bias = _map(r, r.source(node)), r.weight(node, 1), r.constant(node, 2)
+    weight = weight.reshape(*weight.shape, *[1] * line)
     a.only("auto_pad", "NOTSET", "VALID")
-    a.ints("kernel_shape", 2)
-    stride, dilation = a.ints("strides", 2, 1) or (1, 1), a.ints("dilations", 2, 1) or (1, 1)
-    pads, more = a.ints("pads", 4, 0) or (0,) * 4, a.ints("output_padding", 2, 0) or (0, 0)
+    _ints(a, "kernel_shape", line)
+    stride, dilation = _ints(a, "strides", line, 1), _ints(a, "dilations", line, 1)
+    pads, more = a.ints("pads", 2 if line else 4, 0), _ints(a, "output_padding", line, 0, 0)
+    assert pads is not None
+    pads = (pads[0], 0, pads[1], 0) if line else pads
     if a.get("output_shape") is not None:
         raise InputError("attribute output_shape is not supported", fix="use pads and output_padding")
     groups = int(a.get("group", 1))
-    r.result(node, r.builder.transposed_convolution(x, weight, bias, stride, dilation, pads, more, groups))
+    index = r.builder.transposed_convolution(x, weight, bias, stride, dilation, pads, more, groups)
+    _mapped(r, node, index, line)
+
+
+def _squared(b: Composer, x: int) -> int:
+    return b.curve(x, curves.Power, exponent=2)
+
+
+#: What is summed up, and whether the root of the sum is taken.
+_SUMMED: dict[str, tuple[Callable[[Composer, int], int] | None, bool]] = {
+    "ReduceL1": (lambda b, x: b.curve(x, curves.Abs), False),
+    "ReduceL2": (_squared, True),
+    "ReduceMean": (None, False),
+    "ReduceSum": (None, False),
+    "ReduceSumSquare": (_squared, False),
+}
 
 
 def _reduce(r: Reader, node: onnx.NodeProto, a: Attributes) -> None:
@@ -706,8 +838,11 @@ def _reduce(r: Reader, node: onnx.NodeProto, a: Attributes) -> None:
     axes = axes or list(range(rank))
     keep = bool(a.get("keepdims", 1))
     inner = [k - x.batched for k in axes if k >= x.batched]
-    if kind in ("ReduceMean", "ReduceSum"):
-        index = r.builder.reduce(x.index, inner, kind == "ReduceMean", True)
+    if kind in _SUMMED:
+        before, behind = _SUMMED[kind]
+        index = x.index if before is None else before(r.builder, x.index)
+        index = r.builder.reduce(index, inner, kind == "ReduceMean", True)
+        index = r.builder.power(index, 0.5) if behind else index
     else:
         index = r.builder.greatest(x.index, inner, True, kind == "ReduceMax") if inner else x.index
     whole = tuple(1 if k in axes else n for k, n in enumerate(x.whole))
@@ -730,7 +865,10 @@ def _softmax(r: Reader, node: onnx.NodeProto, a: Attributes) -> None:
         raise InputError(f"attribute axis = {axis} before operator set 13", fix="use the last axis, or operator set 13")
     if axis < x.batched:
         raise InputError(f"attribute axis = {axis} is not supported", fix="the batch must stay")
-    index = r.builder.softmax(x.index, axis - x.batched, node.op_type == "LogSoftmax")
+    dropped = r.dropped.get(node.input[0])
+    if dropped is not None:
+        dropped = dropped.reshape(r.builder.shape(x.index))
+    index = r.builder.softmax(x.index, axis - x.batched, node.op_type == "LogSoftmax", dropped)
     r.result(node, index, x.whole)
 
 
@@ -784,12 +922,14 @@ RULES: dict[str, Rule] = {
     "DepthToSpace": _depth_to_space,
     "Div": _binary,
     "Dropout": _dropout,
+    "Einsum": _einsum,
     "Elu": _unary(_elu),
     "Erf": _curve(curves.Erf),
     "Exp": _curve(curves.Exp),
     "Expand": _expand,
     "Flatten": _flatten,
     "Gather": _gather,
+    "GatherND": _gather_nd,
     "Gelu": _unary(_gelu),
     "Gemm": _gemm,
     "GlobalAveragePool": _global_average,
@@ -800,6 +940,7 @@ RULES: dict[str, Rule] = {
     "HardSwish": _curve(curves.HardSwish),
     "Identity": _identity,
     "InstanceNormalization": _group_norm,
+    "IsNaN": _is_nan,
     "LayerNormalization": _layer_norm,
     "LeakyRelu": _unary(lambda b, x, a: b.prelu(x, np.asarray(float(a.get("alpha", 0.01))))),
     "Log": _unary(lambda b, x, a: b.logarithm(x)),
@@ -815,10 +956,13 @@ RULES: dict[str, Rule] = {
     "Pad": _pad,
     "Pow": _pow,
     "Reciprocal": _unary(lambda b, x, a: b.reciprocal(x)),
+    "ReduceL1": _reduce,
+    "ReduceL2": _reduce,
     "ReduceMax": _reduce,
     "ReduceMean": _reduce,
     "ReduceMin": _reduce,
     "ReduceSum": _reduce,
+    "ReduceSumSquare": _reduce,
     "Relu": _unary(lambda b, x, a: b.leaky_relu(x, 0.0)),
     "Reshape": _reshape,
     "Resize": _resize,
@@ -829,6 +973,7 @@ RULES: dict[str, Rule] = {
     "Slice": _slice,
     "Softmax": _softmax,
     "Softplus": _curve(curves.Softplus),
+    "Softsign": _unary(lambda b, x, a: b.softsign(x)),
     "SpaceToDepth": _depth_to_space,
     "Split": _split,
     "Sqrt": _unary(lambda b, x, a: b.power(x, 0.5)),

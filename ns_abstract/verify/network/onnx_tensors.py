@@ -89,7 +89,8 @@ class StoredTensors:
                 raise InputError(f"cannot be read ({error})", file=self.path, field=field, fix=_FIX) from None
         if array.dtype.kind not in "fiub":
             raise InputError(f"has type {array.dtype}", file=self.path, field=field, fix="use float32")
-        if array.dtype.kind == "f" and not np.isfinite(array).all():
+        # what a mask sets to minus infinity is refused where something else than a softmax reads it
+        if array.dtype.kind == "f" and not (np.isfinite(array) | np.isneginf(array)).all():
             raise InputError("holds numbers that are not finite", file=self.path, field=field, fix="train again")
         return array
 
