@@ -18,7 +18,9 @@ _NUMBERS = 8
 _FEW_ROWS, _MANY_ROWS = 128 << 20, 420 << 20
 #: Products a second of one core: of forms in float64, and of rows in float32, few at a time, many, and many that end
 #: by plan; measured.
-_FORMS_SPEED, _FEW_SPEED, _MANY_SPEED, _PLANNED_SPEED = 1.5e9, 2.5e9, 2.5e10, 4e10
+_FORMS_SPEED, _FEW_SPEED, _MANY_SPEED, _PLANNED_SPEED = 1.5e9, 2.5e9, 3e10, 7e10
+#: Seconds that the two rows of a number take besides where they end by plan: most are short; measured.
+_PLANNED_EACH = 3.2e-5
 #: Part of all units that rows are passed back for, in sets that are worth a proof; of a deep network most.
 _OPEN, _DEEP_OPEN = 0.1, 0.4
 
@@ -44,11 +46,12 @@ def estimate(network: Network, dimensions: int) -> tuple[float, float, bool]:
     sizes = [float(np.prod(network.shape(k))) for k in range(count + 1)]
     forwards = 2.0 * sum(products(network, k) for k in range(1, count + 1)) * (1 + dimensions)
     costs = costs_of(network)
-    rows, given_up = costs.foreseen(_OPEN, _DEEP_OPEN)
-    many = costs.deep and not given_up
+    rows = costs.foreseen(_OPEN, _DEEP_OPEN)
+    many = costs.deep and not rows.given_up
     memory = sum(sizes) * 8 * (3 * dimensions + _NUMBERS) + (_MANY_ROWS if many else _FEW_ROWS)
     speed = _PLANNED_SPEED if costs.planned else _MANY_SPEED if costs.deep else _FEW_SPEED
-    return memory, forwards / _FORMS_SPEED + rows / speed, given_up
+    seconds = forwards / _FORMS_SPEED + rows.products / speed + _PLANNED_EACH * rows.numbers
+    return memory, seconds, rows.given_up
 
 
 def check_cell(network: Network, dimensions: int, allowed: float) -> None:

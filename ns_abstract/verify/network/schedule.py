@@ -124,6 +124,20 @@ class Plan(NamedTuple):
     step: int
 
 
+class Foreseen(NamedTuple):
+    """What rows of one cell take.
+
+    Attributes:
+        products: Of all rows.
+        numbers: How many numbers are bounded by rows that end by plan.
+        given_up: Whether rows are given up before the end.
+    """
+
+    products: float
+    numbers: float
+    given_up: bool
+
+
 class Costs:
     """Products that rows of one network take."""
 
@@ -359,19 +373,24 @@ class Costs:
         """Whether rows for all numbers cost so much that each is passed back as far as it pays (N18)."""
         return self.total > max(_DEEP, _OVER * _ALLOWED)
 
-    def foreseen(self, part: float, deep: float) -> tuple[float, bool]:
-        """Products that rows of one cell will take, and whether they are given up before the end (N13).
+    def foreseen(self, part: float, deep: float) -> Foreseen:
+        """What rows of one cell will take (N13).
 
         Args:
             part, deep: Part of all numbers that are bounded by rows, in other networks and in deep ones.
         """
         if not self.deep:
-            return part * self.total, False
+            return Foreseen(part * self.total, 0.0, False)
         if self.planned:
             plan = self.plan(_PLANNED, [_USUAL], 1.0)
-            return (0.0, True) if plan.widest > _HOPELESS else (plan.products, False)
-        taken = sum(deep * products for index, products in self.nodes if self.network.depth[index] > _TIGHT)
-        return min(taken, _ALLOWED), False
+            if plan.widest > _HOPELESS:
+                return Foreseen(0.0, 0.0, True)
+            return Foreseen(plan.products, sum(self.bounded[k] for k in plan.ways), False)
+        taken = [(index, deep * products) for index, products in self.nodes if self.network.depth[index] > _TIGHT]
+        share = min(1.0, _ALLOWED / max(1.0, sum(products for _, products in taken)))
+        # where a sign is not all that is asked, numbers have two rows
+        signs = {node.inputs[0] for node in self.network.nodes if isinstance(node.layer, LeakyRelu)}
+        return Foreseen(share * sum(n if k in signs else 2.0 * n for k, n in taken), 0.0, False)
 
 
 class Schedule:
