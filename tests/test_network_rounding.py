@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import itertools
 from collections.abc import Callable
 from fractions import Fraction
@@ -14,6 +15,7 @@ from onnx_files import OnnxFile, image_sets, session
 
 from ns_abstract.verify.network import ImageSets, Network, bound_outputs, load_network
 from ns_abstract.verify.network.bounds import _Cells
+from ns_abstract.verify.network.sums import partial_sums
 
 Layers = list[tuple[np.ndarray, np.ndarray]]
 #: A product that is lost when it is added to 1 in float32, and 1 stays.
@@ -351,3 +353,63 @@ def test_rows_of_outputs_in_float64_are_tighter(blocks: int, tmp_path: Path) -> 
             assert (found.lower[0] <= y + room).all() and (found.a[0] @ p + found.b[0] <= y + room).all()
         widths.append(-(found.lower[0, :3] + found.lower[0, 3:]).mean())
     assert widths[1] < widths[0]
+
+
+def _all_together(values: tuple[float, ...]) -> float:
+    """The most that the sizes of all partial sums may be together, over all orders and trees."""
+
+    @functools.cache
+    def within(mask: int) -> float:
+        parts = [k for k in range(len(values)) if mask >> k & 1]
+        if len(parts) < 2:
+            return 0.0
+        best, one = 0.0, (mask - 1) & mask
+        while one:
+            best = max(best, within(one) + within(mask ^ one))
+            one = (one - 1) & mask
+        return abs(sum(values[k] for k in parts)) + best
+
+    return within((1 << len(values)) - 1)
+
+
+def _bounded(values: np.ndarray) -> float:
+    sides = np.clip(values, 0.0, None), np.clip(-values, 0.0, None)
+    peak, squares = (max(float((v**k).sum()) for v in sides) for k in (1, 2))
+    given = (torch.tensor(v, dtype=torch.float64) for v in (peak, squares, abs(float(values.sum()))))
+    return float(partial_sums(len(values) - 1, *given))
+
+
+def test_partial_sums_of_every_order() -> None:
+    rng = np.random.default_rng(0)
+    for k in range(60):
+        values = rng.normal(size=int(rng.integers(2, 9))) * np.exp(rng.uniform(0, k % 4) * rng.normal())
+        if k % 3 == 0:
+            values = np.abs(values)
+        elif k % 3 == 1:
+            values = rng.choice([-1.0, 1.0, 1.0, 0.01], len(values))
+        assert _all_together(tuple(values)) <= _bounded(values)
+    assert _bounded(np.zeros(5)) == 0.0
+
+
+def test_partial_sums_are_nearly_reached() -> None:
+    """Equal numbers lose a half of as many times their sum, those that cancel no more in each part."""
+    for n in (100, 1000):
+        for values in (np.ones(n), np.repeat([1.0, -1.0], n // 2)):
+            chain = np.abs(np.cumsum(values)).sum() - 1.0
+            assert chain <= _bounded(values) <= 1.5 * chain
+
+
+def test_scales_that_may_be_folded(tmp_path: Path) -> None:
+    """Where a scale and a layer are connected without an activation between, and only there."""
+    f = OnnxFile((2, 4, 4))
+    f.conv(2, 2, pads=[1, 1, 1, 1])
+    f.node("Relu")
+    f.conv(2, 2, pads=[1, 1, 1, 1])
+    f.node("Transpose", perm=[0, 1, 3, 2])
+    f.node("Mul", f.last, f.constant([[[2.0]], [[3.0]]]))
+    f.node("Relu")
+    f.conv(2, 2)
+    network = load_network(f.write(tmp_path / "net.onnx"))
+    kinds = [type(node.layer).__name__ for node in network.nodes]
+    assert kinds == ["Convolution", "LeakyRelu", "Convolution", "Gather", "Scale", "LeakyRelu", "Convolution"]
+    assert network.scaled == {3, 4, 5}

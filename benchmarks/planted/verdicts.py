@@ -226,6 +226,22 @@ VERDICTS = (
         "test_network_bounds.py::test_plans_keep_to_what_is_allowed",
     ),
     Fault(
+        "network: partial sums on the way to a large sum are forgotten",
+        "verify/network/sums.py",
+        "partial_sums",
+        "half * end",
+        "0.0 * end",
+        "test_network_rounding.py::test_partial_sums_are_nearly_reached",
+    ),
+    Fault(
+        "network: scales are folded into no layer beside them",
+        "verify/network/graph.py",
+        "Network.scaled",
+        "groups[group(k)] = group(index)",
+        "groups[k] = k",
+        "test_network_rounding.py::test_scales_that_may_be_folded",
+    ),
+    Fault(
         "network: rows under way are never parted",
         _NETWORK,
         "_Cells._descend",

@@ -1,4 +1,4 @@
-"""Bounds of a network's outputs over sets of images (docs/design.md, N, N0-N2, N6, N12-N14, N16-N18)."""
+"""Bounds of a network's outputs over sets of images (docs/design.md, N, N0-N2, N6, N12-N14, N16-N18, N20)."""
 
 from __future__ import annotations
 
@@ -32,6 +32,7 @@ from ns_abstract.verify.network.rows import (
 )
 from ns_abstract.verify.network.schedule import TRIALS, Schedule, Way, on_threads
 from ns_abstract.verify.network.slopes import Ascent, Chosen, Held, OpenUnits, derivatives
+from ns_abstract.verify.network.sums import partial_sums
 
 Float64 = NDArray[np.float64]
 Int64 = NDArray[np.int64]
@@ -502,7 +503,8 @@ class _Cells:
         elif self.single:
             count = self._roundings(sources, layer, known)
             self.terms[k] = count
-            moves = moves + self._rounding(sources, layer, known, count, size) + layer.spare(sizes)
+            end = (reference + moved[:, 0]).abs() + moved[:, 1:].abs().sum(1) + radius + moves
+            moves = moves + self._rounding(k, sources, layer, known, count, size, end) + layer.spare(sizes)
         roundings = layer.row_terms + _SPARE + max(self.network.readers[i] for i in sources)
         form = _Form.ranged(reference, moved[:, 0], moved[:, 1:], radius + moves, active)
         if float(size.amax()) >= _OVERFLOW:
@@ -526,10 +528,21 @@ class _Cells:
         return source in self.passages[0].noise
 
     def _rounding(
-        self, sources: tuple[int, ...], layer: Linear, inputs: list[_Form], count: Tensor | int, size: Tensor
+        self,
+        k: int,
+        sources: tuple[int, ...],
+        layer: Linear,
+        inputs: list[_Form],
+        count: Tensor | int,
+        size: Tensor,
+        end: Tensor,
     ) -> Tensor:
-        """What a float32 evaluation of a layer may be off, [m, *shape], for ``size`` = |W| |x| + |bias| (N2)."""
-        few = _gamma(_FOLDING + 3 + len(inputs)) * size
+        """What a float32 evaluation of a layer may be off, [m, *shape].
+
+        ``size`` = |W| |x| + |bias|; ``end``: what its values are at most (N2, N20).
+        """
+        folding = _FOLDING if k in self.network.scaled else 0
+        few = _gamma(folding + 3 + len(inputs)) * size
         if isinstance(layer, Scale):
             # sums before it may start with the offset
             first = torch.zeros(()) if layer.bias is None else layer.bias.abs()
@@ -545,9 +558,16 @@ class _Cells:
         if not isinstance(layer, (Convolution, Matrix, TransposedConvolution)):
             return _gamma(count + _FOLDING) * size
         # partial sums are no larger than the positive products together, or the negative ones
-        balance = layer([f.interval.upper.clamp(min=0.0) + f.interval.lower.clamp(max=0.0) for f in inputs])
+        above, below = inputs[0].interval.upper.clamp(min=0.0), inputs[0].interval.lower.clamp(max=0.0)
+        balance = layer([above + below])
         peak = 0.5 * (size + balance.abs()) * (1.0 + 2.0**-40)
-        return _gamma(count) * (peak + _gamma(count + _FOLDING + 1) * size) + few
+        squared = layer.squared
+        whole = squared.magnitude([above.square() + below.square()])
+        if squared.bias is not None:
+            whole = whole + squared.bias.abs()
+        squares = 0.5 * (whole + squared([above.square() - below.square()]).abs()) * (1.0 + 2.0**-36)
+        together = partial_sums(count, peak, squares, end)
+        return _gamma(1) * (together + count * _gamma(count + _FOLDING + 1) * size) + few
 
     def _roundings(self, sources: tuple[int, ...], layer: Linear, inputs: list[_Form]) -> Tensor | int:
         """Roundings that a layer's sums may suffer; what is added behind sums may be added within them (N2)."""

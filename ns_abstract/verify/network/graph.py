@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from ns_abstract.verify.network.curves import Assumed
-from ns_abstract.verify.network.layers import Activation, Linear, Shape, Sigmoid, Tanh
+from ns_abstract.verify.network.layers import Activation, Linear, Scale, Shape, Sigmoid, Tanh
 from ns_abstract.verify.network.maxima import MaxPool
 from ns_abstract.verify.network.products import Product
 
@@ -116,6 +116,25 @@ class Network:
             mixes = not isinstance(node.layer, Activation) and node.layer.mixes
             depths.append(max(depths[index] for index in node.inputs) + mixes)
         return tuple(depths)
+
+    @cached_property
+    def scaled(self) -> frozenset[int]:
+        """Nodes whose weights a program may have folded scales into: no activation is between (N2)."""
+        groups = list(range(len(self.nodes) + 1))
+
+        def group(k: int) -> int:
+            while groups[k] != k:
+                k = groups[k]
+            return k
+
+        plain = [False, *(not isinstance(node.layer, Activation) for node in self.nodes)]
+        for k, node in enumerate(self.nodes, 1):
+            for index in node.inputs:
+                # siblings that read one node, too: what scales it may be folded into each
+                if plain[k] and (plain[index] or not index):
+                    groups[group(k)] = group(index)
+        marked = {group(k) for k, node in enumerate(self.nodes, 1) if isinstance(node.layer, Scale)}
+        return frozenset(k for k in range(1, len(self.nodes) + 1) if plain[k] and group(k) in marked)
 
     def __call__(self, images: Tensor) -> Tensor:
         """[B, *input_shape] to [B, output_size], in the images' dtype, differentiable."""

@@ -12,7 +12,7 @@ an interval. Labels N1, N2, ... are those of docs/design.md.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import ClassVar
 
@@ -55,6 +55,15 @@ class Linear:
     def roundings(self, active: Sequence[Tensor]) -> Tensor | int:
         """`terms` of sums in which inputs that are not ``active`` [B, *input_shapes[i]] are exactly zero (N2)."""
         return self.terms
+
+    @property
+    def squared(self) -> Linear:
+        """The layer with the squares of its weights and offset, which keep their signs (N20)."""
+        changed = {}
+        for name in ("weight", "offset"):
+            value = getattr(self, name)
+            changed[name] = None if value is None else value * value.abs()
+        return replace(self, **changed)
 
     def apply(self, inputs: Sequence[Tensor]) -> Tensor:
         """``W x`` for inputs [B, *input_shapes[i]]."""
