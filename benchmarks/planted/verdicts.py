@@ -108,9 +108,9 @@ VERDICTS = (
     Fault(
         "network: rows in float64 take weights in float32",
         "verify/network/layers.py",
-        "Convolution.backward",
-        "self._single if value.dtype == torch.float32 else self.weight",
-        "self._single.to(value.dtype)",
+        "Weighted.weight_for",
+        "self._single if rows.dtype == torch.float32 else self.weight",
+        "self._single.to(rows.dtype)",
         "test_network_rounding.py::test_rows_of_outputs_take_float64_weights",
     ),
     Fault(

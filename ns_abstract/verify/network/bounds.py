@@ -14,8 +14,7 @@ from torch import Tensor
 
 from ns_abstract.execution.ending import checkpoint
 from ns_abstract.verify.network.graph import Network, NetworkArithmetic
-from ns_abstract.verify.network.layers import Activation, Convolution, LeakyRelu, Linear, Matrix, Scale, Sum
-from ns_abstract.verify.network.maps import TransposedConvolution
+from ns_abstract.verify.network.layers import Activation, LeakyRelu, Linear, Scale, Sum, Weighted
 from ns_abstract.verify.network.maxima import Candidates, MaxPool, upper_planes
 from ns_abstract.verify.network.products import Product
 from ns_abstract.verify.network.rows import (
@@ -47,6 +46,8 @@ _SPARE = 24
 #: Roundings of the network beside those of a layer's sums: a batch normalisation's factor (sum, root, quotient),
 #: its product with a weight, and as many again.
 _FOLDING = 8
+#: Sums of fewer additions gain too little by their partial sums to pay for them.
+_LONG = 256
 #: Smallest normal number of float32: what a flush to zero may lose.
 _FLUSH = 2.0**-126
 #: Past this a float32 evaluation may overflow.
@@ -503,7 +504,10 @@ class _Cells:
         elif self.single:
             count = self._roundings(sources, layer, known)
             self.terms[k] = count
-            end = (reference + moved[:, 0]).abs() + moved[:, 1:].abs().sum(1) + radius + moves
+
+            def end(moves: Tensor = moves) -> Tensor:
+                return (reference + moved[:, 0]).abs() + moved[:, 1:].abs().sum(1) + radius + moves
+
             moves = moves + self._rounding(k, sources, layer, known, count, size, end) + layer.spare(sizes)
         roundings = layer.row_terms + _SPARE + max(self.network.readers[i] for i in sources)
         form = _Form.ranged(reference, moved[:, 0], moved[:, 1:], radius + moves, active)
@@ -535,7 +539,7 @@ class _Cells:
         inputs: list[_Form],
         count: Tensor | int,
         size: Tensor,
-        end: Tensor,
+        end: Callable[[], Tensor],
     ) -> Tensor:
         """What a float32 evaluation of a layer may be off, [m, *shape].
 
@@ -555,18 +559,20 @@ class _Cells:
                 own = torch.as_tensor(self.terms.get(i, 0), dtype=torch.float64)
                 charges.append(_gamma(own) * others * (1.0 + _gamma(own + _FOLDING)))
             return few + (torch.maximum(*charges) if len(charges) == 2 else sum(charges))
-        if not isinstance(layer, (Convolution, Matrix, TransposedConvolution)):
+        if not isinstance(layer, Weighted):
             return _gamma(count + _FOLDING) * size
         # partial sums are no larger than the positive products together, or the negative ones
         above, below = inputs[0].interval.upper.clamp(min=0.0), inputs[0].interval.lower.clamp(max=0.0)
         balance = layer([above + below])
         peak = 0.5 * (size + balance.abs()) * (1.0 + 2.0**-40)
+        if float(torch.as_tensor(count).max()) < _LONG:
+            return _gamma(count) * (peak + _gamma(count + _FOLDING + 1) * size) + few
         squared = layer.squared
         whole = squared.magnitude([above.square() + below.square()])
         if squared.bias is not None:
             whole = whole + squared.bias.abs()
         squares = 0.5 * (whole + squared([above.square() - below.square()]).abs()) * (1.0 + 2.0**-36)
-        together = partial_sums(count, peak, squares, end)
+        together = partial_sums(count, peak, squares, end())
         return _gamma(1) * (together + count * _gamma(count + _FOLDING + 1) * size) + few
 
     def _roundings(self, sources: tuple[int, ...], layer: Linear, inputs: list[_Form]) -> Tensor | int:

@@ -56,15 +56,6 @@ class Linear:
         """`terms` of sums in which inputs that are not ``active`` [B, *input_shapes[i]] are exactly zero (N2)."""
         return self.terms
 
-    @property
-    def squared(self) -> Linear:
-        """The layer with the squares of its weights and offset, which keep their signs (N20)."""
-        changed = {}
-        for name in ("weight", "offset"):
-            value = getattr(self, name)
-            changed[name] = None if value is None else value * value.abs()
-        return replace(self, **changed)
-
     def apply(self, inputs: Sequence[Tensor]) -> Tensor:
         """``W x`` for inputs [B, *input_shapes[i]]."""
         return inputs[0].reshape(-1, *self.shape)
@@ -87,7 +78,30 @@ class Linear:
 
 
 @dataclass(frozen=True, eq=False)
-class Convolution(Linear):
+class Weighted(Linear):
+    """A layer of sums of products: ``weight`` and ``offset``, float64; None: no offset."""
+
+    weight: Tensor = field(default_factory=lambda: torch.zeros(0))
+    offset: Tensor | None = None
+    mixes: ClassVar[bool] = True
+
+    @cached_property
+    def _single(self) -> Tensor:
+        return self.weight.float()
+
+    def weight_for(self, rows: Tensor) -> Tensor:
+        """Weights in the rows' type."""
+        return self._single if rows.dtype == torch.float32 else self.weight
+
+    @property
+    def squared(self) -> Weighted:
+        """The layer with the squares of its weights and offset, which keep their signs (N20)."""
+        offset = None if self.offset is None else self.offset * self.offset.abs()
+        return replace(self, weight=self.weight * self.weight.abs(), offset=offset)
+
+
+@dataclass(frozen=True, eq=False)
+class Convolution(Weighted):
     """Two-dimensional convolution with zero padding; average pooling and selections are such, too.
 
     Attributes:
@@ -98,25 +112,19 @@ class Convolution(Linear):
         groups: As in ONNX.
     """
 
-    weight: Tensor = field(default_factory=lambda: torch.zeros(0))
-    offset: Tensor | None = None
     stride: tuple[int, int] = (1, 1)
     dilation: tuple[int, int] = (1, 1)
     pads: tuple[int, int, int, int] = (0, 0, 0, 0)
     groups: int = 1
-    mixes: ClassVar[bool] = True
 
     @property
     def bias(self) -> Tensor | None:
         return None if self.offset is None else self.offset[:, None, None]
 
     @cached_property
-    def _single(self) -> Tensor:
-        return self.weight.float()
-
-    @cached_property
-    def _phases(self) -> Tensor | None:
-        return self._parts(self._single)
+    def _phases(self) -> dict[torch.dtype, Tensor | None]:
+        """By the rows' type, made when they are first wanted."""
+        return {}
 
     def _parts(self, weight: Tensor) -> Tensor | None:
         """Weights [s t Cin, Cout, kh', kw'] of the s x t parts of a transposed stride, or None where it has none.
@@ -134,9 +142,10 @@ class Convolution(Linear):
 
     def _transposed(self, value: Tensor) -> Tensor:
         """[R, Cout, h, w] back to [R, Cin, (h - 1) s + kh, (w - 1) t + kw]."""
-        single = value.dtype == torch.float32
-        weight = self._single if single else self.weight
-        phases = self._phases if single else self._parts(weight)
+        weight = self.weight_for(value)
+        if value.dtype not in self._phases:
+            self._phases[value.dtype] = self._parts(weight)
+        phases = self._phases[value.dtype]
         if phases is None:
             return functional.conv_transpose2d(
                 value, weight, stride=self.stride, groups=self.groups, dilation=self.dilation
@@ -189,7 +198,7 @@ class Convolution(Linear):
             value = torch.from_numpy(rows.value)
             whole = functional.conv_transpose2d(
                 value,
-                self._single if value.dtype == torch.float32 else self.weight,
+                self.weight_for(value),
                 padding=(self.pads[0], self.pads[1]),
                 groups=self.groups,
                 dilation=self.dilation,
@@ -201,20 +210,12 @@ class Convolution(Linear):
 
 
 @dataclass(frozen=True, eq=False)
-class Matrix(Linear):
+class Matrix(Weighted):
     """A fully connected layer along the last axis; ``weight`` [out, in], ``offset`` [out] or None, float64."""
-
-    weight: Tensor = field(default_factory=lambda: torch.zeros(0))
-    offset: Tensor | None = None
-    mixes: ClassVar[bool] = True
 
     @property
     def bias(self) -> Tensor | None:
         return self.offset
-
-    @cached_property
-    def _single(self) -> Tensor:
-        return self.weight.float()
 
     def roundings(self, active: Sequence[Tensor]) -> Tensor | int:
         return active[0].sum(-1, keepdim=True).double() + (self.terms - self.weight.shape[1])
@@ -229,7 +230,7 @@ class Matrix(Linear):
         whole = full(rows, self.shape, force=True)
         count = whole.value.shape[0]
         value = torch.from_numpy(whole.value).reshape(count, *self.shape)
-        value = value @ (self._single if value.dtype == torch.float32 else self.weight)
+        value = value @ self.weight_for(value)
         return [Rows.whole(value.numpy().reshape(count, *grid(self.input_shapes[0])))]
 
 

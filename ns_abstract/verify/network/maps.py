@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from ns_abstract.verify.network.layers import Linear
+from ns_abstract.verify.network.layers import Linear, Weighted
 from ns_abstract.verify.network.rows import Rows, full, grid
 
 _UNIT = 2.0**-24
@@ -61,10 +61,13 @@ class Sparse(Linear):
         """[in, out] float32, for rows."""
         return self._matrix.t().float().coalesce()
 
+    def weight_for(self, rows: Tensor) -> Tensor:
+        """[in, out] weights in the rows' type."""
+        return self._single if rows.dtype == torch.float32 else self._matrix.t()
+
     def _rows(self, value: Tensor) -> Tensor:
         """Rows [R, in] for ``value`` [R, out]."""
-        matrix = self._single if value.dtype == torch.float32 else self._matrix.t()
-        return torch.sparse.mm(matrix, value.T).T
+        return torch.sparse.mm(self.weight_for(value), value.T).T
 
     @cached_property
     def _absolute(self) -> Tensor:
@@ -161,7 +164,7 @@ class Differences(Linear):
 
 
 @dataclass(frozen=True, eq=False)
-class TransposedConvolution(Linear):
+class TransposedConvolution(Weighted):
     """Two-dimensional transposed convolution; nearest upsampling by whole factors is one.
 
     Attributes:
@@ -173,21 +176,14 @@ class TransposedConvolution(Linear):
         groups: As in ONNX.
     """
 
-    weight: Tensor = field(default_factory=_none)
-    offset: Tensor | None = None
     stride: tuple[int, int] = (1, 1)
     dilation: tuple[int, int] = (1, 1)
     pads: tuple[int, int] = (0, 0)
     groups: int = 1
-    mixes: ClassVar[bool] = True
 
     @property
     def bias(self) -> Tensor | None:
         return None if self.offset is None else self.offset[:, None, None]
-
-    @cached_property
-    def _single(self) -> Tensor:
-        return self.weight.float()
 
     def _spread(self, x: Tensor, weight: Tensor) -> Tensor:
         whole = functional.conv_transpose2d(
@@ -217,6 +213,5 @@ class TransposedConvolution(Linear):
         bottom, right = need[0] - top - value.shape[2], need[1] - left - value.shape[3]
         # negative pads cut what no input reaches
         value = functional.pad(value, (left, right, top, bottom))
-        weight = self._single if value.dtype == torch.float32 else self.weight
-        found = functional.conv2d(value, weight, None, self.stride, 0, self.dilation, self.groups)
+        found = functional.conv2d(value, self.weight_for(value), None, self.stride, 0, self.dilation, self.groups)
         return [Rows.whole(found.numpy())]
