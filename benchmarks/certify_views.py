@@ -2,7 +2,7 @@
 
     ns-abstract-demo --output-dir DEMO
     python benchmarks/certify_views.py OUTPUT_DIR --demo DEMO [--airplane RUN/config.yml --airplane-path ORBIT.json]
-                                       [--models FOLDER] [--only NAME ...] [--minutes 20]
+                                       [--nerfs FOLDER] [--models FOLDER] [--only NAME ...] [--minutes 20]
 
 Writes camera path, property and certificate of every row below OUTPUT_DIR (as `ns-abstract-certify` takes and leaves
 them), and prints the table. PCP-S and PCP-V are of a fixed partition (docs/certificates.md). Certified cells are then
@@ -26,15 +26,20 @@ from typing import Any
 import numpy as np
 import torch
 from objects import KINDS, RUNS, write_nerf, write_run
-from train_views import CONFIDENCE, NERF, target_of
+from train_views import CONFIDENCE, NEAR_PLANE, SAMPLES, orbit_of, target_of
 
 import ns_abstract as nsa
 from ns_abstract.api.certification import FramePictures, PropertySource, Question
+from ns_abstract.api.files import resized
 from ns_abstract.geometry.camera_path import load_camera_path
 from ns_abstract.io.atomic import write_json
 from ns_abstract.verify.model import NetworkModel
 
 NETWORKS = Path(__file__).resolve().parent / "networks"
+#: Radii of colours for `curve`.
+_CURVE = (0.01, 0.02, 0.03, 0.05, 0.07)
+#: Where the rays of NeRFs of splat scenes begin.
+NERFS = {"airplane": 0.6, "lawn": 0.8}
 #: Scenes of a set that certified cells are attacked with.
 _MEMBERS = 20
 
@@ -91,6 +96,12 @@ ROWS = {
         f"lawn, {kind}": Row("detector_things", "lawn", *detect(kind, x=0.3), (1000,))
         for kind in ("aeroplane", "car", "pottedplant")
     },
+    # NeRFs of the same scenes, trained on their renders
+    "airplane NeRF, x": Row("estimator_airplane_nerf", "airplane NeRF", *estimate(0.05, x=0.08), (40,)),
+    **{
+        f"lawn NeRF, {kind}": Row("detector_lawn_nerf", "lawn NeRF", *detect(kind, x=0.1), (40,))
+        for kind in ("aeroplane", "car")
+    },
     "lawn, aeroplane, past its edge": Row("detector_things", "lawn", *detect("aeroplane", x=1.6), (1000,)),
     "lawn, car, IoU 0.5": Row("detector_things", "lawn", *detect("car", 0.5, x=0.05), (200,)),
     "buoy NeRF, boat": Row("detector_buoy", "buoy", *detect("boat", x=0.3), (100,)),
@@ -106,6 +117,23 @@ ROWS |= {
         (1000,),
     )
     for name, varied in (("poses alone", {}), ("colour 0.05", {"color": 0.05}), ("opacity 0.05", {"opacity": 0.05}))
+}
+# the same question of networks that were trained on the run, plainly and for scenes that vary, and of things
+ROWS |= {
+    f"{'airplane run' if scene == 'airplane' else kind}, orbit, {training}, {quantity} {radius:g}": Row(
+        f"classifier_{scene}_{training}",
+        scene if scene == "airplane" else kind,
+        {**turn(kind)[0], "scene": [{"select": {}, quantity: radius}]},
+        turn(kind)[1],
+        (1000,),
+    )
+    for scene, kinds, trainings in (
+        ("airplane", ("aeroplane",), ("plain", "members", "signs", "certified")),
+        ("things", KINDS, ("certified",)),
+    )
+    for kind in kinds
+    for training in trainings
+    for quantity, radius in (("color", 0.05), ("opacity", 0.05))
 }
 # what certified training is for: parts so coarse that not all can be certified
 ROWS |= {
@@ -125,12 +153,19 @@ def scenes(options: argparse.Namespace) -> dict[str, Callable[[], tuple[nsa.Scen
 
     def nerf() -> tuple[nsa.Scene, Path]:
         config, path = write_nerf(runs)
-        return nsa.load_scene(config, **NERF), path
+        return nsa.load_scene(config, num_samples=SAMPLES, near_plane=NEAR_PLANE), path
+
+    def trained(config: Path, near: float, splats: Callable[[], tuple[nsa.Scene, Path]]) -> tuple[nsa.Scene, Path]:
+        return nsa.load_scene(config, num_samples=SAMPLES, near_plane=near), splats()[1]
 
     found: dict[str, Callable[[], tuple[nsa.Scene, Path]]] = {name: partial(thing, name) for name in RUNS}
     found["buoy"] = nerf
     if options.airplane is not None:
         found["airplane"] = lambda: (nsa.load_scene(options.airplane), options.airplane_path)
+    for name, near in NERFS.items():
+        config = None if options.nerfs is None else next((options.nerfs / name).rglob("config.yml"), None)
+        if config is not None and name in found:
+            found[f"{name} NeRF"] = partial(trained, config, near, found[name])
     if options.demo is not None:
         run = next((options.demo / "airfield").rglob("config.yml"))
         found["airfield"] = lambda: (nsa.load_scene(run), options.demo / "camera_path_orbit.json")
@@ -156,6 +191,50 @@ def attack(pictures: FramePictures, question: Question, found: nsa.Certificate, 
         margin = float(claim.margin(torch.from_numpy(outputs), torch.from_numpy(values[None]))[0])
         wrong += not margin >= max(cell.margin or 0.0, 0.0)
     return count, wrong
+
+
+def margins(pictures: FramePictures, question: Question, parts: int, every: int) -> tuple[np.ndarray, np.ndarray]:
+    """Of each ``every``-th of equal parts of a set of one parameter: the margin proved at once, and the least found.
+
+    Found: at the part's middle, for the scene as stored and for the set's first members. Unlike `nsa.certify` nothing
+    is tried where a proof fails, so many networks can be compared.
+    """
+    model = NetworkModel(question.network, question.property.preprocess, 1 << 30)
+    box, sets, found = pictures.box, [], []
+    ends = np.linspace(box.lower[0], box.upper[0], parts + 1)
+    boxes = [box.replace(0, float(ends[k]), float(ends[k + 1])) for k in range(0, parts, every)]
+    claim = question.property.bind(pictures.pose_set, lambda: model.outputs(pictures.image(box.middle)[None])[0])
+    tried = [None, *itertools.islice(pictures.members(1), _MEMBERS)]
+    for part in boxes:
+        linear, lower, upper, _ = pictures.sets(part)
+        sets.append((*linear, lower, upper))
+        outputs = model.outputs(np.stack([pictures.image(part.middle, member) for member in tried])).astype(np.float64)
+        values = torch.from_numpy(np.repeat(part.middle[None], len(tried), axis=0))
+        found.append(claim.margin(torch.from_numpy(outputs), values).min().item())
+    stacked = [np.stack(arrays) for arrays in zip(*sets, strict=True)]
+    nominal = np.stack([model.outputs(pictures.image(part.middle)[None])[0] for part in boxes])
+    query = claim.query(nominal)
+    inputs = model.input_sets(tuple(stacked[:4]), stacked[4], stacked[5])
+    return np.array(claim.proved(query, model.bound(inputs, query), boxes), np.float64), np.array(found)
+
+
+def curve(options: argparse.Namespace) -> None:
+    """Print what `margins` proves of things all around, by network and by how far all colours may be off."""
+    known, folders = scenes(options), [NETWORKS, *([options.models] if options.models else [])]
+    for file in sorted(file for folder in folders for file in folder.glob("classifier_things*.onnx")):
+        for radius in _CURVE:
+            shares = []
+            for kind in KINDS:
+                scene, path = known[kind]()
+                perturbation, prop = turn(kind)
+                value = {"version": 1, **perturbation, "scene": [{"select": {}, "color": radius}]}
+                value["orbit"] = {**orbit_of(path), **perturbation["orbit"]}
+                question = Question(file, PropertySource.of(prop))
+                poses = nsa.PoseSet.from_json(load_camera_path(path).cameras[0], value).of(scene)
+                pictures = FramePictures(scene.method(), resized(poses, *question.size))
+                shares.append([float((part > 0.0).mean()) for part in margins(pictures, question, 1000, 20)])
+            proved, right = np.mean(shares, axis=0)
+            print(f"| {file.stem} | {radius:g} | proved {proved:.1%} | right on members {right:.1%} |", flush=True)
 
 
 def certify(
@@ -200,10 +279,15 @@ def main() -> None:
     parser.add_argument("--demo", type=Path)
     parser.add_argument("--airplane", type=Path, help="config.yml of the run that the network was trained on")
     parser.add_argument("--airplane-path", type=Path)
+    parser.add_argument("--nerfs", type=Path, help="folder of NeRFs that train_lego.py made of airplane and lawn")
     parser.add_argument("--models", type=Path, help="folder of cifar10_resnet2b.onnx")
     parser.add_argument("--only", nargs="*", choices=list(ROWS))
     parser.add_argument("--minutes", type=float, default=20.0, help="by row")
+    parser.add_argument("--curve", action="store_true", help="nothing but parts proved, by radius of all colours")
     options = parser.parse_args()
+    if options.curve:
+        curve(options)
+        return
     known = scenes(options)
     lines, folders = [], [NETWORKS, *([options.models] if options.models else [])]
     for name, row in ROWS.items():

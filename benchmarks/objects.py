@@ -162,9 +162,11 @@ def _lawn(rng: np.random.Generator) -> tuple[Array, Array, Array]:
     return means, sigmas, _LAWN * rng.uniform(0.9, 1.1, (len(grid), 1))
 
 
-def scene(things: Sequence[Thing], seed: int = 0) -> SplatScene:
-    """Things on a lawn whose tones depend on ``seed``."""
-    parts = [(_lawn(np.random.default_rng(seed)), 0.0), *((thing.blobs(), thing.turn) for thing in things)]
+def scene(things: Sequence[Thing], seed: int = 0, background: ArrayLike | None = None) -> SplatScene:
+    """Things on a lawn whose tones depend on ``seed``, under the sky; or before a ``background`` [3] alone."""
+    parts = [(thing.blobs(), thing.turn) for thing in things]
+    if background is None:
+        parts.insert(0, (_lawn(np.random.default_rng(seed)), 0.0))
     means, sigmas, colors = (np.concatenate(column) for column in zip(*(blobs for blobs, _ in parts), strict=True))
     turns = np.concatenate([np.full(len(blobs[0]), turn) for blobs, turn in parts])
     zero = np.zeros_like(turns)
@@ -174,7 +176,7 @@ def scene(things: Sequence[Thing], seed: int = 0) -> SplatScene:
         quats=np.stack([np.cos(0.5 * turns), zero, zero, np.sin(0.5 * turns)], axis=1).astype(np.float32),
         opacity_logits=np.full(len(means), 3.0, np.float32),
         sh=((np.clip(colors, 0.0, 1.0) - 0.5) / SH_C0)[:, None].astype(np.float32),
-        background=_SKY.astype(np.float32),
+        background=np.asarray(_SKY if background is None else background, np.float32),
         name="things",
     )
 

@@ -7,7 +7,8 @@
 An estimator's outputs are the orbit's target as seen from the camera (x right, y up, z back; normalised units), for
 cameras around the path's first one. Detector and classifier know the things of `objects.py`. Every fifth picture is
 held back. With ``--certified`` an estimator's loss holds bounds over cells of poses of half-width ``--cell`` (parts of
-its ranges), computed once, besides pictures.
+its ranges), computed once, besides pictures; ``--training certified`` is the same of a classifier, whose cells also
+hold all scenes of which colours and opacities of Gaussians are off by ``--color`` and ``--opacity``.
 """
 
 from __future__ import annotations
@@ -15,45 +16,73 @@ from __future__ import annotations
 import argparse
 import itertools
 import json
+import math
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
-from objects import KINDS, Thing, random_thing, random_things, scene
+from objects import KINDS, RUNS, Thing, random_thing, random_things, scene
 from torch import Tensor, nn
 from torch.nn import functional
-from views import HELD, Cells, cells, export, fit, head, pictures
+from views import HELD, Cells, cells, export, fit, head, joined, pictures
 
 import ns_abstract as nsa
+from ns_abstract.api.certification import FramePictures
 from ns_abstract.api.files import resized
 from ns_abstract.geometry.camera_path import Camera, load_camera_path
 from ns_abstract.geometry.poses import PoseSet
 from ns_abstract.geometry.views import around
 from ns_abstract.methods.splat.method import SplatMethod
-from ns_abstract.perturbation.specification import Perturbation
+from ns_abstract.perturbation.specification import parse_perturbation
 from ns_abstract.verify.properties import ANCHORS, Truth, decode
 
 #: Radians by which an estimator's camera is turned in training.
 _TURN = 0.02
-#: How small NeRFs are sampled.
-NERF: dict[str, Any] = {"num_samples": 32, "near_plane": 1.2}
+#: How small NeRFs are sampled, and where their rays begin.
+SAMPLES, NEAR_PLANE = 32, 1.2
 #: Classes and numbers of the head of the detection property (docs/design.md, V4), and its anchors.
 _VOC, _ANCHORS = 20, 5
-#: Where detector and classifier look: distance and elevation (degrees), each from and to; height of what they look at.
-_FAR = {"detector": (2.4, 2.8), "classifier": (1.15, 1.45)}
-_ELEVATION, _HEIGHT = (20.0, 42.0), 0.1
-#: Radians by which a detector's camera is turned away from the one thing of a run.
+
+
+@dataclass(frozen=True)
+class Stand:
+    """Where cameras stand: distance, and elevation in degrees, each from and to."""
+
+    far: tuple[float, float]
+    elevation: tuple[float, float] = (20.0, 42.0)
+
+
+_STANDS = {"detector": Stand((2.4, 2.8)), "classifier": Stand((1.15, 1.45))}
+#: Height of what they look at.
+_HEIGHT = 0.1
+#: With a run: parts of the distance that its cameras are shifted by, and how far those of other things are from its
+#: camera's distance (parts) and elevation (degrees).
+_SHIFT, _NEAR, _TILT = 0.05, 0.1, 10.0
+#: Of how many first members (the brightest, the darkest, and random ones) a picture shows one.
+_MEMBERS = 12
+#: Radians by which a detector's camera is turned away from what a run shows.
 _AWAY = 0.7
 #: Score from which a box counts: the paper's threshold.
 CONFIDENCE = 0.45
 
 
+def sampled(options: argparse.Namespace) -> dict[str, Any]:
+    """How a scene is opened."""
+    return {"num_samples": SAMPLES, "near_plane": options.near_plane} if options.nerf else {}
+
+
+def orbit_of(path: Path) -> dict[str, Any]:
+    """A path's orbit."""
+    return json.loads(path.read_text(encoding="utf-8"))["perturbation"]["orbit"]
+
+
 def target_of(path: Path) -> list[float]:
     """The point that a path's orbit is about."""
-    return json.loads(path.read_text(encoding="utf-8"))["perturbation"]["orbit"]["target"]
+    return orbit_of(path)["target"]
 
 
 def truths(origin: list[float], poses: PoseSet, values: np.ndarray) -> Tensor:
@@ -68,7 +97,7 @@ def within(outputs: Tensor, truth: Tensor, part: float) -> float:
 
 
 def estimator(options: argparse.Namespace) -> None:
-    shown = nsa.load_scene(options.run, **(NERF if options.nerf else {}))
+    shown = nsa.load_scene(options.run, **sampled(options))
     camera, origin = load_camera_path(options.path).cameras[0], target_of(options.path)
     ranges = {"x": options.x, "y": options.y, "z": options.z}
     turns = dict.fromkeys(("yaw", "pitch", "roll"), _TURN)
@@ -97,7 +126,8 @@ def estimator(options: argparse.Namespace) -> None:
         set_loss = regression_loss(sets, small, origin, options.tolerance)
         print(f"{options.cells} cells, {time.process_time():.0f} CPU s", flush=True)
     steps = fit(
-        model, images[~held], loss, options.seconds, sets=sets, set_loss=set_loss, weight=options.certified,
+        model, images[~held], loss, options.seconds, steps=options.steps, sets=sets, set_loss=set_loss,
+        weight=options.certified,
     )  # fmt: skip
     export(model, options.side, options.network)
     with torch.no_grad():
@@ -130,12 +160,24 @@ def regression_loss(sets: Cells, poses: PoseSet, origin: list[float], tolerance:
     return loss
 
 
+def photographed(
+    things: Sequence[Thing],
+    rng: np.random.Generator,
+    stand: Stand,
+    side: int,
+    more: Mapping[str, Any] | None = None,
+    background: np.ndarray | None = None,
+) -> tuple[SplatMethod, PoseSet]:
+    """Things and a camera somewhere around, with ``more`` of a perturbation file about it; see `scene`."""
+    view = around((0.0, 0.0, _HEIGHT), rng.uniform(0.0, 360.0), rng.uniform(*stand.elevation), rng.uniform(*stand.far))
+    camera = nsa.Camera(view.camera_to_world, view.fov, side, side)
+    poses = PoseSet.around(camera, parse_perturbation({"version": 1, **(more or {})}))
+    return SplatMethod(scene(things, int(rng.integers(1 << 30)), background), None, None), poses
+
+
 def photo(things: Sequence[Thing], rng: np.random.Generator, kind: str, side: int) -> tuple[Tensor, PoseSet]:
     """The picture [3, side, side] of things from somewhere around, and its pose."""
-    view = around((0.0, 0.0, _HEIGHT), rng.uniform(0.0, 360.0), rng.uniform(*_ELEVATION), rng.uniform(*_FAR[kind]))
-    camera = nsa.Camera(view.camera_to_world, view.fov, side, side)
-    poses = PoseSet.around(camera, Perturbation())
-    method = SplatMethod(scene(things, int(rng.integers(1 << 30))), None, None)
+    method, poses = photographed(things, rng, _STANDS[kind], side)
     return pictures(method, poses, np.zeros((1, 0)))[0], poses
 
 
@@ -196,8 +238,8 @@ def photos_of_things(options: argparse.Namespace, rng: np.random.Generator) -> M
 
 
 def photos_of_run(options: argparse.Namespace, rng: np.random.Generator) -> Marked:
-    """One thing, at the path's target; often outside of the picture."""
-    shown = nsa.load_scene(options.run, **(NERF if options.nerf else {}))
+    """What a run shows: one thing at the path's target, or some of `RUNS`; often outside of the picture."""
+    shown = nsa.load_scene(options.run, **sampled(options))
     camera, origin = load_camera_path(options.path).cameras[0], np.array(target_of(options.path))
     poses = nsa.PoseSet(
         camera, translation={"x": options.x, "y": 0.2, "z": 0.2}, rotation={"yaw": _AWAY, "pitch": 0.05, "roll": 0.05}
@@ -206,11 +248,19 @@ def photos_of_run(options: argparse.Namespace, rng: np.random.Generator) -> Mark
     values = drawn.box.sample(options.pictures, rng)
     # half of them as upright as those that are certified
     values[::2, 3:] *= 0.05
-    corners = origin + options.extent * np.array(list(itertools.product((-1.0, 1.0), repeat=3)))
-    found = [box_of(corners, drawn.pose(v), drawn.camera)[None] for v in values]
-    boxes = [box[seen(box, options.side)] for box in found]
-    images = list(pictures(shown.method(), drawn, values))
-    return images, boxes, [torch.full((len(box),), list(KINDS).index(options.kind_of_run)) for box in boxes]
+    if options.things is None:
+        cube = origin + options.extent * np.array(list(itertools.product((-1.0, 1.0), repeat=3)))
+        there = [(options.kind_of_run, cube)]
+    else:
+        there = [(thing.kind, thing.corners()) for thing in RUNS[options.things][0]]
+    number = torch.tensor([list(KINDS).index(kind) for kind, _ in there])
+    boxes, kinds = [], []
+    for v in values:
+        found = torch.stack([box_of(corners, drawn.pose(v), drawn.camera) for _, corners in there])
+        inside = seen(found, options.side)
+        boxes.append(found[inside])
+        kinds.append(number[inside])
+    return list(pictures(shown.method(), drawn, values)), boxes, kinds
 
 
 def overlaps(a: Tensor, b: Tensor) -> Tensor:
@@ -252,7 +302,7 @@ def detector(options: argparse.Namespace) -> None:
         size = functional.mse_loss(t[:, 2:], right[:, 2:])
         return 4.0 * value + functional.cross_entropy(logits, kind_[which][mask]) + 4.0 * centre + 2.0 * size
 
-    steps = fit(model, shown[~held], loss, options.seconds)
+    steps = fit(model, shown[~held], loss, options.seconds, steps=options.steps)
     whole = nn.Sequential(*model[:-1], whole_head(used), nn.Flatten())
     export(whole, side, options.network)
     hits = said = things = 0
@@ -275,24 +325,120 @@ def detector(options: argparse.Namespace) -> None:
 # ---------------------------------------------------------------- classifier
 
 
+def shown_member(method: SplatMethod, poses: PoseSet, values: np.ndarray, rng: np.random.Generator) -> Tensor:
+    """[3, H, W] one of the scenes of a set, at parameter values [d]."""
+    shown = FramePictures(method, poses)
+    members = shown.members(int(rng.integers(1 << 30)))
+    image = shown.image(values, next(itertools.islice(members, int(rng.integers(_MEMBERS)), None), None))
+    return torch.from_numpy(image[..., :3]).permute(2, 0, 1).float()
+
+
+class Turning:
+    """Sets of poses of one run of a kind: all around the target of a path's orbit.
+
+    Attributes:
+        method: The run.
+        whole: [azimuth and shifts] what pictures are taken from.
+        circle: [azimuth] what cells lie on.
+        background: [3] of the run.
+        stand: Where cameras of other things stand.
+    """
+
+    def __init__(self, run: Path, path: Path, side: int, more: Mapping[str, Any]) -> None:
+        given = nsa.load_scene(run)
+        camera = load_camera_path(path).cameras[0]
+        orbit = {**orbit_of(path), "azimuth": [-math.pi, math.pi]}
+        out = camera.camera_to_world[:, 3] - np.array(orbit["target"])
+        far = float(np.linalg.norm(out))
+        elevation = math.degrees(math.asin(abs(float(out @ np.array(orbit["axis"]))) / far))
+
+        def set_of(**shifts: float) -> PoseSet:
+            value = {"version": 1, "orbit": orbit, "translation": shifts, **more}
+            return resized(nsa.PoseSet.from_json(camera, value).of(given), side, side)
+
+        method = given.method()
+        if not isinstance(method, SplatMethod):
+            raise SystemExit(f"{run}: other things can only stand before a splat scene's background")
+        self.method, self.circle = method, set_of()
+        self.whole = set_of(**dict.fromkeys("xyz", _SHIFT * far))
+        self.background = self.method.scene.background
+        self.stand = Stand(
+            ((1.0 - _NEAR) * far, (1.0 + _NEAR) * far), (max(0.0, elevation - _TILT), elevation + _TILT)
+        )  # fmt: skip
+
+
+def class_loss(right: Tensor, count: int) -> tuple[Tensor, Any]:
+    """Rows of the outputs, and the cross-entropy of the least that each class [n] can be ahead of all others by.
+
+    The rows [count^2, count] are all differences of two outputs: first the one that is ahead.
+    """
+    one = torch.eye(count)
+    rows = (one[:, None] - one[None]).reshape(count * count, count)
+
+    def loss(found: tuple[Tensor, Tensor, Tensor], which: Tensor, grown: float) -> Tensor:
+        centre, along, radius = found
+        ahead = (centre - along.abs().sum(dim=1) - radius).unflatten(1, (count, count))
+        label = right[which]
+        return functional.cross_entropy(-ahead[torch.arange(len(label)), label], label)
+
+    return rows, loss
+
+
 def classifier(options: argparse.Namespace) -> None:
     rng, names = np.random.default_rng(options.seed), list(KINDS)
     kinds = torch.arange(options.pictures) // 2 % len(names)
-    images = torch.stack([
-        photo([random_thing(rng, names[k], 0.06)], rng, "classifier", options.side)[0] for k in kinds.tolist()
-    ])  # fmt: skip
-    print(f"{len(images)} pictures, {time.process_time():.0f} CPU s", flush=True)
-    held = torch.arange(len(images)) % HELD == 0
+    limits = {name: r for name, r in (("color", options.color), ("opacity", options.opacity)) if r > 0.0}
+    more: dict[str, Any] = {"scene": [{"select": {}, **limits}]} if limits else {}
+    turn = {"target": [0.0, 0.0, _HEIGHT], "axis": [0.0, 0.0, 1.0], "azimuth": [-options.cell, options.cell]}
+    run = None if options.run is None else Turning(options.run, options.path, options.side, more)
+    held = torch.arange(options.pictures) % HELD == 0
+    bounded = options.training in ("signs", "certified")
+    every = max(1, options.pictures // options.cells)
+    images, sets, sides = [], [], []
+    for k, kind in enumerate(kinds.tolist()):
+        cell = bounded and not held[k] and k // (2 * len(names)) % every == 0
+        if run is not None and names[kind] == options.kind_of_run:
+            method, whole, around_it = run.method, run.whole, run.circle
+        else:
+            thing = random_thing(rng, names[kind], 0.06)
+            stand, background = (_STANDS["classifier"], None) if run is None else (run.stand, run.background)
+            about = {**more, **({"orbit": turn} if bounded else {})}
+            method, whole = photographed([thing], rng, stand, options.side, about, background)
+            around_it = whole
+        values = whole.box.sample(1, rng)[0]
+        plain = pictures(method, whole, values[None])[0]
+        images.append(plain if options.training == "plain" else shown_member(method, whole, values, rng))
+        if cell:
+            middle = around_it.box.sample(1, rng) if around_it is not whole else around_it.box.middle[None]
+            sets.append(cells(method, around_it, middle, np.array([options.cell])))
+            sides.append(kind)
+    shown = torch.stack(images)
+    print(f"{len(images)} pictures, {len(sets)} cells, {time.process_time():.0f} CPU s", flush=True)
     model, right = head(options.side, len(names)), kinds[~held]
 
-    def loss(outputs: Tensor, which: Tensor) -> Tensor:
-        return functional.cross_entropy(outputs, right[which], label_smoothing=0.02)
+    def entropy(outputs: Tensor, label: Tensor) -> Tensor:
+        return functional.cross_entropy(outputs, label, label_smoothing=0.02)
 
-    steps = fit(model, images[~held], loss, options.seconds)
+    more_loss: dict[str, Any] = {}
+    if bounded:
+        label = torch.tensor(sides)
+        rows, set_loss = class_loss(label, len(names))
+        with_bounds = {"rows": rows, "set_loss": set_loss}
+        with_signs = {"attacked": lambda outputs, which: entropy(outputs, label[which])}
+        more_loss = {"sets": joined(sets), "weight": options.weight}
+        more_loss |= with_bounds if options.training == "certified" else with_signs
+    begin = time.process_time()
+    steps = fit(
+        model, shown[~held], lambda outputs, which: entropy(outputs, right[which]), options.seconds,
+        steps=options.steps, **more_loss,
+    )  # fmt: skip
     export(model, options.side, options.network)
     with torch.no_grad():
-        accuracy = float((model(images[held]).argmax(dim=1) == kinds[held]).float().mean())
-    print(f"held back: {accuracy:.3f} right of {int(held.sum())}; {steps} steps, {time.process_time():.0f} CPU s")
+        accuracy = float((model(shown[held]).argmax(dim=1) == kinds[held]).float().mean())
+    print(
+        f"held back: {accuracy:.3f} right of {int(held.sum())}; {steps} steps in {time.process_time() - begin:.0f} CPU "
+        f"s, {time.process_time():.0f} in all"
+    )
 
 
 def parser() -> argparse.ArgumentParser:
@@ -305,23 +451,41 @@ def parser() -> argparse.ArgumentParser:
     one.add_argument("--y", type=float, default=0.15)
     one.add_argument("--z", type=float, default=0.2)
     one.add_argument("--tolerance", type=float, default=0.1, help="part of the distance")
-    one.add_argument("--nerf", action="store_true", help="32 samples from 1.2")
+    one.add_argument("--nerf", action="store_true", help="32 samples")
     one.add_argument("--certified", type=float, default=0.0, help="weight of the bounds; 0: plain training")
     one.add_argument("--cell", type=float, default=0.01, help="half-width of a cell, parts of the range's")
     one.add_argument("--cell-axes", default="x")
     one.add_argument("--cells", type=int, default=600)
     two = kinds.add_parser("detector")
-    two.add_argument("--run", type=Path, help="of one thing; left out: pictures of several")
+    two.add_argument("--run", type=Path, help="left out: pictures of things on lawns")
+    two.add_argument("--things", choices=list(RUNS), help="what the run shows; left out: one thing of --kind-of-run")
     two.add_argument("--kind-of-run", choices=list(KINDS), default="boat")
     two.add_argument("--path", type=Path, help="with --run: camera path with an orbit")
     two.add_argument("--x", type=float, default=0.5)
     two.add_argument("--extent", type=float, default=0.22, help="half a side of the cube around the thing")
     two.add_argument("--nerf", action="store_true")
-    for kind in (one, two, kinds.add_parser("classifier")):
+    three = kinds.add_parser("classifier")
+    three.add_argument("--run", type=Path, help="what shows one kind, before whose background the others stand")
+    three.add_argument("--kind-of-run", choices=list(KINDS), default="aeroplane")
+    three.add_argument("--path", type=Path, help="with --run: camera path with an orbit")
+    three.add_argument("--color", type=float, default=0.0, help="how far the colour of every Gaussian may be off")
+    three.add_argument("--opacity", type=float, default=0.0, help="the same of opacities")
+    three.add_argument(
+        "--training", choices=("plain", "members", "signs", "certified"), default="plain",
+        help="on pictures of the scene, of scenes of the set; beside these, on cells: of the picture that a step by "
+        "signs leads to, or of bounds",
+    )  # fmt: skip
+    three.add_argument("--weight", type=float, default=1.0, help="of cells")
+    three.add_argument("--cell", type=float, default=0.0031, help="half-width of a cell, radians of the orbit")
+    three.add_argument("--cells", type=int, default=800, help="about")
+    for kind in (one, two):
+        kind.add_argument("--near-plane", type=float, default=NEAR_PLANE, help="where a NeRF's rays begin")
+    for kind in (one, two, three):
         kind.add_argument("network", type=Path, help="where to write it")
         kind.add_argument("--side", type=int, default=64, help="pixels")
         kind.add_argument("--pictures", type=int, default=3000)
         kind.add_argument("--seconds", type=float, default=60.0, help="processor time of the training")
+        kind.add_argument("--steps", type=int, help="of the training, in place of its time")
         kind.add_argument("--seed", type=int, default=0)
     return found
 

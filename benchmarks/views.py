@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -108,15 +108,27 @@ def cells(method: Method, poses: PoseSet, values: np.ndarray, half: np.ndarray) 
     return Cells(middle, slopes, radius, np.array([centre for centre, _ in boxes]), np.array(sizes))
 
 
-def ranges(model: nn.Sequential, middle: Tensor, slopes: Tensor, radius: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+def joined(found: Sequence[Cells]) -> Cells:
+    """Cells of several scenes, one after the other."""
+    middle, slopes, radius = (
+        torch.cat([getattr(one, name) for one in found]) for name in ("middle", "slopes", "radius")
+    )  # fmt: skip
+    values, half = (np.concatenate([getattr(one, name) for one in found]) for name in ("values", "half"))
+    return Cells(middle, slopes, radius, values, half)
+
+
+def ranges(
+    model: nn.Sequential, middle: Tensor, slopes: Tensor, radius: Tensor, rows: Tensor | None = None
+) -> tuple[Tensor, Tensor, Tensor]:
     """The network's outputs over cells, as sets of the same kind: [n, k], [n, d, k], [n, k]; differentiable.
 
     Linear layers map the set exactly, but for the radius, which takes their absolute weights. ReLU: the parallel band
     of the chord of the range (DeepZ of Singh et al., with one radius for all errors). Float64 charges are left out:
-    this is for training, not a proof.
+    this is for training, not a proof. With ``rows`` [k, outputs] those combinations of the outputs of a last linear
+    layer, which they are multiplied into: tighter than combining what the outputs' radii say.
     """
     count, parameters = slopes.shape[:2]
-    for layer in model:
+    for number, layer in enumerate(model):
         if isinstance(layer, nn.ReLU):
             reach = slopes.abs().sum(dim=1) + radius
             low, high = middle - reach, middle + reach
@@ -133,8 +145,11 @@ def ranges(model: nn.Sequential, middle: Tensor, slopes: Tensor, radius: Tensor)
             flat = functional.conv2d(flat, layer.weight, None, **place)
             radius = functional.conv2d(radius, layer.weight.abs(), None, **place)
         elif isinstance(layer, nn.Linear):
-            middle, flat = layer(middle), functional.linear(flat, layer.weight)
-            radius = functional.linear(radius, layer.weight.abs())
+            weight, bias = layer.weight, layer.bias
+            if rows is not None and number == len(model) - 1:
+                weight, bias = rows @ weight, rows @ bias
+            middle, flat = functional.linear(middle, weight, bias), functional.linear(flat, weight)
+            radius = functional.linear(radius, weight.abs())
         else:
             assert isinstance(layer, (nn.AvgPool2d, nn.Flatten)), layer
             middle, flat, radius = layer(middle), layer(flat), layer(radius)
@@ -150,6 +165,23 @@ Loss = Callable[[Tensor, Tensor], Tensor]
 CellLoss = Callable[[tuple[Tensor, Tensor, Tensor], Tensor, float], Tensor]
 
 
+def signed(model: nn.Module, cell: tuple[Tensor, Tensor, Tensor], loss: Loss, which: Tensor) -> Tensor:
+    """Members of cells (`Cells`: middle, slopes, radius) where one step by the sign of the loss's slope leads.
+
+    From a random member to an end for every parameter and every pixel by itself: more than what colours of Gaussians,
+    which pixels share, can do.
+    """
+    middle, slopes, radius = cell
+    p = (2.0 * torch.rand(slopes.shape[:2]) - 1.0).requires_grad_()
+    r = (2.0 * torch.rand_like(middle) - 1.0).requires_grad_()
+
+    def member(p: Tensor, r: Tensor) -> Tensor:
+        return middle + (slopes * p[:, :, None, None, None]).sum(dim=1) + radius * r
+
+    along = torch.autograd.grad(loss(model(member(p, r)), which), (p, r))
+    return member(*(torch.sign(slope) for slope in along)).detach()
+
+
 def fit(
     model: nn.Sequential,
     images: Tensor,
@@ -159,11 +191,15 @@ def fit(
     steps: int | None = None,
     sets: Cells | None = None,
     set_loss: CellLoss | None = None,
+    rows: Tensor | None = None,
+    attacked: Loss | None = None,
     weight: float = 1.0,
 ) -> int:
     """Train on pictures [n, 3, H, W] for so much processor time, or so many steps.
 
-    With ``sets`` the loss of bounded cells counts ``weight`` times, after a warm-up in which they grow from points.
+    With ``sets`` the loss of bounded cells counts ``weight`` times, after a warm-up in which they grow from points:
+    ``set_loss`` of the outputs' ranges (of ``rows`` of them, as `ranges` has them), or ``attacked`` of the pictures
+    that `signed` finds.
 
     Returns:
         The number of steps.
@@ -178,10 +214,13 @@ def fit(
         shown = images[which]
         value = loss(model(shown + NOISE * torch.randn_like(shown)), which)
         grown = min(1.0, max(0.0, (share - _WARM) / (_RAMP - _WARM)))
-        if sets is not None and set_loss is not None and grown > 0.0:
+        if sets is not None and grown > 0.0:
             some = torch.randint(len(sets.middle), (_CELL_BATCH,))
-            found = ranges(model, sets.middle[some], grown * sets.slopes[some], grown * sets.radius[some])
-            value = value + weight * grown * set_loss(found, some, grown)
+            cell = sets.middle[some], grown * sets.slopes[some], grown * sets.radius[some]
+            if set_loss is not None:
+                value = value + weight * grown * set_loss(ranges(model, *cell, rows), some, grown)
+            if attacked is not None:
+                value = value + weight * grown * attacked(model(signed(model, cell, attacked, some)), some)
         optimizer.zero_grad(set_to_none=True)
         value.backward()
         nn.utils.clip_grad_norm_(model.parameters(), 5.0)
