@@ -240,7 +240,9 @@ def curve(options: argparse.Namespace) -> None:
                 pictures = FramePictures(scene.method(), resized(poses, *question.size))
                 shares.append([float((part > 0.0).mean()) for part in margins(pictures, question, 1000, 20)])
             proved, right = np.mean(shares, axis=0)
-            print(f"| {file.stem} | {radius:g} | proved {proved:.1%} | right as far as attacked {right:.1%} |", flush=True)
+            print(
+                f"| {file.stem} | {radius:g} | proved {proved:.1%} | right as far as attacked {right:.1%} |", flush=True
+            )
 
 
 def certify(
