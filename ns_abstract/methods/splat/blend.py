@@ -339,7 +339,7 @@ def _flattened(t, r, m):
 
 @njit(cache=True, error_model="numpy", forceinline=True)
 def blend_several(begin, end, fragments, palette, moves, t, m):
-    """`blend_quadratic` for several parameters, or none (design.md, B10).
+    """`blend_quadratic` for several parameters, or none (design.md, B7, B10).
 
     ``t`` [m + bends, 4] receives the polynomials; the range of their curvature is part of centres and radii.
     """
