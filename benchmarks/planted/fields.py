@@ -4,12 +4,15 @@ from planted.fault import Fault
 
 _ZONOTOPE, _BOUNDS = "methods/nerf/zonotope.py", "methods/nerf/bounds.py"
 _HSV, _OCCUPANCY, _RELU = "methods/nerf/hsv.py", "methods/nerf/occupancy.py", "methods/nerf/relu_kernel.py"
+_LAYER = "methods/nerf/layer_kernel.py"
 _PLANES, _STRIPS = "methods/nerf/planes.py", "methods/nerf/strips.py"
 _SAMPLES = "methods/nerf/samples.py"
 _PARTS = "test_nerf_certify.py::test_planes_lie_beyond_every_part_exactly"
 _FIELDS = "test_nerf_zonotope.py::test_fields_are_enclosed"
 _LAYERS = "test_nerf_zonotope.py::test_linear_layers_are_enclosed"
 _UNITS = "test_nerf_zonotope.py::test_every_unit_is_enclosed"
+_NARROW = "test_nerf_zonotope.py::test_columns_in_float32_are_charged"
+_PRODUCTS = "test_nerf_zonotope.py::test_products_leave_out_what_is_off"
 _OPACITY = "test_nerf_zonotope.py::test_opacities_are_monotone_bounds"
 _SETS = "test_nerf_frame.py::test_sets_of_poses_are_enclosed"
 _STIFF = "test_nerf_frame.py::test_stiff_fields_are_enclosed"
@@ -24,17 +27,40 @@ FIELDS = (
     ),
     Fault(
         "fields: a layer forgets the box before it",
-        _ZONOTOPE, "FieldBounds._linear", "radius @ right_absolute", "0.0 * radius @ right_absolute",
+        _ZONOTOPE, "FieldBounds._linear", "radius @ layer.absolute[count:]", "0.0 * (radius @ layer.absolute[count:])",
         _LAYERS,
     ),
     Fault(
         "fields: a layer forgets its bias",
-        _ZONOTOPE, "FieldBounds._linear", "poly[:, 0] += bias", "pass", _LAYERS,
+        _ZONOTOPE, "FieldBounds._linear", "poly[:, 0] += layer.bias", "pass", _LAYERS,
     ),
     Fault(
         "fields: error terms of one neuron lose their size",
-        _ZONOTOPE, "FieldBounds._linear", "right[pieces.new_neuron] * pieces.new_size[:, None]",
-        "0.1 * right[pieces.new_neuron] * pieces.new_size[:, None]", _LAYERS,
+        _LAYER, "linear", "terms.new_size[c] * wide[terms.new_neuron[c], j]",
+        "0.1 * terms.new_size[c] * wide[terms.new_neuron[c], j]", _LAYERS,
+    ),
+    Fault(
+        "layers: columns in float32 are not charged",
+        _ZONOTOPE, "FieldBounds._linear", "(steps * (1.0 + 2.0**-10) * UNIT32) * pieces.spread + UNDERFLOW_COLUMNS",
+        "UNDERFLOW_COLUMNS", _NARROW + "[1.0]",
+    ),
+    Fault(
+        "layers: the sum of error terms forgets those that are new",
+        _ZONOTOPE, "FieldBounds._relu", "spread[which, neuron] += error", "pass", _UNITS + "[1-True]",
+    ),
+    Fault(
+        "layers: what fills the last step of a product is not nothing",
+        _LAYER, "linear", "packed_wide[count], packed[count] = 0.0, 0.0",
+        "packed_wide[count], packed[count] = 1.0, 1.0",
+        _PRODUCTS,
+    ),
+    Fault(
+        "layers: a product begins anew with every block of inputs",
+        _LAYER, "multiply", "out[min(r0 + r, count - 1), j] if begin else 0.0", "0.0", _PRODUCTS,
+    ),
+    Fault(
+        "layers: open neurons are left out as those that are off",
+        _LAYER, "linear", "size[b, j] != 0.0", "size[b, j] != 0.0 and terms.slope[b, j] == 1.0", _LAYERS,
     ),
     Fault(
         "fields: an open unit counts as active",
@@ -75,18 +101,17 @@ FIELDS = (
     ),
     Fault(
         "compiled units: the fit is not shifted to its middle",
-        _RELU, "relu", "q[0] += 0.5 * (most + least)", "q[0] += 0.0", _UNITS + "[1-True]",
+        _RELU, "relu", "0.5 * (most[c] + least[c])", "0.0", _UNITS + "[1-True]",
     ),
     Fault(
         "compiled units: columns are halved without their error",
         _RELU, "relu",
-        "(0.5 * (most - least) + CHEBYSHEV_ROUNDING * (sum_q + absolute) + 0.5 * e + 2.0 * slack) * FIELD_UP",
-        "(0.5 * (most - least) + CHEBYSHEV_ROUNDING * (sum_q + absolute) + 2.0 * slack) * FIELD_UP",
+        "(new + 0.5 * e + 2.0 * slack) * FIELD_UP", "(new + 2.0 * slack) * FIELD_UP",
         _UNITS + "[1-True]",
     ),
     Fault(
         "compiled units: an open unit counts as dead",
-        _RELU, "relu", "high <= -(e + r)", "low <= -(e + r)", _UNITS + "[1-True]",
+        _RELU, "_decide", "most[c] <= -rest", "least[c] <= -rest", _UNITS + "[1-True]",
     ),
     Fault(
         "opacity: an upper bound is rounded down",

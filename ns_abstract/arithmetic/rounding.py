@@ -43,6 +43,9 @@ TAYLOR_UP = 1.0 + 2.0**11 * UNIT64
 CHEBYSHEV_ROUNDING = 2.0**-41
 #: Fields of NeRFs: sums over a layer, in any order; at most 2^12 terms.
 FIELD_UP = 1.0 + 2.0**-40
+#: More than what underflow in binary32 (2**-126 each, were subnormals flushed) adds to a neuron
+#: before and behind a layer: at most 2^10 columns, of 2 roundings before and 2^13 behind.
+UNDERFLOW_COLUMNS = 2.0**-90
 #: A shifted colour, and its hue in sixths of a turn: at most 2^8 roundings.
 HUE_ROUNDING = 2.0**-44
 #: Activations and compositing, absolute, by sample: at most 2^8 roundings of numbers up to 2.

@@ -48,6 +48,9 @@ _PARTS = 4096
 _QUIET = 0.02
 #: A cell on which an opacity is open by this much everywhere was far too wide.
 _LOST = 0.5
+#: Shares of the first cells that were far too wide above which they begin narrower, and below which wider. Work on wide
+#: cells is lost and there is more of it, as their error terms are more; so few may be lost.
+_MANY_LOST, _FEW_LOST = 0.1, 0.03
 #: Light that a sample may leave open before compositing has shown where it matters.
 _COARSE = 0.1
 #: A sample is worth halving if it can take away this share of what a part has too much.
@@ -264,6 +267,7 @@ class NerfBounds:
         self.distances = 0.5 * (edges[1:] + edges[:-1])
         self.lengths = edges[1:] - edges[:-1]
         self.taylor = min(_TAYLOR, max(1, self.basis.degree))
+        self._bernstein: dict[tuple[int, ...], Tensor] = {}
         #: Where to begin to look for `RayBounds.displacement`.
         self.displacement = 0.02
 
@@ -346,6 +350,12 @@ class NerfBounds:
         low, high = (np.moveaxis(a, 1, 2).reshape(-1, samples) for a in (low, high))
         return edge_bounds(low, high, self.sampling)
 
+    def bernstein(self, parts: tuple[int, ...]) -> Tensor:
+        """`ChebyshevBasis.bernstein` of the field's basis, kept."""
+        if parts not in self._bernstein:
+            self._bernstein[parts] = torch.from_numpy(self.basis.bernstein(parts)).to(self.device)
+        return self._bernstein[parts]
+
     def division(self, moves: np.ndarray, most: int = _PARTS) -> Division | None:
         """Levels for samples that move by ``moves`` [n, samples, d].
 
@@ -405,6 +415,8 @@ class _Work:
         # light that reaches a sample, and what all samples so far let through
         self.before, self.light = np.ones((samples, n, parts), np.float32), np.ones((n, parts))
         self.cells, self.displacement = 0, owner.displacement
+        # cells of samples that were the first, those of them that were too wide, and whether the box is not narrow
+        self.tried, self.lost, self.wide = 0, 0, False
         inverse = [1.0 / np.array(division.counts(level), np.float64) for level in range(division.levels + 1)]
         # the first level whose cells are narrow enough for the sample
         displacement = [moves @ row for row in inverse]
@@ -431,6 +443,7 @@ class _Work:
             self.before[block] = self.light
             self._bound_block(block)
             self.light *= np.prod(1.0 - self._anywhere(self.alpha_low[block], np.minimum), axis=0)
+        self._learn()
         self._improve()
         color, found = (self.color_low, self.color_high), []
         for shift in shifts:
@@ -466,11 +479,9 @@ class _Work:
             low, high = self.division.boxes(level)
             nodes = 0.5 * (low + high)[:, None] + 0.5 * (high - low)[:, None] * self.basis.nodes
             monomials = np.prod(nodes[:, :, None, :] ** self.pencil.exponents, axis=-1)
-            bernstein = self.basis.bernstein(self.division.inner(level))
-            device = self.owner.device
             self._levels[level] = (
-                torch.from_numpy(monomials).to(device),
-                torch.from_numpy(bernstein).to(device),
+                torch.from_numpy(monomials).to(self.owner.device),
+                self.owner.bernstein(self.division.inner(level)),
                 self.division.members(level),
             )
         return self._levels[level]
@@ -488,9 +499,7 @@ class _Work:
             if not item.size:
                 continue
             waiting[level] = [_Items(ray[item], block[place[item]], cell)]
-        # cells that the box itself makes narrow do not show what wider ones would bear
-        wide = any(level > 0 for level in waiting)
-        halved = tried = 0
+        self.wide |= any(level > 0 for level in waiting)
         for level in range(self.division.levels + 1):
             if level not in waiting:
                 continue
@@ -501,23 +510,24 @@ class _Work:
                 halve, lost, seen = self._bound_batch(level, batch, _COARSE)
                 again.append(batch.take(halve))
                 first = self.start[batch.ray, batch.sample] == level
-                halved += int((lost & first).sum())
-                tried += int((seen & first).sum())
+                self.lost += int((lost & first).sum())
+                self.tried += int((seen & first).sum())
             coarse = join_items(again)
             if level == self.division.levels or not len(coarse):
                 continue
             children = self.division.children(level, coarse.cell)
             finer = _Items(np.tile(coarse.ray, 2), np.tile(coarse.sample, 2), children)
             waiting.setdefault(level + 1, []).append(finer)
-        if tried >= 32:
-            self._learn(halved / tried, wide)
 
-    def _learn(self, lost: float, widen: bool) -> None:
-        """Cells should have started narrower if many of them were ``lost``, wider if few were and ``widen``."""
-        if lost > 0.2:
-            self.displacement *= 0.85
-        elif widen and lost < 0.1:
-            self.displacement *= 1.08
+    def _learn(self) -> None:
+        """Cells should have started narrower if many of them were too wide, wider if few were."""
+        if self.tried < 32:
+            return
+        if self.lost > _MANY_LOST * self.tried:
+            self.displacement *= 0.6
+        elif self.wide and self.lost < _FEW_LOST * self.tried:
+            # cells that the box itself makes narrow do not show what wider ones would bear
+            self.displacement *= 1.2
 
     def _improve(self) -> None:
         """Halve cells that leave colours open beyond the aim, round after round, on the parts where they do."""

@@ -1,4 +1,4 @@
-"""The ReLU of `ns_abstract.methods.nerf.zonotope` for one parameter, compiled: one pass over every piece.
+"""The ReLU of `ns_abstract.methods.nerf.zonotope` for one parameter, compiled: 32 neurons side by side.
 
 The grid is symmetric and ``T_k(-p) = (-1)^k T_k(p)``, so even and odd degrees are summed on one half of it.
 """
@@ -10,214 +10,300 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
+from ns_abstract.arithmetic.chebyshev import ChebyshevBasis
 from ns_abstract.arithmetic.rounding import CHEBYSHEV_ROUNDING, FIELD_UP, UNIT64
+
+#: Neurons side by side.
+LANES = 32
+#: A line may be steeper than need be, and no slope is lost in float32.
+LEAST_SLOPE = 2.0**-60
 
 
 class Grid(NamedTuple):
     """The first half of a symmetric grid of g points, its middle included, and how a polynomial is fitted there.
 
     Attributes:
-        half: [m, (g + 1) / 2] values of the basis.
-        fit_even, fit_odd: [(g + 1) / 2, .] the fit of even and odd degrees.
+        points: (g + 1) / 2; rows and columns of the matrices behind them are zeros, to a multiple of four.
+        even, odd: [points, .] values of the basis' even and odd degrees.
+        fit_even, fit_odd: [., points] the fit of even and odd degrees.
         chord: [m].
         norming: See `ChebyshevBasis.norming`.
     """
 
-    half: np.ndarray
+    points: int
+    even: np.ndarray
+    odd: np.ndarray
     fit_even: np.ndarray
     fit_odd: np.ndarray
     chord: np.ndarray
     norming: float
 
 
+def _padded(matrix: np.ndarray) -> np.ndarray:
+    """``matrix`` with zeros behind it, so that both sides are multiples of four."""
+    rows, columns = matrix.shape
+    out = np.zeros((rows + -rows % 4, columns + -columns % 4))
+    out[:rows, :columns] = matrix
+    return out
+
+
+def grid_of(basis: ChebyshevBasis) -> Grid:
+    """The grid of a ``basis`` of one variable, whose ``grid`` is even."""
+    points = basis.grid // 2 + 1
+    values, fit = basis.evaluation[:points], basis.fit[:, :points]
+    even, odd, fit_even, fit_odd = map(_padded, (values[:, 0::2], values[:, 1::2], fit[0::2], fit[1::2]))
+    return Grid(points, even, odd, fit_even, fit_odd, basis.chord, basis.norming)
+
+
 @njit(cache=True, error_model="numpy")
-def _on_grid(p, half, even, odd, values):
-    """``values[i] = sum_k p[k] T_k(x_i)`` from ``half`` [m, (g + 1) / 2], the grid's first half and its middle."""
-    count = half.shape[1]
+def _multiply(matrix, lanes, out):
+    """``out = matrix @ lanes``, [R, LANES] of [R, K] and [K, LANES]; R and K are multiples of four."""
+    for r in range(0, matrix.shape[0], 4):
+        t0, t1, t2, t3 = out[r], out[r + 1], out[r + 2], out[r + 3]
+        for c in range(LANES):
+            t0[c] = t1[c] = t2[c] = t3[c] = 0.0
+        for i in range(0, matrix.shape[1], 4):
+            p0, p1, p2, p3 = lanes[i], lanes[i + 1], lanes[i + 2], lanes[i + 3]
+            a00, a01, a02, a03 = matrix[r, i], matrix[r, i + 1], matrix[r, i + 2], matrix[r, i + 3]
+            a10, a11, a12, a13 = matrix[r + 1, i], matrix[r + 1, i + 1], matrix[r + 1, i + 2], matrix[r + 1, i + 3]
+            a20, a21, a22, a23 = matrix[r + 2, i], matrix[r + 2, i + 1], matrix[r + 2, i + 2], matrix[r + 2, i + 3]
+            a30, a31, a32, a33 = matrix[r + 3, i], matrix[r + 3, i + 1], matrix[r + 3, i + 2], matrix[r + 3, i + 3]
+            for c in range(LANES):
+                x0, x1, x2, x3 = p0[c], p1[c], p2[c], p3[c]
+                t0[c] += a00 * x0 + a01 * x1 + (a02 * x2 + a03 * x3)
+                t1[c] += a10 * x0 + a11 * x1 + (a12 * x2 + a13 * x3)
+                t2[c] += a20 * x0 + a21 * x1 + (a22 * x2 + a23 * x3)
+                t3[c] += a30 * x0 + a31 * x1 + (a32 * x2 + a33 * x3)
+
+
+@njit(cache=True, error_model="numpy")
+def _on_grid(even, odd, grid, sum_even, sum_odd, values):
+    """``values`` [g, LANES] of polynomials with coefficients ``even`` and ``odd``."""
+    _multiply(grid.even, even, sum_even)
+    _multiply(grid.odd, odd, sum_odd)
     last = values.shape[0] - 1
-    for i in range(count):
-        even[i] = 0.0
-        odd[i] = 0.0
-    for k in range(0, p.shape[0], 2):
-        for i in range(count):
-            even[i] += p[k] * half[k, i]
-    for k in range(1, p.shape[0], 2):
-        for i in range(count):
-            odd[i] += p[k] * half[k, i]
-    for i in range(count):
-        values[last - i] = even[i] - odd[i]
-        values[i] = even[i] + odd[i]
+    for i in range(grid.points):
+        for c in range(LANES):
+            # the middle of the grid is its own mirror; odd polynomials vanish there
+            values[last - i, c] = sum_even[i, c] - sum_odd[i, c]
+            values[i, c] = sum_even[i, c] + sum_odd[i, c]
 
 
 @njit(cache=True, error_model="numpy")
-def _series(values, fit_even, fit_odd, sum_even, sum_odd, q):
-    """``q[k] = sum_i fit[k, i] values[i]`` from the grid's first half and its middle, by even and odd degrees."""
-    count = fit_even.shape[0]
+def _gather(poly, which, neuron, even, odd):
+    """Coefficients of up to LANES neurons into ``even`` and ``odd``; lanes that are left are 0."""
+    for k in range(poly.shape[1]):
+        rows = odd if k % 2 else even
+        for c in range(which.shape[0]):
+            rows[k // 2, c] = poly[which[c], k, neuron[c]]
+        for c in range(which.shape[0], LANES):
+            rows[k // 2, c] = 0.0
+
+
+@njit(cache=True, error_model="numpy")
+def _absolute(even, odd, out):
+    """``out`` [LANES] sums of absolute coefficients."""
+    out[:] = 0.0
+    for k in range(even.shape[0]):
+        for c in range(LANES):
+            out[c] += abs(even[k, c])
+    for k in range(odd.shape[0]):
+        for c in range(LANES):
+            out[c] += abs(odd[k, c])
+
+
+@njit(cache=True, error_model="numpy")
+def _certain(poly, rho, box, failed, slope, size, which, neuron):
+    """Decide the signs that the sums of coefficients decide; returns the number of the others (``which``, ``neuron``).
+
+    See `relu` for the arguments; ``size`` is that of an active neuron where nothing is decided.
+    """
+    pieces, m, n = poly.shape
+    spread = np.empty(n)
+    found = 0
+    for b in range(pieces):
+        if failed[b]:
+            slope[b], size[b], box[b] = 0.0, 0.0, 0.0
+            continue
+        spread[:] = 0.0
+        for k in range(1, m):
+            for j in range(n):
+                spread[j] += abs(poly[b, k, j])
+        for j in range(n):
+            radius = (spread[j] * FIELD_UP + rho[b, j] + box[b, j]) * FIELD_UP
+            middle = poly[b, 0, j]
+            slope[b, j] = 1.0
+            size[b, j] = (abs(middle) + spread[j] + rho[b, j]) * FIELD_UP
+            if middle >= radius:
+                continue
+            if middle <= -radius:
+                slope[b, j] = size[b, j] = box[b, j] = 0.0
+                continue
+            which[found] = b
+            neuron[found] = j
+            found += 1
+    return found
+
+
+@njit(cache=True, error_model="numpy")
+def _ranges(values, absolute, norming, low, high):
+    """``low`` and ``high`` [LANES] of polynomials from their values on the grid (design.md, F2)."""
+    low[:] = np.inf
+    high[:] = -np.inf
+    for i in range(values.shape[0]):
+        for c in range(LANES):
+            v = values[i, c]
+            low[c] = v if v < low[c] else low[c]
+            high[c] = v if v > high[c] else high[c]
+    for c in range(LANES):
+        # what is not a number is passed over above, but not in the sum of absolute coefficients
+        centre = 0.5 * (low[c] + high[c])
+        width = 0.5 * (high[c] - low[c]) * norming + CHEBYSHEV_ROUNDING * absolute[c]
+        low[c] = centre - width
+        high[c] = centre + width
+
+
+@njit(cache=True, error_model="numpy")
+def _decide(poly, rho, box, grid, slope, size, which, neuron, found, low, high):
+    """As `_certain`, by the polynomials' ranges, which are kept in ``low`` and ``high`` [.] where they decide nothing.
+
+    What is not a number stays open, and fails in `relu`.
+    """
+    even, odd = np.zeros((grid.even.shape[1], LANES)), np.zeros((grid.odd.shape[1], LANES))
+    sum_even, sum_odd = np.empty((grid.even.shape[0], LANES)), np.empty((grid.odd.shape[0], LANES))
+    values = np.empty((2 * grid.points - 1, LANES))
+    absolute, least, most = np.empty(LANES), np.empty(LANES), np.empty(LANES)
+    left = 0
+    for first in range(0, found, LANES):
+        past = min(first + LANES, found)
+        _gather(poly, which[first:past], neuron[first:past], even, odd)
+        _absolute(even, odd, absolute)
+        _on_grid(even, odd, grid, sum_even, sum_odd, values)
+        _ranges(values, absolute, grid.norming, least, most)
+        for c in range(past - first):
+            b, j = which[first + c], neuron[first + c]
+            rest = rho[b, j] + box[b, j]
+            if least[c] >= rest:
+                continue
+            if most[c] <= -rest:
+                slope[b, j] = size[b, j] = box[b, j] = 0.0
+                continue
+            which[left], neuron[left] = b, j
+            low[left], high[left] = least[c], most[c]
+            left += 1
+    return left
+
+
+@njit(cache=True, error_model="numpy")
+def _series(values, grid, sum_even, sum_odd, even, odd):
+    """Coefficients ``even`` and ``odd`` of the fit to the positive parts of ``values`` [g, LANES]."""
     last = values.shape[0] - 1
-    sum_even[:] = 0.0
-    sum_odd[:] = 0.0
-    for i in range(count):
-        # the middle of the grid stands for itself; odd polynomials vanish there
-        even = values[i] + values[last - i] if i < count - 1 else values[i]
-        odd = values[i] - values[last - i]
-        for k in range(sum_even.shape[0]):
-            sum_even[k] += fit_even[i, k] * even
-        for k in range(sum_odd.shape[0]):
-            sum_odd[k] += fit_odd[i, k] * odd
-    q[0::2] = sum_even
-    q[1::2] = sum_odd
+    for i in range(grid.points - 1):
+        for c in range(LANES):
+            left = values[i, c] if values[i, c] > 0.0 else 0.0
+            right = values[last - i, c] if values[last - i, c] > 0.0 else 0.0
+            sum_even[i, c] = left + right
+            sum_odd[i, c] = left - right
+    # the middle of the grid stands for itself
+    for c in range(LANES):
+        middle = values[grid.points - 1, c]
+        sum_even[grid.points - 1, c] = middle if middle > 0.0 else 0.0
+        sum_odd[grid.points - 1, c] = 0.0
+    sum_even[grid.points :] = 0.0
+    sum_odd[grid.points :] = 0.0
+    _multiply(grid.fit_even, sum_even, even)
+    _multiply(grid.fit_odd, sum_odd, odd)
 
 
 @njit(cache=True, error_model="numpy")
-def _smallest(values, scratch):
-    """The least of ``values`` by folding, which the processor does many at a time; NaN may be passed over."""
-    n = values.shape[0]
-    rest = (n + 1) // 2
-    for i in range(n - rest):
-        scratch[i] = values[i] if values[i] < values[i + rest] else values[i + rest]
-    if n - rest < rest:
-        scratch[rest - 1] = values[rest - 1]
-    n = rest
-    while n > 1:
-        rest = (n + 1) // 2
-        for i in range(n - rest):
-            scratch[i] = scratch[i] if scratch[i] < scratch[i + rest] else scratch[i + rest]
-        n = rest
-    return scratch[0]
+def _chords(even, odd, even_q, odd_q, chord, above, below):
+    """Distances [LANES] of ``p - q`` and ``q`` from their chords on the grid."""
+    above[:] = 0.0
+    below[:] = 0.0
+    for k in range(chord.shape[0]):
+        p, q = (odd[k // 2], odd_q[k // 2]) if k % 2 else (even[k // 2], even_q[k // 2])
+        for c in range(LANES):
+            below[c] += abs(q[c]) * chord[k]
+            above[c] += abs(p[c] - q[c]) * chord[k]
+
+
+@njit(cache=True, error_model="numpy")
+def _errors(values, fitted, above, below, least, most):
+    """Ends ``least`` and ``most`` [LANES] of ``max(0, p) - q`` from values of p and q on the grid (design.md, F5)."""
+    least[:] = np.inf
+    most[:] = -np.inf
+    for i in range(values.shape[0]):
+        for c in range(LANES):
+            v = values[i, c] if values[i, c] > 0.0 else 0.0
+            v -= fitted[i, c]
+            most[c] = v if v > most[c] else most[c]
+    for i in range(values.shape[0] - 1):
+        for c in range(LANES):
+            left = values[i, c] - fitted[i, c]
+            right = values[i + 1, c] - fitted[i + 1, c]
+            first = (left if left < right else right) - above[c]
+            second = (-fitted[i, c] if fitted[i, c] > fitted[i + 1, c] else -fitted[i + 1, c]) - below[c]
+            first = first if first > second else second
+            least[c] = first if first < least[c] else least[c]
+    for c in range(LANES):
+        most[c] += above[c] if above[c] > below[c] else below[c]
 
 
 @njit(cache=True, error_model="numpy")
 def relu(poly, rho, box, failed, grid, slope, size, which, neuron, error):
     """max(0, z) in place (design.md, F5); returns the number of new error terms.
 
-    One long function: with the range and the fit in functions of their own it takes 1.15 times as long (measured).
-
     Args:
-        poly: [B, m, n] coefficients; replaced.
+        poly: [B, m, n] coefficients; replaced where the sign is open. What is off keeps its own: its size is 0.
         rho: [B, n] sums of absolute columns.
         box: [B, n]; replaced.
         failed: [B].
         grid: `Grid`.
         slope, size: [B, n], filled: what columns are multiplied by; sum of absolute coefficients and columns.
-        which, neuron, error: [B n], filled with piece, neuron and size of the new error terms.
+        which, neuron, error: [B n], filled with piece, neuron and size of the new error terms, piece by piece.
     """
-    half, fit_even, fit_odd, chord, norming = grid
-    pieces, m, n = poly.shape
-    points = 2 * half.shape[1] - 1
-    p, q = np.empty(m), np.empty(m)
-    values, fitted, positive = np.empty(points), np.empty(points), np.empty(points)
-    even, odd = np.empty(half.shape[1]), np.empty(half.shape[1])
-    spread = np.empty(n)
-    scratch, trial = np.empty(points), np.empty(points)
-    sum_even, sum_odd = np.empty(fit_even.shape[1]), np.empty(fit_odd.shape[1])
-    found = 0
-    for b in range(pieces):
-        if failed[b]:
-            for j in range(n):
-                slope[b, j] = 0.0
-                size[b, j] = 0.0
-                box[b, j] = 0.0
-            poly[b] = 0.0
-            continue
-        for j in range(n):
-            spread[j] = 0.0
-        for k in range(1, m):
-            for j in range(n):
-                spread[j] += abs(poly[b, k, j])
-        begin = found
-        for j in range(n):
-            radius = (spread[j] * FIELD_UP + rho[b, j] + box[b, j]) * FIELD_UP
-            middle = poly[b, 0, j]
-            whole = abs(middle) + spread[j] + rho[b, j]
-            if middle >= radius:
-                slope[b, j] = 1.0
-                size[b, j] = whole * FIELD_UP
-                continue
-            if middle <= -radius:
-                slope[b, j] = 0.0
-                size[b, j] = 0.0
-                box[b, j] = 0.0
-                continue
-            absolute = 0.0
-            for k in range(m):
-                p[k] = poly[b, k, j]
-                absolute += abs(p[k])
-            _on_grid(p, half, even, odd, values)
-            low = _smallest(values, scratch)
-            for i in range(points):
-                trial[i] = -values[i]
-            high = -_smallest(trial, scratch)
-            slack = CHEBYSHEV_ROUNDING * absolute
-            centre = 0.5 * (low + high)
-            width = 0.5 * (high - low) * norming + slack
-            low = centre - width
-            high = centre + width
-            e = rho[b, j]
-            r = box[b, j]
-            if low >= e + r:
-                slope[b, j] = 1.0
-                size[b, j] = whole * FIELD_UP
-                continue
-            if high <= -(e + r):
-                slope[b, j] = 0.0
-                size[b, j] = 0.0
-                box[b, j] = 0.0
-                continue
-            # written so that what is not a number stays open, and fails below
-            for i in range(points):
-                positive[i] = values[i] if values[i] > 0.0 else 0.0
-            _series(positive, fit_even, fit_odd, sum_even, sum_odd, q)
-            _on_grid(q, half, even, odd, fitted)
-            below = 0.0
-            above = 0.0
-            sum_q = 0.0
-            for k in range(m):
-                below += abs(q[k]) * chord[k]
-                above += abs(p[k] - q[k]) * chord[k]
-                sum_q += abs(q[k])
-            for i in range(points):
-                trial[i] = fitted[i] - positive[i]
-            most = max(above, below) - _smallest(trial, scratch)
-            for i in range(points - 1):
-                left = values[i] - fitted[i]
-                right = values[i + 1] - fitted[i + 1]
-                first = (left if left < right else right) - above
-                second = (-fitted[i] if fitted[i] > fitted[i + 1] else -fitted[i + 1]) - below
-                trial[i] = first if first > second else second
-            least = _smallest(trial[: points - 1], scratch)
-            new = (0.5 * (most - least) + CHEBYSHEV_ROUNDING * (sum_q + absolute) + 0.5 * e + 2.0 * slack) * FIELD_UP
-            bottom = low - e - r
-            top = high + e + r
-            line = top / (top - bottom)
+    found = _certain(poly, rho, box, failed, slope, size, which, neuron)
+    lows, highs = np.empty(found), np.empty(found)
+    found = _decide(poly, rho, box, grid, slope, size, which, neuron, found, lows, highs)
+    even, odd = np.zeros((grid.even.shape[1], LANES)), np.zeros((grid.odd.shape[1], LANES))
+    even_q, odd_q = np.empty((grid.fit_even.shape[0], LANES)), np.empty((grid.fit_odd.shape[0], LANES))
+    sum_even, sum_odd = np.empty((grid.even.shape[0], LANES)), np.empty((grid.odd.shape[0], LANES))
+    values, fitted = np.empty((2 * grid.points - 1, LANES)), np.empty((2 * grid.points - 1, LANES))
+    absolute, absolute_q, above, below, least, most = np.empty((6, LANES))
+    for first in range(0, found, LANES):
+        past = min(first + LANES, found)
+        _gather(poly, which[first:past], neuron[first:past], even, odd)
+        _absolute(even, odd, absolute)
+        _on_grid(even, odd, grid, sum_even, sum_odd, values)
+        _series(values, grid, sum_even, sum_odd, even_q, odd_q)
+        _absolute(even_q, odd_q, absolute_q)
+        _on_grid(even_q, odd_q, grid, sum_even, sum_odd, fitted)
+        _chords(even, odd, even_q, odd_q, grid.chord, above, below)
+        _errors(values, fitted, above, below, least, most)
+        for c in range(past - first):
+            b, j = which[first + c], neuron[first + c]
+            e, r, slack = rho[b, j], box[b, j], CHEBYSHEV_ROUNDING * absolute[c]
+            new = 0.5 * (most[c] - least[c]) + CHEBYSHEV_ROUNDING * (absolute_q[c] + absolute[c])
+            new = (new + 0.5 * e + 2.0 * slack) * FIELD_UP
+            bottom, top = lows[first + c] - e - r, highs[first + c] + e + r
+            line = max(top / (top - bottom), LEAST_SLOPE)
             line_error = (0.5 * line * -bottom + 4.0 * slack) * FIELD_UP
-            if line_error + line * r < new + r:
-                kept = line
-                new = line_error
+            kept, shift, total = 0.5, 0.5 * (most[c] + least[c]), 0.0
+            by_line = line_error + line * r < new + r
+            if by_line:
+                kept, shift, new = line, 0.5 * line * -bottom, line_error
                 box[b, j] = r * line
-                for k in range(m):
-                    q[k] = p[k] * line
-                q[0] += 0.5 * line * -bottom
-            else:
-                kept = 0.5
-                q[0] += 0.5 * (most + least)
-            sum_q = 0.0
-            for k in range(m):
-                poly[b, k, j] = q[k]
-                sum_q += abs(q[k])
-            new += 8.0 * UNIT64 * (sum_q + e)
+            for k in range(poly.shape[1]):
+                if by_line:
+                    q = line * (odd[k // 2, c] if k % 2 else even[k // 2, c])
+                else:
+                    q = odd_q[k // 2, c] if k % 2 else even_q[k // 2, c]
+                q += shift if k == 0 else 0.0
+                poly[b, k, j] = q
+                total += abs(q)
+            new += 8.0 * UNIT64 * (total + e)
             slope[b, j] = kept
-            size[b, j] = (sum_q + kept * e + new) * FIELD_UP
+            size[b, j] = (total + kept * e + new) * FIELD_UP
             box[b, j] *= FIELD_UP
-            which[found] = b
-            neuron[found] = j
-            error[found] = new
-            found += 1
-        # only certain zeros are left to clear: what is open has its new polynomial
-        place = begin
-        for j in range(n):
-            if place < found and neuron[place] == j:
-                place += 1
-            elif slope[b, j] == 0.0:
-                for k in range(m):
-                    poly[b, k, j] = 0.0
+            error[first + c] = new
     return found

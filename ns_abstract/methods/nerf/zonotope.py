@@ -7,7 +7,8 @@ A batch of B pieces, each a curve (or patch) of points over its own cell of pose
 for every neuron j: polynomials of the pose, shared error terms ("columns") and a box. A linear layer is exact on
 all three; a ReLU whose sign is open over the cell is replaced by a polynomial of the pose fitted to it, and its
 error becomes a column of its own. All columns of a batch stand in one matrix, so pieces with many error terms do
-not make the others wait. All arithmetic is float64 and its rounding is charged to the box.
+not make the others wait. Arithmetic is float64, or float32 for the columns of later layers, and its rounding is
+charged to the box.
 """
 
 from __future__ import annotations
@@ -16,16 +17,29 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from numba import njit
 from torch import Tensor
 
 from ns_abstract.arithmetic.chebyshev import ChebyshevBasis
-from ns_abstract.arithmetic.rounding import CHEBYSHEV_ROUNDING, FIELD_UP, UNIT64, gamma
-from ns_abstract.methods.nerf.relu_kernel import Grid, relu
+from ns_abstract.arithmetic.rounding import (
+    CHEBYSHEV_ROUNDING,
+    FIELD_UP,
+    UNDERFLOW_COLUMNS,
+    UNIT32,
+    UNIT64,
+    gamma,
+)
+from ns_abstract.methods.nerf.layer_kernel import Product, Terms, linear
+from ns_abstract.methods.nerf.relu_kernel import LEAST_SLOPE, Grid, grid_of, relu
 from ns_abstract.methods.nerf.scene import Encoding, FieldWeights, Layer
 
 #: Radii of Bernstein ellipses that are tried for the remainder of an encoding.
 _ELLIPSES = (1.05, 1.15, 1.3, 1.6, 2.0, 2.6, 3.5, 5.0, 8.0, 14.0, 30.0, 80.0, 300.0)
+#: Last layers of the base whose columns are multiplied in float32, as those of the head: the later a radius begins, the
+#: less it grows.
+_NARROW_LAYERS = 4
+#: Roundings of a column's product in float32 beside one by live input: the column, its slope, their product, and the
+#: sums of a step; 2 to spare.
+_NARROW_STEPS = 8
 
 
 def _rounding(inputs: int) -> float:
@@ -33,40 +47,10 @@ def _rounding(inputs: int) -> float:
     return 2.0 * gamma(inputs + 4)
 
 
-@njit(cache=True, error_model="numpy")
-def _sum_by_owner(columns, owner, out):
-    """``out[owner[c]] += |columns[c]|``."""
-    for c in range(columns.shape[0]):
-        b = owner[c]
-        for j in range(columns.shape[1]):
-            out[b, j] += abs(columns[c, j])
-
-
-@njit(cache=True, error_model="numpy")
-def _scale_by_owner(columns, owner, slope):
-    """``columns[c] *= slope[owner[c]]``."""
-    for c in range(columns.shape[0]):
-        b = owner[c]
-        for j in range(columns.shape[1]):
-            columns[c, j] *= slope[b, j]
-
-
 def column_sums(columns: Tensor, owner: Tensor, pieces: int) -> Tensor:
     """[pieces, n] sums of absolute columns [C, n] by owner [C]."""
     out = torch.zeros(pieces, columns.shape[1], dtype=columns.dtype, device=columns.device)
-    if columns.device.type == "cpu":
-        _sum_by_owner(columns.numpy(), owner.numpy(), out.numpy())
-    else:
-        out.index_add_(0, owner, columns.abs())
-    return out
-
-
-def scale_columns(columns: Tensor, owner: Tensor, slope: Tensor) -> None:
-    """Multiply columns [C, n] in place by ``slope`` [pieces, n] of their owners."""
-    if columns.device.type == "cpu":
-        _scale_by_owner(columns.numpy(), owner.numpy(), slope.numpy())
-    else:
-        columns.mul_(slope[owner])
+    return out.index_add_(0, owner, columns.abs())
 
 
 @dataclass
@@ -75,10 +59,13 @@ class Pieces:
 
     Attributes:
         poly: [B, m, n] Chebyshev coefficients.
-        columns, owner: [C, n] error terms and the piece [C] that each belongs to.
+        columns, owner: [C, n] error terms, not yet multiplied by ``slope``, and the piece [C] that each belongs to.
+        slope: [B, n] what the columns of a piece are multiplied by.
         new_owner, new_neuron, new_size: [N] error terms that move one neuron only, not yet in ``columns``.
+        spread: [B, n] sum of the absolute error terms.
         box: [B, n] radius of the rest.
-        size: [B, n] sum of the absolute coefficients and columns.
+        size: [B, n] sum of the absolute coefficients and error terms. 0: the neuron is off, and only ``box`` and
+            ``spread``, which are 0, say something about it.
         failed: [B] whether the piece was given up: its other values mean nothing.
         count: [B] error terms.
     """
@@ -86,16 +73,18 @@ class Pieces:
     poly: Tensor
     columns: Tensor
     owner: Tensor
+    slope: Tensor
     new_owner: Tensor
     new_neuron: Tensor
     new_size: Tensor
+    spread: Tensor
     box: Tensor
     size: Tensor
     failed: Tensor
     count: Tensor
 
     def select(self, which: Tensor) -> Pieces:
-        """The pieces ``which`` [k] (indices)."""
+        """The pieces ``which`` [k] (indices, ascending)."""
         place = torch.full_like(self.failed, -1, dtype=torch.int64)
         place[which] = torch.arange(which.numel(), device=which.device)
         kept, new = place[self.owner] >= 0, place[self.new_owner] >= 0
@@ -103,9 +92,11 @@ class Pieces:
             self.poly[which],
             self.columns[kept],
             place[self.owner[kept]],
+            self.slope[which],
             place[self.new_owner[new]],
             self.new_neuron[new],
             self.new_size[new],
+            self.spread[which],
             self.box[which],
             self.size[which],
             self.failed[which],
@@ -115,11 +106,12 @@ class Pieces:
 
 @dataclass
 class Affine:
-    """A batch before an activation: as in `Pieces`, with all error terms in ``columns``."""
+    """A batch before an activation: as in `Pieces`, with all error terms in ``columns``, whose sums are ``spread``."""
 
     poly: Tensor
     columns: Tensor
     owner: Tensor
+    spread: Tensor
     box: Tensor
     failed: Tensor
     count: Tensor
@@ -127,7 +119,20 @@ class Affine:
     @property
     def radius(self) -> Tensor:
         """[B, n] columns and box together."""
-        return (column_sums(self.columns, self.owner, self.poly.shape[0]) + self.box) * FIELD_UP
+        return (self.spread * FIELD_UP + self.box) * FIELD_UP
+
+
+@dataclass(frozen=True)
+class _Linear:
+    """A linear layer: transposed ``weight`` [in, out], its ``absolute`` value and ``bias`` [out], all float64.
+
+    ``narrow``: the weight in float32, which it is exactly, where columns are multiplied in that.
+    """
+
+    weight: Tensor
+    absolute: Tensor
+    bias: Tensor
+    narrow: Tensor | None
 
 
 class FieldBounds:
@@ -144,19 +149,17 @@ class FieldBounds:
         self, weights: FieldWeights, basis: ChebyshevBasis, limit: int = 400, device: torch.device | str = "cpu"
     ) -> None:
         self.weights, self.basis, self.limit, self.device = weights, basis, limit, torch.device(device)
-        self._base = [self._put(layer) for layer in weights.base]
-        self._head = [self._put(layer) for layer in weights.head]
-        self._density, self._color = self._put(weights.density), self._put(weights.color)
+        self._compiled = self.device.type == "cpu"
+        wide = len(weights.base) - _NARROW_LAYERS
+        self._base = [self._put(layer, i >= wide) for i, layer in enumerate(weights.base)]
+        self._head = [self._put(layer, True) for layer in weights.head]
+        self._density, self._color = self._put(weights.density, True), self._put(weights.color, True)
         kept, rest = (torch.from_numpy(a).to(device) for a in basis.interpolation)
         self._kept, self._rest = kept, rest
         self._evaluation = torch.from_numpy(basis.evaluation).to(device)
         self._fit = torch.from_numpy(np.ascontiguousarray(basis.fit)).to(device)
         self._chord = torch.from_numpy(basis.chord).to(device)
-        self._compiled = self.device.type == "cpu" and basis.dimensions == 1 and basis.grid % 2 == 0
-        middle = basis.grid // 2 + 1
-        halves = (basis.evaluation.T[:, :middle], basis.fit[0::2, :middle].T, basis.fit[1::2, :middle].T)
-        half, fit_even, fit_odd = map(np.ascontiguousarray, halves)
-        self._halves = half, fit_even, fit_odd
+        self._grid = grid_of(basis) if self._compiled and basis.dimensions == 1 and basis.grid % 2 == 0 else None
         degrees = torch.from_numpy(basis.indices).to(device, torch.float64)
         ellipses = torch.tensor(_ELLIPSES, dtype=torch.float64, device=device)
         # [ellipses, d, m]: bound of |Im T_k| on the ellipse of one variable, rounded up
@@ -165,10 +168,12 @@ class FieldBounds:
         )
         self._decay = 4.0 * ellipses**-basis.degree / (ellipses - 1.0) * (1.0 + 2.0**-30)
 
-    def _put(self, layer: Layer) -> tuple[Tensor, Tensor, Tensor]:
-        """Transposed weight [in, out], its absolute value, bias [out]."""
+    def _put(self, layer: Layer, narrow: bool) -> _Linear:
         weight = torch.from_numpy(layer.weight).to(self.device, torch.float64).T.contiguous()
-        return weight, weight.abs(), torch.from_numpy(layer.bias).to(self.device, torch.float64)
+        bias = torch.from_numpy(layer.bias).to(self.device, torch.float64)
+        # only the compiled product gains by float32
+        narrow &= self._compiled
+        return _Linear(weight, weight.abs(), bias, weight.float() if narrow else None)
 
     # --- encodings -----------------------------------------------------------------------------
 
@@ -210,39 +215,60 @@ class FieldBounds:
 
     # --- layers --------------------------------------------------------------------------------
 
-    def _linear(
-        self, pieces: Pieces, layer: tuple[Tensor, Tensor, Tensor], first: tuple[Tensor, Tensor] | None = None
-    ) -> Affine:
+    def _linear(self, pieces: Pieces, layer: _Linear, first: tuple[Tensor, Tensor] | None = None) -> Affine:
         """A linear layer on ``pieces``, after ``first`` (polynomials, remainders) in the order of its inputs (F4)."""
-        weight, absolute, bias = layer
         count = 0 if first is None else first[0].shape[-1]
-        rounding = _rounding(weight.shape[0])
-        right, right_absolute = weight[count:], absolute[count:]
-        poly = pieces.poly @ right
+        rounding = _rounding(layer.weight.shape[0])
         radius = pieces.box + rounding * (pieces.size + pieces.box)
-        box = radius @ right_absolute
+        if layer.narrow is not None:
+            steps = (pieces.size != 0.0).sum(dim=1, keepdim=True) + _NARROW_STEPS
+            radius += (steps * (1.0 + 2.0**-10) * UNIT32) * pieces.spread + UNDERFLOW_COLUMNS
+        box = radius @ layer.absolute[count:] + (0.0 if layer.narrow is None else UNDERFLOW_COLUMNS)
+        poly, columns, owner, spread = self._product(pieces, layer, count)
         if first is not None:
-            poly += first[0] @ weight[:count]
-            box += (first[1] + rounding * (first[0].abs().sum(dim=1) + first[1])) @ absolute[:count]
-        poly[:, 0] += bias
-        box += 4.0 * UNIT64 * (bias.abs() + poly[:, 0].abs())
-        moved = right[pieces.new_neuron] * pieces.new_size[:, None]
-        columns = torch.cat([pieces.columns @ right, moved]) if pieces.columns.shape[0] else moved
-        owner = torch.cat([pieces.owner, pieces.new_owner])
-        return Affine(poly, columns, owner, box * FIELD_UP, pieces.failed, pieces.count)
+            poly += first[0] @ layer.weight[:count]
+            box += (first[1] + rounding * (first[0].abs().sum(dim=1) + first[1])) @ layer.absolute[:count]
+        poly[:, 0] += layer.bias
+        box += 4.0 * UNIT64 * (layer.bias.abs() + poly[:, 0].abs())
+        return Affine(poly, columns, owner, spread, box * FIELD_UP, pieces.failed, pieces.count)
 
-    def _first(self, poly: Tensor, remainder: Tensor, layer: tuple[Tensor, Tensor, Tensor]) -> Affine:
+    def _product(self, pieces: Pieces, layer: _Linear, count: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Polynomials, columns, owners and sums of columns times the weight's rows behind the first ``count``."""
+        weight = layer.weight[count:]
+        (batch, m, _), n = pieces.poly.shape, weight.shape[1]
+        if not self._compiled:
+            columns = (pieces.columns * pieces.slope[pieces.owner]) @ weight
+            columns = torch.cat([columns, weight[pieces.new_neuron] * pieces.new_size[:, None]])
+            owner = torch.cat([pieces.owner, pieces.new_owner])
+            return pieces.poly @ weight, columns, owner, column_sums(columns, owner, batch)
+        kind = weight if layer.narrow is None else layer.narrow[count:]
+        total = pieces.columns.shape[0] + pieces.new_owner.shape[0]
+        poly, spread = torch.empty(batch, m, n, dtype=torch.float64), torch.empty(batch, n, dtype=torch.float64)
+        columns, owner = torch.empty(total, n, dtype=kind.dtype), torch.empty(total, dtype=torch.int64)
+        places = torch.arange(batch + 1)
+        before = (
+            pieces.columns.to(kind.dtype), torch.searchsorted(pieces.owner, places), pieces.slope,
+            torch.searchsorted(pieces.new_owner, places), pieces.new_neuron, pieces.new_size,
+        )  # fmt: skip
+        linear(
+            pieces.poly.numpy(), pieces.size.numpy(), Terms(*(a.numpy() for a in before)), weight.numpy(),
+            kind.numpy(), Product(*(a.numpy() for a in (poly, columns, owner, spread))),
+        )  # fmt: skip
+        return poly, columns, owner, spread
+
+    def _first(self, poly: Tensor, remainder: Tensor, layer: _Linear) -> Affine:
         """A linear layer on polynomials and remainders alone."""
-        weight, absolute, bias = layer
-        out = poly @ weight
-        box = (remainder + _rounding(weight.shape[0]) * (poly.abs().sum(dim=1) + remainder)) @ absolute
-        out[:, 0] += bias
-        box += 4.0 * UNIT64 * (bias.abs() + out[:, 0].abs())
+        out = poly @ layer.weight
+        rounding = _rounding(layer.weight.shape[0])
+        box = (remainder + rounding * (poly.abs().sum(dim=1) + remainder)) @ layer.absolute
+        out[:, 0] += layer.bias
+        box += 4.0 * UNIT64 * (layer.bias.abs() + out[:, 0].abs())
         pieces = poly.shape[0]
         return Affine(
             out,
-            torch.zeros(0, weight.shape[1], dtype=torch.float64, device=self.device),
+            torch.zeros(0, out.shape[2], dtype=torch.float64, device=self.device),
             torch.zeros(0, dtype=torch.int64, device=self.device),
+            torch.zeros_like(box),
             box * FIELD_UP,
             torch.zeros(pieces, dtype=torch.bool, device=self.device),
             torch.zeros(pieces, dtype=torch.int64, device=self.device),
@@ -250,11 +276,13 @@ class FieldBounds:
 
     def _relu(self, z: Affine) -> Pieces:
         """max(0, z) (design.md, F5)."""
-        rho = column_sums(z.columns, z.owner, z.poly.shape[0]) * FIELD_UP
-        found = self._relu_compiled(z, rho) if self._compiled else self._relu_torch(z, rho)
+        rho = z.spread * FIELD_UP
+        found = self._relu_torch(z, rho) if self._grid is None else self._relu_compiled(z, rho, self._grid)
         poly, box, size, slope, which, neuron, error = found
         columns, owner = z.columns, z.owner
-        scale_columns(columns, owner, slope)
+        spread = rho * slope
+        spread[which, neuron] += error
+        spread *= FIELD_UP
         count = z.count.index_add(0, which, torch.ones_like(which))
         failed = z.failed | (count > self.limit) | ~torch.isfinite(size).all(dim=1)
         if bool((failed & ~z.failed).any()):
@@ -262,16 +290,16 @@ class FieldBounds:
             columns, owner = columns[stays], owner[stays]
             stays = ~failed[which]
             which, neuron, error = which[stays], neuron[stays], error[stays]
-            poly[failed], box[failed], size[failed] = 0.0, 0.0, 0.0
-        return Pieces(poly, columns, owner, which, neuron, error, box, size, failed, count)
+            poly[failed], box[failed], size[failed], spread[failed] = 0.0, 0.0, 0.0, 0.0
+        return Pieces(poly, columns, owner, slope, which, neuron, error, spread, box, size, failed, count)
 
-    def _relu_compiled(self, z: Affine, rho: Tensor) -> tuple[Tensor, ...]:
+    def _relu_compiled(self, z: Affine, rho: Tensor, grid: Grid) -> tuple[Tensor, ...]:
         """See `_relu_torch`; ``z`` is used up."""
         pieces, _, n = z.poly.shape
         slope, size = torch.empty(2, pieces, n, dtype=torch.float64)
         places = torch.empty(2, pieces * n, dtype=torch.int64)
         error = torch.empty(pieces * n, dtype=torch.float64)
-        poly, grid = z.poly.contiguous(), Grid(*self._halves, self._chord.numpy(), self.basis.norming)
+        poly = z.poly.contiguous()
         found = relu(
             poly.numpy(), rho.numpy(), z.box.numpy(), z.failed.numpy(), grid, slope.numpy(), size.numpy(),
             places[0].numpy(), places[1].numpy(), error.numpy(),
@@ -306,7 +334,7 @@ class FieldBounds:
         error = (error + 0.5 * e + 2.0 * slack) * FIELD_UP
         # or a line through the whole range
         bottom, top = (low - e - r), (high + e + r)
-        line = top / (top - bottom)
+        line = (top / (top - bottom)).clamp(min=LEAST_SLOPE)
         line_error = (0.5 * line * -bottom + 4.0 * slack) * FIELD_UP
         use_line = line_error + line * r < error + r
         q = torch.where(use_line[:, None], p * line[:, None], q)
