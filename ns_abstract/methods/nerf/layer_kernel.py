@@ -1,4 +1,4 @@
-"""Linear layers of `ns_abstract.methods.nerf.zonotope` on a CPU, compiled: a neuron that is off costs nothing (design.md, F4).
+"""Linear layers of `ns_abstract.methods.nerf.zonotope` on a CPU, compiled: what is off costs nothing (design.md, F4).
 
 About half of a field's neurons are off on all of a piece. Each piece's products run over the other rows of the weight
 alone, which are packed once for its polynomials and columns.
