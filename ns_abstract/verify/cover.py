@@ -235,11 +235,7 @@ class Cover:
             weights: Of its middle.
         """
         root, feasible = self.frame(cell)
-        inner = root
-        for axis, middle in enumerate(root.middle.tolist()):
-            half = 0.5 * (root.upper[axis] - root.lower[axis]) / _PROBE
-            inner = inner.replace(axis, max(middle - half, root.lower[axis]), min(middle + half, root.upper[axis]))
-        found = self._sets(inner)
+        found = self._sets(_about_middle(root, 1.0 / _PROBE))
         if found is None:
             return Covered(None, self._cuts(cell, root, None, 1.0), 0)
         cost, effects = weights.loss(found, self.opening) * _PROBE**_POWER, weights.effects(found) * _PROBE
@@ -266,11 +262,7 @@ class Cover:
         outputs = self.model.outputs(self.scene.image(np.array(whole.middle))[None])
         query, first, share = self.claim.query(outputs), math.nan, _LEAST
         while share <= 1.0:
-            box = whole
-            for axis, middle in enumerate(whole.middle.tolist()):
-                half = 0.5 * share * (whole.upper[axis] - whole.lower[axis])
-                box = box.replace(axis, max(middle - half, whole.lower[axis]), min(middle + half, whole.upper[axis]))
-            sets = self._sets(box)
+            sets = self._sets(_about_middle(whole, share))
             if sets is None:
                 break
             rows = self.sharing.family(self._images([sets]))
@@ -455,6 +447,15 @@ class Cover:
         root = self.frame(cell)[0]
         part = (np.array(root.upper) - np.array(root.lower)) / width
         return float(np.log2(np.maximum(effects * part / goal, 1.0)).sum())
+
+
+def _about_middle(box: ParameterBox, share: float) -> ParameterBox:
+    """The box about the middle of ``box`` whose widths are a ``share`` of its own."""
+    inner = box
+    for axis, middle in enumerate(box.middle.tolist()):
+        half = 0.5 * share * (box.upper[axis] - box.lower[axis])
+        inner = inner.replace(axis, max(middle - half, box.lower[axis]), min(middle + half, box.upper[axis]))
+    return inner
 
 
 def divisions(effects: np.ndarray, cost: float, aim: float, most: int) -> list[int]:
