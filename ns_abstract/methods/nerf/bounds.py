@@ -359,7 +359,7 @@ class NerfBounds:
     def division(self, moves: np.ndarray, most: int = _PARTS) -> Division | None:
         """Levels for samples that move by ``moves`` [n, samples, d].
 
-        None where that would be more than ``most`` parts: the box is far too wide.
+        None where that would be more than ``most`` parts and narrower boxes would need fewer.
         """
         d = moves.shape[2]
         if d == 0:
@@ -367,15 +367,19 @@ class NerfBounds:
         widest = moves.reshape(-1, d).max(axis=0)
         if not np.isfinite(widest).all():
             return None
+        deeper = _DEEPER.get(d, _DEEPER_MORE)
+        finer = _FINER.get(d, 0)
+        levels = most.bit_length() - 1 - deeper - d * finer
         axes: list[int] = []
-        while widest.sum() > self.displacement and len(axes) < 40:
+        while widest.sum() > self.displacement:
+            if len(axes) >= levels:
+                # a sample's own interval is as wide in any box
+                if widest[: d - self.swept].sum() > self.displacement:
+                    return None
+                break
             axis = int(np.argmax(widest))
             axes.append(axis)
             widest[axis] *= 0.5
-        deeper = _DEEPER.get(d, _DEEPER_MORE)
-        finer = _FINER.get(d, 0)
-        if 1 << (len(axes) + deeper + d * finer) > most:
-            return None
         for _ in range(deeper):
             axis = int(np.argmax(widest))
             axes.append(axis)
