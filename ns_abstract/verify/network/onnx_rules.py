@@ -12,6 +12,7 @@ import onnx
 from ns_abstract.io.errors import InputError
 from ns_abstract.verify.network import curves
 from ns_abstract.verify.network.compose import Composer, interpolation
+from ns_abstract.verify.network.einsum import einsum
 from ns_abstract.verify.network.graph import item
 from ns_abstract.verify.network.layers import Shape
 from ns_abstract.verify.network.onnx_graph import Attributes, Reader, Rule, Value
@@ -423,68 +424,9 @@ def _matrix(constant: Any) -> Any:
 
 
 def _einsum(r: Reader, node: onnx.NodeProto, a: Attributes) -> None:
-    """Sums of products of one or two operands, as products of matrices."""
-    equation = str(a.get("equation", "")).replace(" ", "")
-    left, arrow, out = equation.partition("->")
-    names = left.split(",")
     operands = [_operand(r, node, k) for k in range(len(node.input))]
-    if not arrow:
-        out = "".join(sorted(v for v in set(left) - {","} if left.count(v) == 1))
-    letters = [*names, out]
-    if len(names) != len(operands) or not 1 <= len(names) <= 2 or not all(v.isalpha() or not v for v in letters):
-        raise InputError(f"attribute equation = {equation} is not supported", fix="name all axes of one or two values")
-    if any(len(set(v)) != len(v) for v in letters) or not set(out) <= set(left):
-        raise InputError(f"attribute equation = {equation} is not supported", fix="name every axis of a value once")
-    sizes: dict[str, int] = {}
-    for name, operand in zip(names, operands, strict=True):
-        shape = operand.whole if isinstance(operand, Value) else operand.shape
-        if len(name) != len(shape) or any(sizes.setdefault(v, n) != n for v, n in zip(name, shape, strict=True)):
-            raise InputError(f"attribute equation = {equation} on {item(shape)}", fix="check the sizes")
-    first = names[0]
-    second = names[1] if len(names) == 2 else ""
-    both = [v for v in first if v in second]
-    lead, inner = [v for v in both if v in out], [v for v in both if v not in out]
-    rows, columns = ([v for v in name if v not in both and v in out] for name in (first, second))
-    one = _axes_of(r, operands[0], first, lead, rows, inner, sizes)
-    if len(operands) == 1:
-        index, order = one, rows
-    else:
-        two = _axes_of(r, operands[1], second, lead, columns, inner, sizes)
-        index, order = _matrices(r.builder, one, two), [*lead, *rows, *columns]
-    assert isinstance(index, int)
-    b = r.builder
-    index = b.transpose(b.reshape(index, tuple(sizes[v] for v in order) or (1,)), [order.index(v) for v in out] or [0])
-    r.result(node, index, tuple(sizes[v] for v in out))
-
-
-def _axes_of(
-    r: Reader, operand: Value | np.ndarray, name: str, lead: list[str], own: list[str], inner: list[str], sizes: Any
-) -> int | np.ndarray:
-    """An operand of an einsum as matrices [lead, own, inner]; what no one else names is summed up."""
-    alone = [k for k, v in enumerate(name) if v not in (*lead, *own, *inner)]
-    rest = [v for v in name if v in (*lead, *own, *inner)]
-    order = [rest.index(v) for v in (*lead, *own, *inner)]
-    shape = tuple(math.prod(sizes[v] for v in part) for part in (lead, own, inner))
-    if not isinstance(operand, Value):
-        return np.asarray(operand, np.float64).sum(tuple(alone)).transpose(order).reshape(shape)
-    b = r.builder
-    index = b.reduce(b.reshape(operand.index, operand.whole), alone, False, False)
-    return b.reshape(b.transpose(index, order) if rest else index, shape)
-
-
-def _matrices(b: Composer, one: int | np.ndarray, two: int | np.ndarray) -> int:
-    """``one two^T`` of matrices [N, R, K] and [N, C, K], as [N, R, C]."""
-    if isinstance(one, int) and isinstance(two, int):
-        return b.matmul(one, b.transpose(two, (0, 2, 1)))
-    if not isinstance(one, int):
-        assert isinstance(two, int)
-        return b.transpose(_matrices(b, two, one), (0, 2, 1))
-    assert not isinstance(two, int)
-    n, rows, k = b.shape(one)
-    if n == 1:
-        return b.matrix(one, two[0], None)
-    spread = b.spread(b.reshape(one, (n, rows, 1, k)), (n, rows, two.shape[1], k))
-    return b.reduce(b.scale(spread, two[:, None], None), [3], False, False)
+    given = [(p.index, p.whole) if isinstance(p, Value) else (p, p.shape) for p in operands]
+    r.result(node, *einsum(r.builder, str(a.get("equation", "")), given))
 
 
 # ---------------------------------------------------------------- shapes

@@ -1,0 +1,82 @@
+"""Sums of products in Einstein's notation, as products of matrices."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+
+from ns_abstract.io.errors import InputError
+from ns_abstract.verify.network.compose import Composer
+from ns_abstract.verify.network.graph import item
+from ns_abstract.verify.network.layers import Shape
+
+#: A node or a constant, with its shape as the file sees it: with the batch, where there is one.
+Operand = tuple[int | np.ndarray, Shape]
+
+
+def einsum(b: Composer, equation: str, operands: Sequence[Operand]) -> tuple[int, Shape]:
+    """The node of an equation of one or two operands, and its shape.
+
+    Raises:
+        InputError: The equation is not read, or does not fit.
+    """
+    equation = equation.replace(" ", "")
+    left, arrow, out = equation.partition("->")
+    names = left.split(",")
+    if not arrow:
+        out = "".join(sorted(v for v in set(left) - {","} if left.count(v) == 1))
+    letters = [*names, out]
+    if len(names) != len(operands) or not 1 <= len(names) <= 2 or not all(v.isalpha() or not v for v in letters):
+        raise InputError(f"equation = {equation} is not supported", fix="name all axes of one or two values")
+    if any(len(set(v)) != len(v) for v in letters) or not set(out) <= set(left):
+        raise InputError(f"equation = {equation} is not supported", fix="name every axis of a value once")
+    sizes: dict[str, int] = {}
+    for name, (_, shape) in zip(names, operands, strict=True):
+        if len(name) != len(shape) or any(sizes.setdefault(v, n) != n for v, n in zip(name, shape, strict=True)):
+            raise InputError(f"equation = {equation} on {item(shape)}", fix="check the sizes")
+    first = names[0]
+    second = names[1] if len(names) == 2 else ""
+    both = [v for v in first if v in second]
+    lead, inner = [v for v in both if v in out], [v for v in both if v not in out]
+    rows, columns = ([v for v in name if v not in both and v in out] for name in (first, second))
+    one = _axes_of(b, operands[0], first, lead, rows, inner, sizes)
+    if len(operands) == 1:
+        index, order = one, rows
+    else:
+        two = _axes_of(b, operands[1], second, lead, columns, inner, sizes)
+        index, order = _matrices(b, one, two), [*lead, *rows, *columns]
+    assert isinstance(index, int)
+    index = b.transpose(b.reshape(index, tuple(sizes[v] for v in order) or (1,)), [order.index(v) for v in out] or [0])
+    return index, tuple(sizes[v] for v in out)
+
+
+def _axes_of(
+    b: Composer, operand: Operand, name: str, lead: list[str], own: list[str], inner: list[str], sizes: dict[str, int]
+) -> int | np.ndarray:
+    """An operand as matrices [lead, own, inner]; what no one else names is summed up."""
+    value, whole = operand
+    alone = [k for k, v in enumerate(name) if v not in (*lead, *own, *inner)]
+    rest = [v for v in name if v in (*lead, *own, *inner)]
+    order = [rest.index(v) for v in (*lead, *own, *inner)]
+    shape = tuple(math.prod(sizes[v] for v in part) for part in (lead, own, inner))
+    if not isinstance(value, int):
+        return np.asarray(value, np.float64).sum(tuple(alone)).transpose(order).reshape(shape)
+    index = b.reduce(b.reshape(value, whole), alone, False, False)
+    return b.reshape(b.transpose(index, order) if rest else index, shape)
+
+
+def _matrices(b: Composer, one: int | np.ndarray, two: int | np.ndarray) -> int:
+    """``one two^T`` of matrices [N, R, K] and [N, C, K], as [N, R, C]."""
+    if isinstance(one, int) and isinstance(two, int):
+        return b.matmul(one, b.transpose(two, (0, 2, 1)))
+    if not isinstance(one, int):
+        assert isinstance(two, int)
+        return b.transpose(_matrices(b, two, one), (0, 2, 1))
+    assert not isinstance(two, int)
+    n, rows, k = b.shape(one)
+    if n == 1:
+        return b.matrix(one, two[0], None)
+    spread = b.spread(b.reshape(one, (n, rows, 1, k)), (n, rows, two.shape[1], k))
+    return b.reduce(b.scale(spread, two[:, None], None), [3], False, False)
