@@ -151,7 +151,10 @@ REFUSED: dict[str, tuple[Callable[[Behind, Tensor], Tensor], str]] = {
     "mask of the image": (lambda m, y: y * (y > 0.0), "only constants are read"),
     "batch inside": (lambda m, y: (y.transpose(0, 1) * m.w[:, :1, None, None]).transpose(0, 1), "move the batch"),
     "numbers that are none": (lambda m, y: y + torch.full((1,), float("inf")), "is not finite"),
-    "much of nothing": (lambda m, y: y + torch.zeros(1, 1, 1, 1).expand(-1, 1 << 20, 1 << 12, -1).mean(), "too "),
+    "much of nothing": (
+        lambda m, y: y + torch.zeros(1, 1, 1, 1).expand(-1, 1 << 20, 1 << 12, -1).mean(),
+        "needs more than",
+    ),
 }
 
 

@@ -278,7 +278,9 @@ class Reader:
                     found = self._folded(node)
                 else:
                     if rule is None:
-                        raise InputError("depends on the image", fix="only constants are read here")
+                        raise InputError(
+                            "operator is not supported on what depends on the image", fix="only constants are read here"
+                        )
                     if arguments.mixed and short not in self.operators.anywhere:
                         raise InputError("works on a value with the batch inside its shape", fix="move the batch first")
                     found = rule(self, arguments)
