@@ -40,6 +40,10 @@ FIELDS = (
         "0.1 * terms.new_size[c] * wide[terms.new_neuron[c], j]", _LAYERS,
     ),
     Fault(
+        "layers: gradual underflow of columns in float32 is not charged",
+        "arithmetic/rounding.py", "", "UNDERFLOW_COLUMNS = 2.0**-90", "UNDERFLOW_COLUMNS = 0.0", _NARROW + "[1e-39]",
+    ),
+    Fault(
         "layers: columns in float32 are not charged",
         _ZONOTOPE, "FieldBounds._linear", "(steps * (1.0 + 2.0**-10) * UNIT32) * pieces.spread + UNDERFLOW_COLUMNS",
         "UNDERFLOW_COLUMNS", _NARROW + "[1.0]",

@@ -337,4 +337,20 @@ VERDICTS = (
         "np.clip(np.asarray(pose, np.float64), lower, None)",
         "test_verdict_maps.py::test_the_nearest_certified_pose",
     ),
+    Fault(
+        "torch's graphs: moved numbers come from the places beside theirs",
+        "verify/network/exported_rules.py",
+        "_moved",
+        "places.astype(np.int64) - 1",
+        "places.astype(np.int64) - 2",
+        "test_network_exported.py::test_operators_are_read_and_bounded[roll]",
+    ),
+    Fault(
+        "torch's graphs: a causal mask takes out what is seen",
+        "verify/network/exported_rules.py",
+        "_attention",
+        "~np.tri(*dropped.shape[-2:], dtype=bool)",
+        "np.tri(*dropped.shape[-2:], dtype=bool)",
+        "test_network_exported.py::test_operators_are_read_and_bounded[causal attention]",
+    ),
 )

@@ -351,16 +351,18 @@ class Reader:
         Raises:
             InputError: There is none, or torch refuses.
         """
-        given = {name: torch.from_numpy(np.asarray(v)) for name, v in {**self.constants, **values}.items()}
-        used = {part["name"] for entry in node["inputs"] for part in named_tensors(entry["arg"])} & given.keys()
+        known = {**self.constants, **values}
+        used = {name: known[name] for entry in node["inputs"] for name in named_values(entry["arg"]) if name in known}
+        given = {name: v if isinstance(v, int) else torch.from_numpy(np.asarray(v)) for name, v in used.items()}
+        shapes = {name: v.to("meta") if isinstance(v, torch.Tensor) else v for name, v in given.items()}
         try:
-            size = _applied(node, {name: given[name].to("meta") for name in used}, "meta")
+            size = _applied(node, shapes, "meta")
             for part in size if isinstance(size, (list, tuple)) else [size]:
                 self.builder.reserve(2.0 * part.numel() if isinstance(part, torch.Tensor) else 1.0)
-            return _applied(node, {name: given[name] for name in used})
+            return _applied(node, given)
         except InputError:
             raise
-        except (RuntimeError, NotImplementedError, TypeError, ValueError, IndexError, KeyError) as error:
+        except (RuntimeError, TypeError, ValueError, IndexError, KeyError) as error:
             raise InputError(f"torch refuses it ({show(str(error))})", fix=FIX) from None
 
     def _folded(self, node: dict[str, Any]) -> Any:
@@ -379,12 +381,16 @@ def _floats(content: Any) -> Any:
     return [float(v) for v in content] if isinstance(content, list) else float(content)
 
 
-def named_tensors(argument: dict[str, Any]) -> list[dict[str, Any]]:
-    """The tensors that an argument names."""
+def named_values(argument: dict[str, Any]) -> list[str]:
+    """Names of the tensors and sizes in an argument."""
     kind, content = next(iter(argument.items()))
     if kind == "as_optional_tensors":
-        return [part for entry in content for part in named_tensors(entry)]
-    return [content] if kind == "as_tensor" else content if kind == "as_tensors" else []
+        return [name for entry in content for name in named_values(entry)]
+    if kind in ("as_tensor", "as_tensors"):
+        return [str(entry["name"]) for entry in (content if kind == "as_tensors" else [content])]
+    if kind in ("as_sym_int", "as_sym_ints"):
+        return [str(e["as_name"]) for e in (content if kind == "as_sym_ints" else [content]) if "as_name" in e]
+    return []
 
 
 def _applied(node: dict[str, Any], values: dict[str, Any], device: str = "cpu") -> Any:

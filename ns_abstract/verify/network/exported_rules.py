@@ -12,7 +12,7 @@ from ns_abstract.io.errors import InputError
 from ns_abstract.verify.network import curves
 from ns_abstract.verify.network.compose import Axis, Composer, interpolation
 from ns_abstract.verify.network.einsum import einsum
-from ns_abstract.verify.network.exported_graph import Arguments, Index, Operators, Reader, Rule, named_tensors
+from ns_abstract.verify.network.exported_graph import Arguments, Index, Operators, Reader, Rule, named_values
 from ns_abstract.verify.network.graph import item
 
 _ONES = (1, 1)
@@ -363,7 +363,7 @@ def _joined(r: Reader, parts: list[Any], axis: int) -> Index:
     b, wholes = r.builder, [_whole(r, part) for part in parts]
     shapes = [shape for _, shape in wholes]
     if any(v[:axis] + v[axis + 1 :] != shapes[0][:axis] + shapes[0][axis + 1 :] for v in shapes):
-        raise InputError(f"shapes {[item(v) for v in shapes]} do not fit", fix="check the axis")
+        raise InputError(f"shapes {[item(v) for v in shapes]} do not fit", fix="check the axis, or export with a batch of 1")
     whole = (*shapes[0][:axis], sum(v[axis] for v in shapes), *shapes[0][axis + 1 :])
     b.reserve(float(math.prod(whole)) * len(parts))
     moving, offset, done = [], np.zeros(whole), 0
@@ -568,7 +568,7 @@ def _mixed(a: Arguments) -> bool:
 
 
 def _names(node: dict[str, Any]) -> list[str]:
-    return [str(part["name"]) for entry in node["inputs"] for part in named_tensors(entry["arg"]) if "name" in part]
+    return [name for entry in node["inputs"] for name in named_values(entry["arg"])]
 
 
 def _moved(r: Reader, x: int, places: np.ndarray) -> Index:
