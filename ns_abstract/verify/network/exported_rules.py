@@ -363,7 +363,9 @@ def _joined(r: Reader, parts: list[Any], axis: int) -> Index:
     b, wholes = r.builder, [_whole(r, part) for part in parts]
     shapes = [shape for _, shape in wholes]
     if any(v[:axis] + v[axis + 1 :] != shapes[0][:axis] + shapes[0][axis + 1 :] for v in shapes):
-        raise InputError(f"shapes {[item(v) for v in shapes]} do not fit", fix="check the axis, or export with a batch of 1")
+        raise InputError(
+            f"shapes {[item(v) for v in shapes]} do not fit", fix="check the axis, or export with a batch of 1"
+        )
     whole = (*shapes[0][:axis], sum(v[axis] for v in shapes), *shapes[0][axis + 1 :])
     b.reserve(float(math.prod(whole)) * len(parts))
     moving, offset, done = [], np.zeros(whole), 0
