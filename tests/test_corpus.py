@@ -698,7 +698,7 @@ SIGNALS = [
     row("certify", "SIGTERM", "", options=f"{LONG} --workers 1", signals=(signal.SIGTERM,), after="larger than", code=3, memory=WORK, prop={"type": "classification", "label": 0, "preprocess": PREPROCESS, "partitions": 100000}),
     row("certify", "SIGINT twice", "", options=f"{LONG} --workers 1", signals=(signal.SIGINT, signal.SIGINT), after="larger than", code=3, memory=WORK, prop={"type": "classification", "label": 0, "preprocess": PREPROCESS, "partitions": 100000}),
     row("certify", "SIGTERM and SIGINT", "", options=f"{LONG} --workers 2", signals=(signal.SIGTERM, signal.SIGINT), after="larger than", code=3, memory=WORK, prop={"type": "classification", "label": 0, "preprocess": PREPROCESS, "partitions": 100000}),
-    row("certify", "SIGHUP", "", options=f"{LONG} --workers 1", signals=(signal.SIGHUP,), after="larger than", code=-1, memory=WORK),
+    row("certify", "SIGHUP", "", options=f"{LONG} --workers 1", signals=(signal.SIGHUP,), after="larger than", code=-1, memory=WORK, prop={"type": "classification", "label": 0, "preprocess": PREPROCESS, "partitions": 100000}),
     row("render", "SIGINT", "", options=f"{LONG} --target-ratio 1.00001", signals=(signal.SIGINT,), after="gsplat", code=3, memory=WORK),
     row("render", "SIGTERM", "", options=f"{LONG} --target-ratio 1.00001", signals=(signal.SIGTERM,), after="gsplat", code=3, memory=WORK),
     row("render", "SIGINT twice", "", options=f"{LONG} --target-ratio 1.00001", signals=(signal.SIGINT, signal.SIGINT), after="gsplat", code=3, memory=WORK),
