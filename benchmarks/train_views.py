@@ -333,18 +333,28 @@ def shown_member(method: SplatMethod, poses: PoseSet, values: np.ndarray, rng: n
     return torch.from_numpy(image[..., :3]).permute(2, 0, 1).float()
 
 
+def moved(shift: float, turn: float) -> dict[str, Any]:
+    """A set of poses: shifts along the camera's axes and turns about them, of a perturbation file."""
+    found = {"translation": dict.fromkeys("xyz", shift)}
+    if turn > 0.0:
+        found["rotation"] = dict.fromkeys(("yaw", "pitch", "roll"), turn)
+    return found
+
+
 class Turning:
     """Sets of poses of one run of a kind: all around the target of a path's orbit.
 
     Attributes:
         method: The run.
         whole: [azimuth and shifts] what pictures are taken from.
-        circle: [azimuth] what cells lie on.
+        cells: What cells lie in: the circle [azimuth], or shifts and turns of the path's first camera.
         background: [3] of the run.
         stand: Where cameras of other things stand.
     """
 
-    def __init__(self, run: Path, path: Path, side: int, more: Mapping[str, Any]) -> None:
+    def __init__(
+        self, run: Path, path: Path, side: int, more: Mapping[str, Any], shift: float = 0.0, turn: float = 0.0
+    ) -> None:
         given = nsa.load_scene(run)
         camera = load_camera_path(path).cameras[0]
         orbit = {**orbit_of(path), "azimuth": [-math.pi, math.pi]}
@@ -352,15 +362,16 @@ class Turning:
         far = float(np.linalg.norm(out))
         elevation = math.degrees(math.asin(abs(float(out @ np.array(orbit["axis"]))) / far))
 
-        def set_of(**shifts: float) -> PoseSet:
-            value = {"version": 1, "orbit": orbit, "translation": shifts, **more}
+        def set_of(about: Mapping[str, Any]) -> PoseSet:
+            value = {"version": 1, **about, **more}
             return resized(nsa.PoseSet.from_json(camera, value).of(given), side, side)
 
         method = given.method()
         if not isinstance(method, SplatMethod):
             raise SystemExit(f"{run}: other things can only stand before a splat scene's background")
-        self.method, self.circle = method, set_of()
-        self.whole = set_of(**dict.fromkeys("xyz", _SHIFT * far))
+        self.method = method
+        self.cells = set_of(moved(shift, turn) if shift > 0.0 else {"orbit": orbit})
+        self.whole = set_of({"orbit": orbit, **moved(_SHIFT * far, turn)})
         self.background = self.method.scene.background
         self.stand = Stand(
             ((1.0 - _NEAR) * far, (1.0 + _NEAR) * far), (max(0.0, elevation - _TILT), elevation + _TILT)
@@ -389,8 +400,17 @@ def classifier(options: argparse.Namespace) -> None:
     kinds = torch.arange(options.pictures) // 2 % len(names)
     limits = {name: r for name, r in (("color", options.color), ("opacity", options.opacity)) if r > 0.0}
     more: dict[str, Any] = {"scene": [{"select": {}, **limits}]} if limits else {}
-    turn = {"target": [0.0, 0.0, _HEIGHT], "axis": [0.0, 0.0, 1.0], "azimuth": [-options.cell, options.cell]}
-    run = None if options.run is None else Turning(options.run, options.path, options.side, more)
+    half = np.array([options.cell])
+    if options.shift > 0.0:
+        half = np.repeat([options.cell_shift, options.cell_turn], 3)
+        # turns that make up for the shifts are among them, since all is farther than 1
+        about = moved(options.cell_shift, options.cell_shift + options.cell_turn)
+    else:
+        turn = {"target": [0.0, 0.0, _HEIGHT], "axis": [0.0, 0.0, 1.0], "azimuth": [-options.cell, options.cell]}
+        about = {"orbit": turn}
+    run = None
+    if options.run is not None:
+        run = Turning(options.run, options.path, options.side, more, options.shift, options.turn)
     held = torch.arange(options.pictures) % HELD == 0
     bounded = options.training in ("signs", "certified")
     every = max(1, options.pictures // options.cells)
@@ -398,19 +418,20 @@ def classifier(options: argparse.Namespace) -> None:
     for k, kind in enumerate(kinds.tolist()):
         cell = bounded and not held[k] and k // (2 * len(names)) % every == 0
         if run is not None and names[kind] == options.kind_of_run:
-            method, whole, around_it = run.method, run.whole, run.circle
+            method, whole, around_it = run.method, run.whole, run.cells
         else:
             thing = random_thing(rng, names[kind], 0.06)
             stand, background = (_STANDS["classifier"], None) if run is None else (run.stand, run.background)
-            about = {**more, **({"orbit": turn} if bounded else {})}
-            method, whole = photographed([thing], rng, stand, options.side, about, background)
+            method, whole = photographed(
+                [thing], rng, stand, options.side, {**more, **(about if bounded else {})}, background
+            )
             around_it = whole
         values = whole.box.sample(1, rng)[0]
         plain = pictures(method, whole, values[None])[0]
         images.append(plain if options.training == "plain" else shown_member(method, whole, values, rng))
         if cell:
             middle = around_it.box.sample(1, rng) if around_it is not whole else around_it.box.middle[None]
-            sets.append(cells(method, around_it, middle, np.array([options.cell])))
+            sets.append(cells(method, around_it, middle, half, options.shift > 0.0))
             sides.append(kind)
     shown = torch.stack(images)
     print(f"{len(images)} pictures, {len(sets)} cells, {time.process_time():.0f} CPU s", flush=True)
@@ -478,6 +499,14 @@ def parser() -> argparse.ArgumentParser:
     three.add_argument("--weight", type=float, default=1.0, help="of cells")
     three.add_argument("--cell", type=float, default=0.0031, help="half-width of a cell, radians of the orbit")
     three.add_argument("--cells", type=int, default=800, help="about")
+    three.add_argument(
+        "--shift", type=float, default=0.0,
+        help="with --run: cells are slanted parts of shifts of the path's first camera by this, normalised units, and "
+        "--turn",
+    )  # fmt: skip
+    three.add_argument("--turn", type=float, default=0.0, help="radians of yaw, pitch and roll")
+    three.add_argument("--cell-shift", type=float, default=0.012, help="half-widths of such a part")
+    three.add_argument("--cell-turn", type=float, default=0.004)
     for kind in (one, two):
         kind.add_argument("--near-plane", type=float, default=NEAR_PLANE, help="where a NeRF's rays begin")
     for kind in (one, two, three):

@@ -83,15 +83,20 @@ class Cells:
     half: np.ndarray
 
 
-def cells(method: Method, poses: PoseSet, values: np.ndarray, half: np.ndarray) -> Cells:
-    """Bounded cells of half-widths [d] around parameter values [n, d], cut off at the ends of the set."""
-    shown = FramePictures(method, poses)
+def cells(method: Method, poses: PoseSet, values: np.ndarray, half: np.ndarray, slanted: bool = False) -> Cells:
+    """Bounded cells of half-widths [d] around parameter values [n, d], cut off at the ends of the set.
+
+    ``slanted``: the cells' parameters, but not ``values``, are counted as certificates count them (docs/design.md, P2).
+    """
+    shown = FramePictures(method, poses, slanted=slanted)
     whole, found, boxes = shown.box, [], []
-    for v in values:
+    for v in counted(shown.pose_set, values):
         box = whole
         for axis in range(whole.dimensions):
             low, high = whole.lower[axis], whole.upper[axis]
             box = box.replace(axis, max(low, v[axis] - half[axis]), min(high, v[axis] + half[axis]))
+        box = shown.frame.feasible(box)
+        assert box is not None, "no cell around a pose is empty"
         linear, lower, upper, _ = shown.sets(box)
         a_lower, b_lower, a_upper, b_upper = (np.asarray(part, np.float64) for part in linear)
         slopes, middle = 0.5 * (a_lower + a_upper), 0.5 * (b_lower + b_upper)
@@ -106,6 +111,14 @@ def cells(method: Method, poses: PoseSet, values: np.ndarray, half: np.ndarray) 
     middle, slopes, radius = (torch.from_numpy(np.stack(part)).float() for part in zip(*found, strict=True))
     sizes = [[0.5 * (b - a) for a, b in zip(box.lower, box.upper, strict=True)] for _, box in boxes]
     return Cells(middle, slopes, radius, np.array([centre for centre, _ in boxes]), np.array(sizes))
+
+
+def counted(poses: PoseSet, values: np.ndarray) -> np.ndarray:
+    """Parameters [n, d] of a set as a slanted one counts them (`PoseSet.sheared`)."""
+    found, names = np.array(values, np.float64), poses.box.names
+    for name, factors in poses.shear.items():
+        found[:, names.index(name)] -= sum(factor * values[:, names.index(other)] for other, factor in factors.items())
+    return found
 
 
 def joined(found: Sequence[Cells]) -> Cells:

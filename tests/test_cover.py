@@ -470,6 +470,32 @@ def test_what_width_costs_is_found_about_the_middle() -> None:
     assert cover is not None and cover.opening == 42.0
 
 
+class Wider(Curved):
+    """The same pictures, known half as well."""
+
+    def sets(self, box: ParameterBox) -> Any:
+        linear, lower, upper, slopes = super().sets(box)
+        (a_lower, b_lower, a_upper, b_upper), room = linear, 0.5 * (upper - lower)
+        return (a_lower, b_lower - room, a_upper, b_upper + room), lower - room, upper + room, slopes
+
+
+@pytest.mark.parametrize("first_is_wider", [False, True])
+def test_the_way_with_fewer_parts_is_taken(first_is_wider: bool) -> None:
+    """Whichever is asked, cells are proved by the same parts; the choice does not depend on cells."""
+    found = []
+    for wider in (first_is_wider, not first_is_wider):
+        model = Rounded(0.1, True)
+        scenes: list[Any] = [Curved(2), Wider(2)]
+        first, second = scenes[::-1] if wider else scenes
+        cover = Cover(first, model, model, CLAIM, other=Cover(second, model, model, CLAIM))
+        assert cover.other is not None and (cover.parts > cover.other.parts) is wider
+        search = Search(first, model, CLAIM, Grid.adaptive(first.box, (2, 2)), cover=cover)
+        cell = search.grid.box_of(search.grid.roots()[-1])
+        found.append(cover.prove(cell, np.array([0.5, 0.1]), EVEN))
+        assert found[-1] == replace(cover, other=None, scene=scenes[0]).prove(cell, np.array([0.5, 0.1]), EVEN)
+    assert found[0] == found[1]
+
+
 def test_one_part_without_a_proof_leaves_the_cell_without() -> None:
     """Whatever bounds say of the other parts."""
     search, _ = covered(0.1, most=64)

@@ -394,17 +394,19 @@ class Certification:
         """
         if pictures.box.dimensions < 2 or pictures.frame.tilewise:
             return None
-        poses = pictures.pose_set
+        poses, straight = pictures.pose_set, Cover(pictures, self.model, self.model, self.claim(pictures))
         slanted = FramePictures(method, poses, self.picture, response, slanted=True)
         if not (shear := slanted.pose_set.shear):
-            return Cover(pictures, self.model, self.model, self.claim(pictures))
+            return straight
 
         def frame(cell: ParameterBox) -> tuple[ParameterBox, Callable[[ParameterBox], ParameterBox | None]]:
             found = poses.within(cell).sheared(shear)
             return found.box, found.feasible
 
         claim = self.claim(pictures, slanted.pose_set)
-        return Cover(slanted, self.model, self.model, claim, frame, most=_MOST_SLANTED, block=1, aim=_AIM_SLANTED)
+        return Cover(
+            slanted, self.model, self.model, claim, frame, most=_MOST_SLANTED, block=1, aim=_AIM_SLANTED, other=straight
+        )
 
     def around(self, extra: SceneVariation) -> Certification:
         """The same with more scenes in the sets."""

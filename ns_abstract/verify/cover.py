@@ -32,6 +32,9 @@ _OPENING = 42.0
 _LEAST = 2.0**-9
 #: What a box may cost is foreseen by so small a part of it: wide ones show nothing.
 _PROBE = 4
+#: Looks at a part about the middle of the set before two ways to cover it are compared, and most parts that are told
+#: apart there.
+_TRIALS, _MANY = 4, 1 << 40
 #: Most parts that are bounded together, where rows serve for neighbours and where they do not.
 _GROUP, _JOINED = 64, 8
 #: Times what parts are cut for from which on the network is not asked.
@@ -215,6 +218,7 @@ class Cover:
         most: Most parts of a cell, about; one that would take more is cut first.
         block: Most cells that are examined together.
         aim: What the sets of parts may cost of the margin (`Weights.loss`), at first.
+        other: Another way to cover the same cells, taken where it needs fewer parts.
     """
 
     scene: Scene
@@ -225,6 +229,7 @@ class Cover:
     most: int = 64
     block: int = 2
     aim: float = 0.26
+    other: Cover | None = None
 
     def prove(self, cell: ParameterBox, outputs: np.ndarray, weights: Weights) -> Covered:
         """Try to prove a cell, if it takes few enough parts.
@@ -234,6 +239,14 @@ class Cover:
             outputs: [n] outputs seen in it.
             weights: Of its middle.
         """
+        return self._chosen._prove(cell, outputs, weights)
+
+    @cached_property
+    def _chosen(self) -> Cover:
+        """This way, or the other: the same wherever it is asked for (V15)."""
+        return self if self.other is None or self.parts <= self.other.parts else self.other
+
+    def _prove(self, cell: ParameterBox, outputs: np.ndarray, weights: Weights) -> Covered:
         root, feasible = self.frame(cell)
         found = self._sets(_about_middle(root, 1.0 / _PROBE))
         if found is None:
@@ -273,6 +286,21 @@ class Cover:
             most = min(most, self.aim / max(float(sets.widths.mean()), 1e-300))
             share *= 2.0
         return most
+
+    @cached_property
+    def parts(self) -> float:
+        """Parts of the whole set, about, if all were as those about its middle whose mean width costs what it may."""
+        whole = self.scene.box
+        counts = np.full(whole.dimensions, float(_PROBE))
+        for _ in range(_TRIALS):
+            found = self._sets(_about_middle(whole, 1.0 / counts))
+            if found is None:
+                return math.inf
+            cost = self.opening * float(found.widths.mean())
+            effects = Weights(np.ones_like(found.widths), 1.0).effects(found) * counts + 1e-300
+            cost *= float(effects.sum() / (effects / counts).sum()) ** _POWER
+            counts = np.array(divisions(effects, cost, self.aim, _MANY), np.float64)
+        return float(counts.prod())
 
     def _sets(self, box: ParameterBox) -> PictureSets | None:
         checkpoint()
@@ -449,11 +477,11 @@ class Cover:
         return float(np.log2(np.maximum(effects * part / goal, 1.0)).sum())
 
 
-def _about_middle(box: ParameterBox, share: float) -> ParameterBox:
-    """The box about the middle of ``box`` whose widths are a ``share`` of its own."""
-    inner = box
-    for axis, middle in enumerate(box.middle.tolist()):
-        half = 0.5 * share * (box.upper[axis] - box.lower[axis])
+def _about_middle(box: ParameterBox, share: float | np.ndarray) -> ParameterBox:
+    """The box about the middle of ``box`` whose widths are a ``share`` (or [d] shares) of its own."""
+    inner, shares = box, np.broadcast_to(share, (box.dimensions,)).tolist()
+    for axis, (middle, part) in enumerate(zip(box.middle.tolist(), shares, strict=True)):
+        half = 0.5 * part * (box.upper[axis] - box.lower[axis])
         inner = inner.replace(axis, max(middle - half, box.lower[axis]), min(middle + half, box.upper[axis]))
     return inner
 
