@@ -400,6 +400,8 @@ def _serve() -> None:
     """Fork for every line of stdin; answers on stdout."""
     answers = os.fdopen(os.dup(1), "w")
     os.dup2(2, 1)
+    # whoever started the tests with nohup ignores it
+    signal.signal(signal.SIGHUP, signal.SIG_DFL)
     for name in _IMPORTS:
         importlib.import_module(name)
     loaded = False
