@@ -11,9 +11,9 @@ import numpy as np
 from ns_abstract.io.errors import InputError
 from ns_abstract.verify.network import curves
 from ns_abstract.verify.network.compose import Axis, Composer, interpolation
-from ns_abstract.verify.network.einsum import einsum
 from ns_abstract.verify.network.exported_graph import Arguments, Index, Operators, Reader, Rule, named_values
 from ns_abstract.verify.network.graph import item
+from ns_abstract.verify.network.operands import einsum, joined, matmul
 
 _ONES = (1, 1)
 
@@ -269,37 +269,21 @@ def _whole(r: Reader, value: Any) -> tuple[Any, tuple[int, ...]]:
 
 
 def _matmul(r: Reader, a: Arguments) -> Index:
-    b = r.builder
-    (one, first), (two, second) = (
-        _whole(r, a.get("self")),
-        _whole(r, a.get("other" if "other" in a.found else "mat2")),
-    )
-    if isinstance(one, int) and isinstance(two, int):
-        rank = max(len(first), len(second))
-        if min(len(first), len(second)) < 2:
-            raise InputError(f"shapes {item(first)} and {item(second)}", fix="give both two axes or more")
-        wholes = [(1,) * (rank - len(v)) + v for v in (first, second)]
-        lead = np.broadcast_shapes(wholes[0][:-2], wholes[1][:-2])
-        left, right = (b.spread(b.reshape(k, w), (*lead, *w[-2:])) for k, w in zip((one, two), wholes, strict=True))
-        shape = (*lead, wholes[0][-2], wholes[1][-1])
-        return _shaped(r, b.matmul(left, right), shape)
-    weight = two if isinstance(one, int) else one
-    if weight.ndim < 2 or math.prod(weight.shape[:-2]) != 1:
-        raise InputError(f"weights {item(weight.shape)}", fix="a matrix expected")
-    weight = weight.reshape(weight.shape[-2:])
-    if isinstance(one, int):
-        return _shaped(r, b.matrix(b.reshape(one, first), weight.T, None), (*first[:-1], weight.shape[1]))
-    if len(second) < 2:
-        raise InputError(f"a value {item(second)}", fix="give it two axes or more")
-    return _shaped(r, b.matrix_from_left(weight, b.reshape(two, second)), (*second[:-2], weight.shape[0], second[-1]))
+    other = a.get("other" if "other" in a.found else "mat2")
+    return _shaped(r, *matmul(r.builder, _whole(r, a.get("self")), _whole(r, other)))
+
+
+def _apart(whole: tuple[int, ...]) -> tuple[tuple[int, ...], tuple[int, ...] | None]:
+    """The item of a shape in the file, and that shape where the batch is inside of it."""
+    if not whole:
+        raise InputError("leaves a number without an axis", fix="keep an axis")
+    return (whole, whole) if len(whole) < 2 or whole[0] != 1 else (whole[1:], None)
 
 
 def _shaped(r: Reader, index: int, whole: tuple[int, ...]) -> Index:
     """A node in its shape in the file."""
-    if not whole:
-        raise InputError("leaves a number without an axis", fix="keep an axis")
-    inside = len(whole) < 2 or whole[0] != 1
-    return Index(r.builder.reshape(index, whole if inside else whole[1:]), whole if inside else None)
+    shape, inside = _apart(whole)
+    return Index(r.builder.reshape(index, shape), inside)
 
 
 def _addmm(r: Reader, a: Arguments) -> Index:
@@ -360,28 +344,7 @@ def _joined(r: Reader, parts: list[Any], axis: int) -> Index:
     """Values and constants one after another along an axis of the whole, not the batch."""
     if all(isinstance(part, Index) and part.whole is None for part in parts):
         return Index(r.builder.concat([part.number for part in parts], axis - 1))
-    b, wholes = r.builder, [_whole(r, part) for part in parts]
-    shapes = [shape for _, shape in wholes]
-    if any(v[:axis] + v[axis + 1 :] != shapes[0][:axis] + shapes[0][axis + 1 :] for v in shapes):
-        raise InputError(
-            f"shapes {[item(v) for v in shapes]} do not fit", fix="check the axis, or export with a batch of 1"
-        )
-    whole = (*shapes[0][:axis], sum(v[axis] for v in shapes), *shapes[0][axis + 1 :])
-    b.reserve(float(math.prod(whole)) * len(parts))
-    moving, offset, done = [], np.zeros(whole), 0
-    for value, shape in wholes:
-        place = (slice(None),) * axis + (slice(done, done + shape[axis]),)
-        done += shape[axis]
-        if isinstance(value, int):
-            index = np.full(whole, -1, np.int64)
-            index[place] = b.positions(value).reshape(shape)
-            moving.append(b.rearranged(value, index))
-        else:
-            offset[place] = value
-    if not np.isfinite(offset).all():
-        raise InputError("joins numbers that are not finite", fix="write the network without that")
-    total = b.sum(tuple(moving), (1,) * len(moving), exact=True) if len(moving) > 1 else moving[0]
-    return _shaped(r, b.shift(total, offset), whole)
+    return _shaped(r, *joined(r.builder, [_whole(r, part) for part in parts], axis))
 
 
 def _addcmul(r: Reader, a: Arguments) -> Index:
@@ -575,15 +538,12 @@ def _names(node: dict[str, Any]) -> list[str]:
 
 def _moved(r: Reader, x: int, places: np.ndarray) -> Index:
     """The numbers of an item at flat positions from 1 on, in their shape; 0: the number 0."""
-    index, whole = places.astype(np.int64) - 1, places.shape
-    if index.size == 0 or not whole:
-        raise InputError("leaves nothing, or a number without an axis", fix="check the sizes")
-    inside = len(whole) < 2 or whole[0] != 1
-    item_shape = whole if inside else whole[1:]
-    index = index.reshape(item_shape)
+    if places.size == 0:
+        raise InputError("leaves nothing", fix="check the sizes")
+    shape, inside = _apart(places.shape)
+    index = (places.astype(np.int64) - 1).reshape(shape)
     same = index.size == math.prod(r.builder.shape(x)) and bool((index.reshape(-1) == np.arange(index.size)).all())
-    number = r.builder.reshape(x, item_shape) if same else r.builder.rearranged(x, index)
-    return Index(number, whole if inside else None)
+    return Index(r.builder.reshape(x, shape) if same else r.builder.rearranged(x, index), inside)
 
 
 def _parts(r: Reader, a: Arguments, name: str, kind: str) -> list[Index]:
@@ -609,12 +569,6 @@ def _parts(r: Reader, a: Arguments, name: str, kind: str) -> list[Index]:
         found.append(Index(r.builder.part(x, chosen)))
         done += length
     return found
-
-
-def _weight_norm(r: Reader, a: Arguments) -> np.ndarray:
-    weight, length, axis = a.needed("v"), a.needed("g"), int(a.get("dim", 0))
-    others = tuple(k for k in range(weight.ndim) if k != axis % weight.ndim)
-    return weight * (length / np.sqrt(np.square(weight).sum(axis=others, keepdims=True)))
 
 
 def _pool(r: Reader, a: Arguments) -> tuple[int, Any, Any, Any, Any, Any]:
@@ -748,31 +702,22 @@ def _batch_size(r: Reader, a: Arguments) -> int:
 
 _VIEWS = frozenset(
     (
-        "alias",
-        "chunk",
-        "contiguous",
-        "dropout",
-        "expand",
-        "feature_dropout",
-        "flatten",
-        "permute",
-        "reshape",
-        "select",
-        "slice",
+        "alias", "chunk", "contiguous", "detach", "diagonal", "dropout", "expand", "expand_as",
+        "feature_dropout", "flatten", "movedim", "narrow", "permute", "reshape", "select", "slice", "split",
+        "split_with_sizes", "squeeze", "swapaxes", "t", "to", "transpose", "unbind", "unflatten", "unsqueeze",
+        "view",
     )
-)
-_VIEWS |= {"detach", "diagonal", "expand_as", "movedim", "narrow", "swapaxes", "t", "to", "unflatten"}
-_VIEWS |= {"expand", "split", "split_with_sizes", "squeeze", "transpose", "unbind", "unsqueeze", "view"}
+)  # fmt: skip
 #: Operators that are only read where all is constant.
 _FOLDED = frozenset(
     (
-        "arange.default", "arange.start", "arange.start_step", "bitwise_and.Tensor", "bitwise_not.default",
-        "detach_.default", "eq.Scalar", "eq.Tensor", "full.default", "full_like.default", "ge.Scalar", "ge.Tensor",
-        "gt.Scalar", "gt.Tensor", "le.Scalar", "le.Tensor", "lift_fresh_copy.default", "linspace.default",
-        "logical_and.default", "logical_not.default", "logical_or.default", "lt.Scalar", "lt.Tensor", "ne.Scalar",
-        "new_full.default", "new_ones.default", "new_zeros.default", "ones.default", "ones_like.default",
-        "outer.default", "scalar_tensor.default", "sin.default", "cos.default", "tril.default", "triu.default",
-        "zeros.default", "zeros_like.default",
+        "_weight_norm.default", "arange.default", "arange.start", "arange.start_step", "bitwise_and.Tensor",
+        "bitwise_not.default", "detach_.default", "eq.Scalar", "eq.Tensor", "full.default", "full_like.default",
+        "ge.Scalar", "ge.Tensor", "gt.Scalar", "gt.Tensor", "le.Scalar", "le.Tensor", "lift_fresh_copy.default",
+        "linspace.default", "logical_and.default", "logical_not.default", "logical_or.default", "lt.Scalar",
+        "lt.Tensor", "ne.Scalar", "new_full.default", "new_ones.default", "new_zeros.default", "ones.default",
+        "ones_like.default", "outer.default", "scalar_tensor.default", "sin.default", "cos.default",
+        "tril.default", "triu.default", "zeros.default", "zeros_like.default",
     )
 )  # fmt: skip
 #: Those that only move numbers.
@@ -787,67 +732,48 @@ _MOVES = frozenset(
 )  # fmt: skip
 _RULES: dict[str, Rule] = {
     **dict.fromkeys(_MOVES, _moves),
-    "adaptive_avg_pool1d.default": _on_map(_adaptive, "self"),
-    "addcmul.default": _addcmul,
-    "addmm.default": _addmm,
-    "avg_pool1d.default": _on_map(_average_pool, "self"),
-    "bmm.default": _matmul,
-    "clamp_max.default": _unary(_clamp),
-    "clamp_min.default": _unary(_clamp),
-    "constant_pad_nd.default": _pad,
-    "conv1d.default": _on_map(_conv, "input", "weight"),
-    "conv_transpose1d.default": _on_map(_conv_transpose, "input", "weight"),
-    "detach.default": _same,
-    "dropout_.default": _dropout,
-    "einsum.default": _einsum,
-    "expand_as.default": _expand_as,
-    "feature_dropout_.default": _dropout,
-    "glu.default": _glu,
-    "linalg_vector_norm.default": _vector_norm,
-    "masked_fill.Scalar": _masked_fill,
-    "max_pool1d.default": _on_map(_max_pool, "self"),
-    "mm.default": _matmul,
-    "scaled_dot_product_attention.default": _attention,
-    "softshrink.default": _unary(_softshrink),
-    "square.default": _unary(lambda b, x, a: b.power(x, 2.0)),
-    "stack.default": _stack,
-    "std.correction": _variance(True),
-    "std.dim": _variance(True),
-    "threshold.default": _unary(_threshold),
-    "to.dtype": _to,
-    "upsample_bicubic2d.vec": _upsample("cubic"),
-    "var.correction": _variance(False),
-    "var.dim": _variance(False),
-    "where.ScalarOther": _where,
-    "where.ScalarSelf": _where,
-    "where.self": _where,
-    "_weight_norm.default": _weight_norm,
     "abs.default": _curve(curves.Abs),
+    "adaptive_avg_pool1d.default": _on_map(_adaptive, "self"),
     "adaptive_avg_pool2d.default": _adaptive,
     "add.Tensor": _sum(1),
     "add_.Tensor": _sum(1),
+    "addcmul.default": _addcmul,
+    "addmm.default": _addmm,
     "alias.default": _same,
     "amax.default": _reduced("amax"),
     "amin.default": _reduced("amin"),
+    "avg_pool1d.default": _on_map(_average_pool, "self"),
     "avg_pool2d.default": _average_pool,
     "batch_norm.default": _batch_norm,
+    "bmm.default": _matmul,
     "cat.default": _cat,
     "celu.default": _unary(_celu),
     "chunk.default": lambda r, a: _parts(r, a, "chunks", "chunk"),
     "clamp.default": _unary(_clamp),
+    "clamp_max.default": _unary(_clamp),
+    "clamp_min.default": _unary(_clamp),
     "clone.default": _same,
+    "constant_pad_nd.default": _pad,
     "contiguous.default": _same,
+    "conv1d.default": _on_map(_conv, "input", "weight"),
     "conv2d.default": _conv,
+    "conv_transpose1d.default": _on_map(_conv_transpose, "input", "weight"),
     "conv_transpose2d.input": _conv_transpose,
+    "detach.default": _same,
     "div.Tensor": _div,
     "dropout.default": _dropout,
+    "dropout_.default": _dropout,
+    "einsum.default": _einsum,
     "elu.default": _unary(_elu),
     "erf.default": _curve(curves.Erf),
     "exp.default": _curve(curves.Exp),
     "expand.default": _expand,
+    "expand_as.default": _expand_as,
     "feature_dropout.default": _dropout,
+    "feature_dropout_.default": _dropout,
     "flatten.using_ints": _flatten,
     "gelu.default": _unary(_gelu),
+    "glu.default": _glu,
     "group_norm.default": _group_norm,
     "hardsigmoid.default": _unary(_hard_sigmoid),
     "hardswish.default": _curve(curves.HardSwish),
@@ -858,16 +784,20 @@ _RULES: dict[str, Rule] = {
     "layer_norm.default": _layer_norm,
     "leaky_relu.default": _unary(lambda b, x, a: b.prelu(x, np.asarray(_number(a, "negative_slope", 0.01)))),
     "leaky_relu_.default": _unary(lambda b, x, a: b.prelu(x, np.asarray(_number(a, "negative_slope", 0.01)))),
+    "linalg_vector_norm.default": _vector_norm,
     "linear.default": _linear,
     "log.default": _unary(lambda b, x, a: b.logarithm(x)),
     "log_sigmoid.default": _unary(_log_sigmoid),
     "log_softmax.int": _softmax(True),
+    "masked_fill.Scalar": _masked_fill,
     "matmul.default": _matmul,
+    "max_pool1d.default": _on_map(_max_pool, "self"),
     "max_pool2d.default": _max_pool,
     "maximum.default": _extreme(True),
     "mean.dim": _reduced("mean"),
     "minimum.default": _extreme(False),
     "mish.default": _curve(curves.Mish),
+    "mm.default": _matmul,
     "mul.Tensor": _mul,
     "neg.default": _unary(lambda b, x, a: b.scale(x, -np.ones(()), None)),
     "pad.default": _pad,
@@ -879,6 +809,7 @@ _RULES: dict[str, Rule] = {
     "relu_.default": _unary(lambda b, x, a: b.leaky_relu(x, 0.0)),
     "reshape.default": _view,
     "rsub.Scalar": _rsub,
+    "scaled_dot_product_attention.default": _attention,
     "selu.default": _unary(_selu),
     "sigmoid.default": _unary(lambda b, x, a: b.sigmoid(x)),
     "silu.default": _curve(curves.Silu),
@@ -886,16 +817,29 @@ _RULES: dict[str, Rule] = {
     "slice.Tensor": _slice,
     "softmax.int": _softmax(False),
     "softplus.default": _unary(_softplus),
+    "softshrink.default": _unary(_softshrink),
     "split.Tensor": lambda r, a: _parts(r, a, "split_size", "split"),
     "split_with_sizes.default": lambda r, a: _parts(r, a, "split_sizes", "split"),
     "sqrt.default": _unary(lambda b, x, a: b.power(x, 0.5)),
+    "square.default": _unary(lambda b, x, a: b.power(x, 2.0)),
+    "stack.default": _stack,
+    "std.correction": _variance(True),
+    "std.dim": _variance(True),
     "sub.Tensor": _sum(-1),
     "sum.dim_IntList": _reduced("sum"),
     "sym_size.int": _batch_size,
     "tanh.default": _unary(lambda b, x, a: b.tanh(x)),
+    "threshold.default": _unary(_threshold),
+    "to.dtype": _to,
+    "upsample_bicubic2d.vec": _upsample("cubic"),
     "upsample_bilinear2d.vec": _upsample("linear"),
     "upsample_nearest2d.vec": _upsample("nearest"),
+    "var.correction": _variance(False),
+    "var.dim": _variance(False),
     "view.default": _view,
+    "where.ScalarOther": _where,
+    "where.ScalarSelf": _where,
+    "where.self": _where,
 }
 #: Those that read values with the batch inside their shape, too: all functions of every number among them.
 _ANYWHERE = _MOVES | frozenset(

@@ -12,10 +12,10 @@ import onnx
 from ns_abstract.io.errors import InputError
 from ns_abstract.verify.network import curves
 from ns_abstract.verify.network.compose import Composer, interpolation
-from ns_abstract.verify.network.einsum import einsum
 from ns_abstract.verify.network.graph import item
 from ns_abstract.verify.network.layers import Shape
 from ns_abstract.verify.network.onnx_graph import Attributes, Reader, Rule, Value
+from ns_abstract.verify.network.operands import Operand, einsum, joined, matmul
 
 #: A mask that adds less than this takes a number out of a softmax: in float32 its exponential is zero.
 _DROPPED = -3e38
@@ -388,44 +388,16 @@ def _where(r: Reader, node: onnx.NodeProto, a: Attributes) -> None:
     r.result(node, r.builder.scale(index, np.ones(()), offset) if offset.any() else index, whole)
 
 
+def _given(operand: Value | np.ndarray) -> Operand:
+    return (operand.index, operand.whole) if isinstance(operand, Value) else (operand, operand.shape)
+
+
 def _matmul(r: Reader, node: onnx.NodeProto, a: Attributes) -> None:
-    b = r.builder
-    one, two = (_operand(r, node, k) for k in range(2))
-    if isinstance(one, Value) and isinstance(two, Value):
-        rank = max(len(one.whole), len(two.whole))
-        if min(len(one.whole), len(two.whole)) < 2:
-            raise InputError(f"shapes {item(one.whole)} and {item(two.whole)}", fix="give both two axes or more")
-        wholes = [(1,) * (rank - len(v.whole)) + v.whole for v in (one, two)]
-        lead = np.broadcast_shapes(wholes[0][:-2], wholes[1][:-2])
-        # as items without a batch
-        first, second = (
-            b.spread(b.reshape(v.index, w), (*lead, *w[-2:])) for v, w in zip((one, two), wholes, strict=True)
-        )
-        r.result(node, b.matmul(first, second), (*lead, wholes[0][-2], wholes[1][-1]))
-        return
-    if isinstance(one, Value):
-        weight = _matrix(two)
-        r.result(node, b.matrix(one.index, weight.T, None), (*one.whole[:-1], weight.shape[1]))
-        return
-    assert isinstance(two, Value)
-    weight = _matrix(one)
-    if len(two.whole) < 2:
-        raise InputError(f"a value {item(two.whole)}", fix="give it two axes or more")
-    x = b.reshape(two.index, two.whole)
-    r.result(node, b.matrix_from_left(weight, x), (*two.whole[:-2], weight.shape[0], two.whole[-1]))
-
-
-def _matrix(constant: Any) -> Any:
-    """A constant as a matrix [.., ..] float64."""
-    found = np.asarray(constant, np.float64)
-    if found.ndim < 2 or math.prod(found.shape[:-2]) != 1:
-        raise InputError(f"weights {item(found.shape)}", fix="a matrix expected")
-    return found.reshape(found.shape[-2:])
+    r.result(node, *matmul(r.builder, *(_given(_operand(r, node, k)) for k in range(2))))
 
 
 def _einsum(r: Reader, node: onnx.NodeProto, a: Attributes) -> None:
-    operands = [_operand(r, node, k) for k in range(len(node.input))]
-    given = [(p.index, p.whole) if isinstance(p, Value) else (p, p.shape) for p in operands]
+    given = [_given(_operand(r, node, k)) for k in range(len(node.input))]
     r.result(node, *einsum(r.builder, str(a.get("equation", "")), given))
 
 
@@ -553,23 +525,9 @@ def _concat(r: Reader, node: onnx.NodeProto, a: Attributes) -> None:
     if len(values) == len(parts) and axis > 0 and all(v.batched for v in values):
         r.result(node, r.builder.concat([v.index for v in values], axis - 1))
         return
-    whole = (*wholes[0][:axis], sum(w[axis] for w in wholes), *wholes[0][axis + 1 :])
     if axis == 0 and all(v.batched for v in values):
         raise InputError("attribute axis = 0 is not supported", fix="the batch, axis 0, must stay")
-    after = Value(0, whole).item
-    r.builder.reserve(float(math.prod(whole)) * len(parts))
-    moving, offset, done = [], np.zeros(whole), 0
-    for part, size in zip(parts, (w[axis] for w in wholes), strict=True):
-        place = (slice(None),) * axis + (slice(done, done + size),)
-        done += size
-        if isinstance(part, Value):
-            index = np.full(whole, -1, np.int64)
-            index[place] = _places(r, part)
-            moving.append(r.builder.rearranged(part.index, index.reshape(after)))
-        else:
-            offset[place] = part
-    total = r.builder.sum(tuple(moving), (1,) * len(moving), exact=True) if len(moving) > 1 else moving[0]
-    r.result(node, r.builder.shift(total, offset.reshape(after)), whole)
+    r.result(node, *joined(r.builder, [_given(p) for p in parts], axis))
 
 
 def _slice(r: Reader, node: onnx.NodeProto, a: Attributes) -> None:

@@ -1,9 +1,10 @@
-"""Sums of products in Einstein's notation, as products of matrices."""
+"""What nodes and constants make together, in shapes as a file sees them: products of matrices, and joins."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 
@@ -80,3 +81,67 @@ def _matrices(b: Composer, one: int | np.ndarray, two: int | np.ndarray) -> int:
         return b.matrix(one, two[0], None)
     spread = b.spread(b.reshape(one, (n, rows, 1, k)), (n, rows, two.shape[1], k))
     return b.reduce(b.scale(spread, two[:, None], None), [3], False, False)
+
+
+def matmul(b: Composer, one: Operand, two: Operand) -> tuple[int, Shape]:
+    """The product of matrices, one of which at least depends on the image, and its shape.
+
+    Raises:
+        InputError: They do not fit, or a constant is more than one matrix.
+    """
+    (left, first), (right, second) = one, two
+    if isinstance(left, int) and isinstance(right, int):
+        rank = max(len(first), len(second))
+        if min(len(first), len(second)) < 2:
+            raise InputError(f"shapes {item(first)} and {item(second)}", fix="give both two axes or more")
+        wholes = [(1,) * (rank - len(whole)) + whole for whole in (first, second)]
+        lead = np.broadcast_shapes(wholes[0][:-2], wholes[1][:-2])
+        # as items without a batch
+        nodes = zip((left, right), wholes, strict=True)
+        spread = (b.spread(b.reshape(index, whole), (*lead, *whole[-2:])) for index, whole in nodes)
+        return b.matmul(*spread), (*lead, wholes[0][-2], wholes[1][-1])
+    if isinstance(left, int):
+        weight = _matrix(right)
+        return b.matrix(left, weight.T, None), (*first[:-1], weight.shape[1])
+    assert isinstance(right, int)
+    weight = _matrix(left)
+    if len(second) < 2:
+        raise InputError(f"a value {item(second)}", fix="give it two axes or more")
+    return b.matrix_from_left(weight, b.reshape(right, second)), (*second[:-2], weight.shape[0], second[-1])
+
+
+def _matrix(constant: Any) -> Any:
+    """A constant as a matrix [.., ..] float64."""
+    found = np.asarray(constant, np.float64)
+    if found.ndim < 2 or math.prod(found.shape[:-2]) != 1:
+        raise InputError(f"weights {item(found.shape)}", fix="a matrix expected")
+    return found.reshape(found.shape[-2:])
+
+
+def joined(b: Composer, parts: Sequence[Operand], axis: int) -> tuple[int, Shape]:
+    """Nodes and constants one after another along an axis, and their shape.
+
+    Raises:
+        InputError: They do not fit, or a constant is not finite.
+    """
+    shapes = [whole for _, whole in parts]
+    if any(v[:axis] + v[axis + 1 :] != shapes[0][:axis] + shapes[0][axis + 1 :] for v in shapes):
+        problem = f"shapes {[item(v) for v in shapes]} do not fit"
+        raise InputError(problem, fix="check the axis, or export with a batch of 1")
+    whole = (*shapes[0][:axis], sum(v[axis] for v in shapes), *shapes[0][axis + 1 :])
+    after = whole[1:] if len(whole) > 1 and whole[0] == 1 else whole
+    b.reserve(float(math.prod(whole)) * len(parts))
+    moving, offset, done = [], np.zeros(whole), 0
+    for value, shape in parts:
+        place = (slice(None),) * axis + (slice(done, done + shape[axis]),)
+        done += shape[axis]
+        if isinstance(value, int):
+            index = np.full(whole, -1, np.int64)
+            index[place] = b.positions(value).reshape(shape)
+            moving.append(b.rearranged(value, index.reshape(after)))
+        else:
+            offset[place] = value
+    if not np.isfinite(offset).all():
+        raise InputError("joins numbers that are not finite", fix="write the network without that")
+    total = b.sum(tuple(moving), (1,) * len(moving), exact=True) if len(moving) > 1 else moving[0]
+    return b.shift(total, offset.reshape(after)), whole
