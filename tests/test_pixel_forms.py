@@ -13,7 +13,13 @@ from numba import njit
 from ns_abstract.arithmetic.rounding import REAL, charges
 from ns_abstract.arithmetic.simd.intrinsics import pointer
 from ns_abstract.arithmetic.simd.lanes import load8, store
-from ns_abstract.methods.splat.alphas import _Exponent, _fitted_exponential, _Limits
+from ns_abstract.methods.splat.alphas import (
+    _affine_forms,
+    _Exponent,
+    _exponent_of_several,
+    _fitted_exponential,
+    _Limits,
+)
 from ns_abstract.methods.splat.blend import blend_several
 from ns_abstract.methods.splat.block import (
     ALPHA_HIGH,
@@ -26,6 +32,7 @@ from ns_abstract.methods.splat.block import (
     color_size,
     fragment_width,
 )
+from ns_abstract.methods.splat.records import FORMS, columns
 from ns_abstract.methods.splat.stage_data import FormShape
 
 
@@ -35,7 +42,8 @@ def _fitted(exponent_, limits, charged, out_):
     zero = 0.0 * load8(exponent, 0)
     alpha = _fitted_exponential(
         _Exponent(
-            load8(exponent, 0), load8(exponent, 8), load8(exponent, 16), zero, load8(exponent, 24), zero
+            load8(exponent, 0), load8(exponent, 8), load8(exponent, 16), zero, load8(exponent, 24),
+            load8(exponent, 32), load8(exponent, 40),
         ),
         limits, charged,
     )  # fmt: skip
@@ -49,7 +57,8 @@ def _fitted(exponent_, limits, charged, out_):
 def test_a_straight_exponent_is_fitted(middle):
     """exp of an exponent that is linear in one parameter: only the fit's remainder and rounding are left (B3)."""
     slopes = np.array([1e-3, 0.01, 0.1, 0.25, 0.4, 0.6, 0.8, 1.0]) * min(1.0, middle)
-    exponent = np.stack([middle - slopes, middle + slopes, np.full(8, middle), slopes]).ravel()
+    straight = np.zeros(8)
+    exponent = np.stack([middle - slopes, middle + slopes, np.full(8, middle), slopes, straight, straight]).ravel()
     out = np.zeros(32)
     limits = _Limits(1.0, 1.0, 0.0, 60.0, 1e-12, 1e-12, 0.999, 1.0)
     _fitted(exponent, limits, charges(REAL), out)
@@ -64,6 +73,87 @@ def test_a_straight_exponent_is_fitted(middle):
         assert off <= radius[lane] + 1e-15
         # a jump at a threshold of 1e-12 is charged as well, and the rounding of exp
         assert radius[lane] <= 1.3 * off + 1e-11
+
+
+@pytest.mark.parametrize("distance", [0.3, 1.0, 2.5])
+@pytest.mark.parametrize("toward", [0.0, 0.7, 1.0])
+def test_a_bent_exponent_is_fitted(distance, toward):
+    """exp of half a squared distance that moves ``toward`` the mean or past it: half of what is dropped is kept."""
+    moved = np.array([1e-3, 0.01, 0.05, 0.1, 0.2, 0.3, 0.4, 0.5]) * min(1.0, distance)
+    # y = (distance + toward moved p, sqrt(1 - toward^2) moved p)
+    slopes, bends = distance * toward * moved, 0.5 * moved * moved
+    middle = 0.5 * distance * distance
+    share = slopes**2 / (2.0 * distance**2 * bends)
+    out = np.zeros(32)
+    limits = _Limits(1.0, 1.0, 0.0, 60.0, 1e-12, 1e-12, 0.9999999, 1.0)
+    for turn in (bends, bends * (1.0 + 0.5 * share)):
+        low = np.maximum(0.0, middle - slopes)
+        exponent = np.stack([low, middle + slopes + bends, np.full(8, middle), slopes, bends, turn])
+        _fitted(exponent.ravel(), limits, charges(REAL), out)
+        center, radius, weight, curve = out.reshape(4, 8)
+        for lane in range(8):
+            off = 0.0
+            for p in np.linspace(-1.0, 1.0, 81):
+                linear, square = slopes[lane] * p, bends[lane] * p * p
+                form = center[lane] + weight[lane] * (linear + square) + curve[lane] * linear * linear
+                off = max(off, abs(form - math.exp(-middle - linear - square)))
+            assert off <= radius[lane] + 1e-15, (turn[lane], lane)
+            if toward == 1.0 and turn is not bends and weight[lane] != 0.0:
+                # moving along its own offset
+                assert radius[lane] <= 3.0 * off + 1e-11
+
+
+@pytest.mark.parametrize("bend", [-0.3, -0.1, 0.1, 0.3])
+def test_an_exponent_that_bends_either_way_is_fitted(bend):
+    """With one parameter curvature may have either sign (B3)."""
+    slopes = np.array([0.0, 0.01, 0.05, 0.1, 0.2, 0.3, 0.4, 0.5])
+    least, most = 2.0 - slopes + min(bend, 0.0), 2.0 + slopes + max(bend, 0.0)
+    sizes, turn = np.full(8, abs(bend)), np.full(8, bend)
+    out = np.zeros(32)
+    limits = _Limits(1.0, 1.0, 0.0, 60.0, 1e-12, 1e-12, 0.999, 1.0)
+    _fitted(np.stack([least, most, np.full(8, 2.0), slopes, sizes, turn]).ravel(), limits, charges(REAL), out)
+    center, radius, weight, curve = out.reshape(4, 8)
+    for lane, slope in enumerate(slopes):
+        for p in np.linspace(-1.0, 1.0, 81):
+            linear, square = slope * p, bend * p * p
+            form = center[lane] + weight[lane] * (linear + square) + curve[lane] * linear * linear
+            assert abs(form - math.exp(-2.0 - linear - square)) <= radius[lane] + 1e-15
+
+
+@njit(error_model="numpy")
+def _moved(record_, offsets_, rows_, limits, charged, m, out_):
+    record, offsets, rows, out = pointer(record_), pointer(offsets_), pointer(rows_), pointer(out_)
+    exponent = _exponent_of_several(
+        record, _affine_forms(record, m, False), load8(offsets, 0), load8(offsets, 8), rows, 8 * 24, m, False
+    )
+    alpha = _fitted_exponential(exponent, limits, charged)
+    store(out, 0, alpha.center)
+    store(out, 8, alpha.radius)
+    store(out, 16, alpha.weight)
+    store(out, 24, alpha.curve)
+
+
+@pytest.mark.parametrize("across", [0.0, 0.3, 1.0])
+def test_what_moves_along_or_across_its_offset(across):
+    """Of offsets that two parameters move, the curvature stands for no more of itself than it may (B3)."""
+    m, moved = 3, 0.6
+    record = np.zeros(int(columns(5, m)))
+    record[FORMS], record[FORMS + 2 * (m + 1)] = 1.0, 1.0
+    # the mean moves to the right with the first parameter, and up with the second
+    record[FORMS + 3 * (m + 1) + 1], record[FORMS + 4 * (m + 1) + 2] = moved, across * moved
+    offsets = np.array([[0.1, 0.5, 1.0, 1.5, 2.0, 1.0, 0.2, 0.7], [0.0, 0.1, 0.0, 0.5, 0.3, 1.0, 1.5, 0.7]])
+    rows, out = np.zeros(8 * 64), np.zeros(32)
+    limits = _Limits(1.0, 1.0, 0.0, 60.0, 1e-12, 1e-12, 0.9999999, 1.0)
+    _moved(record, offsets.ravel(), rows, limits, charges(REAL), m, out)
+    center, radius, weight, curve = out.reshape(4, 8)
+    slopes, bends = rows.reshape(-1, 8)[FORM + 1 : FORM + 3], rows.reshape(-1, 8)[FORM + m + 1 : FORM + m + 4]
+    for lane in range(8):
+        for p, q in itertools.product(np.linspace(-1.0, 1.0, 21), repeat=2):
+            linear = slopes[0, lane] * p + slopes[1, lane] * q
+            square = bends[0, lane] * p * p + bends[1, lane] * p * q + bends[2, lane] * q * q
+            form = center[lane] + weight[lane] * (linear + square) + curve[lane] * linear * linear
+            x, y = offsets[0, lane] - moved * p, offsets[1, lane] - across * moved * q
+            assert abs(form - math.exp(-0.5 * (x * x + y * y))) <= radius[lane] + 1e-15, (lane, p, q)
 
 
 @njit(error_model="numpy")
@@ -95,8 +185,8 @@ def test_blends_of_exact_alphas(d, moving):
     """Alphas that are polynomials, without radii: what is dropped of their products is charged, and hardly more."""
     generator = np.random.default_rng(10 * d + moving)
     shape = FormShape(d, 1, d + 1)
-    count, width, forms = 4, int(fragment_width(shape)), d + 1 if moving else 1
-    for size in (0.02, 0.3):
+    width, forms = int(fragment_width(shape)), d + 1 if moving else 1
+    for size, count in ((0.02, 4), (0.3, 4), (0.3, 24)):
         values = np.zeros((count, width))
         colors = np.zeros((count, color_size(forms) // 4, 4))
         lists = np.zeros((count, LISTED), np.uint32)
@@ -140,3 +230,53 @@ def test_blends_of_exact_alphas(d, moving):
         if size < 0.1:
             found = sum(float(most[channel] - least[channel]) for channel in range(3))
             assert 2.0 * radius[:3].sum() < (2.5 if d < 6 else 8.0) * found
+
+
+def _two_layers(front, behind, radius=0.0, bounds=None):
+    """Polynomials and radii of two layers of two parameters and one channel; alphas are [6] coefficients."""
+    d, m = 2, 3
+    shape = FormShape(d, 1, m)
+    width = int(fragment_width(shape))
+    values, colors, lists = np.zeros((2, width)), np.zeros((2, color_size(1) // 4, 4)), np.zeros((2, LISTED), np.uint32)
+    for e, alpha in enumerate((front, behind)):
+        spread = np.abs(alpha[1:]).sum()
+        values[e, FORM : FORM + m], values[e, FORM + m + 1 : FORM + m + 4] = alpha[:3], alpha[3:]
+        values[e, FORM + m] = radius
+        ends = (alpha[0] - spread, alpha[0] + spread) if bounds is None else bounds
+        values[e, ALPHA_LOW], values[e, ALPHA_HIGH] = ends
+        colors[e, :, 0] = 1.0 - e
+        colors[e, 1, 0] = 0.0
+        lists[e, :2] = e, e
+    t, out = np.zeros(4 * (3 * m + 4 + 3)), np.zeros(12)
+    background = np.array([0.5, 0.0, 0.0, 0.0])
+    _blended(values.ravel(), lists.ravel(), colors.ravel(), background, shape, 1, 2, t, out)
+    return t.reshape(-1, 4)[:m, 0], out[0], out[4], out[8]
+
+
+@pytest.mark.parametrize("straight", [0.0, 0.1])
+def test_curvatures_of_two_layers(straight):
+    """Whatever products of parameters two alphas bend by, also where they never bend together (B10)."""
+    shapes = 0.05 * np.array([[2, 0, 0], [0, 2, 0], [0, 0, 2], [-2, 0, 0], [1, 2, 1], [1, -2, 1]])
+    grid = list(itertools.product(np.linspace(-1.0, 1.0, 9), repeat=2))
+    for first, second in itertools.product(shapes, repeat=2):
+        front, behind = [0.5, straight, -straight, *first], [0.5, -straight, straight, *second]
+        form, radius, low, high = _two_layers(np.array(front), np.array(behind))
+        for p, q in grid:
+            monomials = [1.0, p, q, p * p, p * q, q * q]
+            over, under = np.dot(front, monomials), np.dot(behind, monomials)
+            value = 0.5 + under * (0.0 - 0.5)
+            value += over * (1.0 - value)
+            assert abs(value - np.dot(form, monomials[:3])) <= radius + 1e-15, (first, second, p, q)
+            assert low - 1e-15 <= value <= high + 1e-15
+
+
+def test_an_interval_replaces_a_form_that_says_less():
+    """Bounds of alpha that are narrower than its form's radius: the pixel's radius is that of the interval (B7)."""
+    alpha = np.array([0.5, 0.01, 0.02, 0.0, 0.0, 0.0])
+    form, radius, low, high = _two_layers(alpha, alpha, 0.4, (0.45, 0.55))
+    assert 2.0 * radius <= (high - low) * (1.0 + 1e-12)
+    for over, under in itertools.product([0.45, 0.5, 0.55], repeat=2):
+        value = 0.5 - 0.5 * under
+        value += over * (1.0 - value)
+        assert low - 1e-15 <= value <= high + 1e-15
+        assert abs(value - form[0]) <= radius + 1e-15

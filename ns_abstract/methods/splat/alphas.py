@@ -55,6 +55,8 @@ class _Exponent(NamedTuple):
         low, high: Bounds.
         center, radius: Of the form.
         slope, bend: Sizes of its linear and quadratic parts.
+        turn: Twice what stands for the quadratic part in products with it; that is between 0 and ``bend``, or minus
+            ``bend`` if this is negative.
     """
 
     low: Any
@@ -63,6 +65,7 @@ class _Exponent(NamedTuple):
     radius: Any
     slope: Any
     bend: Any
+    turn: Any
 
 
 class _Alpha(NamedTuple):
@@ -175,7 +178,7 @@ def _quadratic_alphas(record, begin, n, given, block, limits, charges, antialias
             # alpha stays below the threshold
             continue
         high = minimum(high, s0 + top + radius + rounding)
-        alpha = _fitted_exponential(_Exponent(low, high, s0, radius, slope, bend), limits, charges)
+        alpha = _fitted_exponential(_Exponent(low, high, s0, radius, slope, bend, quadratic), limits, charges)
         bent = fma(alpha.weight, quadratic, alpha.curve * (linear * linear))
         # the columns between alpha's bounds and its form are set later
         store_columns(
@@ -284,10 +287,16 @@ def _exponent_of_several(record, f, ax, ay, rows, scratch, m, antialiased):
     size = fma(c1, e1, fma(c2, e2, s0)) + f.k_high + bend
     radius = (first + second + fma(FRAGMENT_ROUNDING, size, f.k_radius)) * UP
     low, high = _square_sum_range(c1, c2, e1, e2, f.k_low, f.k_high)
+    turn = bend
+    if not antialiased:
+        # the curvature is no less than the square of the linear part over 2 c^2
+        room = 2.0 * fma(c1, c1, c2 * c2) * bend
+        share = where(room > 0.0, sl * sl / where(room > 0.0, room, 1.0), 0.0)
+        turn = bend * fma(0.5 * (1.0 - 2.0**-40), minimum(share, 1.0), 1.0)
     # half a sum of squares is not negative
     spread = (sl + radius + FRAGMENT_ROUNDING * (center + bend)) * UP
     return _Exponent(
-        maximum(low, center - spread), minimum(high, center + (spread + bend) * UP), center, radius, sl, bend
+        maximum(low, center - spread), minimum(high, center + (spread + bend) * UP), center, radius, sl, bend, turn
     )
 
 
@@ -356,10 +365,13 @@ def _fitted_exponential(sigma, limits, charges):
     weight = fma(2.0 * j2, t0, -k1)
     spread = sr + l + b
     size = fma(abs(t0), 4.0 + abs(t0), fma(spread, 1.0 + spread, 4.0))
-    bent = fma(b, fma(2.0, l, b), sr * fma(2.0, l + b, sr))
+    # the linear part times twice what the curvature is off half its turn, and the square of that
+    turn = abs(sigma.turn)
+    bent = fma(l, 2.0 * b - turn, fma(0.125 * turn, turn, sr * fma(2.0, l + b, sr)))
     error = fma(abs(weight), sr, fma(j2, bent, fma(FRAGMENT_ROUNDING + 2.0 * EXP_RELATIVE_ERROR, size, fit)))
     radius = fma(scale, error, 1.01 * e_low * fma(opacity_high, slack, opacity_spread))
-    center = scale * fma(t0, fma(j2, t0, -k1), k0)
+    center = scale * fma(t0, fma(j2, t0, -k1), fma(-0.125 * j2, turn * turn, k0))
+    weight = fma(j2, sigma.turn, weight)
     # alpha_max
     excess = maximum(0.0, a_high - alpha_max)
     a_high = minimum(a_high, alpha_max * (1.0 + charges.threshold))

@@ -267,6 +267,47 @@ def blend_quadratic(begin, end, fragments, palette, moves, t):
 
 
 @njit(cache=True, error_model="numpy", forceinline=True)
+def _bend_range(bends, u, m):
+    """Range of a quadratic part, at most 0 to at least 0, from its ``bends`` (design.md, B10); ``u`` [m] is scratch."""
+    for k in range(1, m):
+        u[k] = 0.0
+    low, high, pair = 0.0, 0.0, 0
+    for j in range(1, m):
+        own, shared = bends[pair], u[j]
+        pair += 1
+        for k in range(j + 1, m):
+            # |p_j p_k| is at most half the sum of their squares
+            half = 0.5 * abs(bends[pair])
+            shared += half
+            u[k] += half
+            pair += 1
+        low += min(0.0, own - shared)
+        high += max(0.0, own + shared)
+    return low, high
+
+
+@njit(cache=True, error_model="numpy", forceinline=True)
+def _curve_range(t, u, m):
+    """`_bend_range` of the polynomials ``t`` [m + bends, 4], channel by channel; ``u`` [m, 4] is scratch."""
+    low = 0.0 * load4(t, 0)
+    high = low
+    for k in range(1, m):
+        store(u, 4 * k, low)
+    pair = m
+    for j in range(1, m):
+        own, shared = load4(t, 4 * pair), load4(u, 4 * j)
+        pair += 1
+        for k in range(j + 1, m):
+            half = 0.5 * abs(load4(t, 4 * pair))
+            shared = shared + half
+            store(u, 4 * k, load4(u, 4 * k) + half)
+            pair += 1
+        low = low + minimum(0.0, own - shared)
+        high = high + maximum(0.0, own + shared)
+    return low, high
+
+
+@njit(cache=True, error_model="numpy", forceinline=True)
 def _step_of_several(r, at, key, fragments, palette, t, u, m):
     """One fragment over polynomials and radii ``r``; returns the new radii (design.md, B7, B10).
 
@@ -277,9 +318,16 @@ def _step_of_several(r, at, key, fragments, palette, t, u, m):
     moving = forms > 1
     form = advanced(values, at + FORM)
     bends = advanced(form, m + 1)
+    # alpha's curvature is about - bent to about + bent, that of what is behind likewise
+    low, high = _bend_range(bends, u, m)
+    about, bent, bend_size = 0.5 * (low + high), 0.5 * (high - low), high - low
+    sunk, risen = _curve_range(t, u, m)
+    middle_curve, wound, curved = 0.5 * (sunk + risen), 0.5 * (risen - sunk), maximum(risen, -sunk)
     a0 = form[0]
+    kept = a0 + about
     p0 = load4(t, 0)
     value = load4(colors, key) - p0
+    shown = value - middle_curve
     steep = 0.0
     change_size = 0.0 * p0
     for k in range(1, m):
@@ -288,13 +336,11 @@ def _step_of_several(r, at, key, fragments, palette, t, u, m):
         if moving:
             change = load4(colors, key + 4 * k) - slope
         store(u, 4 * k, change)
-        store(t, 4 * k, fma(a0, change, fma(form[k], value, slope)))
+        store(t, 4 * k, fma(kept, change, fma(form[k], shown, slope)))
         steep += abs(form[k])
         change_size = change_size + abs(change)
-    middle = fma(a0, value, p0)
+    middle = fma(about, middle_curve, fma(a0, value, p0))
     store(t, 0, middle)
-    curved = 0.0 * p0
-    bent = 0.0
     pair = 0
     for j in range(1, m):
         change, a = load4(u, 4 * j), form[j]
@@ -303,38 +349,22 @@ def _step_of_several(r, at, key, fragments, palette, t, u, m):
             product = a * load4(u, 4 * k)
             if j < k:
                 product = fma(form[k], change, product)
-            store(t, 4 * (m + pair), fma(-a0, curve, fma(bends[pair], value, curve + product)))
-            curved = curved + abs(curve)
-            bent += abs(bends[pair])
+            store(t, 4 * (m + pair), fma(-kept, curve, fma(bends[pair], shown, curve + product)))
             pair += 1
     size = abs(value) + change_size + curved
-    dropped = fma(steep, curved, bent * (change_size + curved))
+    dropped = fma(steep, wound, bent * (change_size + wound)) * UP
     added = fma(values[at + ALPHA_HIGH], load4(colors, key + 4 * forms), dropped)
-    added = fma(form[m], size, fma(FRAGMENT_ROUNDING, fma(1.0 + steep + bent, size, abs(middle)), added))
+    rounding = fma(1.0 + steep + bend_size, size + 2.0 * curved, abs(middle))
+    added = fma(form[m], size * UP, fma(FRAGMENT_ROUNDING, rounding, added))
     return fma(1.0 - values[at + ALPHA_LOW], r, added)
 
 
 @njit(cache=True, error_model="numpy", forceinline=True)
-def _flattened(t, r, m):
+def _flattened(t, r, u, m):
     """Put the range of the curvature behind the polynomials ``t`` into their centres and the radii ``r`` (B10)."""
-    low = 0.0 * r
-    high, size = low, low
-    for j in range(1, m):
-        own, shared = 0.0 * r, 0.0 * r
-        pair = m
-        for i in range(1, m):
-            for k in range(i, m):
-                if i == j and k == j:
-                    own = load4(t, 4 * pair)
-                elif i == j or k == j:
-                    # |p_i p_k| is at most half the sum of their squares
-                    shared = shared + 0.5 * abs(load4(t, 4 * pair))
-                pair += 1
-        low = low + minimum(0.0, own - shared)
-        high = high + maximum(0.0, own + shared)
-        size = size + abs(own) + shared
+    low, high = _curve_range(t, u, m)
     store(t, 0, load4(t, 0) + 0.5 * (low + high))
-    return r + 0.5 * (high - low) + 2.0 * FRAGMENT_ROUNDING * (abs(load4(t, 0)) + size)
+    return r + 0.5 * (high - low) + 2.0 * FRAGMENT_ROUNDING * (abs(load4(t, 0)) + 2.0 * (high - low))
 
 
 @njit(cache=True, error_model="numpy", forceinline=True)
@@ -360,7 +390,15 @@ def blend_several(begin, end, fragments, palette, moves, t, m):
             store(t, 0, load4(t, 0) + 0.5 * (rises - falls))
             r = r + 0.5 * (rises + falls)
             ends = _Ends(ends.low - falls, ends.high + rises, ends.darkest, ends.brightest)
-    return _flattened(t, r, m), ends
+        # where the interval says more than the form, the form is the interval
+        half = 0.5 * (ends.high - ends.low)
+        wide = r > half
+        if bits(wide) & 7 != 0:
+            store(t, 0, where(wide, 0.5 * (ends.low + ends.high), load4(t, 0)))
+            for k in range(1, m + fragments.bends):
+                store(t, 4 * k, where(wide, 0.0, load4(t, 4 * k)))
+            r = where(wide, half * UP + FRAGMENT_ROUNDING * (abs(ends.low) + abs(ends.high)), r)
+    return _flattened(t, r, u, m), ends
 
 
 @njit(cache=True, error_model="numpy", forceinline=True)
