@@ -32,7 +32,7 @@ _LOOKS = 16
 #: Excess over what the goal allows from which on cells are cut into four parts rather than two.
 _FAR = 4.0
 #: Pixels that typical Gaussians move by at most in the first cell of one parameter, and by each of several.
-FIRST_MOTION, FIRST_MOTIONS = 0.5, 1.0
+FIRST_MOTION, FIRST_MOTIONS = 0.5, 0.6
 #: A first cover of one parameter aims at this part of the excess that the goal, or the ratio if larger, allows.
 _AIM_SHARE, _AIM_RATIO = 0.6, 1.05
 #: Halving the first cell of one parameter leaves less than this part of its excess, or does not help; an excess from

@@ -243,7 +243,7 @@ def _store_fragments(rows, alpha, values, at, width, m):
 
 @njit(cache=True, error_model="numpy", forceinline=True)
 def _exponent_of_several(record, f, ax, ay, rows, scratch, m, antialiased):
-    """The `_Exponent` of pixels at offsets ``ax``, ``ay`` (design.md, B1-B2, B10).
+    """The `_Exponent` of pixels at offsets ``ax``, ``ay`` (design.md, B1-B3, B10).
 
     ``rows`` [., 8] receives its slopes and behind the radius its curvature; ``scratch`` is the first that is free.
     """
