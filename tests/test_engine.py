@@ -89,6 +89,7 @@ class Waves:
             self.camera = SimpleNamespace(width=height, height=width)
         self.weight, self.phase = self._tiles(weight), self._tiles(phase)
         self.calls: list[tuple[ParameterBox, list[int], Any]] = []
+        self.wanted: list[int] = []
 
     def _tiles(self, picture: np.ndarray) -> np.ndarray:
         rest = picture.shape[2:]
@@ -111,10 +112,19 @@ class Waves:
         low_sine, high_sine = sine_range(middle - radius, middle + radius)
         return 0.5 + 0.4 * low_sine, 0.5 + 0.4 * high_sine, radius
 
-    def bound(self, box: ParameterBox, tiles: np.ndarray, within: Any = None, keep_linear: bool = False) -> Any:
+    def bound(
+        self, box: ParameterBox, tiles: np.ndarray, within: Any = None, keep_linear: bool = False,
+        pixels: np.ndarray | None = None,
+    ) -> Any:  # fmt: skip
         self.calls.append((box, list(map(int, tiles)), within))
         lower, upper, radius = self.exact(box)
         lower, upper = outward((lower - self.slack * radius**2)[tiles], (upper + self.slack * radius**2)[tiles])
+        wanted = np.zeros((self.tile_count, SIDE, SIDE), bool)
+        wanted[tiles] = True if pixels is None else pixels
+        self.wanted.append(int(wanted.sum()))
+        # what a context was not asked for is not there
+        assert within is None or not (wanted & ~within.wanted).any()
+        lower[~wanted[tiles]], upper[~wanted[tiles]] = 0.0, 1.0
         half = 0.5 * (np.array(box.upper) - np.array(box.lower))
         linear = None
         if keep_linear:
@@ -125,7 +135,7 @@ class Waves:
             lower=lower,
             upper=upper,
             slopes=np.abs(self.weight).mean(axis=(0, 1, 2, 3)) * half,
-            context=SimpleNamespace(box=box, shown=None, nbytes=0),
+            context=SimpleNamespace(box=box, shown=None, nbytes=0, wanted=wanted),
             linear=linear,
         )
 
@@ -219,10 +229,10 @@ class Watched(Waves):
         self.rendered.append(float(values[0]))
         return super().render(values, tiles)
 
-    def bound(self, box: ParameterBox, tiles: np.ndarray, within: Any = None, keep_linear: bool = False) -> Any:
+    def bound(self, box: ParameterBox, tiles: np.ndarray, within: Any = None, *rest: Any) -> Any:
         if within is not None and self.before_splits is None:
             self.before_splits = list(self.rendered), list(self.allowed)
-        return super().bound(box, tiles, within, keep_linear)
+        return super().bound(box, tiles, within, *rest)
 
 
 def test_first_cover_is_rendered_in_every_other_part_until_the_goal_asks_for_more() -> None:
@@ -283,8 +293,8 @@ def test_first_cover_stays_coarse_where_smaller_cells_do_not_help() -> None:
     frame = Waves(1, slack=0.0)
     bound = frame.bound
 
-    def loose(box: ParameterBox, tiles: np.ndarray, within: Any = None, keep_linear: bool = False) -> Any:
-        found = bound(box, tiles, within, keep_linear)
+    def loose(*arguments: Any) -> Any:
+        found = bound(*arguments)
         found.lower[...], found.upper[...] = found.lower - 0.05, found.upper + 0.05
         return found
 
@@ -306,6 +316,31 @@ def test_ratio_falls_to_the_goal(dimensions: int, ratio: float, first: float) ->
     assert result.trace[-1].mpg <= ratio * result.trace[-1].mpg_witness
     assert result.trace[-1].mpg == pytest.approx(mean_pixel_gap(result.lower, result.upper), rel=1e-12)
     assert result.cells < 4000
+
+
+@pytest.mark.parametrize("ratio", [1.0, 1.2])
+def test_leaves_are_split_for_the_pixels_where_they_leave_much_open(ratio: float) -> None:
+    shares = []
+    for keep_leaves in (False, True):
+        frame = Waves(2, slack=1.0)
+        result = refine(frame, Goal(ratio, FOREVER, 400), keep_leaves=keep_leaves)
+        check(frame, result)
+        assert ratio == 1.0 or result.trace[-1].mpg <= ratio * result.trace[-1].mpg_witness
+        splits = [k for k, (_, _, within) in enumerate(frame.calls) if within is not None]
+        assert len(splits) > 20
+        asked = sum(frame.wanted[k] for k in splits)
+        shares.append(asked / sum(SIDE**2 * len(frame.calls[k][1]) for k in splits))
+    # linear sets are kept of every pixel
+    assert 0.05 < shares[0] < 0.9 and shares[1] == 1.0
+
+
+def test_a_stricter_goal_asks_for_no_pixel_that_was_left_before() -> None:
+    frame = Waves(2, slack=1.0)
+    refinement = Refinement(frame, 0, Goal(1.2, FOREVER, 4000))
+    before = refinement.run()
+    after = refinement.proceed(Goal(1.001, FOREVER, before.cells + 300))
+    check(frame, after)
+    assert after.trace[-1].mpg < before.trace[-1].mpg
 
 
 def test_stops_at_the_goal_and_not_later() -> None:
@@ -634,8 +669,8 @@ def test_children_that_contradict_their_parent_are_not_believed() -> None:
     frame = Waves(1, width=4, height=4)
     bound = frame.bound
 
-    def shifted(box: ParameterBox, tiles: np.ndarray, within: Any = None, keep_linear: bool = False) -> Any:
-        found = bound(box, tiles, within, keep_linear)
+    def shifted(box: ParameterBox, tiles: np.ndarray, within: Any = None, *rest: Any) -> Any:
+        found = bound(box, tiles, within, *rest)
         if within is not None:
             # beyond what the parent allows in some pixels
             found.lower[...], found.upper[...] = 0.96, 0.97

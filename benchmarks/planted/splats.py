@@ -11,6 +11,8 @@ _BLEND = "methods/splat/blend.py"
 _BOUNDS = "methods/splat/bounds.py"
 _ALPHAS = "methods/splat/alphas.py"
 _BLOCK = "methods/splat/block.py"
+_LISTS = "methods/splat/lists.py"
+_PIXELS = "methods/splat/pixels.py"
 _FORM_COLORS = "methods/splat/form_colors.py"
 _LINE_COLORS = "methods/splat/line_colors.py"
 _COLORS = "methods/splat/colors.py"
@@ -488,6 +490,30 @@ SPLATS = (
         "fma(0.5 * (1.0 - 2.0**-40), minimum(share, 1.0), 1.0)",
         "1.9",
         "test_pixel_forms.py::test_what_moves_along_or_across_its_offset[1.0]",
+    ),
+    Fault(
+        "pixels that are not wanted are taken for bounded ones",
+        _PIXELS,
+        "_bound_block",
+        "_set_trivial(signed(~place.wanted), left, above, bounds, m)",
+        "_set_trivial(signed(0), left, above, bounds, m)",
+        "test_lists.py::test_wanted_pixels_are_bounded_as_in_the_whole_picture[radii0-1-False-arithmetic0]",
+    ),
+    Fault(
+        "layers of pixels that are not wanted are those of nothing",
+        _PIXELS,
+        "_bound_block",
+        "shade_layers(place.wanted, left, above, block, inputs, bounds)",
+        "shade_layers(signed(-1), left, above, block, inputs, bounds)",
+        "test_lists.py::test_layers_of_pixels_that_are_not_wanted_are_unknown",
+    ),
+    Fault(
+        "wanted pixels are those of another block",
+        _LISTS,
+        "pixel_sets",
+        "chosen.reshape(count, along, BLOCK, along, BLOCK).swapaxes(2, 3)",
+        "chosen.reshape(count, along, BLOCK, along, BLOCK).swapaxes(1, 3)",
+        "test_lists.py::test_wanted_pixels_are_bounded_as_in_the_whole_picture[radii0-1-False-arithmetic0]",
     ),
     Fault(
         "pixels that the batch has hidden take further layers",

@@ -25,9 +25,10 @@ class _EveryGaussian(SplatFrame):
     """Looks at every Gaussian in every cell, whatever the cell around it shows."""
 
     def bound(
-        self, box: ParameterBox, tiles: np.ndarray, within: Context | None = None, keep_linear: bool = False
-    ) -> TileBounds:
-        return super().bound(box, tiles, None, keep_linear)
+        self, box: ParameterBox, tiles: np.ndarray, within: Context | None = None, keep_linear: bool = False,
+        pixels: np.ndarray | None = None,
+    ) -> TileBounds:  # fmt: skip
+        return super().bound(box, tiles, None, keep_linear, pixels)
 
 
 def _refined(frame: SplatFrame, index: int, cells: int, seed: int) -> tuple[FrameResult, float]:

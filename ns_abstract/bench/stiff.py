@@ -106,10 +106,11 @@ class WatchedFrame(SplatFrame):
         return picture
 
     def bound(
-        self, box: ParameterBox, tiles: np.ndarray, within: Context | None = None, keep_linear: bool = False
-    ) -> TileBounds:
+        self, box: ParameterBox, tiles: np.ndarray, within: Context | None = None, keep_linear: bool = False,
+        pixels: np.ndarray | None = None,
+    ) -> TileBounds:  # fmt: skip
         """See `SplatFrame.bound`."""
-        found = super().bound(box, tiles, within, keep_linear)
+        found = super().bound(box, tiles, within, keep_linear, pixels)
         self.not_finite += _not_finite(found.lower, found.upper, found.slopes, *(found.linear or ()))
         self.crossed += int((found.lower > found.upper).sum())
         return found

@@ -38,6 +38,8 @@ _AIM_SHARE, _AIM_RATIO = 0.6, 1.05
 #: Halving the first cell of one parameter leaves less than this part of its excess, or does not help; an excess from
 #: this part of the largest on may only be cut off at 0 and 1.
 _HELPS, _CUT_OFF = 0.5, 0.25
+#: Part of the gap beyond the witnesses that a goal allows which a leaf may leave open at a pixel for good.
+_CLOSED_SHARE = 0.25
 #: Leaves whose box is narrower than this part of the set are not split: rounding rules there.
 _NARROWEST = 2.0**-40
 #: Most corners of the set that are rendered at the start.
@@ -234,6 +236,8 @@ class Refinement:
         self.leaf_sets: dict[tuple[int, int], tuple[ParameterBox, tuple[np.ndarray, ...]]] = {}
         self._kept_bytes = 0
         self._held_bytes = 0
+        #: what a leaf may leave open at a pixel that it is not bounded at any more; never falls
+        self._closed_excess = 0.0
         self._numbers = itertools.count()
         self._views: list[tuple[np.ndarray, np.ndarray]] = []
 
@@ -287,10 +291,15 @@ class Refinement:
         )  # fmt: skip
         self.witness_lower[which], self.witness_upper[which] = least, most
 
-    def _bound(self, cell: _Cell, parent: _Cell | None, tiles: np.ndarray) -> tuple[np.ndarray, np.ndarray, Bounds]:
-        """Lower and upper [t, side, side, 3] that can be relied on, and all that the frame returned."""
+    def _bound(
+        self, cell: _Cell, parent: _Cell | None, tiles: np.ndarray, pixels: np.ndarray | None = None
+    ) -> tuple[np.ndarray, np.ndarray, Bounds]:
+        """Lower and upper [t, side, side, 3] that can be relied on, and all that the frame returned.
+
+        Only some ``pixels`` [t, side, side] may be wanted, which must be among those of ``parent``.
+        """
         within = None if parent is None else parent.context
-        bounds = self.frame.bound(cell.box, self._numbers_of(tiles), within, self.keep_leaves)
+        bounds = self.frame.bound(cell.box, self._numbers_of(tiles), within, self.keep_leaves, pixels)
         return self._take(cell, bounds)
 
     def _take(self, cell: _Cell, bounds: Bounds) -> tuple[np.ndarray, np.ndarray, Bounds]:
@@ -573,6 +582,7 @@ class Refinement:
             # what is kept for the result cannot be given up for room
             if self._kept_bytes >= self.goal.leaf_bytes:
                 return
+            self._close_excess(point)
             jobs, parts = self._choose()
             changes: dict[int, _Change] = {}
             fresh: set[int] = set()
@@ -598,6 +608,12 @@ class Refinement:
             for t, change in changes.items():
                 self.tiles[t].replace(change)
             self._update_outer(np.array(sorted(changes), np.int64))
+
+    def _close_excess(self, point: TracePoint) -> None:
+        """Leave pixels of leaves for good that could take little more away from what the goal allows."""
+        if not self.keep_leaves and self.frame.channels == COLORS and not self.frame.tilewise:
+            allowed = (self.goal.ratio - 1.0) * point.mpg_witness + self.goal.slack
+            self._closed_excess = max(self._closed_excess, _CLOSED_SHARE * allowed)
 
     def _choose(self) -> tuple[list[tuple[_Cell, dict[int, int]]], int]:
         """The cells to split in the next round, each with its row by tile, and into how many parts."""
@@ -638,13 +654,7 @@ class Refinement:
         for t, tile in enumerate(self.tiles):
             if tile.lower is None or tile.upper is None:
                 continue
-            colors = np.s_[..., :COLORS]
-            lower, upper = tile.lower[colors], tile.upper[colors]
-            if self._known is not None:
-                lower, upper = np.maximum(lower, self._known[0][t]), np.minimum(upper, self._known[1][t])
-            beyond = np.maximum(0.0, self.witness_lower[t][colors] - lower)
-            beyond += np.maximum(0.0, upper - self.witness_upper[t][colors])
-            amount = beyond[:, self.inside[t]].sum(axis=(1, 2), dtype=np.float64)
+            amount = self._open(t, tile.lower, tile.upper).sum(axis=(1, 2), dtype=np.float64)
             done = (amount <= 0.0) | np.array([cell.narrow for cell in tile.cells])
             tile.close(done)
             amount = amount[~done]
@@ -656,6 +666,20 @@ class Refinement:
             owner.extend((t, k) for k in range(amount.size))
         self._held_bytes += sum(_context_bytes(context) for context in contexts.values())
         return np.concatenate(excess), owner
+
+    def _open(self, t: int, lower: np.ndarray, upper: np.ndarray) -> np.ndarray:
+        """[n, side, side] what leaves of tile t leave open beyond the witnesses, where that is not too little.
+
+        A pixel where a leaf has nothing open has nothing open in any part of it, then or later.
+        """
+        colors = np.s_[..., :COLORS]
+        lower, upper = lower[colors], upper[colors]
+        if self._known is not None:
+            lower, upper = np.maximum(lower, self._known[0][t]), np.minimum(upper, self._known[1][t])
+        beyond = np.maximum(0.0, self.witness_lower[t][colors] - lower)
+        beyond += np.maximum(0.0, upper - self.witness_upper[t][colors])
+        beyond = beyond.sum(axis=-1)
+        return np.where(self.inside[t] & (beyond > self._closed_excess), beyond, 0.0)
 
     def _close_least(self, order: np.ndarray, owner: list[tuple[int, int]]) -> None:
         """Free memory: the half of the leaves that have least excess are not split any more."""
@@ -671,6 +695,7 @@ class Refinement:
     def _split(self, cell: _Cell, rows: dict[int, int], parts: int, changes: dict[int, _Change]) -> int:
         """Bound the parts of ``cell`` in the tiles of ``rows``; returns the bytes of the new leaves."""
         tiles = np.array(list(rows), np.int64)
+        pixels = self._wanted(rows)
         children = [self._cell(part) for part in self._halved(cell, parts)]
         if cell.box.dimensions > 1:
             if children:
@@ -682,7 +707,7 @@ class Refinement:
                 child, step = children[(number - 1) // steps], (number - 1) % steps + 1
                 end = np.array(child.box.upper)
                 self._witness(end if step == steps else child.box.at(np.array([2.0 * step / steps - 1.0])), tiles)
-        found = [self._bound(child, cell, tiles) for child in children]
+        found = [self._bound(child, cell, tiles, pixels) for child in children]
         added = 0
         for k, (t, row) in enumerate(rows.items()):
             tile, change = self.tiles[t], changes.setdefault(t, _Change())
@@ -700,6 +725,20 @@ class Refinement:
             if child.context is not cell.context:
                 added += _context_bytes(child.context)
         return added
+
+    def _wanted(self, rows: dict[int, int]) -> np.ndarray | None:
+        """[t, side, side] the pixels that leaves in the tiles and rows ``rows`` are split for; None: all.
+
+        Linear sets are kept of all pixels, and layers are not looked at for where they are open.
+        """
+        if self.keep_leaves or self.frame.channels > COLORS:
+            return None
+        found = []
+        for t, row in rows.items():
+            tile = self.tiles[t]
+            assert tile.lower is not None and tile.upper is not None
+            found.append(self._open(t, tile.lower[row][None], tile.upper[row][None])[0] > 0.0)
+        return np.stack(found)
 
     # --- results -------------------------------------------------------------------------------
 

@@ -185,8 +185,19 @@ class Frame(Protocol):
         """Other scenes of the set; none where only poses vary."""
         ...
 
-    def bound(self, box: ParameterBox, tiles: np.ndarray, within: Any = None, keep_linear: bool = False) -> Bounds:
-        """Bounds of ``tiles`` over ``box``; ``within`` is the context of these tiles and a box around it."""
+    def bound(
+        self, box: ParameterBox, tiles: np.ndarray, within: Any = None, keep_linear: bool = False,
+        pixels: np.ndarray | None = None,
+    ) -> Bounds:  # fmt: skip
+        """Bounds of ``tiles`` over a cell.
+
+        Args:
+            box: The cell.
+            tiles: [t] numbers.
+            within: The context of these tiles, and of all ``pixels``, from a box around this one.
+            keep_linear: Whether linear bounds are asked for.
+            pixels: [t, side, side] which pixels are wanted, others may be left at [0, 1]; all if None.
+        """
         ...
 
     def feasible(self, box: ParameterBox) -> ParameterBox | None:

@@ -189,8 +189,9 @@ class NerfFrame:
         return pose[:, 3] - distance * pose[:, 2]
 
     def bound(
-        self, box: ParameterBox, tiles: np.ndarray, within: RayContext | None = None, keep_linear: bool = False
-    ) -> RayBox:
+        self, box: ParameterBox, tiles: np.ndarray, within: RayContext | None = None, keep_linear: bool = False,
+        pixels: np.ndarray | None = None,
+    ) -> RayBox:  # fmt: skip
         """Bounds of the rays ``tiles`` over ``box``; ``within`` is the context of these rays and a box around it.
 
         Rays that there is no time for any more (`ns_abstract.execution.ending`) are bounded by [0, 1].

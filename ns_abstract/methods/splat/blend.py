@@ -11,7 +11,7 @@ from numba import njit
 
 from ns_abstract.arithmetic.elementary import fma
 from ns_abstract.arithmetic.rounding import FRAGMENT_ROUNDING, UNIT64, UP
-from ns_abstract.arithmetic.simd.intrinsics import advanced, lowest_bit
+from ns_abstract.arithmetic.simd.intrinsics import advanced, lowest_bit, signed
 from ns_abstract.arithmetic.simd.lanes import bits, load4, load8, maximum, minimum, store, where
 from ns_abstract.methods.splat.block import (
     ALPHA_HIGH,
@@ -448,8 +448,8 @@ def _slack(q, ends, block, inputs, u):
 
 
 @njit(cache=True, error_model="numpy")
-def shade(left, above, reordered, block, inputs, bounds):
-    """Blend every pixel's fragments and write its bounds (design.md, B7-B9).
+def shade(pixels, left, above, reordered, block, inputs, bounds):
+    """Blend the fragments of each of a block's ``pixels`` and write its bounds (design.md, B7-B9).
 
     The block begins at column ``left`` and row ``above`` of its tile, whose parts of `PixelBounds` are ``bounds``;
     ``reordered`` tells whether fragments may move. Row OPEN of `Fragments.per_pixel` bounds the light that comes to
@@ -464,7 +464,9 @@ def shade(left, above, reordered, block, inputs, bounds):
     scratch = _Scratch(u, block.entries.depth_radius, block.entries.first)
     for k in range(d):
         store(sums, 4 * k, 0.0 * load4(palette.background, 0))
-    for q in range(PIXELS):
+    while pixels != 0:
+        q = lowest_bit(pixels)
+        pixels = signed(pixels & (pixels - 1))
         begin = q * fragments.capacity
         end = begin + int(fragments.lengths[q])
         if order == 2:

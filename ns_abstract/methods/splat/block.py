@@ -45,12 +45,13 @@ _POSITIONS = 1024
 
 
 class Place(NamedTuple):
-    """A block's first pixel in the picture, and its tile's column and row."""
+    """A block's first pixel in the picture, its tile's column and row, and the set of its pixels that are wanted."""
 
     x0: int
     y0: int
     tile_x: int
     tile_y: int
+    wanted: int
 
 
 class Fragments(NamedTuple):

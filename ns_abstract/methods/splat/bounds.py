@@ -18,7 +18,7 @@ from ns_abstract.methods.splat.activate import Splats
 from ns_abstract.methods.splat.colors import color_magnitudes, fixed_colors, gathered, moving_colors
 from ns_abstract.methods.splat.constants import Rasteriser, raster_rules
 from ns_abstract.methods.splat.gaussians import covariance_noise, gaussian_stage
-from ns_abstract.methods.splat.lists import TileLists, depth_order, marked, tile_lists, tile_mask
+from ns_abstract.methods.splat.lists import TileLists, depth_order, marked, pixel_sets, tile_lists, tile_mask
 from ns_abstract.methods.splat.pixels import pixel_stage
 from ns_abstract.methods.splat.records import columns, exponent_limits
 from ns_abstract.methods.splat.stage_data import (
@@ -144,6 +144,7 @@ class SplatBounds:
         keep_linear: bool = False,
         floor: float = -1.0,
         layers: bool = False,
+        pixels: np.ndarray | None = None,
     ) -> CellBounds:
         """Bounds of the tiles ``wanted`` over the poses enclosed by ``forms`` (design.md, G10).
 
@@ -151,11 +152,12 @@ class SplatBounds:
             camera: Intrinsics and size.
             forms: The cell's poses.
             wanted: Tile numbers; all if None.
-            candidates: Scene indices that may be visible (from an enclosing cell); all if None.
+            candidates: Scene indices that may be visible there (from an enclosing cell); all if None.
             keep_linear: Whether to return the linear sets.
             floor: What no more light comes to may have any colour that is there (B6); negative, and for rasterisers
                 without a stop: every layer counts.
             layers: Whether to bound accumulation and expected depth, too.
+            pixels: [t, side, side] which of the tiles' pixels are wanted, nothing is said of the others; all if None.
         """
         splats = self.splats
         shape = form_shape(forms.rotation.basis)
@@ -198,11 +200,11 @@ class SplatBounds:
         colors = self._colors(forms, camera_magnitude, candidates, alive, n)
         mask = tile_mask(wanted, across * down)
         offsets, entries = tile_lists(depth_order(alive, gaussians.depth), gaussians.tiles, mask, across)
-        pixels = (wanted.size, self.side, self.side, 3)
+        shaped = (wanted.size, self.side, self.side, 3)
         found = PixelBounds(
-            lower=np.zeros(pixels),
-            upper=np.zeros(pixels),
-            linear=np.zeros((wanted.size if keep_linear else 0, *pixels[1:], m + 1)),
+            lower=np.zeros(shaped),
+            upper=np.zeros(shaped),
+            linear=np.zeros((wanted.size if keep_linear else 0, *shaped[1:], m + 1)),
             layers=np.zeros((wanted.size if layers else 0, self.side, self.side, 4)),
             slopes=np.zeros((wanted.size, d)),
             statistics=np.zeros((threads(), 5), np.int64),
@@ -214,6 +216,7 @@ class SplatBounds:
             common = np.ascontiguousarray(offset[: m + 1, 2])
         pixel_stage(
             TileLists(wanted, offsets, entries),
+            pixel_sets(np.broadcast_to(True, found.lower.shape[:3]) if pixels is None else pixels),
             gaussians,
             self._viewing_axes(forms, rotation_magnitude, gaussians),
             view,

@@ -13,7 +13,7 @@ import numpy as np
 from numba import njit
 
 from ns_abstract.arithmetic.rounding import FRAGMENT_ROUNDING, UNIT64, UP
-from ns_abstract.arithmetic.simd.intrinsics import advanced
+from ns_abstract.arithmetic.simd.intrinsics import advanced, lowest_bit, signed
 from ns_abstract.arithmetic.simd.lanes import maximum, minimum, store
 from ns_abstract.methods.splat.blend import blend_quadratic, blend_several, form_range
 from ns_abstract.methods.splat.block import (
@@ -25,7 +25,7 @@ from ns_abstract.methods.splat.block import (
     color_size,
     listed_fragment,
 )
-from ns_abstract.methods.splat.lists import BLOCK, PIXELS
+from ns_abstract.methods.splat.lists import BLOCK
 
 #: Lanes of accumulation and depth.
 _SUM, DEPTH = 0, 3
@@ -142,8 +142,8 @@ def _weighted_mean(t, radius, low, high, total_low, total_high, order, m):
 
 
 @njit(cache=True, error_model="numpy")
-def shade_layers(left, above, block, inputs, bounds):
-    """Write `PixelBounds.layers` of every pixel of a block that `shade` has shaded (design.md, D1-D4).
+def shade_layers(pixels, left, above, block, inputs, bounds):
+    """Write `PixelBounds.layers` of those ``pixels`` of a block that `shade` has shaded (design.md, D1-D4).
 
     Reads the depths in lane `DEPTH` of the palette, and changes rows of moves, which are of no use afterwards.
     """
@@ -157,7 +157,9 @@ def shade_layers(left, above, block, inputs, bounds):
     result = advanced(reference, m)
     # a fragment that is drawn has this alpha at least
     least = inputs.rules.alpha_min * (1.0 - 2.0 * charges.threshold)
-    for q in range(PIXELS):
+    while pixels != 0:
+        q = lowest_bit(pixels)
+        pixels = signed(pixels & (pixels - 1))
         begin, n = q * fragments.capacity, int(fragments.lengths[q])
         end = begin + n
         _set_reference(begin, end, fragments, block.palette, reference, m)

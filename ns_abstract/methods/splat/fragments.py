@@ -591,7 +591,7 @@ def collect_fragments(numbers, place, inputs, block, marks_):
     # not as literals, for which what is called would be compiled once more
     pairs, slots, moved, used = signed(0), signed(0), signed(1), signed(0)
     # pixels that take light, and those that take none, or too little, behind the fragments whose place is still open
-    live, dim = signed(-1), signed(0)
+    live, dim = signed(place.wanted), signed(0)
     missing = length
     for start in range(0, length, BATCH):
         some = min(BATCH, length - start)

@@ -247,14 +247,15 @@ class SplatFrame:
         return self.pose_set.feasible(box)
 
     def bound(
-        self, box: ParameterBox, tiles: np.ndarray, within: Context | None = None, keep_linear: bool = False
-    ) -> TileBounds:
-        """Bounds of ``tiles`` over ``box``; ``within`` is the context of these tiles and a box around it."""
+        self, box: ParameterBox, tiles: np.ndarray, within: Context | None = None, keep_linear: bool = False,
+        pixels: np.ndarray | None = None,
+    ) -> TileBounds:  # fmt: skip
+        """See `ns_abstract.refine.protocol.Frame.bound`."""
         checkpoint()
         forms = self.pose_set.enclosure(box, self.order)
         candidates = self._candidates(tiles, within)
         layers = self.channels > COLORS
-        cell = self.bounds.cell(self.camera, forms, tiles, candidates, keep_linear, self._floor, layers)
+        cell = self.bounds.cell(self.camera, forms, tiles, candidates, keep_linear, self._floor, layers, pixels)
         lower, upper = cell.lower, cell.upper
         if cell.layers is not None:
             low, high = (

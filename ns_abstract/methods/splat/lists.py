@@ -56,6 +56,14 @@ def tile_mask(wanted, count):
     return mask
 
 
+def pixel_sets(chosen):
+    """[t, blocks] int64 sets of each block's pixels that are ``chosen`` [t, side, side], blocks row by row."""
+    count, side, _ = chosen.shape
+    along = side // BLOCK
+    by_block = chosen.reshape(count, along, BLOCK, along, BLOCK).swapaxes(2, 3).reshape(count, along * along, PIXELS)
+    return np.packbits(by_block, axis=-1, bitorder="little").view("<i8")[..., 0]
+
+
 @njit(cache=True, error_model="numpy")
 def touching(indices, tiles, wanted, tiles_x):
     """Those of ``indices`` whose range of ``tiles`` holds one of which ``wanted`` is not 0; see `tile_lists`."""

@@ -12,14 +12,14 @@ import numpy as np
 from numba import njit
 
 from ns_abstract.arithmetic.rounding import Charges
-from ns_abstract.arithmetic.simd.intrinsics import borrowed, pointer, taken
+from ns_abstract.arithmetic.simd.intrinsics import borrowed, lowest_bit, pointer, signed, taken
 from ns_abstract.geometry.camera_path import Intrinsics
 from ns_abstract.methods.splat.blend import shade, swap_bounds
 from ns_abstract.methods.splat.block import Place, block_of, longest_list, new_buffers, resized
 from ns_abstract.methods.splat.constants import RasterRules
 from ns_abstract.methods.splat.depths import ACCUMULATION_HIGH, ACCUMULATION_LOW, DEPTH_HIGH, DEPTH_LOW, shade_layers
 from ns_abstract.methods.splat.fragments import GIVE_UP, GROW, apply_stops, collect_fragments, number_groups
-from ns_abstract.methods.splat.lists import BLOCK, PIXELS, TileLists, block_lists, longest_first
+from ns_abstract.methods.splat.lists import BLOCK, TileLists, block_lists, longest_first
 from ns_abstract.methods.splat.sharing import by_tiles
 from ns_abstract.methods.splat.stage_data import (
     Colors,
@@ -33,12 +33,12 @@ from ns_abstract.methods.splat.stage_data import (
 
 
 @njit(cache=True, error_model="numpy")
-def _set_trivial(numbers, left, above, bounds, m):
-    """Bounds of a block of which nothing is known; every Gaussian of ``numbers`` may be drawn."""
+def _set_trivial(pixels, left, above, bounds, m):
+    """Bounds of those ``pixels`` of a block of which nothing is known."""
     lower, upper, linear = bounds.lower, bounds.upper, bounds.linear
-    for k in range(numbers.size):
-        bounds.marks[numbers[k]] = 1
-    for q in range(PIXELS):
+    while pixels != 0:
+        q = lowest_bit(pixels)
+        pixels = signed(pixels & (pixels - 1))
         row, column = above + q // BLOCK, left + q % BLOCK
         for channel in range(3):
             lower[row, column, channel] = 0.0
@@ -60,7 +60,10 @@ def _bound_block(numbers, place, inputs, block, bounds):
     `PixelBounds`, where ``linear`` starts with the tile's or is empty and ``statistics`` is the thread's row.
     """
     camera, direction, ray = inputs.intrinsics, inputs.axes.middle, block.ray
-    left, above = place.x0 % bounds.lower.shape[0], place.y0 % bounds.lower.shape[0]
+    left, above, m = place.x0 % bounds.lower.shape[0], place.y0 % bounds.lower.shape[0], inputs.shape.monomials
+    _set_trivial(signed(~place.wanted), left, above, bounds, m)
+    if place.wanted == 0:
+        return True
     u = (place.x0 + 0.5 * BLOCK - camera.cx) / camera.fx
     v = (place.y0 + 0.5 * BLOCK - camera.cy) / camera.fy
     for k in range(3):
@@ -72,7 +75,9 @@ def _bound_block(numbers, place, inputs, block, bounds):
     if pairs == GIVE_UP:
         # too much may be reordered
         bounds.statistics[3] += 1
-        _set_trivial(numbers, left, above, bounds, inputs.shape.monomials)
+        for k in range(numbers.size):
+            bounds.marks[numbers[k]] = 1
+        _set_trivial(signed(place.wanted), left, above, bounds, m)
         return True
     if slots > 0:
         swap_bounds(pairs, slots, block)
@@ -80,9 +85,9 @@ def _bound_block(numbers, place, inputs, block, bounds):
         number_groups(numbers.size, block.entries)
     bounds.statistics[1] += longest_list(block.fragments.lengths)
     bounds.statistics[2] += pairs
-    shade(left, above, slots > 0, block, inputs, bounds)
+    shade(place.wanted, left, above, slots > 0, block, inputs, bounds)
     if bounds.layers.shape[0] > 0:
-        shade_layers(left, above, block, inputs, bounds)
+        shade_layers(place.wanted, left, above, block, inputs, bounds)
     return True
 
 
@@ -112,7 +117,7 @@ def _tile_bounds(bounds, number, thread):
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def _pixel_worker(share, lists, gaussians, axes, intrinsics, colors, rules, charges, cutoffs, shape, bounds):
+def _pixel_worker(share, lists, pixels, gaussians, axes, intrinsics, colors, rules, charges, cutoffs, shape, bounds):
     """One thread's tiles; see `Share` and `pixel_stage`."""
     sequence, counter = borrowed(share.sequence), pointer(share.counter)
     inputs = _borrowed_inputs(gaussians, axes, intrinsics, colors, rules, charges, cutoffs, shape)
@@ -139,7 +144,8 @@ def _pixel_worker(share, lists, gaussians, axes, intrinsics, colors, rules, char
             tile_y * side, side, block_offsets, block_entries,
         )  # fmt: skip
         for b in range(blocks * blocks):
-            place = Place(tile_x * side + (b % blocks) * BLOCK, tile_y * side + (b // blocks) * BLOCK, tile_x, tile_y)
+            x0, y0 = tile_x * side + (b % blocks) * BLOCK, tile_y * side + (b // blocks) * BLOCK
+            place = Place(x0, y0, tile_x, tile_y, pixels[number, b])
             if place.x0 >= camera.width or place.y0 >= camera.height:
                 continue
             numbers = block_entries[block_offsets[b] : block_offsets[b + 1]]
@@ -154,13 +160,15 @@ def _pixel_worker(share, lists, gaussians, axes, intrinsics, colors, rules, char
 
 
 def pixel_stage(
-    lists: TileLists, gaussians: ProjectedGaussians, axes: ViewingAxes, intrinsics: Intrinsics, colors: Colors,
-    rules: RasterRules, charges: Charges, cutoffs: Cutoffs, shape: FormShape, bounds: PixelBounds,
+    lists: TileLists, pixels: np.ndarray, gaussians: ProjectedGaussians, axes: ViewingAxes, intrinsics: Intrinsics,
+    colors: Colors, rules: RasterRules, charges: Charges, cutoffs: Cutoffs, shape: FormShape, bounds: PixelBounds,
 ) -> None:  # fmt: skip
     """Bounds of the pixels of the tiles ``lists.wanted`` (design.md, B).
 
     Args:
         lists: Of all tiles of the image.
+        pixels: [t, blocks] the set of the pixels of each block that are wanted, blocks row by row; nothing is known of
+            the others.
         gaussians: Projected.
         axes: What decides their order.
         intrinsics: The camera's.
@@ -173,5 +181,5 @@ def pixel_stage(
     """
     by_tiles(
         _pixel_worker, longest_first(lists.wanted, lists.offsets), bounds.statistics.shape[0],
-        lists, gaussians, axes, intrinsics, colors, rules, charges, cutoffs, shape, bounds,
+        lists, pixels, gaussians, axes, intrinsics, colors, rules, charges, cutoffs, shape, bounds,
     )  # fmt: skip
