@@ -139,6 +139,11 @@ class Waves:
             linear=linear,
         )
 
+    def bound_parts(
+        self, boxes: Any, tiles: np.ndarray, within: Any, keep_linear: bool, pixels: np.ndarray | None
+    ) -> list[Any]:
+        return [self.bound(box, tiles, within, keep_linear, pixels) for box in boxes]
+
     def feasible(self, box: ParameterBox) -> ParameterBox | None:
         return box
 
@@ -318,6 +323,12 @@ def test_ratio_falls_to_the_goal(dimensions: int, ratio: float, first: float) ->
     assert result.cells < 4000
 
 
+class Whole(Waves):
+    """Does not take some pixels of a tile."""
+
+    bound_parts = None  # type: ignore[assignment]
+
+
 @pytest.mark.parametrize("ratio", [1.0, 1.2])
 def test_leaves_are_split_for_the_pixels_where_they_leave_much_open(ratio: float) -> None:
     shares = []
@@ -330,7 +341,10 @@ def test_leaves_are_split_for_the_pixels_where_they_leave_much_open(ratio: float
         assert len(splits) > 20
         asked = sum(frame.wanted[k] for k in splits)
         shares.append(asked / sum(SIDE**2 * len(frame.calls[k][1]) for k in splits))
-    # linear sets are kept of every pixel
+    # linear sets are kept of every pixel, and frames need not know better
+    frame = Whole(2, slack=1.0)
+    check(frame, refine(frame, Goal(ratio, FOREVER, 400)))
+    assert frame.wanted == [SIDE**2 * len(tiles) for _, tiles, _ in frame.calls]
     assert 0.05 < shares[0] < 0.9 and shares[1] == 1.0
 
 

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import threading
 import time
+from collections.abc import Iterator
+from contextvars import ContextVar
 
 import numpy as np
 import pytest
@@ -11,7 +14,7 @@ from test_bounds import TURN, camera, moves, scene
 
 from ns_abstract.arithmetic.rounding import FLOAT32, REAL
 from ns_abstract.arithmetic.simd.intrinsics import pointer, taken
-from ns_abstract.execution.threads import side_by_side, threads, use_threads
+from ns_abstract.execution.threads import _pool, each, lane, side_by_side, threads, use_threads
 from ns_abstract.geometry.poses import PoseSet
 from ns_abstract.methods.splat.activate import Splats
 from ns_abstract.methods.splat.bounds import SplatBounds
@@ -106,12 +109,81 @@ def test_number_of_threads(monkeypatch: pytest.MonkeyPatch):
         use_threads(threads())
 
 
-def many(antialiased: bool = False) -> Splats:
-    """400 Gaussians before a background."""
-    generator = np.random.default_rng(6)
+@pytest.fixture
+def four_threads(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """As on a machine with four cores."""
+    monkeypatch.setattr("numba.config.NUMBA_NUM_THREADS", 4)
+    _pool.cache_clear()
+    use_threads(4)
+    yield
+    monkeypatch.undo()
+    _pool.cache_clear()
+    use_threads(threads())
+
+
+@pytest.mark.parametrize(("count", "lanes", "share"), [(0, 0, 0), (1, 1, 4), (2, 2, 2), (3, 3, 1), (9, 4, 1)])
+@pytest.mark.usefixtures("four_threads")
+def test_pieces_of_work_share_the_threads(count, lanes, share):
+    met = threading.Barrier(max(lanes, 1))
+    state = ContextVar("state", default=0)
+    state.set(7)
+
+    def work(item: int) -> tuple[int, int, int, int]:
+        if item < lanes:
+            # all of them at once
+            met.wait(20.0)
+        seen: list[int] = []
+        side_by_side(seen.append, threads())
+        assert sorted(seen) == list(range(share))
+        return item, lane(), threads(), state.get()
+
+    found = each(work, range(count))
+    assert [item for item, *_ in found] == list(range(count))
+    assert {number for _, number, *_ in found} == set(range(lanes))
+    assert all(rest == [share, 7] for _, _, *rest in found)
+    assert (lane(), threads()) == (0, 4)
+
+
+@pytest.mark.usefixtures("four_threads")
+def test_the_first_error_of_a_piece_of_work_is_heard_when_all_have_ended():
+    ended: list[int] = []
+
+    def work(item: int) -> None:
+        if item in (1, 2):
+            time.sleep(0.1 * (3 - item))
+            raise ValueError(item)
+        time.sleep(0.3)
+        ended.append(item)
+
+    with pytest.raises(ValueError, match="1"):
+        each(work, range(40))
+    assert sorted(ended) == [0, 3]
+
+
+@pytest.mark.parametrize("radii", [{"yaw": 0.03}, {"x": 0.02, "yaw": 0.03}])
+@pytest.mark.usefixtures("four_threads")
+def test_cells_that_are_bounded_at_once_are_those_bounded_one_by_one(radii):
+    """Also where cells that turn share their colours, and where there are fewer threads than cells, or more."""
+    poses = PoseSet.around(camera(70, 50, 50.0), moves(**radii))
+    alone, shared = (SplatFrame(many(degree=1), GSPLAT_1_4_0, FLOAT32, poses) for _ in range(2))
+    tiles = np.arange(alone.tile_count)
+    for count in (2, 9):
+        boxes = poses.box.split(0, count)
+        together = each(lambda box: shared.bound(box, tiles), boxes)
+        for box, other in zip(boxes, together, strict=True):
+            one = alone.bound(box, tiles)
+            for name in ("lower", "upper", "slopes"):
+                np.testing.assert_array_equal(getattr(one, name), getattr(other, name))
+            np.testing.assert_array_equal(one.context.visible, other.context.visible)
+
+
+def many(antialiased: bool = False, degree: int = 0) -> Splats:
+    """400 Gaussians before a background, of colours that depend on the direction if ``degree`` is 1."""
+    generator, coefficients = np.random.default_rng(6), np.random.default_rng(7)
     return scene(
         *(
             {"mean": (*place, depth), "scale": 0.2, "opacity": 0.8, "quat": TURN, "color": color}
+            | ({"sh": coefficients.normal(0.3, 0.3, (4, 3))} if degree else {})
             for place, depth, color in zip(
                 generator.uniform(-3.0, 3.0, (400, 2)), generator.uniform(-9.0, -4.0, 400),
                 generator.uniform(size=(400, 3)), strict=True,

@@ -335,8 +335,8 @@ SPLATS = (
         "colours are kept where the camera moves",
         _BOUNDS,
         "SplatBounds._colors",
-        "self._seen_from is None or self._seen_from[0] != view",
-        "self._seen_from is None",
+        "seen is None or seen[0] != view",
+        "seen is None",
         "test_bounds.py::test_colors_are_shared_by_cells_that_turn_and_not_by_others",
     ),
     Fault(
@@ -490,6 +490,14 @@ SPLATS = (
         "fma(0.5 * (1.0 - 2.0**-40), minimum(share, 1.0), 1.0)",
         "1.9",
         "test_pixel_forms.py::test_what_moves_along_or_across_its_offset[1.0]",
+    ),
+    Fault(
+        "cells that are bounded at once write into the same memory",
+        _BOUNDS,
+        "SplatBounds._buffer",
+        "(lane(), name)",
+        "(0, name)",
+        "test_lists.py::test_cells_that_are_bounded_at_once_are_those_bounded_one_by_one[radii1]",
     ),
     Fault(
         "pixels that are not wanted are taken for bounded ones",

@@ -115,6 +115,13 @@ class WatchedFrame(SplatFrame):
         self.crossed += int((found.lower > found.upper).sum())
         return found
 
+    def bound_parts(
+        self, boxes: Sequence[ParameterBox], tiles: np.ndarray, within: Context | None, keep_linear: bool,
+        pixels: np.ndarray | None,
+    ) -> list[TileBounds]:  # fmt: skip
+        """See `SplatFrame.bound_parts`; one by one, since they are counted."""
+        return [self.bound(box, tiles, within, keep_linear, pixels) for box in boxes]
+
 
 def _not_finite(*arrays: np.ndarray) -> int:
     return sum(int(a.size - np.isfinite(a).sum()) for a in arrays)

@@ -6,11 +6,17 @@ body and around it.
 
 from __future__ import annotations
 
+import itertools
 import os
-from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Callable, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor, wait
+from contextvars import ContextVar, copy_context
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import NamedTuple, TypeVar
+
+T = TypeVar("T")
+R = TypeVar("R")
 
 
 @dataclass
@@ -23,6 +29,16 @@ class _Setting:
 _setting = _Setting()
 
 
+class _Lane(NamedTuple):
+    """One of several pieces of work that go on side by side: its number, and the threads that it has to itself."""
+
+    number: int
+    threads: int
+
+
+_lane: ContextVar[_Lane | None] = ContextVar("lane", default=None)
+
+
 def _most() -> int:
     """As numba sees it: the cores, or fewer by the variable NUMBA_NUM_THREADS."""
     import numba
@@ -30,8 +46,17 @@ def _most() -> int:
     return numba.config.NUMBA_NUM_THREADS  # pyright: ignore[reportPrivateImportUsage, reportAttributeAccessIssue]
 
 
+def lane() -> int:
+    """Number of the calling piece of work among those of `each` that go on side by side; 0 outside."""
+    found = _lane.get()
+    return 0 if found is None else found.number
+
+
 def threads() -> int:
-    """How many work side by side."""
+    """How many work side by side, of those that the calling piece of work has to itself."""
+    found = _lane.get()
+    if found is not None:
+        return found.threads
     most = _most()
     return most if _setting.count is None else max(1, min(_setting.count, most))
 
@@ -49,7 +74,40 @@ def _pool(process: int) -> ThreadPoolExecutor:
 
 def side_by_side(work: Callable[[int], object], count: int) -> None:
     """Call ``work`` with 0 .. ``count`` - 1, the first in this thread and the others beside it, and wait for all."""
-    others = [_pool(os.getpid()).submit(work, number) for number in range(1, count)]
-    work(0)
+    others: list[Future[object]] = []
+    try:
+        others = [_pool(os.getpid()).submit(copy_context().run, work, number) for number in range(1, count)]
+        work(0)
+    finally:
+        # whatever ended this one: they write into memory that is used again
+        wait(others)
     for other in others:
         other.result()
+
+
+def each(work: Callable[[T], R], items: Sequence[T]) -> list[R]:
+    """``work`` of every item, several side by side, each with its share of the threads.
+
+    Raises:
+        Exception: What ``work`` raised of the first item of which it raised anything; the others have ended.
+    """
+    mine = threads()
+    lanes = min(mine, len(items))
+    if lanes < 2:
+        return [work(item) for item in items]
+    found: dict[int, R] = {}
+    raised: dict[int, Exception] = {}
+    turns = itertools.count()
+
+    def run(number: int) -> None:
+        _lane.set(_Lane(number, mine // lanes))
+        while not raised and (turn := next(turns)) < len(items):
+            try:
+                found[turn] = work(items[turn])
+            except Exception as error:
+                raised[turn] = error
+
+    side_by_side(lambda number: copy_context().run(run, number), lanes)
+    if raised:
+        raise raised[min(raised)]
+    return [found[turn] for turn in range(len(items))]

@@ -22,7 +22,7 @@ import numpy as np
 from ns_abstract.execution.ending import AbandonedError, abandoning
 from ns_abstract.geometry.box import ParameterBox
 from ns_abstract.geometry.tiles import in_tiles
-from ns_abstract.refine.protocol import ACCUMULATION, COLORS, DEPTH, Bounds, Context, Frame, Render
+from ns_abstract.refine.protocol import ACCUMULATION, COLORS, DEPTH, Bounds, Context, Frame, PartsFrame, Render
 from ns_abstract.refine.result import FrameResult, Layer, Leaves, PartResult, TracePoint, Views, gap, joined
 
 #: Part of the whole excess that one round of splitting takes on.
@@ -259,6 +259,14 @@ class Refinement:
 
     # --- the two sides -------------------------------------------------------------------------
 
+    @property
+    def _some_pixels(self) -> bool:
+        """Whether leaves are split for some of their pixels.
+
+        Linear sets are kept of all pixels, and nobody looks where layers are open.
+        """
+        return isinstance(self.frame, PartsFrame) and not self.keep_leaves and self.frame.channels == COLORS
+
     def _cell(self, part: _Part) -> _Cell:
         return _Cell(next(self._numbers), part, _narrow(part.box, self.frame.box))
 
@@ -292,15 +300,20 @@ class Refinement:
         self.witness_lower[which], self.witness_upper[which] = least, most
 
     def _bound(
-        self, cell: _Cell, parent: _Cell | None, tiles: np.ndarray, pixels: np.ndarray | None = None
-    ) -> tuple[np.ndarray, np.ndarray, Bounds]:
-        """Lower and upper [t, side, side, 3] that can be relied on, and all that the frame returned.
+        self, cells: list[_Cell], parent: _Cell | None, tiles: np.ndarray, pixels: np.ndarray | None = None
+    ) -> list[tuple[np.ndarray, np.ndarray, Bounds]]:
+        """Of each cell, lower and upper [t, side, side, 3] that can be relied on, and all that the frame returned.
 
         Only some ``pixels`` [t, side, side] may be wanted, which must be among those of ``parent``.
         """
         within = None if parent is None else parent.context
-        bounds = self.frame.bound(cell.box, self._numbers_of(tiles), within, self.keep_leaves, pixels)
-        return self._take(cell, bounds)
+
+        boxes, numbers = [cell.box for cell in cells], self._numbers_of(tiles)
+        if isinstance(self.frame, PartsFrame):
+            found = self.frame.bound_parts(boxes, numbers, within, self.keep_leaves, pixels)
+        else:
+            found = [self.frame.bound(box, numbers, within, self.keep_leaves) for box in boxes]
+        return [self._take(*both) for both in zip(cells, found, strict=True)]
 
     def _take(self, cell: _Cell, bounds: Bounds) -> tuple[np.ndarray, np.ndarray, Bounds]:
         self.cells += 1
@@ -473,13 +486,13 @@ class Refinement:
                 self.leaf_sets.clear()
                 self._kept_bytes = 0
                 cell = self._cell(self._whole)
-                lower, upper, bounds = self._bound(cell, None, everything)
+                [(lower, upper, bounds)] = self._bound([cell], None, everything)
                 leaves = [(cell, lower, upper)]
                 self._keep(cell, bounds, everything)
                 break
             cell = self._cell(part)
             known = part.box == first.box
-            lower, upper, bounds = self._take(cell, probe) if known else self._bound(cell, None, everything)
+            lower, upper, bounds = self._take(cell, probe) if known else self._bound([cell], None, everything)[0]
             leaves.append((cell, lower, upper))
             self._keep(cell, bounds, everything)
             if number % 2:
@@ -611,7 +624,7 @@ class Refinement:
 
     def _close_excess(self, point: TracePoint) -> None:
         """Leave pixels of leaves for good that could take little more away from what the goal allows."""
-        if not self.keep_leaves and self.frame.channels == COLORS and not self.frame.tilewise:
+        if self._some_pixels:
             allowed = (self.goal.ratio - 1.0) * point.mpg_witness + self.goal.slack
             self._closed_excess = max(self._closed_excess, _CLOSED_SHARE * allowed)
 
@@ -707,7 +720,7 @@ class Refinement:
                 child, step = children[(number - 1) // steps], (number - 1) % steps + 1
                 end = np.array(child.box.upper)
                 self._witness(end if step == steps else child.box.at(np.array([2.0 * step / steps - 1.0])), tiles)
-        found = [self._bound(child, cell, tiles, pixels) for child in children]
+        found = self._bound(children, cell, tiles, pixels)
         added = 0
         for k, (t, row) in enumerate(rows.items()):
             tile, change = self.tiles[t], changes.setdefault(t, _Change())
@@ -727,11 +740,8 @@ class Refinement:
         return added
 
     def _wanted(self, rows: dict[int, int]) -> np.ndarray | None:
-        """[t, side, side] the pixels that leaves in the tiles and rows ``rows`` are split for; None: all.
-
-        Linear sets are kept of all pixels, and layers are not looked at for where they are open.
-        """
-        if self.keep_leaves or self.frame.channels > COLORS:
+        """[t, side, side] the pixels that leaves in the tiles and rows ``rows`` are split for; None: all."""
+        if not self._some_pixels:
             return None
         found = []
         for t, row in rows.items():

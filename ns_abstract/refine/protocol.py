@@ -7,7 +7,7 @@ every set of poses. Nothing above `ns_abstract.methods.load` asks which one it i
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 
@@ -185,19 +185,8 @@ class Frame(Protocol):
         """Other scenes of the set; none where only poses vary."""
         ...
 
-    def bound(
-        self, box: ParameterBox, tiles: np.ndarray, within: Any = None, keep_linear: bool = False,
-        pixels: np.ndarray | None = None,
-    ) -> Bounds:  # fmt: skip
-        """Bounds of ``tiles`` over a cell.
-
-        Args:
-            box: The cell.
-            tiles: [t] numbers.
-            within: The context of these tiles, and of all ``pixels``, from a box around this one.
-            keep_linear: Whether linear bounds are asked for.
-            pixels: [t, side, side] which pixels are wanted, others may be left at [0, 1]; all if None.
-        """
+    def bound(self, box: ParameterBox, tiles: np.ndarray, within: Any = None, keep_linear: bool = False) -> Bounds:
+        """Bounds of ``tiles`` over ``box``; ``within`` is the context of these tiles and a box around it."""
         ...
 
     def feasible(self, box: ParameterBox) -> ParameterBox | None:
@@ -234,6 +223,26 @@ class Frame(Protocol):
             shown: Number of scene elements that some cell shows, if they are told apart.
             lower: [H, W, 3] what refinement found.
             upper: [H, W, 3] likewise.
+        """
+        ...
+
+
+@runtime_checkable
+class PartsFrame(Protocol):
+    """What a `Frame` may have beside: the parts of a cell are bounded together, at some pixels only."""
+
+    def bound_parts(
+        self, boxes: Sequence[ParameterBox], tiles: np.ndarray, within: Any, keep_linear: bool,
+        pixels: np.ndarray | None,
+    ) -> Sequence[Bounds]:  # fmt: skip
+        """What `Frame.bound` returns of each of ``boxes``.
+
+        Args:
+            boxes: Cells.
+            tiles: [t] numbers.
+            within: The context of these tiles, and at least of these pixels, from a box around all cells.
+            keep_linear: Whether linear bounds are asked for.
+            pixels: [t, side, side] which pixels are wanted, others may be left at [0, 1]; all if None.
         """
         ...
 

@@ -189,9 +189,8 @@ class NerfFrame:
         return pose[:, 3] - distance * pose[:, 2]
 
     def bound(
-        self, box: ParameterBox, tiles: np.ndarray, within: RayContext | None = None, keep_linear: bool = False,
-        pixels: np.ndarray | None = None,
-    ) -> RayBox:  # fmt: skip
+        self, box: ParameterBox, tiles: np.ndarray, within: RayContext | None = None, keep_linear: bool = False
+    ) -> RayBox:
         """Bounds of the rays ``tiles`` over ``box``; ``within`` is the context of these rays and a box around it.
 
         Rays that there is no time for any more (`ns_abstract.execution.ending`) are bounded by [0, 1].

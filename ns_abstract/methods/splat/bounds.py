@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ns_abstract.arithmetic.rounding import FRAGMENT_ROUNDING, REGION, UNIT64, Arithmetic, Charges, charges
-from ns_abstract.execution.threads import threads
+from ns_abstract.execution.threads import lane, threads
 from ns_abstract.geometry.camera_path import Camera
 from ns_abstract.geometry.poses import PoseForms
 from ns_abstract.geometry.tiles import tile_grid
@@ -104,7 +104,7 @@ class SplatBounds:
         self.rules = raster_rules(rasteriser, splats.antialiased)
         self.side = rasteriser.work_tile
         self.charges = charges(arithmetic)
-        self._buffers: dict[str, np.ndarray] = {}
+        self._buffers: dict[tuple[int, str], np.ndarray] = {}
         self._least_step: float | None = None
         self._exponent_limits = exponent_limits(self.varied.opacity_high, self.rules.alpha_min, self.charges)
         self._extents = np.sqrt(np.square(splats.axes).sum(axis=1).max(axis=1, initial=0.0))
@@ -113,7 +113,7 @@ class SplatBounds:
             self.charges.plain_color * float(np.abs(splats.sh).max(initial=1.0)) if splats.degree == 0 else 0.0
         )
         self._color_magnitudes = color_magnitudes(splats.sh, splats.degree) if splats.degree > 0 else None
-        self._seen_from: tuple[tuple[float, ...], np.ndarray] | None = None
+        self._seen_from: dict[int, tuple[tuple[float, ...], np.ndarray]] = {}
         self._plain_colors = _shifted_colors(self.varied, self.charges) if splats.degree == 0 else None
 
     def _tied(self, origin: np.ndarray) -> bool:
@@ -126,13 +126,13 @@ class SplatBounds:
         return self.varied.mean_radius.shape[0] == 0 and self._least_step > 4.0 * UNIT64 * largest
 
     def _buffer(self, name: str, shape: tuple[int, ...], dtype: type = np.float64) -> np.ndarray:
-        """Uninitialised memory that begins with a cache line and is kept from call to call."""
-        size = math.prod(shape)
-        kept = self._buffers.get(name)
+        """Uninitialised memory that begins with a cache line and is kept from call to call of the same lane."""
+        size, key = math.prod(shape), (lane(), name)
+        kept = self._buffers.get(key)
         if kept is None or kept.size < size:
             room = np.empty(size * np.dtype(dtype).itemsize + 64, np.uint8)
             start = -room.ctypes.data % 64
-            kept = self._buffers[name] = room[start : start + room.size - 64].view(dtype)
+            kept = self._buffers[key] = room[start : start + room.size - 64].view(dtype)
         return kept[:size].reshape(shape)
 
     def cell(
@@ -298,16 +298,17 @@ class SplatBounds:
         if not np.any(position.linear) and float(position.radius.max()) < 1e-9:
             position_error += 2.0 * float(position.radius.max())
             view = (*position.center.tolist(), position_error)
-            if self._seen_from is None or self._seen_from[0] != view:
+            seen = self._seen_from.get(lane())
+            if seen is None or seen[0] != view:
                 # of every Gaussian: cells that only turn the camera share them
                 colors = self._buffer("colors", (splats.count, 6))
                 fixed_colors(scene, position.center, position_error, self.charges, colors)
-                self._seen_from = view, colors
-            colors = self._seen_from[1]
+                seen = self._seen_from[lane()] = view, colors
+            colors = seen[1]
             return colors if n == splats.count else gathered(colors, candidates, alive, self._buffer("some", (n, 6)))
         indices = np.empty((alive.size, 2), np.int64)
         indices[:, 0], indices[:, 1] = alive, candidates[alive]
-        self._seen_from = None
+        self._seen_from.pop(lane(), None)
         shape = form_shape(position.basis)
         colors = self._buffer("colors", (n, 3 * (shape.monomials + 1)))
         moving_colors(indices, scene, position.data, forms.origin, position_error, self.charges, shape, colors)

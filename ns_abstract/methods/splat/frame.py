@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
@@ -12,6 +12,7 @@ import numpy as np
 from ns_abstract.arithmetic.outward import outward
 from ns_abstract.arithmetic.rounding import Arithmetic
 from ns_abstract.execution.ending import checkpoint
+from ns_abstract.execution.threads import each
 from ns_abstract.geometry.box import ParameterBox
 from ns_abstract.geometry.poses import PoseSet, translation_only
 from ns_abstract.geometry.tiles import tile_grid
@@ -250,7 +251,7 @@ class SplatFrame:
         self, box: ParameterBox, tiles: np.ndarray, within: Context | None = None, keep_linear: bool = False,
         pixels: np.ndarray | None = None,
     ) -> TileBounds:  # fmt: skip
-        """See `ns_abstract.refine.protocol.Frame.bound`."""
+        """See `ns_abstract.refine.protocol.Frame.bound`, and `bound_parts` for ``pixels``."""
         checkpoint()
         forms = self.pose_set.enclosure(box, self.order)
         candidates = self._candidates(tiles, within)
@@ -271,6 +272,13 @@ class SplatFrame:
             assert cell.linear is not None
             linear = linear_sets(cell.linear, cell.lower, cell.upper, box.dimensions)
         return TileBounds(lower, upper, cell.slopes, context, linear, int(cell.statistics[3]))
+
+    def bound_parts(
+        self, boxes: Sequence[ParameterBox], tiles: np.ndarray, within: Context | None, keep_linear: bool,
+        pixels: np.ndarray | None,
+    ) -> list[TileBounds]:  # fmt: skip
+        """See `ns_abstract.refine.protocol.PartsFrame`."""
+        return each(lambda box: self.bound(box, tiles, within, keep_linear, pixels), boxes)
 
     def _candidates(self, tiles: np.ndarray, within: Context | None) -> np.ndarray | None:
         if within is None:
