@@ -160,6 +160,21 @@ def test_the_first_error_of_a_piece_of_work_is_heard_when_all_have_ended():
     assert sorted(ended) == [0, 3]
 
 
+@pytest.mark.usefixtures("four_threads")
+def test_cells_that_are_bounded_at_once_have_memory_of_their_own():
+    bounds, met = SplatBounds(many(), GSPLAT_1_4_0, REAL), threading.Barrier(2)
+
+    def taken_in(item: int) -> np.ndarray:
+        met.wait(20.0)
+        return bounds._buffer("record", (7, 3))
+
+    one, other = each(taken_in, range(2))
+    assert one.shape == other.shape == (7, 3) and not np.shares_memory(one, other)
+    assert np.shares_memory(bounds._buffer("record", (7, 3)), one) != np.shares_memory(
+        bounds._buffer("record", (7, 3)), other
+    )
+
+
 @pytest.mark.parametrize("radii", [{"yaw": 0.03}, {"x": 0.02, "yaw": 0.03}])
 @pytest.mark.usefixtures("four_threads")
 def test_cells_that_are_bounded_at_once_are_those_bounded_one_by_one(radii):

@@ -497,7 +497,7 @@ SPLATS = (
         "SplatBounds._buffer",
         "(lane(), name)",
         "(0, name)",
-        "test_lists.py::test_cells_that_are_bounded_at_once_are_those_bounded_one_by_one[radii1]",
+        "test_lists.py::test_cells_that_are_bounded_at_once_have_memory_of_their_own",
     ),
     Fault(
         "pixels that are not wanted are taken for bounded ones",
