@@ -78,7 +78,7 @@ def main() -> None:
     parser.add_argument("output_dir", type=Path)
     parser.add_argument("--layers", type=int, default=8)
     parser.add_argument("--width", type=int, default=256)
-    parser.add_argument("--skip", type=int, default=4)
+    parser.add_argument("--skip", type=int, help="layer that the position is given to again; default: half of them")
     parser.add_argument("--head-width", type=int, default=128)
     parser.add_argument("--minutes", type=float, default=30.0, help="of processor time")
     parser.add_argument("--smoothness-penalty", type=float, default=0.0, help="of abstract-nerf (design.md, W5)")
@@ -93,6 +93,7 @@ def main() -> None:
     with np.load(options.pictures, allow_pickle=False) as data:
         images, poses = data["images"], data["c2w"]
         focal, near, far = (float(data[name]) for name in ("focal", "near", "far"))
+    skip = options.layers // 2 if options.skip is None else options.skip
     held = np.arange(len(images)) % 8 == 0
     side, device = images.shape[1], options.device
     reach = options.reach
@@ -106,7 +107,7 @@ def main() -> None:
     colors = images[~held].reshape(len(directions), -1, 4) / 255.0
     d, o, c = (torch.from_numpy(a.reshape(-1, a.shape[-1])).float().to(device) for a in (directions, origins, colors))
     bright = torch.nonzero(torch.from_numpy(images[~held].reshape(-1, 4)[:, 3] > 0)).ravel()
-    network = NerfNetwork(options.layers, options.width, options.skip, 2, options.head_width).to(device)
+    network = NerfNetwork(options.layers, options.width, skip, 2, options.head_width).to(device)
     unused = (torch.arange(60) % 10 >= options.frequencies).nonzero().ravel().to(device)
     drop_waves(network, unused)
     optimizer = torch.optim.Adam(network.parameters(), lr=1e-3, eps=1e-8)

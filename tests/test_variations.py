@@ -247,8 +247,8 @@ def test_planted_depth_order(monkeypatch: pytest.MonkeyPatch) -> None:
     right = bounds_module.pixel_stage
 
     def certain(*arguments):
-        lists, gaussians, *rest = arguments
-        right(lists, gaussians._replace(depth_error=np.zeros_like(gaussians.depth_error)), *rest)
+        lists, pixels, gaussians, *rest = arguments
+        right(lists, pixels, gaussians._replace(depth_error=np.zeros_like(gaussians.depth_error)), *rest)
 
     monkeypatch.setattr(bounds_module, "pixel_stage", certain)
     assert case.attack()[0].violations > 0

@@ -168,7 +168,7 @@ def pixel_stage(
     Args:
         lists: Of all tiles of the image.
         pixels: [t, blocks] the set of the pixels of each block that are wanted, blocks row by row; nothing is known of
-            the others.
+            the others (design.md, R4).
         gaussians: Projected.
         axes: What decides their order.
         intrinsics: The camera's.
