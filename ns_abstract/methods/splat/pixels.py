@@ -1,4 +1,4 @@
-"""Per-pixel stage of the bounds: the tiles of a picture, block by block, on all threads (design.md, B1-B9).
+"""Per-pixel stage of the bounds: the tiles of a picture, block by block, on all threads (design.md, B1-B9, R4).
 
 A block of `PIXELS` pixels passes two steps: `fragments` collects what may be drawn, with alphas from `alphas`, and
 `blend` blends it, each pixel by itself; `block` tells how fragments are kept.
@@ -168,7 +168,7 @@ def pixel_stage(
     Args:
         lists: Of all tiles of the image.
         pixels: [t, blocks] the set of the pixels of each block that are wanted, blocks row by row; nothing is known of
-            the others (design.md, R4).
+            the others.
         gaussians: Projected.
         axes: What decides their order.
         intrinsics: The camera's.
