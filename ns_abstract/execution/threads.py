@@ -73,11 +73,14 @@ def _pool(process: int) -> ThreadPoolExecutor:
 
 
 def side_by_side(work: Callable[[int], object], count: int) -> None:
-    """Call ``work`` with 0 .. ``count`` - 1, the first in this thread and the others beside it, and wait for all."""
+    """Call ``work`` with 0 .. ``count`` - 1, the first in this thread and the others beside it, and wait for all.
+
+    Each has a copy of the caller's context variables.
+    """
     others: list[Future[object]] = []
     try:
         others = [_pool(os.getpid()).submit(copy_context().run, work, number) for number in range(1, count)]
-        work(0)
+        copy_context().run(work, 0)
     finally:
         # whatever ended this one: they write into memory that is used again
         wait(others)
@@ -107,7 +110,7 @@ def each(work: Callable[[T], R], items: Sequence[T]) -> list[R]:
             except Exception as error:
                 raised[turn] = error
 
-    side_by_side(lambda number: copy_context().run(run, number), lanes)
+    side_by_side(run, lanes)
     if raised:
         raise raised[min(raised)]
     return [found[turn] for turn in range(len(items))]

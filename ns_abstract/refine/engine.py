@@ -78,6 +78,10 @@ class Goal:
     leaf_bytes: int = 4 << 30
     slack: float = 0.0
 
+    def excess(self, mpg_witness: float) -> float:
+        """MPG beyond the witness MPG that is good enough."""
+        return (self.ratio - 1.0) * mpg_witness + self.slack
+
     def met(self, point: TracePoint) -> bool:
         """Whether the bounds are good enough."""
         return point.mpg <= self.ratio * point.mpg_witness + self.slack
@@ -307,7 +311,6 @@ class Refinement:
         Only some ``pixels`` [t, side, side] may be wanted, which must be among those of ``parent``.
         """
         within = None if parent is None else parent.context
-
         boxes, numbers = [cell.box for cell in cells], self._numbers_of(tiles)
         if isinstance(self.frame, PartsFrame):
             found = self.frame.bound_parts(boxes, numbers, within, self.keep_leaves, pixels)
@@ -545,7 +548,7 @@ class Refinement:
         motion = float(np.nan_to_num(self.frame.motion(self.frame.box)[0], nan=0.0))
         # odd: the middle of the set, which is rendered, is that of a part
         count, before = 2 * int(min(motion / FIRST_MOTION, _COVER_CELLS) / 2.0) + 1, np.inf
-        ratio = max(self.goal.ratio, _AIM_RATIO)
+        goal = replace(self.goal, ratio=max(self.goal.ratio, _AIM_RATIO))
         unsure = _CUT_OFF * self._mpg(np.zeros_like(self.image), np.ones_like(self.image))
         while True:
             part = self._cut(self._whole, 0, count)[count // 2]
@@ -553,7 +556,7 @@ class Refinement:
             ends = [self._witness(np.array(end)) for end in (part.box.lower, part.box.upper)]
             low, high = np.minimum.reduce([self.image, *ends]), np.maximum.reduce([self.image, *ends])
             excess = self._mpg(*_usable(probe.lower, probe.upper)) - self._mpg(low, high)
-            aim = _AIM_SHARE * ((ratio - 1.0) * self._mpg(self.witness_lower, self.witness_upper) + self.goal.slack)
+            aim = _AIM_SHARE * goal.excess(self._mpg(self.witness_lower, self.witness_upper))
             # it falls with the square of the width
             wanted = math.ceil(count * math.sqrt(min(excess / aim, 1e6))) if aim > 0.0 < excess else count
             most = int(min(affordable, _COVER_CELLS))
@@ -625,8 +628,7 @@ class Refinement:
     def _close_excess(self, point: TracePoint) -> None:
         """Leave pixels of leaves for good that could take little more away from what the goal allows."""
         if self._some_pixels:
-            allowed = (self.goal.ratio - 1.0) * point.mpg_witness + self.goal.slack
-            self._closed_excess = max(self._closed_excess, _CLOSED_SHARE * allowed)
+            self._closed_excess = max(self._closed_excess, _CLOSED_SHARE * self.goal.excess(point.mpg_witness))
 
     def _choose(self) -> tuple[list[tuple[_Cell, dict[int, int]]], int]:
         """The cells to split in the next round, each with its row by tile, and into how many parts."""

@@ -64,11 +64,11 @@ class CellBounds:
     Attributes:
         wanted: [t] tile numbers, row-major.
         lower, upper: [t, side, side, 3] float64 enclosures of every image of the cell.
-        visible: [n] scene indices of the Gaussians that some pose of the cell may show in these tiles.
+        visible: [n] scene indices of the Gaussians that some pose of the cell may show on the pixels that were wanted.
         tile_ranges: [n, 4] their ranges of tiles: columns first and past, rows first and past.
         linear: [t, side, side, 3, m + 1] polynomial coefficients and radius, or None.
         layers: [t, side, side, 4] accumulation and expected depth as in `PixelBounds.layers`, or None.
-        slopes: [d] mean absolute linear coefficients.
+        slopes: [d] mean absolute linear coefficients; 0 where pixels were not wanted.
         statistics: Blocks, layers, uncertain pairs, blocks that gave up on order, pixels with results that were not
             numbers.
     """
@@ -106,9 +106,16 @@ class SplatBounds:
         self.charges = charges(arithmetic)
         self._buffers: dict[tuple[int, str], np.ndarray] = {}
         self._least_step: float | None = None
-        self._exponent_limits = exponent_limits(self.varied.opacity_high, self.rules.alpha_min, self.charges)
-        self._extents = np.sqrt(np.square(splats.axes).sum(axis=1).max(axis=1, initial=0.0))
-        self._noise = covariance_noise(splats.axes, self.charges)
+        self._scene = SceneGaussians(
+            means=self.varied.mean_middle,
+            mean_radius=self.varied.mean_radius,
+            axes=splats.axes,
+            extents=np.sqrt(np.square(splats.axes).sum(axis=1).max(axis=1, initial=0.0)),
+            noise=covariance_noise(splats.axes, self.charges),
+            opacity_low=self.varied.opacity_low,
+            opacity_high=self.varied.opacity_high,
+            exponent_limits=exponent_limits(self.varied.opacity_high, self.rules.alpha_min, self.charges),
+        )
         self._color_radius = (
             self.charges.plain_color * float(np.abs(splats.sh).max(initial=1.0)) if splats.degree == 0 else 0.0
         )
@@ -175,27 +182,9 @@ class SplatBounds:
         rotation_magnitude = np.maximum(np.abs(low), np.abs(high)).ravel()
         low, high = forms.position.bounds()
         camera_magnitude = np.maximum(np.abs(low), np.abs(high))
-        gaussians = ProjectedGaussians(
-            record=self._buffer("record", (n, columns(6 if splats.antialiased else 5, m))),
-            box=self._buffer("box", (n, 4)),
-            tiles=self._buffer("tiles", (n, 8), np.int32),
-            depth=self._buffer("depth", (n,)),
-            delta=self._buffer("delta", (n, 3)),
-            depth_error=self._buffer("depth_error", (n,)),
-        )
-        state = self._buffer("state", (n,), np.uint8)
-        scene = SceneGaussians(
-            means=self.varied.mean_middle,
-            mean_radius=self.varied.mean_radius,
-            axes=splats.axes,
-            extents=self._extents,
-            noise=self._noise,
-            opacity_low=self.varied.opacity_low,
-            opacity_high=self.varied.opacity_high,
-            exponent_limits=self._exponent_limits,
-        )
+        gaussians, state = self._room(n, m), self._buffer("state", (n,), np.uint8)
         poses = CellPoses(rotation, offset, forms.origin, camera_magnitude, rotation_magnitude)
-        gaussian_stage(candidates, scene, poses, view, self.rules, self.charges, shape, gaussians, state)
+        gaussian_stage(candidates, self._scene, poses, view, self.rules, self.charges, shape, gaussians, state)
         alive = np.flatnonzero(state)
         colors = self._colors(forms, camera_magnitude, candidates, alive, n)
         mask = tile_mask(wanted, across * down)
@@ -233,6 +222,17 @@ class SplatBounds:
             found.slopes.sum(axis=0) / (max(wanted.size, 1) * self.side**2 * 3),
             found.statistics.sum(axis=0),
         )  # fmt: skip
+
+    def _room(self, n: int, m: int) -> ProjectedGaussians:
+        """Memory for ``n`` Gaussians' forms of ``m`` coefficients."""
+        return ProjectedGaussians(
+            record=self._buffer("record", (n, columns(6 if self.splats.antialiased else 5, m))),
+            box=self._buffer("box", (n, 4)),
+            tiles=self._buffer("tiles", (n, 8), np.int32),
+            depth=self._buffer("depth", (n,)),
+            delta=self._buffer("delta", (n, 3)),
+            depth_error=self._buffer("depth_error", (n,)),
+        )
 
     def _viewing_axes(
         self, forms: PoseForms, rotation_magnitude: np.ndarray, gaussians: ProjectedGaussians

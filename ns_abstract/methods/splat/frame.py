@@ -45,7 +45,7 @@ _WORTH_KEEPING = 0.8
 
 @dataclass(frozen=True)
 class Context:
-    """What a cell may show in the tiles that were bounded, for the same tiles of the cells inside it.
+    """What a cell may show on the pixels that were wanted, for these pixels of the cells inside it.
 
     Attributes:
         visible: [n] scene indices.

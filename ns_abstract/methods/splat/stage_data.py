@@ -188,8 +188,8 @@ class PixelBounds(NamedTuple):
             were uncertain, pixels with results that were not numbers.
         layers: [t, side, side, 4] bounds of the accumulation, and of the expected depth where anything is drawn (see
             `depths`; infinity before its negative: nothing can be), or empty.
-        marks: [n] uint8; set to 1 for every Gaussian that some pixel of these tiles may draw or stop at. Those that
-            stay 0 are hidden or too faint for every pose: leaving them out changes nothing.
+        marks: [n] uint8; set to 1 for every Gaussian that some wanted pixel of these tiles may draw or stop at. Those
+            that stay 0 are hidden or too faint for every pose: leaving them out changes nothing.
     """
 
     lower: np.ndarray
