@@ -36,6 +36,14 @@ def slow(folder: str, number: int) -> tuple[int, int]:
     return number, os.getpid()
 
 
+def address(file: Path) -> str | None:
+    """Where the scheduler of ``file`` listens, as soon as all of the file is there: it is not written at once."""
+    try:
+        return json.loads(file.read_text())["address"]
+    except (FileNotFoundError, json.JSONDecodeError):
+        return None
+
+
 class Parts:
     """A scheduler and two workers."""
 
@@ -45,8 +53,7 @@ class Parts:
         file = folder / "scheduler.json"
         self.scheduler = self._start("scheduler", "--host", "127.0.0.1", "--port", "0", "--no-dashboard",
                                      "--scheduler-file", str(file))  # fmt: skip
-        until(file.exists)
-        self.address: str = json.loads(file.read_text())["address"]
+        self.address: str = until(lambda: address(file), "the scheduler's file")
         self.workers = [self.worker() for _ in range(2)]
 
     def worker(self) -> subprocess.Popen[str]:
