@@ -3,17 +3,22 @@
 from __future__ import annotations
 
 import csv
+import json
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
+from certifying import linear
 
+from ns_abstract.api.certifying import CertifyProgress
 from ns_abstract.api.files import PathJob
+from ns_abstract.bench import certificates, plan, rules, scale
 from ns_abstract.bench import paper as paper_tables
-from ns_abstract.bench import plan, rules, scale
 from ns_abstract.bench.sets import open_jobs, pose_set, splat_of
-from ns_abstract.cli.bench import Plan, Rules, Scale, Tightness, bench
+from ns_abstract.cli.bench import Certificates, Plan, Rules, Scale, Tightness, bench
 from ns_abstract.cli.common import DONE
 from ns_abstract.io.errors import InputError
 from ns_abstract.methods.splat.activate import activate
@@ -144,3 +149,43 @@ def test_cost_by_scale(blobs, tmp_path: Path) -> None:
 def test_scale_needs_one_run(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="found 0 runs"):
         bench(Scale(output_dir=tmp_path))
+
+
+@pytest.mark.parametrize(("label", "verdict"), [(0, "certified"), (1, "falsified")])
+def test_certified_fraction_of_a_network_that_always_says_the_same(
+    blobs, tmp_path: Path, label: int, verdict: str
+) -> None:
+    net = linear(tmp_path / "net.onnx", np.zeros((2, 3 * 16 * 16)), np.array([1.0, -1.0]), 16)
+    prop = tmp_path / "property.json"
+    prop.write_text(json.dumps({"type": "classification", "label": label, "preprocess": {"resize": [16, 16]}}))
+    options = Certificates(
+        (blobs.config,), blobs.path, tmp_path, model=net, property=prop, sets=("x",), seconds=600.0, workers=1,
+        marks=(600.0, 900.0),
+    )  # fmt: skip
+    assert bench(options) == DONE
+    with open(tmp_path / "certificates.csv", newline="") as stream:
+        (row,) = csv.DictReader(stream)
+    assert float(row[verdict]) == 1.0 and row["at 600 s"] == row["certified"] and "at 900 s" not in row
+
+
+def test_certified_fraction_against_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    points = [CertifyProgress(0.1 * k, 0.0, 0.0, 1.0 - 0.1 * k, 4.0 * k) for k in range(9)]
+
+    def certify(*_: Any, on_progress: Any, **__: Any) -> Any:
+        for point in points:
+            on_progress(point)
+        effort = {"cells_bounded": 20, "worker_seconds": 60.0}
+        return SimpleNamespace(
+            report={"effort": effort}, parameters=("x",), certified=0.8, falsified=0.05, unknown=0.15, seconds=33.0
+        )
+
+    monkeypatch.setattr(certificates, "certify", certify)
+    monkeypatch.setattr(certificates.PoseSet, "from_json", lambda *_: None)
+    said: list[str] = []
+    any_: Any = None
+    row = certificates.curve(any_, any_, "x", {}, Path("net.onnx"), any_, 60.0, 2, (3.0, 10.0, 32.0, 40.0), said.append)
+    assert [row[f"at {mark} s"] for mark in (3, 10, 32, 40)] == pytest.approx([0.0, 0.2, 0.8, 0.8])
+    assert row["worker s / bounded"] == 3.0
+    # at 12, 24 seconds, and not at every point
+    assert [text.split(",")[0] for text in said] == ["x: searching for 60 s", "x: 12 s", "x: 24 s"]
+    assert "certified 30.00%" in said[1]

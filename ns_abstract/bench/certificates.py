@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +11,8 @@ from ns_abstract.api.poses import PoseSet
 from ns_abstract.api.scenes import Scene
 from ns_abstract.geometry.camera_path import Camera
 
+#: Seconds between two words of where a search stands.
+_SAID = 10.0
 #: Sets by name, as a perturbation file writes them.
 SETS: dict[str, dict[str, Any]] = {
     "x": {"translation": {"x": 0.05}},
@@ -37,6 +39,7 @@ def curve(
     seconds: float,
     workers: int,
     marks: Sequence[float],
+    said: Callable[[str], object] = lambda text: None,
 ) -> dict[str, Any]:
     """Search one set for ``seconds``.
 
@@ -46,15 +49,29 @@ def curve(
         seconds, workers: Time and processes.
         marks: Times, in seconds from the call, at which the certified fraction is told; kernels have to be loaded, and
             compiled at the first time, within them.
+        said: Told from time to time where the search stands.
 
     Returns:
         A row: certified fraction at the marks and at the end, falsified and unknown ones, cells bounded by the network,
         worker seconds by bounded cell.
     """
     points: list[CertifyProgress] = []
+    said(f"{name}: searching for {seconds:g} s")
+    due = _SAID
+
+    def on_progress(point: CertifyProgress) -> None:
+        nonlocal due
+        points.append(point)
+        if point.seconds >= due:
+            due = point.seconds + _SAID
+            said(
+                f"{name}: {point.seconds:.0f} s, certified {point.certified:.2%}, falsified {point.falsified:.2%}, "
+                f"unknown {point.unknown:.2%}"
+            )
+
     found = certify(
         scene, PoseSet.from_json(camera, specification), model, prop,
-        time_budget=seconds, workers=workers, on_progress=points.append,
+        time_budget=seconds, workers=workers, on_progress=on_progress,
     )  # fmt: skip
     effort = found.report["effort"]
     bounded = effort["cells_bounded"]

@@ -245,6 +245,10 @@ class Vnnlib:
     """What "unsat" covers: every float32 evaluation and the exact network, or the exact network alone."""
 
 
+def _said(text: str) -> None:
+    print(text, file=sys.stderr, flush=True)
+
+
 def vnnlib(options: Vnnlib) -> int:
     """Decide the instances; the exit code is 2 if a file could not be used."""
     from ns_abstract.bench.vnnlib import run_folder
@@ -359,7 +363,7 @@ def certificates(options: Certificates) -> int:
         rows.append(
             curve(
                 scene, path.cameras[options.frame], name, known[name], options.model, options.property, options.seconds,
-                options.workers, marks,
+                options.workers, marks, _said,
             )
         )  # fmt: skip
         print("\n".join(markdown([rows[-1]]).splitlines()[0 if len(rows) == 1 else 2 :]), flush=True)
@@ -378,7 +382,7 @@ def loops(options: Loops) -> int:
     marks = [mark for mark in options.marks if mark <= options.seconds]
     found = measure(
         load_scene(options.load_config), options.loop, options.seconds, options.workers, options.runs, marks,
-        options.seed, lambda text: print(text, file=sys.stderr, flush=True),
+        options.seed, _said,
     )  # fmt: skip
     for name, rows in (("loops", found.search), ("loops-steps", found.steps)):
         if rows:

@@ -22,14 +22,24 @@ import numpy as np
 from ns_abstract.execution.ending import AbandonedError, abandoning
 from ns_abstract.geometry.box import ParameterBox
 from ns_abstract.geometry.tiles import in_tiles
-from ns_abstract.refine.protocol import ACCUMULATION, COLORS, DEPTH, Bounds, Context, Frame, PartsFrame, Render
+from ns_abstract.refine.protocol import (
+    ACCUMULATION,
+    COLORS,
+    DEPTH,
+    MOST_PARTS,
+    Bounds,
+    Context,
+    Frame,
+    PartsFrame,
+    Render,
+)
 from ns_abstract.refine.result import FrameResult, Layer, Leaves, PartResult, TracePoint, Views, gap, joined
 
 #: Part of the whole excess that one round of splitting takes on.
 _ROUND_SHARE = 0.8
 #: Times in a round that the goal is looked at.
 _LOOKS = 16
-#: Excess over what the goal allows from which on cells are cut into four parts rather than two.
+#: Excess over what the goal allows from which on cells are cut into `MOST_PARTS` rather than two.
 _FAR = 4.0
 #: Pixels that typical Gaussians move by at most in the first cell of one parameter, and by each of several.
 FIRST_MOTION, FIRST_MOTIONS = 0.5, 0.6
@@ -48,6 +58,8 @@ _CORNERS = 64
 _MEMBERS, _MEMBERS_BY_WITNESS = 48, 2
 #: Part of the time that the first cover of the set may take.
 _COVER_SHARE = 0.5
+#: A first cell that takes up to this many times what a cover's cells may take is timed again before fewer are made.
+_HELD_UP = 4.0
 #: Most cells of the first cover.
 _COVER_CELLS = 4096
 #: Part of the gap beyond the witnesses that a goal allows which parts of a frame share by their pixels.
@@ -537,7 +549,7 @@ class Refinement:
             motion[axis] *= 0.5
             history.append(parts)
         first = parts[len(parts) // 2]
-        probe, allowed = self._probe(first, everything)
+        probe, allowed = self._probe(first, everything, len(parts))
         while len(parts) > allowed and len(history) > 1:
             history.pop()
             parts = history[-1]
@@ -565,12 +577,21 @@ class Refinement:
                 return self._cut(self._whole, 0, max(1, min(wanted if helped else count, most))), part, probe
             count, before = 2 * count + 1, excess
 
-    def _probe(self, part: _Part, everything: np.ndarray) -> tuple[Bounds, float]:
-        """Bounds of ``part``, and how many such cells time and memory allow."""
-        started = time.perf_counter()
-        probe = self.frame.bound(part.box, self._numbers_of(everything), None, self.keep_leaves)
-        seconds = time.perf_counter() - started
-        allowed = _COVER_SHARE * self.goal.seconds / max(seconds, 1e-4)
+    def _probe(self, part: _Part, everything: np.ndarray, wanted: int = 1) -> tuple[Bounds, float]:
+        """Bounds of ``part``, and how many such cells time and memory allow, of ``wanted`` ones."""
+
+        def timed() -> tuple[Bounds, float]:
+            started = time.perf_counter()
+            found = self.frame.bound(part.box, self._numbers_of(everything), None, self.keep_leaves)
+            return found, time.perf_counter() - started
+
+        budget = _COVER_SHARE * self.goal.seconds
+        probe, seconds = timed()
+        if self.goal.cells is None and budget < wanted * seconds <= _HELD_UP * budget:
+            # a single one may have been held up
+            probe, again = timed()
+            seconds = min(seconds, again)
+        allowed = budget / max(seconds, 1e-4)
         if self.goal.cells is not None:
             allowed = self.goal.cells / 2
         size = probe.lower.nbytes + probe.upper.nbytes + _context_bytes(probe.context) + _linear_bytes(probe)
@@ -655,7 +676,7 @@ class Refinement:
         # excess falls at least in proportion to the width: far from the goal, levels are skipped
         moved = (self.witness_upper - self.witness_lower)[..., :COLORS]
         allowed = (self.goal.ratio - 1.0) * float(moved[self.inside].sum())
-        return jobs, 4 if running[-1] > _FAR * allowed else 2
+        return jobs, MOST_PARTS if running[-1] > _FAR * allowed else 2
 
     def _excess(self) -> tuple[np.ndarray, list[tuple[int, int]]]:
         """What every open leaf leaves open beyond the witnesses, and its tile and row.

@@ -23,6 +23,8 @@ if TYPE_CHECKING:
 LinearSets = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
 #: Channels of a picture, and the places of what may stand behind them.
 COLORS, ACCUMULATION, DEPTH = 3, 3, 4
+#: Most cells that are bounded together.
+MOST_PARTS = 4
 #: Parameter values [d] and tile numbers (None: all) to tiles [t, side, side, channels] float32.
 Render = Callable[[np.ndarray, "np.ndarray | None"], np.ndarray]
 #: Picture [H, W, 3] and parameter values [d] to a number, differentiable.
@@ -238,7 +240,7 @@ class PartsFrame(Protocol):
         """What `Frame.bound` returns of each of ``boxes``.
 
         Args:
-            boxes: Cells.
+            boxes: Cells, at most `MOST_PARTS`.
             tiles: [t] numbers.
             within: The context of these tiles, and at least of these pixels, from a box around all cells.
             keep_linear: Whether linear bounds are asked for.

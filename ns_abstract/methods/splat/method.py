@@ -11,6 +11,7 @@ import numpy as np
 
 from ns_abstract.arithmetic.rounding import Arithmetic
 from ns_abstract.arithmetic.rounding import arithmetic as arithmetic_named
+from ns_abstract.execution.threads import threads
 from ns_abstract.geometry.box import ParameterBox
 from ns_abstract.geometry.poses import COLOR_SHIFTS, PoseSet
 from ns_abstract.io.errors import InputError
@@ -24,14 +25,14 @@ from ns_abstract.methods.splat.scene import SplatScene
 from ns_abstract.methods.splat.variations import VariedSplats, vary
 from ns_abstract.perturbation.specification import Perturbation
 from ns_abstract.perturbation.variations import SceneVariation
-from ns_abstract.refine.protocol import Elements, Frame
+from ns_abstract.refine.protocol import MOST_PARTS, Elements, Frame
 
 if TYPE_CHECKING:
     import torch
 
     from ns_abstract.methods.splat.reference import Reference
 
-#: Bytes that the kernels need by Gaussian, beside the scene itself (record, boxes, colours, buffers).
+#: Bytes that the kernels need by Gaussian and cell, beside the scene itself (record, boxes, colours, buffers).
 _BYTES_BY_GAUSSIAN = 1200
 #: The same of the ranges of a varied scene and of the member that is rendered.
 _BYTES_BY_VARIED = 400
@@ -141,7 +142,8 @@ class SplatMethod:
         """Bytes that bounding pictures of ``pixels`` needs beside the leaves."""
         arrays = (self.splats.means, self.splats.axes, self.splats.opacity, self.splats.sh)
         ranges = sum(v.varies for v in self._varied.values()) * _BYTES_BY_VARIED
-        by_gaussian = self.splats.count * (_BYTES_BY_GAUSSIAN + ranges)
+        # cells that are bounded side by side have buffers of their own
+        by_gaussian = self.splats.count * (min(threads(), MOST_PARTS) * _BYTES_BY_GAUSSIAN + ranges)
         return 2 * sum(a.nbytes for a in arrays) + by_gaussian + pixels * 400 + (256 << 20)
 
     @property
