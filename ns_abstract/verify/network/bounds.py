@@ -15,7 +15,7 @@ from torch import Tensor
 from ns_abstract.execution.ending import checkpoint
 from ns_abstract.verify.network.graph import Network, NetworkArithmetic
 from ns_abstract.verify.network.layers import Activation, LeakyRelu, Linear, Scale, Sum, Weighted
-from ns_abstract.verify.network.maxima import Candidates, MaxPool, upper_planes
+from ns_abstract.verify.network.maxima import Candidates, MaxPool, Planes, upper_planes
 from ns_abstract.verify.network.products import Product
 from ns_abstract.verify.network.rows import (
     Columns,
@@ -731,36 +731,12 @@ class _Cells:
         slopes: list[Tensor] = []
         step = max(1, _ROWS_AT_ONCE // (8 * len(layer.steps) ** 2 * 4))
         for part in where.split(step):
-            cell, channel, window = part.T
-            at = cell, channel, window
-            places = layer.places[:, window].T
-            inside, number = places >= 0, channel[:, None] * x.c[0, 0].numel() + places.clamp(min=0)
-
-            def gathered(v: Tensor, cell: Tensor = cell, number: Tensor = number) -> Tensor:
-                return v.flatten(1)[cell[:, None], number]
-
-            known = Candidates(
-                inside,
-                reference=gathered(x.reference),
-                middle=gathered(x.c),
-                radius=gathered(x.r),
-                slopes=torch.stack([gathered(x.a[:, i]) for i in range(self.d)], 2),
-                lower=gathered(interval.lower),
-                upper=gathered(interval.upper),
-                winner=winner[:, :, 0][at],
-            )
-            apart = self._apart(source, layer, part, known)
-            row = torch.arange(len(part))
-            top = apart[row, :, known.winner].amax(1)
-            left = top > 0.0
-            if not bool(left.any()):
+            tilted = self._tilted(source, layer, x, interval, winner[:, :, 0], part)
+            if tilted is None:
                 continue
-            known, apart = Candidates(*(v[left] for v in known)), apart[left]
-            at, top = tuple(v[left] for v in at), top[left]
-            planes = upper_planes(known, apart)
+            at, top, known, near, planes = tilted
             which[at] = torch.arange(len(top)) + sum(map(len, slopes))
             base = (planes.slopes * known.reference).sum(1) - reference[at]
-            near = gathered(x.width)[left]
             room = _REFERENCES * ((planes.slopes * known.reference.abs()).sum(1) + reference[at].abs())
             for passage, unit, give, offset in zip(self.passages, units, gives, offsets, strict=True):
                 rounded = (planes.slopes.to(passage.dtype).double() - planes.slopes).abs()
@@ -776,11 +752,11 @@ class _Cells:
             radius = (radius + _REFERENCES * (planes.slopes * known.size).sum(1)) * (1.0 + 2.0**-40)
             own = r[at] + 0.5 * top
             better = radius < own
-            tilted = (planes.slopes[:, :, None] * known.slopes).sum(1)
+            rows = (planes.slopes[:, :, None] * known.slopes).sum(1)
             c[at] = torch.where(better, middle, c[at] + 0.5 * top)
             r[at] = torch.where(better, radius, own * (1.0 + 2.0**-40) + _REFERENCES * c[at].abs())
             cells, channels, windows = at
-            a[cells, :, channels, windows] = torch.where(better[:, None], tilted, a[cells, :, channels, windows])
+            a[cells, :, channels, windows] = torch.where(better[:, None], rows, a[cells, :, channels, windows])
             most[at] = torch.minimum(most[at], own_upper[at] + top)
         grown = (m, *shape)
         chosen_slopes = torch.cat(slopes) if slopes else torch.zeros((0, len(layer.steps)))
@@ -803,6 +779,38 @@ class _Cells:
         room = 2.0**-50 * (reference.abs() + form.width)
         least = lower.amax(2).reshape(grown)
         return self._within(form, least - reference - room, most.reshape(grown) - reference + room)
+
+    def _tilted(
+        self, source: int, layer: MaxPool, x: _Form, interval: _Interval, winner: Tensor, where: Tensor
+    ) -> _Tilted | None:
+        """Planes above those windows of ``where`` [n, 3] in which something may be above the ``winner``; None: none."""
+        cell, channel, window = where.T
+        at = cell, channel, window
+        places = layer.places[:, window].T
+        inside, number = places >= 0, channel[:, None] * x.c[0, 0].numel() + places.clamp(min=0)
+
+        def gathered(v: Tensor) -> Tensor:
+            return v.flatten(1)[cell[:, None], number]
+
+        known = Candidates(
+            inside,
+            reference=gathered(x.reference),
+            middle=gathered(x.c),
+            radius=gathered(x.r),
+            slopes=torch.stack([gathered(x.a[:, i]) for i in range(self.d)], 2),
+            lower=gathered(interval.lower),
+            upper=gathered(interval.upper),
+            winner=winner[at],
+        )
+        apart = self._apart(source, layer, where, known)
+        top = apart[torch.arange(len(where)), :, known.winner].amax(1)
+        left = top > 0.0
+        if not bool(left.any()):
+            return None
+        known = Candidates(*(v[left] for v in known))
+        return _Tilted(
+            tuple(v[left] for v in at), top[left], known, gathered(x.width)[left], upper_planes(known, apart[left])
+        )
 
     def _apart(self, source: int, layer: MaxPool, where: Tensor, known: Candidates) -> Tensor:
         """How far numbers of windows may be above one another, by forms and by rows where these help."""
@@ -1446,6 +1454,24 @@ class _Passage:
     def takes(self, rows: Rows) -> bool:
         """Whether rows are of this type."""
         return rows.value.dtype == self.number
+
+
+class _Tilted(NamedTuple):
+    """Windows whose winner may be exceeded, and planes above them.
+
+    Attributes:
+        at: Their cells, channels and numbers, [n] each.
+        top: [n] what may be above the winner.
+        known: Their numbers.
+        near: [n, K] how far these may be from their references.
+        planes: One above each.
+    """
+
+    at: tuple[Tensor, ...]
+    top: Tensor
+    known: Candidates
+    near: Tensor
+    planes: Planes
 
 
 class _Maxima(NamedTuple):
