@@ -293,13 +293,13 @@ def test_no_time_leaves_frames_missing_but_no_frame_in_part(blobs: Inputs) -> No
 
 def test_memory_is_shared_by_the_tasks_of_a_machine(blobs: Inputs) -> None:
     job = job_of(blobs)
-    limit = (4 * job.base_memory + (6 << 30)) / 2**30
+    limit = (4 * job.base_memory(2) + (6 << 30)) / 2**30
     limited = open_job(dataclasses.replace(job.settings, memory_limit=limit))
     engine = Machines([2, 1], [1])
     list(bound_frames(limited, [0], engine=engine, budget=60.0, target_ratio=3.0))
-    leaves = (limited.memory - 2 * job.base_memory) // 2
+    leaves = (limited.memory - 2 * job.base_memory(2)) // 2
     assert {goal.leaf_bytes for goal in engine.goals} == {leaves // 3}
-    tight = open_job(dataclasses.replace(job.settings, memory_limit=1.5 * job.base_memory / 2**30))
+    tight = open_job(dataclasses.replace(job.settings, memory_limit=1.5 * job.base_memory(2) / 2**30))
     with pytest.raises(InputError, match="2 workers on one machine") as refused:
         list(bound_frames(tight, [0], engine=engine, budget=60.0))
     assert refused.value.field == "--memory-limit"

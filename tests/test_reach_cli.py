@@ -29,6 +29,8 @@ from ns_abstract.demo.gate import gate
 from ns_abstract.demo.writing import write_loop_demo
 from ns_abstract.geometry.box import ParameterBox
 from ns_abstract.geometry.poses import SCENE_TURNS
+from ns_abstract.io import memory
+from ns_abstract.io.errors import InputError
 from ns_abstract.perturbation.variations import SceneVariation, Selection
 from ns_abstract.reach.film import along
 from ns_abstract.reach.search import Run, first_outside, pushes, simulate
@@ -98,6 +100,16 @@ def finished(edge: Course, tmp_path_factory: pytest.TempPathFactory) -> Path:
 def cells(folder: Path) -> list[tuple[Any, ...]]:
     with sqlite3.connect(folder / "cells.sqlite") as base:
         return sorted(base.execute("SELECT frame, lower, upper, verdict, margin, counterexample FROM cells").fetchall())
+
+
+def test_a_network_that_does_not_fit_into_the_memory_is_refused(
+    course: Course, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    scene = load_scene(course.config)
+    monkeypatch.setattr(memory, "available_memory", lambda: 1 << 30)
+    open_loop(scene, course.loop, workers=1)
+    with pytest.raises(InputError, match=r"onnx: needs about .* GiB for a cell in \d parameters .*fewer --workers"):
+        open_loop(scene, course.loop, workers=1 << 16)
 
 
 def test_no_two_gaussians_are_equally_deep() -> None:

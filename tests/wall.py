@@ -163,7 +163,7 @@ class WallMethod:
             if perturbation.rotation or perturbation.scene:
                 raise InputError("the camera looks straight on", field="rotation", fix="leave the key out")
 
-    def memory(self, pixels: int) -> int:
+    def memory(self, pixels: int, threads: int) -> int:
         return 1000 * pixels
 
     def frame(self, poses: PoseSet, slanted: bool = False, layers: bool = False) -> WallFrame:

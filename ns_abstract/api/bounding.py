@@ -111,7 +111,8 @@ def bound_part(
 
 def local_workers(job: Job) -> int:
     """Processes of a cluster on this machine: as many as there are cores and the scene fits into memory."""
-    return max(1, min(len(os.sched_getaffinity(0)), job.memory // (2 * job.base_memory)))
+    cores = len(os.sched_getaffinity(0))
+    return next((n for n in range(cores, 1, -1) if 2 * n * job.base_memory(n) <= job.memory), 1)
 
 
 def bound_frames(
@@ -233,9 +234,10 @@ def _goal(job: Job, part: Part, target_ratio: float, leaf_bytes: int) -> Goal:
 
 def _leaf_bytes(job: Job, processes: int) -> int:
     """Bytes for the leaves of all processes on one machine together."""
-    if job.memory_limit is not None and processes * job.base_memory > job.memory:
+    needed = processes * job.base_memory(processes)
+    if job.memory_limit is not None and needed > job.memory:
         raise InputError(
-            f"{processes} workers on one machine need {processes * job.base_memory / 2**30:.1f} GiB, "
+            f"{processes} workers on one machine need {needed / 2**30:.1f} GiB, "
             f"{job.memory / 2**30:.1f} GiB may be used",
             field="--memory-limit",
             fix="raise it, or start fewer workers",

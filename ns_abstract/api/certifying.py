@@ -18,7 +18,7 @@ import numpy as np
 
 from ns_abstract.api.bounding import listener
 from ns_abstract.api.certification import MEMORY, Certification, PropertySource, Question, examine_block, examine_here
-from ns_abstract.api.job import MOST_MEMORY, Job
+from ns_abstract.api.job import Job
 from ns_abstract.api.margins import NOT_ASKED, SHARE, Margins, certified_cells
 from ns_abstract.api.poses import PoseSet
 from ns_abstract.api.scenes import Scene
@@ -29,7 +29,7 @@ from ns_abstract.execution.engines import Engine, EngineName, started
 from ns_abstract.execution.stopping import StopRequest, interruptible
 from ns_abstract.geometry.box import ParameterBox
 from ns_abstract.io.errors import InputError
-from ns_abstract.io.memory import available_memory
+from ns_abstract.io.memory import allowed_memory
 from ns_abstract.report.cameras import Cameras, cameras_entry, cell_cameras, standing
 from ns_abstract.report.certificate import CertifiedRun, LastReport, certificate_document, coverage, verdict
 from ns_abstract.report.certificate_page import Closer, certificate_page
@@ -57,17 +57,10 @@ _SEEN, _SEEN_PIXELS = 64, 96
 _COMPARED, _COMPARE_SHARE, _COMPARE_LEAST = 5, 0.03, 1.0
 
 
-def _allowed(limit: float | None, workers: int) -> float:
-    """Bytes that one of ``workers`` processes may take; ``limit`` in GiB for all, or None."""
-    free = available_memory()
-    whole = 0.8 * free if free is not None else 8 << 30
-    return (min(limit, MOST_MEMORY) * 2**30 if limit else whole) / workers
-
-
 def network_memory(limit: float | None, workers: int) -> int:
     """Bytes for the network's bounds of one of ``workers`` processes; ``limit`` in GiB for all, or None."""
     # half: images and torch need room beside the bounds; a power of two, so that it hardly depends on the moment
-    return min(MEMORY, 1 << int(np.log2(max(2.0, 0.5 * _allowed(limit, workers)))))
+    return min(MEMORY, 1 << int(np.log2(max(2.0, 0.5 * allowed_memory(limit) / workers))))
 
 
 def check_network_memory(found: Certification, limit: float | None, workers: int) -> None:
@@ -77,7 +70,7 @@ def check_network_memory(found: Certification, limit: float | None, workers: int
         InputError: It does, about.
     """
     dimensions = max(1, len(found.parameters))
-    check_cell(found.network, dimensions, _allowed(limit, 1 if found.job.rays else workers))
+    check_cell(found.network, dimensions, allowed_memory(limit) / (1 if found.job.rays else workers))
 
 
 @dataclass(frozen=True)

@@ -17,16 +17,15 @@ import numpy as np
 from ns_abstract.api.scenes import Scene, SceneSource
 from ns_abstract.execution.ending import AbandonedError, abandoning
 from ns_abstract.execution.opening import Recipe
+from ns_abstract.execution.threads import most_threads
 from ns_abstract.geometry.poses import PoseSet
 from ns_abstract.io.errors import InputError
-from ns_abstract.io.memory import available_memory
+from ns_abstract.io.memory import allowed_memory
 from ns_abstract.perturbation.variations import SceneVariation
 from ns_abstract.refine.engine import Goal, Refinement
 from ns_abstract.refine.protocol import Frame, Method
 from ns_abstract.refine.result import LAYERS, FrameResult, PartResult, TracePoint, joined
 
-#: GiB beyond which a limit is none.
-MOST_MEMORY = 2.0**20
 #: Bytes for leaves below which nothing can be done.
 _LEAST_LEAF_BYTES = 64 << 20
 #: Seconds that the ray with which kernels are compiled may take.
@@ -95,15 +94,12 @@ class Job:
     @property
     def memory(self) -> int:
         """Bytes this job may use."""
-        if self.memory_limit is not None:
-            return int(min(self.memory_limit, MOST_MEMORY) * 2**30)
-        free = available_memory()
-        return int(0.8 * free) if free is not None else 8 << 30
+        return allowed_memory(self.memory_limit)
 
-    @property
-    def base_memory(self) -> int:
-        """Bytes that a process needs beside the leaves."""
-        return self.method.memory(max(poses.camera.width * poses.camera.height for poses in self.pose_sets))
+    def base_memory(self, processes: int = 1) -> int:
+        """Bytes that each of ``processes`` on one machine, which share its threads, needs beside the leaves."""
+        pixels = max(poses.camera.width * poses.camera.height for poses in self.pose_sets)
+        return self.method.memory(pixels, max(1, most_threads() // processes))
 
     def around(self, extra: SceneVariation) -> Job:
         """The same sets with more scenes in them."""
@@ -119,9 +115,10 @@ class Job:
         limit = self.memory_limit
         if limit is not None and not 0.0 < limit < float("inf"):
             raise InputError(f"found {limit}", field="--memory-limit", fix="give a positive number of GiB")
-        if self.base_memory > self.memory:
+        needed = self.base_memory()
+        if needed > self.memory:
             raise InputError(
-                f"{self.method.content} at this size needs {self.base_memory / 2**30:.2g} GiB, "
+                f"{self.method.content} at this size needs {needed / 2**30:.2g} GiB, "
                 f"{self.memory / 2**30:.2g} GiB may be used",
                 field="--memory-limit",
                 fix="raise it, or raise --downscale-factor",
@@ -129,7 +126,7 @@ class Job:
 
     def leaf_bytes(self, processes: int) -> int:
         """Bytes for the leaves that ``processes`` on one machine may have together."""
-        return max(processes * _LEAST_LEAF_BYTES, (self.memory - processes * self.base_memory) // 2)
+        return max(processes * _LEAST_LEAF_BYTES, (self.memory - processes * self.base_memory(processes)) // 2)
 
     # ---------------------------------------------------------------- frames
 

@@ -32,6 +32,7 @@ from ns_abstract.execution.stopping import StopRequest, interruptible
 from ns_abstract.execution.threads import use_threads
 from ns_abstract.geometry.box import ParameterBox
 from ns_abstract.io.errors import InputError
+from ns_abstract.io.memory import allowed_memory
 from ns_abstract.perturbation.specification import TRANSLATIONS
 from ns_abstract.perturbation.variations import SceneVariation
 from ns_abstract.reach.film import along, film_size, made
@@ -46,6 +47,7 @@ from ns_abstract.report.record import file_stamp, guarantee_text, plain, version
 from ns_abstract.verify.cells import Cell, Grid
 from ns_abstract.verify.model import NetworkModel
 from ns_abstract.verify.network import NetworkArithmetic, load_network
+from ns_abstract.verify.network.explain import check_cell
 from ns_abstract.verify.response import Response
 from ns_abstract.verify.scene_margin import (
     CAMERA_KINDS,
@@ -695,7 +697,7 @@ def reach(
         raise InputError(f"found {workers}", field="workers", fix="give a number of at least 1")
     if resume and output_dir is None:
         raise InputError("given without output_dir", field="resume", fix="give the folder to go on with")
-    job = open_loop(scene, Path(loop), arithmetic, network_arithmetic)
+    job = open_loop(scene, Path(loop), arithmetic, network_arithmetic, workers)
     settings = {"time_budget": time_budget, "arithmetic": arithmetic, "workers": workers, "engine": engine}
     with ExitStack() as stack:
         folder = Path(output_dir) if output_dir is not None else Path(
@@ -716,16 +718,23 @@ def reach(
 
 
 def open_loop(
-    scene: Scene, file: Path, arithmetic: str | None = None, network_arithmetic: NetworkArithmetic = "float32"
+    scene: Scene,
+    file: Path,
+    arithmetic: str | None = None,
+    network_arithmetic: NetworkArithmetic = "float32",
+    workers: int = 1,
 ) -> LoopJob:
     """Open LOOP.json with its network.
 
     Raises:
-        InputError: A file or a field cannot be used.
+        InputError: A file or a field cannot be used, or there is not the memory for ``workers`` processes.
     """
     loop = load_loop(file)
     try:
-        return LoopJob(scene, loop, arithmetic, network_arithmetic)
+        job = LoopJob(scene, loop, arithmetic, network_arithmetic)
+        dimensions = job.job.pose_sets[0].box.dimensions
+        check_cell(job.network, dimensions, allowed_memory(None) / workers, "fewer --workers")
+        return job
     except InputError as error:
         raise error.within(file) if error.field and not error.field.startswith("--") else error from None
 

@@ -83,7 +83,7 @@ def reach(options: Reach) -> int:
 
             program = ProgramOptions(renderer=options.renderer, gsplat_version=options.gsplat_version)
             scene = SceneSource(options.load_config, program).open()
-            job = open_loop(scene, options.loop, options.arithmetic, options.network_arithmetic)
+            job = open_loop(scene, options.loop, options.arithmetic, options.network_arithmetic, options.workers)
             found = ReachRun(job, options.output_dir, vars(options), ("ns-abstract-reach", *sys.argv[1:]))
         console = plain_console()
         said = 0.0

@@ -39,8 +39,8 @@ class _Lane(NamedTuple):
 _lane: ContextVar[_Lane | None] = ContextVar("lane", default=None)
 
 
-def _most() -> int:
-    """As numba sees it: the cores, or fewer by the variable NUMBA_NUM_THREADS."""
+def most_threads() -> int:
+    """Of this machine, as numba sees it: the cores, or fewer by the variable NUMBA_NUM_THREADS."""
     import numba
 
     return numba.config.NUMBA_NUM_THREADS  # pyright: ignore[reportPrivateImportUsage, reportAttributeAccessIssue]
@@ -57,7 +57,7 @@ def threads() -> int:
     found = _lane.get()
     if found is not None:
         return found.threads
-    most = _most()
+    most = most_threads()
     return most if _setting.count is None else max(1, min(_setting.count, most))
 
 
@@ -69,7 +69,7 @@ def use_threads(count: int) -> None:
 @lru_cache(maxsize=1)
 def _pool(process: int) -> ThreadPoolExecutor:
     """Those of one process: a fork has none."""
-    return ThreadPoolExecutor(max(1, _most() - 1), "kernels")
+    return ThreadPoolExecutor(max(1, most_threads() - 1), "kernels")
 
 
 def side_by_side(work: Callable[[int], object], count: int) -> None:

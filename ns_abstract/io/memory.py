@@ -6,6 +6,11 @@ from pathlib import Path
 
 from ns_abstract.io.errors import InputError
 
+#: GiB: larger limits are taken for this one, which no machine has.
+MOST_MEMORY = 2.0**20
+#: Part of what is free that is taken where nothing is said, and bytes where the system does not say what is free.
+_SHARE, _USUAL = 0.8, 8 << 30
+
 
 def available_memory() -> int | None:
     """Bytes of memory this process may still take, or None where the system does not say."""
@@ -21,6 +26,14 @@ def available_memory() -> int | None:
     except (OSError, ValueError):
         pass
     return min(amounts) if amounts else None
+
+
+def allowed_memory(limit: float | None) -> int:
+    """Bytes that may be taken: ``limit`` in GiB, or most of what is free where it is None."""
+    if limit is not None:
+        return int(min(limit, MOST_MEMORY) * 2**30)
+    free = available_memory()
+    return _USUAL if free is None else int(_SHARE * free)
 
 
 def check_memory(needed: int, file: Path, what: str) -> None:

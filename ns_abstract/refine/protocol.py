@@ -330,8 +330,8 @@ class Method(Protocol):
         """
         ...
 
-    def memory(self, pixels: int) -> int:
-        """Bytes that bounding pictures of ``pixels`` needs beside the leaves."""
+    def memory(self, pixels: int, threads: int) -> int:
+        """Bytes that a process of so many threads needs beside the leaves to bound pictures of ``pixels``."""
         ...
 
     def frame(self, poses: PoseSet, slanted: bool = False, layers: bool = False) -> Frame:

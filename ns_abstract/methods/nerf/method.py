@@ -160,8 +160,8 @@ class NerfMethod:
         if any(perturbation.scene for perturbation in perturbations):
             raise InputError("a NeRF has no Gaussians", field="scene", fix="leave the key out")
 
-    def memory(self, pixels: int) -> int:
-        """Bytes that bounding pictures of ``pixels`` needs beside the leaves."""
+    def memory(self, pixels: int, threads: int) -> int:
+        """See `Method.memory`; rays are bounded one after another."""
         weights = sum(array.nbytes for array in self.scene.fine.arrays())
         voxels = 0 if self.scene.occupancy is None else self.scene.occupancy.occupied.size
         return 8 * weights + VOXEL_BYTES * voxels + pixels * (400 + 4 * self.sampling.samples) + (1 << 30)

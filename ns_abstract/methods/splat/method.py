@@ -11,7 +11,6 @@ import numpy as np
 
 from ns_abstract.arithmetic.rounding import Arithmetic
 from ns_abstract.arithmetic.rounding import arithmetic as arithmetic_named
-from ns_abstract.execution.threads import threads
 from ns_abstract.geometry.box import ParameterBox
 from ns_abstract.geometry.poses import COLOR_SHIFTS, PoseSet
 from ns_abstract.io.errors import InputError
@@ -138,12 +137,12 @@ class SplatMethod:
             self._varied[variations] = vary(self.scene, self.splats, variations)
         return self._varied[variations]
 
-    def memory(self, pixels: int) -> int:
-        """Bytes that bounding pictures of ``pixels`` needs beside the leaves."""
+    def memory(self, pixels: int, threads: int) -> int:
+        """See `Method.memory`."""
         arrays = (self.splats.means, self.splats.axes, self.splats.opacity, self.splats.sh)
         ranges = sum(v.varies for v in self._varied.values()) * _BYTES_BY_VARIED
         # cells that are bounded side by side have buffers of their own
-        by_gaussian = self.splats.count * (min(threads(), MOST_PARTS) * _BYTES_BY_GAUSSIAN + ranges)
+        by_gaussian = self.splats.count * (min(threads, MOST_PARTS) * _BYTES_BY_GAUSSIAN + ranges)
         return 2 * sum(a.nbytes for a in arrays) + by_gaussian + pixels * 400 + (256 << 20)
 
     @property

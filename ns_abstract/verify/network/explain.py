@@ -54,8 +54,12 @@ def estimate(network: Network, dimensions: int) -> tuple[float, float, bool]:
     return memory, seconds, rows.given_up
 
 
-def check_cell(network: Network, dimensions: int, allowed: float) -> None:
+def check_cell(
+    network: Network, dimensions: int, allowed: float, remedy: str = "a larger --memory-limit, fewer --workers"
+) -> None:
     """Refuse a network one cell of which takes more than ``allowed`` bytes, before any is bounded.
+
+    ``remedy`` is what may be given instead of a smaller network.
 
     Raises:
         InputError: It does, about.
@@ -67,7 +71,7 @@ def check_cell(network: Network, dimensions: int, allowed: float) -> None:
             f"needs about {needed / 2**30:.1f} GiB for a cell in {dimensions} parameters ({numbers:,.0f} numbers), "
             f"{allowed / 2**30:.1f} GiB are allowed",
             file=network.source,
-            fix="give a larger --memory-limit, fewer --workers, or a smaller network or image",
+            fix=f"give {remedy}, or a smaller network or image",
         )
 
 
