@@ -183,16 +183,19 @@ def test_divisions_are_nested_covers(axes: tuple[int, ...], finer: int) -> None:
     d = 3 if 2 in axes else max(axes, default=0) + 1
     division = Division(axes, d, finer)
     total = int(np.prod(division.parts))
+    assert division.below[-1] == -1 and len(division.below) == division.levels + 1
     for level in range(division.levels + 1):
         members, (low, high) = division.members(level), division.boxes(level)
         assert sorted(members.ravel()) == list(range(total))
         # the parts of a cell in their own order, which bounds of parts are in
         assert (np.diff(members, axis=1) > 0).all()
         assert np.prod(high - low, axis=1).sum() == pytest.approx(2.0**d)
-        if level == division.levels:
+        below = division.below[level]
+        if below < 0:
             continue
         cells = np.arange(len(low))
-        children, finer_members = division.children(level, cells), division.members(level + 1)
+        children, finer_members = division.children(level, cells), division.members(below)
+        assert below > level and len(children) == 2 * len(cells)
         for k, cell in enumerate(np.tile(cells, 2)):
             assert set(finer_members[children[k]]) <= set(members[cell])
 

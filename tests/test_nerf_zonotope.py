@@ -12,7 +12,7 @@ from nerfs import raw_outputs, tiny_weights
 from ns_abstract.methods.nerf import zonotope
 from ns_abstract.methods.nerf.bounds import basis_of, opacity
 from ns_abstract.methods.nerf.layer_kernel import Product, Terms, linear
-from ns_abstract.methods.nerf.scene import FieldWeights
+from ns_abstract.methods.nerf.scene import Encoding, FieldWeights, Layer
 from ns_abstract.methods.nerf.zonotope import Affine, FieldBounds
 
 #: A tolerance of zero: what is compared carries its own rounding.
@@ -51,8 +51,8 @@ def worst(
     curve = curves(count, half, dimensions, seed)
     direction = curves(count, half, dimensions, seed + 1)
     zero = torch.zeros(count, 3, dtype=torch.float64)
-    encoded = field.encode(on_curve(curve, basis.nodes), zero, weights.position)
-    seen = field.encode(on_curve(direction, basis.nodes), zero, weights.direction)
+    encoded = field.encode(on_curve(curve, basis.nodes), zero, field.position)
+    seen = field.encode(on_curve(direction, basis.nodes), zero, field.direction)
     pieces = field.base(*encoded)
     found = [field.density(pieces), field.color(pieces, *seen)]
     rng = np.random.default_rng(seed + 2)
@@ -84,6 +84,51 @@ def test_fields_are_enclosed(name: str, half: float) -> None:
 def test_several_parameters(dimensions: int, half: float) -> None:
     excess, compared, _ = worst(tiny_weights(4), half, dimensions, count=6)
     assert excess <= 0.0 and compared > 0
+
+
+def unseeing(weights: FieldWeights, position: list[int], direction: list[int]) -> FieldWeights:
+    """``weights`` without those of some frequencies, and without the weight of one wave of a coordinate."""
+
+    def without(layer: Layer, encoding: Encoding, gone: list[int]) -> Layer:
+        matrix = layer.weight.copy()
+        waves = matrix[:, : encoding.size - 3].reshape(-1, 2, 3, encoding.count)
+        waves[..., gone] = 0.0
+        waves[:, 1, 2, 0] = 0.0
+        matrix[:, : encoding.size - 3] = waves.reshape(len(matrix), -1)
+        return replace(layer, weight=matrix)
+
+    base = tuple(
+        without(layer, weights.position, position) if i == 0 or layer.skip else layer
+        for i, layer in enumerate(weights.base)
+    )
+    head = (without(weights.head[0], weights.direction, direction), *weights.head[1:])
+    return replace(weights, base=base, head=head)
+
+
+@pytest.mark.parametrize("gone", [[], [2], [1, 3]])
+def test_waves_that_no_weight_looks_at_are_left_out(gone: list[int]) -> None:
+    whole = tiny_weights(3)
+    weights = unseeing(whole, gone, [0])
+    for waves, encoding, left in (
+        (weights.position_waves, weights.position, gone),
+        (weights.direction_waves, weights.direction, [0]),
+    ):
+        kept = [k for k in range(encoding.count) if k not in left]
+        assert waves.frequencies.tolist() == encoding.frequencies[kept].tolist()
+        assert waves.columns.size == 6 * len(kept) + 3
+    assert len(weights.plan) == bool(gone) + 1 and not whole.plan
+    # one layer that looks is enough
+    other = replace(weights, base=(weights.base[0], *whole.base[1:]))
+    assert any(layer.skip for layer in whole.base) and other.position_waves.frequencies.size == whole.position.count
+    excess, compared, ratio = worst(weights, 3e-3)
+    assert excess <= 0.0 and compared > 0 and ratio < 3.0
+
+
+def test_a_wave_that_is_wrongly_left_out_is_noticed(monkeypatch: pytest.MonkeyPatch) -> None:
+    weights = tiny_weights(3)
+    fewer = unseeing(weights, [2], []).position_waves
+    monkeypatch.setattr(FieldWeights, "position_waves", fewer)
+    assert worst(weights, 3e-3)[0] > 0.0
 
 
 def random_batch(field: FieldBounds, width: int, seed: int) -> Affine:
@@ -255,7 +300,7 @@ def test_pieces_with_too_many_terms_are_given_up() -> None:
     field = FieldBounds(weights, basis, limit=3)
     curve = curves(8, 0.3, 1, 0)
     nodes = on_curve(curve, basis.nodes)
-    pieces = field.base(*field.encode(nodes, torch.zeros(8, 3, dtype=torch.float64), weights.position))
+    pieces = field.base(*field.encode(nodes, torch.zeros(8, 3, dtype=torch.float64), field.position))
     assert pieces.failed.any()
     assert not pieces.failed[pieces.owner].any() and not pieces.failed[pieces.new_owner].any()
 
@@ -265,7 +310,7 @@ def test_numbers_that_are_none_fail() -> None:
     field = FieldBounds(weights, basis)
     nodes = on_curve(curves(4, 0.01, 1, 0), basis.nodes).clone()
     nodes[2] = float("nan")
-    pieces = field.base(*field.encode(nodes, torch.zeros(4, 3, dtype=torch.float64), weights.position))
+    pieces = field.base(*field.encode(nodes, torch.zeros(4, 3, dtype=torch.float64), field.position))
     assert pieces.failed.tolist() == [False, False, True, False]
 
 
@@ -279,7 +324,7 @@ def test_compiled_and_torch_agree(monkeypatch: pytest.MonkeyPatch) -> None:
         assert field._grid is not None
         if not compiled:
             field._grid = None
-        found.append(field.base(*field.encode(nodes, zero, weights.position)))
+        found.append(field.base(*field.encode(nodes, zero, field.position)))
     assert found[0].new_size.numel() > 0
     for name in ("owner", "new_owner", "new_neuron", "failed", "count"):
         assert torch.equal(getattr(found[0], name), getattr(found[1], name)), name

@@ -150,6 +150,7 @@ def bernstein_matrices(degree: int, parts: int) -> Float64Array:
     return np.array([a / denominator for a in numerators.ravel()]).reshape(numerators.shape)
 
 
+@lru_cache(maxsize=64)
 def _bernstein_integers(degree: int, parts: int) -> tuple[NDArray[np.object_], int]:
     """`bernstein_matrices` as numerators [parts, degree + 1, degree + 1] and their common denominator."""
     n = degree + 1

@@ -40,17 +40,19 @@ _BLOCK = 8
 #: Halvings below cells of the starting width, by number of parameters (one level may concern any axis).
 _DEEPER = {0: 0, 1: 4}
 _DEEPER_MORE = 6
-#: Halvings of the deepest cells into parts, by axis.
-_FINER = {1: 2, 2: 1}
+#: Halvings of the deepest cells into parts, by axis; the cells of a line have two or three parts as it is.
+_FINER = {2: 1}
 #: Most parts of one box.
 _PARTS = 4096
 #: Light (in [0, 1]) that a skipped sample may add, as a share of the tolerance.
 _QUIET = 0.02
 #: A cell on which an opacity is open by this much everywhere was far too wide.
 _LOST = 0.5
-#: Shares of the first cells that were far too wide above which they begin narrower, and below which wider. Work on wide
-#: cells is lost and there is more of it, as their error terms are more; so few may be lost.
-_MANY_LOST, _FEW_LOST = 0.1, 0.03
+#: Shares of the first cells that were far too wide and factors by which later ones begin narrower: the first share that
+#: is exceeded counts. Work on wide cells is lost and there is more of it, as their error terms are more.
+_LOST_SHARES = ((0.25, 0.6), (0.04, 0.87))
+#: The share below which they begin wider, and the factor: this costs little, as the shares rise steeply with the width.
+_FEW_LOST, _WIDER = 0.01, 1.08
 #: Light that a sample may leave open before compositing has shown where it matters.
 _COARSE = 0.1
 #: A sample is worth halving if it can take away this share of what a part has too much.
@@ -77,8 +79,11 @@ def basis_of(dimensions: int) -> ChebyshevBasis:
 class Division:
     """Nested equal cells of a box, and the parts that results are kept for.
 
+    A line has levels of 3, 6, 12, ... cells between those of 2, 4, 8, ...: cells are then nearer to the width that
+    the network's bounds bear.
+
     Attributes:
-        axes: Axis that is halved from each level to the next.
+        axes: Axis that is halved from each level to the next; of a line, to that with twice as many cells.
         dimensions: Of the box.
         finer: Halvings of the deepest level's cells into parts, by axis.
     """
@@ -87,18 +92,35 @@ class Division:
     dimensions: int
     finer: int = 0
 
+    @cached_property
+    def _line(self) -> tuple[int, ...]:
+        """Cells of every level of a line."""
+        halved = len(self.axes)
+        return tuple(sorted([1 << k for k in range(halved + 1)] + [3 << k for k in range(halved - 1)]))
+
     @property
     def levels(self) -> int:
         """The deepest level."""
-        return len(self.axes)
+        return len(self._line) - 1 if self.dimensions == 1 else len(self.axes)
 
     def counts(self, level: int) -> tuple[int, ...]:
         """Cells by axis of a level."""
+        if self.dimensions == 1:
+            return (self._line[level],)
         return tuple(1 << self.axes[:level].count(j) for j in range(self.dimensions))
+
+    @cached_property
+    def below(self) -> tuple[int, ...]:
+        """The level that halves the cells of each level, or -1."""
+        if self.dimensions == 1:
+            return tuple(self._line.index(2 * n) if 2 * n in self._line else -1 for n in self._line)
+        return (*range(1, self.levels + 1), -1)
 
     @cached_property
     def parts(self) -> tuple[int, ...]:
         """Parts by axis of the whole box."""
+        if self.dimensions == 1:
+            return (3 * self._line[-1] << self.finer,)
         return tuple(n << self.finer for n in self.counts(self.levels))
 
     def inner(self, level: int) -> tuple[int, ...]:
@@ -120,14 +142,15 @@ class Division:
         return whole.transpose(order).reshape(math.prod(counts), math.prod(inner))
 
     def children(self, level: int, cells: np.ndarray) -> np.ndarray:
-        """[2 n] cells of the next level inside ``cells`` [n]."""
-        counts, axis = self.counts(level), self.axes[level]
+        """[2 n] cells of the level `below` inside ``cells`` [n]."""
+        counts, axis = self.counts(level), 0 if self.dimensions == 1 else self.axes[level]
+        halves = self.counts(self.below[level])
         places = np.array(np.unravel_index(cells, counts)).reshape(self.dimensions, -1)
         found = []
         for half in (0, 1):
             inside = places.copy()
             inside[axis] = 2 * inside[axis] + half
-            found.append(np.ravel_multi_index(tuple(inside), self.counts(level + 1)))
+            found.append(np.ravel_multi_index(tuple(inside), halves))
         return np.concatenate(found)
 
 
@@ -338,7 +361,7 @@ class NerfBounds:
             ray, place = rays[first : first + _BATCH], places[first : first + _BATCH]
             lines, radius = pencil.points(ray, self.distances[place], 0.0 * self.distances[place])
             nodes = monomials @ torch.from_numpy(lines).to(self.device)
-            encoded = coarse.encode(nodes, torch.from_numpy(radius).to(self.device), coarse.weights.position)
+            encoded = coarse.encode(nodes, torch.from_numpy(radius).to(self.device), coarse.position)
             z = coarse.density(coarse.base(*encoded))
             ends = _parts(z, bernstein)
             length = torch.from_numpy(self.lengths[place]).to(self.device)[:, None]
@@ -369,7 +392,7 @@ class NerfBounds:
             return None
         deeper = _DEEPER.get(d, _DEEPER_MORE)
         finer = _FINER.get(d, 0)
-        levels = most.bit_length() - 1 - deeper - d * finer
+        levels = (most // 3 if d == 1 else most).bit_length() - 1 - deeper - d * finer
         axes: list[int] = []
         while widest.sum() > self.displacement:
             if len(axes) >= levels:
@@ -517,28 +540,33 @@ class _Work:
                 self.lost += int((lost & first).sum())
                 self.tried += int((seen & first).sum())
             coarse = join_items(again)
-            if level == self.division.levels or not len(coarse):
+            below = self.division.below[level]
+            if below < 0 or not len(coarse):
                 continue
             children = self.division.children(level, coarse.cell)
             finer = _Items(np.tile(coarse.ray, 2), np.tile(coarse.sample, 2), children)
-            waiting.setdefault(level + 1, []).append(finer)
+            waiting.setdefault(below, []).append(finer)
 
     def _learn(self) -> None:
         """Cells should have started narrower if many of them were too wide, wider if few were."""
         if self.tried < 32:
             return
-        if self.lost > _MANY_LOST * self.tried:
-            self.displacement *= 0.6
-        elif self.wide and self.lost < _FEW_LOST * self.tried:
-            # cells that the box itself makes narrow do not show what wider ones would bear
-            self.displacement *= 1.2
+        for share, narrower in _LOST_SHARES:
+            if self.lost > share * self.tried:
+                self.displacement *= narrower
+                return
+        # cells that the box itself makes narrow do not show what wider ones would bear
+        if self.wide and self.lost < _FEW_LOST * self.tried:
+            self.displacement *= _WIDER
 
     def _improve(self) -> None:
         """Halve cells that leave colours open beyond the aim, round after round, on the parts where they do."""
         rays = np.arange(self.light.shape[0])
+        below = np.array([*self.division.below, -1])
         for _ in range(_ROUNDS):
             low, high, impact = self._impact(rays)
-            able = (self.level[:, rays] >= 0) & (self.level[:, rays] < self.division.levels)
+            # cells of level -1 were never bounded
+            able = below[self.level[:, rays]] >= 0
             threshold = np.full(impact.shape[1:], self.tolerance)
             if self.aim is not None:
                 excess = np.maximum(high - self.aim[1][rays, None], self.aim[0][rays, None] - low).max(axis=2)
@@ -549,7 +577,7 @@ class _Work:
             if not sample.size:
                 return
             ray = rays[ray]
-            level = self.level[sample, ray, part] + 1
+            level = below[self.level[sample, ray, part]]
             for deeper in np.unique(level):
                 which = level == deeper
                 cell = self._cell_of(deeper)[part[which]]
@@ -660,7 +688,7 @@ class _Work:
         self.cells += len(items)
         there = monomials[torch.from_numpy(items.cell).to(device)]
         nodes = there @ torch.from_numpy(lines).to(device)
-        encoded = field.encode(nodes, torch.from_numpy(radius).to(device), field.weights.position)
+        encoded = field.encode(nodes, torch.from_numpy(radius).to(device), field.position)
         pieces = field.base(*encoded)
         density = field.density(pieces)
         low, high, error = _parts(density, bernstein)
@@ -684,7 +712,7 @@ class _Work:
         halve = (open_ * light).max(axis=1) > coarse
         shines = (high_a * light).max(axis=1) > self._negligible
         # what is halved gets its colours from the halves, if there are any
-        final = ~halve | (level == self.division.levels)
+        final = ~halve | (self.division.below[level] < 0)
         coloured = np.flatnonzero(shines & final & ~density.failed.cpu().numpy())
         if coloured.size:
             self._color(pieces, items.take(coloured), coloured, there, bernstein, rows)
@@ -704,7 +732,7 @@ class _Work:
         index = torch.from_numpy(which).to(device)
         direction = there[index] @ torch.from_numpy(self.pencil.direction[items.ray]).to(device)
         radius = self.pencil.direction_radius[items.ray] + 96.0 * UNIT64
-        encoded = field.encode(direction, torch.from_numpy(radius).to(device), field.weights.direction)
+        encoded = field.encode(direction, torch.from_numpy(radius).to(device), field.direction)
         color = field.color(pieces.select(index), *encoded)
         low, high, error = _parts(color, bernstein)
         bad = color.failed[:, None, None]
@@ -794,12 +822,15 @@ class _Work:
 def _parts(value: Affine, bernstein: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Bounds [B, parts, n] of an affine batch on every part of its cell, and its radius [B, n]."""
     error = value.radius
-    controls = torch.einsum("pkm,bmn->bpkn", bernstein, value.poly)
+    (batch, m, n), (parts, k, _) = value.poly.shape, bernstein.shape
+    # pieces and outputs side by side
+    controls = (bernstein.reshape(parts * k, m) @ value.poly.transpose(0, 1).reshape(m, batch * n)).view(parts, k, -1)
+    least, most = (ends.view(parts, batch, n).transpose(0, 1) for ends in (controls.amin(dim=1), controls.amax(dim=1)))
     # on parts that are nearly the whole cell, Bernstein coefficients of high degrees are far from the values
     spread = value.poly[:, 1:].abs().sum(dim=1)[:, None]
     middle = value.poly[:, :1]
-    low = torch.maximum(controls.amin(dim=2), middle - spread)
-    high = torch.minimum(controls.amax(dim=2), middle + spread)
+    low = torch.maximum(least, middle - spread)
+    high = torch.minimum(most, middle + spread)
     slack = (error + CHEBYSHEV_ROUNDING * (value.poly.abs().sum(dim=1) * bernstein.abs().amax()))[:, None]
     return low - slack, high + slack, error
 

@@ -172,6 +172,7 @@ class NerfMethod:
         s, scene = self.sampling, self.scene
         grid = scene.occupancy
         declared = () if grid is None else (f"density declared 0 outside of a grid: {grid.describe()}",)
+        declared += scene.fine.plan
         shows = scene.coarse_samples + scene.importance_samples + 1
         if s.kind == "hierarchical":
             return (

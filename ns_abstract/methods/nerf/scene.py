@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
+from functools import cached_property
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -50,6 +52,27 @@ class Layer:
     skip: bool = False
 
 
+class Waves(NamedTuple):
+    """What of an encoded vector some weight looks at.
+
+    Attributes:
+        frequencies: [k] those of `Encoding.frequencies`.
+        columns: [6 k + 3] their places in the encoded vector, and those of the vector itself.
+    """
+
+    frequencies: NDArray[np.float64]
+    columns: NDArray[np.int64]
+
+
+def _waves(encoding: Encoding, layers: Sequence[Layer]) -> Waves:
+    """What the ``layers``, whose first inputs are the encoded vector, look at."""
+    looks = np.any([layer.weight[:, : encoding.size].any(axis=0) for layer in layers], axis=0)
+    places = np.arange(encoding.size - 3).reshape(2, 3, encoding.count)
+    used = looks[places].any(axis=(0, 1))
+    own = np.arange(encoding.size - 3, encoding.size)
+    return Waves(encoding.frequencies[used], np.concatenate([places[:, :, used].ravel(), own]))
+
+
 @dataclass(frozen=True)
 class FieldWeights:
     """One field (nerfstudio/fields/vanilla_nerf_field.py, ``NeRFField``).
@@ -73,6 +96,30 @@ class FieldWeights:
         """All weights and biases in a fixed order."""
         layers = (*self.base, self.density, *self.head, self.color)
         return [array for layer in layers for array in (layer.weight, layer.bias)]
+
+    @cached_property
+    def position_waves(self) -> Waves:
+        """Of the encoded position."""
+        return _waves(self.position, [layer for i, layer in enumerate(self.base) if i == 0 or layer.skip])
+
+    @cached_property
+    def direction_waves(self) -> Waves:
+        """Of the encoded direction."""
+        return _waves(self.direction, self.head[:1])
+
+    @property
+    def plan(self) -> tuple[str, ...]:
+        """What is left out of the field, one sentence each."""
+        pairs = (
+            ("positions", self.position, self.position_waves),
+            ("directions", self.direction, self.direction_waves),
+        )
+        return tuple(
+            f"{encoding.count - waves.frequencies.size} of {encoding.count} frequencies of encoded {name} left out: "
+            "no weight looks at them"
+            for name, encoding, waves in pairs
+            if waves.frequencies.size < encoding.count
+        )
 
     @property
     def text(self) -> str:

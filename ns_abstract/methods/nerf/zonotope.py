@@ -13,7 +13,7 @@ charged to the box.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -30,7 +30,7 @@ from ns_abstract.arithmetic.rounding import (
 )
 from ns_abstract.methods.nerf.layer_kernel import Product, Terms, linear
 from ns_abstract.methods.nerf.relu_kernel import LEAST_SLOPE, Grid, grid_of, relu
-from ns_abstract.methods.nerf.scene import Encoding, FieldWeights, Layer
+from ns_abstract.methods.nerf.scene import Encoding, FieldWeights, Layer, Waves
 
 #: Radii of Bernstein ellipses that are tried for the remainder of an encoding.
 _ELLIPSES = (1.05, 1.15, 1.3, 1.6, 2.0, 2.6, 3.5, 5.0, 8.0, 14.0, 30.0, 80.0, 300.0)
@@ -135,6 +135,12 @@ class _Linear:
     narrow: Tensor | None
 
 
+def _seeing(layer: Layer, encoding: Encoding, waves: Waves) -> Layer:
+    """``layer``, whose first inputs are the encoded vector, without those that nothing looks at."""
+    kept = np.concatenate([waves.columns, np.arange(encoding.size, layer.weight.shape[1])])
+    return replace(layer, weight=np.ascontiguousarray(layer.weight[:, kept]))
+
+
 class FieldBounds:
     """Bounds of one field.
 
@@ -151,8 +157,13 @@ class FieldBounds:
         self.weights, self.basis, self.limit, self.device = weights, basis, limit, torch.device(device)
         self._compiled = self.device.type == "cpu"
         wide = len(weights.base) - _NARROW_LAYERS
-        self._base = [self._put(layer, i >= wide) for i, layer in enumerate(weights.base)]
-        self._head = [self._put(layer, True) for layer in weights.head]
+        self.position, self.direction = weights.position_waves, weights.direction_waves
+        self._base = [
+            self._put(_seeing(layer, weights.position, self.position) if i == 0 or layer.skip else layer, i >= wide)
+            for i, layer in enumerate(weights.base)
+        ]
+        self._head = [self._put(_seeing(weights.head[0], weights.direction, self.direction), True)]
+        self._head += [self._put(layer, True) for layer in weights.head[1:]]
         self._density, self._color = self._put(weights.density, True), self._put(weights.color, True)
         kept, rest = (torch.from_numpy(a).to(device) for a in basis.interpolation)
         self._kept, self._rest = kept, rest
@@ -177,19 +188,19 @@ class FieldBounds:
 
     # --- encodings -----------------------------------------------------------------------------
 
-    def encode(self, nodes: Tensor, radius: Tensor, encoding: Encoding) -> tuple[Tensor, Tensor]:
+    def encode(self, nodes: Tensor, radius: Tensor, seen: Waves) -> tuple[Tensor, Tensor]:
         """Polynomials and remainders of an encoded vector (design.md, F3).
 
         Args:
             nodes: [B, nodes, 3] the vector's polynomial at the basis' nodes. Its degree by variable is at most
                 the basis'.
             radius: [B, 3] distance of the vector from the polynomial.
-            encoding: Its frequencies.
+            seen: ``position`` or ``direction``.
 
         Returns:
-            [B, m, size] coefficients, [B, size] remainders.
+            [B, m, k] coefficients, [B, k] remainders, of the columns seen.
         """
-        omega = 2.0 * np.pi * torch.from_numpy(encoding.frequencies).to(self.device)
+        omega = 2.0 * np.pi * torch.from_numpy(seen.frequencies).to(self.device)
         angles = (nodes[..., None] * omega).flatten(-2)
         values = torch.cat([torch.sin(angles), torch.cos(angles), nodes], dim=-1)
         poly = torch.matmul(self._kept, values)
@@ -226,7 +237,7 @@ class FieldBounds:
         box = radius @ layer.absolute[count:] + (0.0 if layer.narrow is None else UNDERFLOW_COLUMNS)
         poly, columns, owner, spread = self._product(pieces, layer, count)
         if first is not None:
-            poly += first[0] @ layer.weight[:count]
+            poly.flatten(0, 1).addmm_(first[0].flatten(0, 1), layer.weight[:count])
             box += (first[1] + rounding * (first[0].abs().sum(dim=1) + first[1])) @ layer.absolute[:count]
         poly[:, 0] += layer.bias
         box += 4.0 * UNIT64 * (layer.bias.abs() + poly[:, 0].abs())
