@@ -385,23 +385,6 @@ def test_a_cover_that_takes_too_long_becomes_one_cell(dimensions: int, monkeypat
     assert len(result.leaves.tile) == frame.tile_count
 
 
-@pytest.mark.parametrize(("later", "cells"), [(0.1, 64), (1.5, 32), (9.0, 4)])
-def test_a_first_cell_that_was_held_up_does_not_make_the_cover_coarser(
-    later: float, cells: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    frame = Waves(2, pace=2.0)
-    # half of 100 s is for the cover, of which 64 cells of 1.5 s take too long
-    first = 1.5 if later < 9.0 else later
-    monkeypatch.setattr(
-        engine,
-        "time",
-        SimpleNamespace(perf_counter=lambda: min(len(frame.calls), 1) * first + max(len(frame.calls) - 1, 0) * later),
-    )
-    result = refine(frame, Goal(3.0, 100.0))
-    check(frame, result)
-    assert result.trace[-1].cells == cells
-
-
 # ---------------------------------------------------------------- reproducible
 
 

@@ -58,8 +58,6 @@ _CORNERS = 64
 _MEMBERS, _MEMBERS_BY_WITNESS = 48, 2
 #: Part of the time that the first cover of the set may take.
 _COVER_SHARE = 0.5
-#: A first cell that takes up to this many times what a cover's cells may take is timed again before fewer are made.
-_HELD_UP = 4.0
 #: Most cells of the first cover.
 _COVER_CELLS = 4096
 #: Part of the gap beyond the witnesses that a goal allows which parts of a frame share by their pixels.
@@ -549,7 +547,7 @@ class Refinement:
             motion[axis] *= 0.5
             history.append(parts)
         first = parts[len(parts) // 2]
-        probe, allowed = self._probe(first, everything, len(parts))
+        probe, allowed = self._probe(first, everything)
         while len(parts) > allowed and len(history) > 1:
             history.pop()
             parts = history[-1]
@@ -577,21 +575,12 @@ class Refinement:
                 return self._cut(self._whole, 0, max(1, min(wanted if helped else count, most))), part, probe
             count, before = 2 * count + 1, excess
 
-    def _probe(self, part: _Part, everything: np.ndarray, wanted: int = 1) -> tuple[Bounds, float]:
-        """Bounds of ``part``, and how many such cells time and memory allow, of ``wanted`` ones."""
-
-        def timed() -> tuple[Bounds, float]:
-            started = time.perf_counter()
-            found = self.frame.bound(part.box, self._numbers_of(everything), None, self.keep_leaves)
-            return found, time.perf_counter() - started
-
-        budget = _COVER_SHARE * self.goal.seconds
-        probe, seconds = timed()
-        if self.goal.cells is None and budget < wanted * seconds <= _HELD_UP * budget:
-            # a single one may have been held up
-            probe, again = timed()
-            seconds = min(seconds, again)
-        allowed = budget / max(seconds, 1e-4)
+    def _probe(self, part: _Part, everything: np.ndarray) -> tuple[Bounds, float]:
+        """Bounds of ``part``, and how many such cells time and memory allow."""
+        started = time.perf_counter()
+        probe = self.frame.bound(part.box, self._numbers_of(everything), None, self.keep_leaves)
+        seconds = time.perf_counter() - started
+        allowed = _COVER_SHARE * self.goal.seconds / max(seconds, 1e-4)
         if self.goal.cells is not None:
             allowed = self.goal.cells / 2
         size = probe.lower.nbytes + probe.upper.nbytes + _context_bytes(probe.context) + _linear_bytes(probe)
