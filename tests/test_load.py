@@ -853,6 +853,12 @@ def test_memory_is_checked_before_reading(run: Run, monkeypatch: pytest.MonkeyPa
     assert load_scene(run.config).count == GAUSSIANS
 
 
+@pytest.mark.parametrize("limit", [0.0, -1.0, float("nan"), float("inf")])
+def test_limits_of_memory_that_are_none(limit: float) -> None:
+    with pytest.raises(InputError, match="--memory-limit: found"):
+        memory.allowed_memory(limit)
+
+
 def test_available_memory() -> None:
     found = memory.available_memory()
     assert found is None or found > 2**20

@@ -112,9 +112,6 @@ class Job:
         return other
 
     def _check_memory(self) -> None:
-        limit = self.memory_limit
-        if limit is not None and not 0.0 < limit < float("inf"):
-            raise InputError(f"found {limit}", field="--memory-limit", fix="give a positive number of GiB")
         needed = self.base_memory()
         if needed > self.memory:
             raise InputError(

@@ -32,7 +32,6 @@ from ns_abstract.execution.stopping import StopRequest, interruptible
 from ns_abstract.execution.threads import use_threads
 from ns_abstract.geometry.box import ParameterBox
 from ns_abstract.io.errors import InputError
-from ns_abstract.io.memory import allowed_memory
 from ns_abstract.perturbation.specification import TRANSLATIONS
 from ns_abstract.perturbation.variations import SceneVariation
 from ns_abstract.reach.film import along, film_size, made
@@ -733,7 +732,7 @@ def open_loop(
     try:
         job = LoopJob(scene, loop, arithmetic, network_arithmetic)
         dimensions = job.job.pose_sets[0].box.dimensions
-        check_cell(job.network, dimensions, allowed_memory(None) / workers, "fewer --workers")
+        check_cell(job.network, dimensions, job.job.memory / workers, "fewer --workers")
         return job
     except InputError as error:
         raise error.within(file) if error.field and not error.field.startswith("--") else error from None

@@ -29,8 +29,14 @@ def available_memory() -> int | None:
 
 
 def allowed_memory(limit: float | None) -> int:
-    """Bytes that may be taken: ``limit`` in GiB, or most of what is free where it is None."""
+    """Bytes that may be taken: ``limit`` in GiB, or most of what is free where it is None.
+
+    Raises:
+        InputError: It is no positive number.
+    """
     if limit is not None:
+        if not 0.0 < limit < float("inf"):
+            raise InputError(f"found {limit}", field="--memory-limit", fix="give a positive number of GiB")
         return int(min(limit, MOST_MEMORY) * 2**30)
     free = available_memory()
     return _USUAL if free is None else int(_SHARE * free)

@@ -93,35 +93,35 @@ class Division:
     finer: int = 0
 
     @cached_property
-    def _line(self) -> tuple[int, ...]:
-        """Cells of every level of a line."""
+    def _levels(self) -> list[tuple[int, ...]]:
+        """Cells by axis of every level."""
         halved = len(self.axes)
-        return tuple(sorted([1 << k for k in range(halved + 1)] + [3 << k for k in range(halved - 1)]))
+        found = [tuple(1 << self.axes[:level].count(j) for j in range(self.dimensions)) for level in range(halved + 1)]
+        if self.dimensions == 1:
+            found += [(3 << k,) for k in range(halved - 1)]
+        return sorted(found, key=math.prod)
 
     @property
     def levels(self) -> int:
         """The deepest level."""
-        return len(self._line) - 1 if self.dimensions == 1 else len(self.axes)
+        return len(self._levels) - 1
 
     def counts(self, level: int) -> tuple[int, ...]:
         """Cells by axis of a level."""
-        if self.dimensions == 1:
-            return (self._line[level],)
-        return tuple(1 << self.axes[:level].count(j) for j in range(self.dimensions))
+        return self._levels[level]
 
     @cached_property
     def below(self) -> tuple[int, ...]:
         """The level that halves the cells of each level, or -1."""
-        if self.dimensions == 1:
-            return tuple(self._line.index(2 * n) if 2 * n in self._line else -1 for n in self._line)
-        return (*range(1, self.levels + 1), -1)
+        level_of = {math.prod(counts): level for level, counts in enumerate(self._levels)}
+        return tuple(level_of.get(2 * cells, -1) for cells in level_of)
 
     @cached_property
     def parts(self) -> tuple[int, ...]:
         """Parts by axis of the whole box."""
-        if self.dimensions == 1:
-            return (3 * self._line[-1] << self.finer,)
-        return tuple(n << self.finer for n in self.counts(self.levels))
+        # cells of halves and of thirds are made of the same parts
+        finer = (3 if self.dimensions == 1 else 1) << self.finer
+        return tuple(finer * n for n in self.counts(self.levels))
 
     def inner(self, level: int) -> tuple[int, ...]:
         """Parts by axis of one cell of a level."""
@@ -143,8 +143,8 @@ class Division:
 
     def children(self, level: int, cells: np.ndarray) -> np.ndarray:
         """[2 n] cells of the level `below` inside ``cells`` [n]."""
-        counts, axis = self.counts(level), 0 if self.dimensions == 1 else self.axes[level]
-        halves = self.counts(self.below[level])
+        counts, halves = self.counts(level), self.counts(self.below[level])
+        axis = int(np.argmax(np.array(halves) > counts))
         places = np.array(np.unravel_index(cells, counts)).reshape(self.dimensions, -1)
         found = []
         for half in (0, 1):
