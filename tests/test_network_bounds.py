@@ -16,9 +16,18 @@ import torch
 from onnx_files import OnnxFile, attack, image_sets, members, session
 
 from ns_abstract.io.errors import InputError
-from ns_abstract.verify.network import ImageSets, Network, NetworkArithmetic, bound_outputs, load_network, schedule
+from ns_abstract.verify.network import (
+    ImageSets,
+    Network,
+    NetworkArithmetic,
+    bound_outputs,
+    load_network,
+    rounding,
+    schedule,
+)
 from ns_abstract.verify.network import bounds as module
 from ns_abstract.verify.network.layers import Convolution
+from ns_abstract.verify.network.reached import Enough, Goal, Reached
 from ns_abstract.verify.network.rows import columns_of, concretize
 
 Vector = list[Fraction]
@@ -465,21 +474,21 @@ def test_what_ends_rows() -> None:
     """A sign; or both ends close, and no kink between; what a ReLU cuts off may be as wide as it likes."""
     lower = np.array([-3.0, -3.0, 1.0, 1.0, -1.0, -0.1, 2.0])
     upper = np.array([-1.0, 3.0, 1.1, 3.0, -0.9, 0.1, 2.1])
-    found = module._Reached(np.zeros((7, 2, 2)), lower, upper, np.zeros(7, np.int64))
+    found = Reached(np.zeros((7, 2, 2)), lower, upper, np.zeros(7, np.int64))
     every = np.arange(7)
 
-    def done(goal: module._Goal, negative: bool, zero: float = 0.0) -> list[int]:
-        enough = module._Enough(goal, np.full(7, zero), np.full(7, negative))
+    def done(goal: Goal, negative: bool, zero: float = 0.0) -> list[int]:
+        enough = Enough(goal, np.full(7, zero), np.full(7, negative))
         return np.flatnonzero(enough.done(found, every)).tolist()
 
-    assert done(module._Goal(), False) == [2, 3, 6]
-    assert done(module._Goal(0.2), False) == [0, 2, 4, 6]
-    assert done(module._Goal(0.2), True) == [2, 3, 4, 6]
-    assert done(module._Goal(0.2, cut=False), False) == [2, 4, 6]
-    assert done(module._Goal(0.2, kink=False), False) == [2, 4, 5, 6]
+    assert done(Goal(), False) == [2, 3, 6]
+    assert done(Goal(0.2), False) == [0, 2, 4, 6]
+    assert done(Goal(0.2), True) == [2, 3, 4, 6]
+    assert done(Goal(0.2, cut=False), False) == [2, 4, 6]
+    assert done(Goal(0.2, kink=False), False) == [2, 4, 5, 6]
     # relative to references zero is elsewhere
-    assert done(module._Goal(0.2, cut=False), False, zero=2.05) == [2, 4, 5]
-    enough = module._Enough(module._Goal(0.2), np.zeros(7), every > 3)
+    assert done(Goal(0.2, cut=False), False, zero=2.05) == [2, 4, 5]
+    enough = Enough(Goal(0.2), np.zeros(7), every > 3)
     np.testing.assert_array_equal(enough[4:].done(found, every[:3]), [False, False, True])
 
 
@@ -717,7 +726,7 @@ def test_parts_change_nothing_but_rounding(tmp_path: Path, monkeypatch: pytest.M
     rows[:3] = np.eye(3, network.output_size, 4)
     whole = bound_outputs(network, images, rows, np.zeros(6))
     tiny = bound_outputs(network, images, rows, np.zeros(6), memory=1)
-    monkeypatch.setattr(module, "_ROWS_AT_ONCE", 1)
+    monkeypatch.setattr(module, "ROWS_AT_ONCE", 1)
     single = bound_outputs(network, images, rows, np.zeros(6))
     one = [bound_outputs(network, images[k : k + 1], rows[[0, 4]], np.zeros(2)).lower[0] for k in range(5)]
     for other in (tiny.lower, single.lower):
@@ -781,7 +790,8 @@ def test_float32_rounding_is_needed(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     rows = np.concatenate([np.eye(4), -np.eye(4)])
     for charged in (True, False):
         if not charged:
-            monkeypatch.setattr(module, "UNIT", 0.0)
+            for part in (module, rounding):
+                monkeypatch.setattr(part, "UNIT", 0.0)
         lower = bound_outputs(network, images, rows, np.zeros(8)).lower
         broken[charged] = int((lower > y @ rows.T).sum())
     assert broken[True] == 0

@@ -15,6 +15,7 @@ from ns_abstract.verify.network import ImageSets, bound_outputs, load_network
 from ns_abstract.verify.network import bounds as module
 from ns_abstract.verify.network.layers import Convolution, LeakyRelu, Matrix, Scale, Sum
 from ns_abstract.verify.network.maxima import Candidates
+from ns_abstract.verify.network.passages import Maxima
 
 Build = Callable[[OnnxFile], object]
 
@@ -419,11 +420,11 @@ def _rivals_forgotten(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def _last_of_a_window(monkeypatch: pytest.MonkeyPatch) -> None:
-    def backward(self, rows, layer, batch):
-        return original(self._replace(winner=0 * self.winner), rows, layer, batch)
+    def backward(self, rows, layer, cell, total):
+        return original(self._replace(winner=0 * self.winner), rows, layer, cell, total)
 
-    original = module._Maxima.backward
-    monkeypatch.setattr(module._Maxima, "backward", backward)
+    original = Maxima.backward
+    monkeypatch.setattr(Maxima, "backward", backward)
 
 
 def _narrow_magnitude(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -5,6 +5,7 @@ from planted.fault import Fault
 _SEARCH = "verify/search.py"
 _VNNLIB = "verify/vnnlib.py"
 _NETWORK = "verify/network/bounds.py"
+_REACHED, _ROUNDING = "verify/network/reached.py", "verify/network/rounding.py"
 _RESPONSE = "verify/response.py"
 _MAPS = "report/verdict_maps.py"
 
@@ -43,25 +44,25 @@ VERDICTS = (
     ),
     Fault(
         "network: half of a sum's roundings are charged",
-        _NETWORK,
-        "_Cells._rounding",
+        _ROUNDING,
+        "Rounding.charge",
         "0.5 * (size + balance.abs())",
         "0.25 * (size + balance.abs())",
         "test_network_rounding.py::test_sums_that_lose_as_much_as_they_can[1]",
     ),
     Fault(
         "network: partial sums are taken to be no larger than the whole",
-        _NETWORK,
-        "_Cells._rounding",
+        _ROUNDING,
+        "Rounding.charge",
         "0.5 * (size + balance.abs())",
         "balance.abs()",
         "test_network_rounding.py::test_sums_that_cancel",
     ),
     Fault(
         "network: sums that start with what is added behind them are not charged",
-        _NETWORK,
-        "_Cells._rounding",
-        "_gamma(own)",
+        _ROUNDING,
+        "Rounding.charge",
+        "gamma(own)",
         "0.0 * own",
         "test_network_rounding.py::test_sums_that_start_with_what_is_added",
     ),
@@ -101,8 +102,8 @@ VERDICTS = (
         "network: float32 rows are charged by float64's unit roundoff",
         _NETWORK,
         "_Cells.__init__",
-        "_Passage(torch.float32, UNIT)",
-        "_Passage(torch.float32, _DOUBLE_UNIT)",
+        "Passage(torch.float32, UNIT, sums)",
+        "Passage(torch.float32, DOUBLE_UNIT, sums)",
         "test_network_rounding.py::test_rounding_of_rows_over_sets[False]",
     ),
     Fault(
@@ -179,8 +180,8 @@ VERDICTS = (
     ),
     Fault(
         "network: rows of numbers that may have either sign end on the way",
-        _NETWORK,
-        "_Enough.done",
+        _REACHED,
+        "Enough.done",
         "tight & ((lower >= zero) | (upper <= zero))",
         "tight",
         "test_network_bounds.py::test_what_ends_rows",
@@ -245,7 +246,7 @@ VERDICTS = (
         "network: rows under way are never parted",
         _NETWORK,
         "_Cells._descend",
-        "batch.bytes > min(_ROWS_AT_ONCE, self.memory // 16)",
+        "batch.bytes > min(ROWS_AT_ONCE, self.memory // 16)",
         "batch.bytes > 1 << 62",
         "test_network_bounds.py::test_rows_that_end_by_plan_keep_within_memory",
     ),

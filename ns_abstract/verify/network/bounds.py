@@ -4,21 +4,26 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
-from typing import Any, Literal, NamedTuple
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from ns_abstract.execution.ending import checkpoint
+from ns_abstract.verify.network.forms import Form, Interval
 from ns_abstract.verify.network.graph import Network, NetworkArithmetic
-from ns_abstract.verify.network.layers import Activation, LeakyRelu, Linear, Scale, Sum, Weighted
+from ns_abstract.verify.network.layers import Activation, LeakyRelu, Linear, Sum
 from ns_abstract.verify.network.maxima import Candidates, MaxPool, Planes, upper_planes
+from ns_abstract.verify.network.passages import Maxima, Offered, Passage
 from ns_abstract.verify.network.products import Product
+from ns_abstract.verify.network.reached import Enough, Goal, Reached, Trace
+from ns_abstract.verify.network.rounding import DOUBLE_UNIT, FLUSH, OVERFLOW, SPARE, UNIT, Rounding, gamma
 from ns_abstract.verify.network.rows import (
     Columns,
+    Float64,
+    Int64,
     Rows,
     charge,
     columns_of,
@@ -27,31 +32,11 @@ from ns_abstract.verify.network.rows import (
     grid,
     join,
     pass_activation,
-    pass_maximum,
 )
 from ns_abstract.verify.network.schedule import TRIALS, Schedule, Way, on_threads
+from ns_abstract.verify.network.sets import ImageSets, OutputBounds, Signs, Substitution
 from ns_abstract.verify.network.slopes import Ascent, Chosen, Held, OpenUnits, derivatives
-from ns_abstract.verify.network.sums import partial_sums
 
-Float64 = NDArray[np.float64]
-Int64 = NDArray[np.int64]
-Substitution = Literal["everywhere", "end", "box"]
-
-#: Unit roundoff of float32: of the bounded evaluation, and of most rows.
-UNIT = 2.0**-24
-#: Unit roundoff of float64: of sums of offsets, and of rows of outputs in real arithmetic.
-_DOUBLE_UNIT = 2.0**-53
-#: Roundings of rows beside those of their sums: stored weights and slopes, products with them.
-_SPARE = 24
-#: Roundings of the network beside those of a layer's sums: a batch normalisation's factor (sum, root, quotient),
-#: its product with a weight, and as many again.
-_FOLDING = 8
-#: Sums of fewer additions gain too little by their partial sums to pay for them.
-_LONG = 256
-#: Smallest normal number of float32: what a flush to zero may lose.
-_FLUSH = 2.0**-126
-#: Past this a float32 evaluation may overflow.
-_OVERFLOW = 2.0**126
 #: So many open numbers of a node are tightened only if some of them gain by it: if not so large a part of these
 #: keeps so large a part of its width.
 _MANY, _SOME, _GAIN = 1024, 64, 0.95
@@ -68,70 +53,7 @@ _REFERENCES = 2.0**-46
 #: Room for rounding above zero where nothing better is looked for.
 _SURE = 1e-9
 #: Bytes of rows that are worked on at a time: they should stay in a processor's cache.
-_ROWS_AT_ONCE = 24 << 20
-
-
-@dataclass(frozen=True)
-class ImageSets:
-    """``m`` linear sets of the network's input, flattened to ``n = prod(input_shape)`` numbers.
-
-    For every p in [-1, 1]^d the images x(p) of cell k obey both
-    ``a_lower[k] p + b_lower[k] <= x(p) <= a_upper[k] p + b_upper[k]`` and ``lower[k] <= x(p) <= upper[k]``;
-    the arrays contain whatever rounding produced the images.
-
-    Attributes:
-        a_lower, a_upper: [m, n, d] float64.
-        b_lower, b_upper, lower, upper: [m, n] float64.
-    """
-
-    a_lower: Float64
-    b_lower: Float64
-    a_upper: Float64
-    b_upper: Float64
-    lower: Float64
-    upper: Float64
-
-    def __post_init__(self) -> None:
-        m, n, d = self.a_lower.shape
-        for name in ("a_upper", "b_lower", "b_upper", "lower", "upper"):
-            shape = (m, n, d) if name.startswith("a") else (m, n)
-            if getattr(self, name).shape != shape:
-                raise ValueError(f"{name} {shape} expected, got {getattr(self, name).shape}")
-
-    @property
-    def count(self) -> int:
-        """Number of cells m."""
-        return self.a_lower.shape[0]
-
-    @property
-    def dimensions(self) -> int:
-        """Number of parameters d."""
-        return self.a_lower.shape[2]
-
-    def __getitem__(self, cells: slice) -> ImageSets:
-        return ImageSets(*(getattr(self, name)[cells] for name in self.__dataclass_fields__))
-
-
-#: Signs that are assumed of a node's numbers: where they are in the node [B], and 1 or -1 [B] for "not negative" or
-#: "not positive".
-Signs = tuple[Int64, Float64]
-
-
-@dataclass(frozen=True)
-class OutputBounds:
-    """Lower bounds of ``rows @ y + offset``; minus infinity where nothing is known, never NaN.
-
-    Attributes:
-        lower: [m, k] for every p of the cell; infinite where no image has the signs that are assumed.
-        a, b: [m, k, d], [m, k]: ``a p + b`` is a lower bound at p.
-        loosest: [m, k, 2] where signs are assumed: the node and the place in it of the input of an open unit that costs
-            the row most, about; -1 where no unit is open.
-    """
-
-    lower: Float64
-    a: Float64
-    b: Float64
-    loosest: Int64 | None = None
+ROWS_AT_ONCE = 24 << 20
 
 
 def bound_outputs(
@@ -182,62 +104,6 @@ def bound_outputs(
     return OutputBounds(*(np.concatenate([getattr(part, name) for part in parts]) for name in names))
 
 
-class _Interval(NamedTuple):
-    """What a node's numbers are at least and at most, [m, *shape]."""
-
-    lower: Tensor
-    upper: Tensor
-
-    @property
-    def size(self) -> Tensor:
-        return torch.maximum(self.lower.abs(), self.upper.abs())
-
-    @property
-    def spread(self) -> Tensor:
-        """What they are above and below zero, together."""
-        return self.upper.clamp(min=0.0) - self.lower.clamp(max=0.0)
-
-
-@dataclass
-class _Form:
-    """``z = reference + c + a p + e`` with |e| <= r: what is known of a node in every cell (N1).
-
-    Attributes:
-        reference: [m, *shape]: the node's exact values are near it; all that follows is relative to it.
-        c, r: [m, *shape].
-        a: [m, d, *shape].
-        lower, upper: [m, *shape]; what ``z - reference`` is at least and at most.
-        active: [m, *shape]; False where z is exactly zero.
-    """
-
-    reference: Tensor
-    c: Tensor
-    a: Tensor
-    r: Tensor
-    lower: Tensor
-    upper: Tensor
-    active: Tensor
-
-    @property
-    def width(self) -> Tensor:
-        """How far z may be from the reference."""
-        return torch.maximum(self.lower.abs(), self.upper.abs())
-
-    @property
-    def interval(self) -> _Interval:
-        """What z is at least and at most."""
-        room = 2.0**-50 * self.reference.abs()
-        low = self.reference + self.lower - room - 2.0**-50 * self.lower.abs()
-        return _Interval(low, self.reference + self.upper + room + 2.0**-50 * self.upper.abs())
-
-    @staticmethod
-    def ranged(reference: Tensor, c: Tensor, a: Tensor, r: Tensor, active: Tensor | None = None) -> _Form:
-        """With the range of the form itself."""
-        radius = (a.abs().sum(1) + r) * (1.0 + 2.0**-40) + c.abs() * 2.0**-50
-        active = torch.ones_like(c, dtype=torch.bool) if active is None else active
-        return _Form(reference, c, a, r, c - radius, c + radius, active)
-
-
 class _Cells:
     """Bounds of one network over some cells."""
 
@@ -271,24 +137,23 @@ class _Cells:
         self.flush = np.zeros(self.count)
         fields = self._fields(images)
         self._planes(fields, substitution)
+        # every number is passed by a few times at most
+        numbers = sum(int(np.prod(network.shape(k))) for k in range(len(network.nodes) + 1))
+        sums = 4.0 * DOUBLE_UNIT * (numbers + len(network.nodes))
         #: what rows take on their way; rows of outputs take the last, the others the first
-        self.passages = [_Passage(torch.float32, UNIT)]
+        self.passages = [Passage(torch.float32, UNIT, sums)]
         if not self.single:
             # beside the rounding of a float32 network that of rows is little
-            self.passages.append(_Passage(torch.float64, _DOUBLE_UNIT))
-        #: what sums of offsets in float64 lose: every number is passed by a few times at most
-        numbers = sum(int(np.prod(network.shape(k))) for k in range(len(network.nodes) + 1))
-        self.sums = 4.0 * _DOUBLE_UNIT * (numbers + len(network.nodes))
+            self.passages.append(Passage(torch.float64, DOUBLE_UNIT, sums))
         #: lines with slopes of another cell's rows
-        self.offered: dict[int, _Offered] = {}
-        #: roundings of sums
-        self.terms: dict[int, Tensor | int] = {}
+        self.offered: dict[int, Offered] = {}
+        self.rounding = Rounding(network)
         #: nodes whose rounding is in that of their only reader
         self.folded: set[int] = set()
         #: what rows may stop at
         self.stops: dict[int, Columns] = {}
         #: what is known of nodes, while other nodes read them
-        self.forms: list[_Form | None] = []
+        self.forms: list[Form | None] = []
         #: products that rows have not taken because they ended on the way
         self.spared = 0.0
         #: part of the latest ReLU's inputs whose signs have not been found out
@@ -316,7 +181,7 @@ class _Cells:
         """[m, *shape] what is relative to at node ``k``: that of its inputs passed on with float64's rounding."""
         return passed_on()
 
-    def _sized(self, form: _Form) -> _Form:
+    def _sized(self, form: Form) -> Form:
         """The form, or one of more cells, by which rounding is charged: sizes are all that is read of it."""
         return form
 
@@ -334,7 +199,7 @@ class _Cells:
         b_lower, lower = (v - c - 2.0**-51 * (np.abs(v) + np.abs(c)) for v in (b_lower, lower))
         b_upper, upper = (v - c + 2.0**-51 * (np.abs(v) + np.abs(c)) for v in (b_upper, upper))
         # numpy keeps the order of axes in memory that the images came with
-        self.image = _Planes(
+        self.image = ImagePlanes(
             np.ascontiguousarray(np.stack([a_lower, a_upper], 1)).reshape(self.count, 2, *shape, self.d),
             np.ascontiguousarray(np.stack([b_lower, b_upper], 1)).reshape(self.count, 2, *shape),
             np.ascontiguousarray(lower).reshape(self.count, *shape),
@@ -342,7 +207,7 @@ class _Cells:
         )
         self.columns = columns_of(*self.image)
 
-    def _image(self) -> _Form:
+    def _image(self) -> Form:
         """The image as a form: the middle of its planes."""
         shape = self.network.input_shape
         slopes, offsets = torch.from_numpy(self.image.slopes), torch.from_numpy(self.image.offsets)
@@ -352,11 +217,11 @@ class _Cells:
         spread = spread.clamp(min=0.0) + 2.0**-50 * (offsets.abs().amax(1) + slopes.abs().amax(1).sum(-1))
         c, spread = c.reshape(-1, *shape), spread.reshape(-1, *shape)
         reference = torch.from_numpy(self.middle).reshape(-1, *shape)
-        form = _Form.ranged(reference, c, a, spread)
+        form = Form.ranged(reference, c, a, spread)
         lower, upper = torch.from_numpy(self.image.lower), torch.from_numpy(self.image.upper)
         return self._within(form, lower.reshape(-1, *shape), upper.reshape(-1, *shape))
 
-    def _within(self, form: _Form, lower: Tensor, upper: Tensor) -> _Form:
+    def _within(self, form: Form, lower: Tensor, upper: Tensor) -> Form:
         """The form with bounds that are known besides; a cell without values in it is given up."""
         low, high = torch.maximum(form.lower, lower), torch.minimum(form.upper, upper)
         fine = low <= high
@@ -372,7 +237,7 @@ class _Cells:
             told = np.array([len(signs) > 0 for signs in self.assumed]) & self.good
             self.vacant |= told & crossed.reshape(self.count, -1).any(1).numpy()
         self.good &= good.numpy()
-        found = _Form(form.reference, form.c, form.a, form.r, low, high, form.active)
+        found = Form(form.reference, form.c, form.a, form.r, low, high, form.active)
         if bool(good.all()):
             return found
 
@@ -380,13 +245,13 @@ class _Cells:
         def clear(t: Tensor) -> Tensor:
             return torch.where(good.reshape(-1, *[1] * (t.ndim - 1)), t, torch.zeros_like(t))
 
-        return _Form(*(clear(getattr(found, name)) for name in _Form.__dataclass_fields__))
+        return Form(*(clear(getattr(found, name)) for name in Form.__dataclass_fields__))
 
     # ------------------------------------------------------------ forwards
 
-    def _forward(self) -> _Form:
+    def _forward(self) -> Form:
         """Lines and rounding of every node; returns what is known of the last one."""
-        forms: list[_Form | None] = [self._image()]
+        forms: list[Form | None] = [self._image()]
         self.forms = forms
         if self.schedule.planned:
             self._learn(0, False)
@@ -450,7 +315,7 @@ class _Cells:
             assert form is not None
             self.stops[index] = self._stop(index, form)
 
-    def _assume(self, source: int, z: _Form) -> _Form:
+    def _assume(self, source: int, z: Form) -> Form:
         """What is known of node ``source`` where its numbers have the signs that are assumed (N16)."""
         if self.assumed is None or not any(source in signs for signs in self.assumed):
             return z
@@ -469,13 +334,13 @@ class _Cells:
             low, high = lower[cell, at], upper[cell, at]
             lower[cell, at] = torch.where(positive, torch.minimum(torch.maximum(low, zero), high), low)
             upper[cell, at] = torch.where(positive, high, torch.maximum(torch.minimum(high, zero), low))
-            noise = UNIT * (_SPARE + self.network.readers[source]) * width[cell, flat]
+            noise = UNIT * (SPARE + self.network.readers[source]) * width[cell, flat]
             if self._rounds(source):
                 noise = noise + self.passages[0].noise[source].flatten(1).numpy()[cell, flat]
             self.held[cell][source] = Held(flat, side, -zero.numpy(), noise)
         return replace(z, lower=lower.reshape(z.lower.shape), upper=upper.reshape(z.upper.shape))
 
-    def _combine(self, k: int, sources: tuple[int, ...], layer: Linear, inputs: list[_Form]) -> _Form:
+    def _combine(self, k: int, sources: tuple[int, ...], layer: Linear, inputs: list[Form]) -> Form:
         """A linear layer (N1, N2)."""
         m, d = self.count, self.d
         reference = self._reference(k, lambda: layer([f.reference for f in inputs]))
@@ -495,97 +360,41 @@ class _Cells:
         radius, width, size = found.split([m, *[len(sizes[0])] * 2])
         if layer.bias is not None:
             size = size + layer.bias.abs()
-        moves = own * size + (layer.terms + 1) * _FLUSH
+        moves = own * size + (layer.terms + 1) * FLUSH
         active = None
         if not layer.terms:
             active = layer.magnitude([f.active.double() for f in inputs]) != 0.0
             if layer.bias is not None:
                 active = active | (layer.bias != 0.0)
         elif self.single:
-            count = self._roundings(sources, layer, known)
-            self.terms[k] = count
 
             def end(moves: Tensor = moves) -> Tensor:
                 return (reference + moved[:, 0]).abs() + moved[:, 1:].abs().sum(1) + radius + moves
 
-            moves = moves + self._rounding(k, sources, layer, known, count, size, end) + layer.spare(sizes)
-        roundings = layer.row_terms + _SPARE + max(self.network.readers[i] for i in sources)
-        form = _Form.ranged(reference, moved[:, 0], moved[:, 1:], radius + moves, active)
-        if float(size.amax()) >= _OVERFLOW:
-            self.good &= (size.flatten(1).amax(1) < _OVERFLOW).numpy()
+            moves = moves + self.rounding.charge(k, sources, layer, known, size, end) + layer.spare(sizes)
+        roundings = layer.row_terms + SPARE + max(self.network.readers[i] for i in sources)
+        form = Form.ranged(reference, moved[:, 0], moved[:, 1:], radius + moves, active)
+        if float(size.amax()) >= OVERFLOW:
+            self.good &= (size.flatten(1).amax(1) < OVERFLOW).numpy()
         for sized, shape in zip(known, layer.input_shapes, strict=True):
-            lost = int(np.prod(shape)) * (layer.row_terms + 2) * _FLUSH
+            lost = int(np.prod(shape)) * (layer.row_terms + 2) * FLUSH
             self.flush += lost * sized.width.flatten(1).amax(1).numpy()
         folded = [i for i in sources if isinstance(layer, Sum) and self._rounds(i) and self.network.readers[i] == 1]
         self.folded.update(folded)
         for passage in self.passages:
-            rows = _gamma(roundings, passage.unit)
+            rows = gamma(roundings, passage.unit)
             noise = ((moves + rows * width) * (1.0 + 2.0**-40)).expand(m, *layer.shape)
             for source in folded:
                 # one charge instead of several
                 noise = noise + passage.noise[source]
-            passage.noise[k] = noise * (1.0 + 2.0**-40 + self.sums)
+            passage.noise[k] = noise * (1.0 + 2.0**-40 + passage.sums)
         return self._within(form, form.lower, form.upper)
 
     def _rounds(self, source: int) -> bool:
         """Whether rows are charged on node ``source``."""
         return source in self.passages[0].noise
 
-    def _rounding(
-        self,
-        k: int,
-        sources: tuple[int, ...],
-        layer: Linear,
-        inputs: list[_Form],
-        count: Tensor | int,
-        size: Tensor,
-        end: Callable[[], Tensor],
-    ) -> Tensor:
-        """What a float32 evaluation of a layer may be off, [m, *shape].
-
-        ``size`` = |W| |x| + |bias|; ``end``: what its values are at most (N2, N20).
-        """
-        folding = _FOLDING if k in self.network.scaled else 0
-        few = _gamma(folding + 3 + len(inputs)) * size
-        if isinstance(layer, Scale):
-            # sums before it may start with the offset
-            first = torch.zeros(()) if layer.bias is None else layer.bias.abs()
-            return _gamma(count) * first * (1.0 + _gamma(count + _FOLDING)) + few
-        if isinstance(layer, Sum):
-            # the sum of one input may start with the others
-            charges = []
-            for i, f in zip(sources, inputs, strict=True):
-                others = size - f.interval.size * (1.0 - 2.0**-40)
-                own = torch.as_tensor(self.terms.get(i, 0), dtype=torch.float64)
-                charges.append(_gamma(own) * others * (1.0 + _gamma(own + _FOLDING)))
-            return few + (torch.maximum(*charges) if len(charges) == 2 else sum(charges))
-        if not isinstance(layer, Weighted):
-            return _gamma(count + _FOLDING) * size
-        # partial sums are no larger than the positive products together, or the negative ones
-        above, below = inputs[0].interval.upper.clamp(min=0.0), inputs[0].interval.lower.clamp(max=0.0)
-        balance = layer([above + below])
-        peak = 0.5 * (size + balance.abs()) * (1.0 + 2.0**-40)
-        if float(torch.as_tensor(count).max()) < _LONG:
-            return _gamma(count) * (peak + _gamma(count + _FOLDING + 1) * size) + few
-        squared = layer.squared
-        whole = squared.magnitude([above.square() + below.square()])
-        if squared.bias is not None:
-            whole = whole + squared.bias.abs()
-        squares = 0.5 * (whole + squared([above.square() - below.square()]).abs()) * (1.0 + 2.0**-36)
-        together = partial_sums(count, peak, squares, end())
-        return _gamma(1) * (together + count * _gamma(count + _FOLDING + 1) * size) + few
-
-    def _roundings(self, sources: tuple[int, ...], layer: Linear, inputs: list[_Form]) -> Tensor | int:
-        """Roundings that a layer's sums may suffer; what is added behind sums may be added within them (N2)."""
-        if not isinstance(layer, (Scale, Sum)):
-            return layer.roundings([f.active for f in inputs])
-        before = [self.network.nodes[i - 1].layer for i in sources if i]
-        most = max((b.terms for b in before if isinstance(b, Linear)), default=0)
-        counts = [torch.as_tensor(self.terms[i], dtype=torch.float64) for i in sources if i in self.terms]
-        found = torch.as_tensor(float(layer.terms - most), dtype=torch.float64)
-        return found + functools.reduce(torch.maximum, counts) if counts else found
-
-    def _activate(self, k: int, source: int, layer: Activation, z: _Form) -> _Form:
+    def _activate(self, k: int, source: int, layer: Activation, z: Form) -> Form:
         """An activation (N3, N4)."""
         lower, upper = z.interval
         size = z.interval.size
@@ -601,16 +410,16 @@ class _Cells:
         half = half + 2.0**-50 * (band.lower_offset.abs() + band.upper_offset.abs() + s.abs() * z.reference.abs())
         half = half + 2.0**-48 * s.abs() * (z.c.abs() + z.a.abs().sum(1))
         radius = s.abs() * z.r * (1.0 + 2.0**-40) + half
-        form = _Form.ranged(reference, s * z.c + middle, s[:, None] * z.a, radius)
+        form = Form.ranged(reference, s * z.c + middle, s[:, None] * z.a, radius)
         if isinstance(layer, LeakyRelu) and layer.alpha == 0.0:
             form.active = upper > 0.0
         lines = layer.lines(lower, upper)
         fold = self._rounds(source) and self.network.readers[source] == 1
 
-        def stored(chosen: Sequence[tuple[Tensor, Tensor, Tensor]], passage: _Passage) -> np.ndarray:
+        def stored(chosen: Sequence[tuple[Tensor, Tensor, Tensor]], passage: Passage) -> np.ndarray:
             """As `pass_activation` wants slope, lower and upper offset for rows of either sign."""
             # the slope as stored, rows' products with it and sums where branches meet
-            found, unit = [], (_SPARE + self.network.readers[source]) * passage.unit
+            found, unit = [], (SPARE + self.network.readers[source]) * passage.unit
             for (slope, low, high), side in zip(chosen, (-1.0, 1.0), strict=True):
                 rounded = slope.to(passage.dtype).double()
                 base, apart = slope * z.reference - reference, band.lower_slope - slope
@@ -619,8 +428,8 @@ class _Cells:
                 if fold:
                     give = give + rounded.abs() * passage.noise[source]
                 ends = (
-                    self._outward(low + base - give, -1.0, passage),
-                    self._outward(high + base + give, 1.0, passage),
+                    passage.outward(low + base - give, -1.0),
+                    passage.outward(high + base + give, 1.0),
                 )
                 found += [rounded.to(passage.dtype), *(ends if side < 0.0 else reversed(ends))]
             return torch.stack(found).reshape(6, self.count, *grid(layer.shape)).numpy()
@@ -642,33 +451,26 @@ class _Cells:
             for slope, ends, (low, high, tilt), use in zip(slopes, plain, tilted, better, strict=True):
                 offsets.append((slope, torch.where(use, low, ends[0]), torch.where(use, high, ends[1])))
                 tilts.append(torch.where(use[:, None], tilt, torch.zeros_like(tilt)))
-            self.offered[k] = _Offered(stored(offsets, self.passages[0]), torch.stack(tilts).flatten(3).numpy())
+            self.offered[k] = Offered(stored(offsets, self.passages[0]), torch.stack(tilts).flatten(3).numpy())
         if fold:
             self.folded.add(source)
         if self.slope_steps and isinstance(layer, LeakyRelu):
             first = self.passages[0]
-            loose = (_SPARE + self.network.readers[source]) * first.unit * z.width
+            loose = (SPARE + self.network.readers[source]) * first.unit * z.width
             loose = loose + (first.noise[source] if fold else 0.0)
             given = (lower, upper, z.reference, reference, loose, room + torch.zeros_like(lower))
             self.open[k] = _open_units(layer, given)
-        lost = int(np.prod(layer.shape)) * 2 * _FLUSH
+        lost = int(np.prod(layer.shape)) * 2 * FLUSH
         self.flush += lost * z.width.reshape(self.count, -1).amax(1).numpy()
         ends = layer.range(lower, upper)
         room = room + 2.0**-48 * (ends[0].abs() + ends[1].abs())
         return self._within(form, ends[0] - reference - room, ends[1] - reference + room)
 
-    def _outward(self, value: Tensor, side: float, passage: _Passage) -> Tensor:
-        """An offset as rows take it, farther out by what their sums of offsets may lose."""
-        if passage.dtype == torch.float32:
-            # half a unit of float32 is more than that, up to 2^26 numbers
-            return _outward(value, side)
-        return value + side * self.sums * value.abs()
-
     def _lent(self, k: int) -> tuple[np.ndarray, np.ndarray] | None:
         """Slopes [1, *shape] of rows of another cell on node ``k``, not negative and negative ones."""
         return None
 
-    def _multiply(self, k: int, sources: tuple[int, ...], layer: Product, x: _Form, y: _Form) -> _Form:
+    def _multiply(self, k: int, sources: tuple[int, ...], layer: Product, x: Form, y: Form) -> Form:
         """A product of two nodes (N9)."""
         m, first, second = self.count, x.interval, y.interval
         size = first.size * second.size
@@ -678,16 +480,16 @@ class _Cells:
         base = alpha * x.reference + beta * y.reference - reference
         # roundings of the plane relative to the references, and the network's
         own = alpha.abs() * x.reference.abs() + beta.abs() * y.reference.abs() + reference.abs()
-        room = 2.0**-48 * (own + plane.low.abs() + plane.high.abs()) + 2 * _FLUSH
+        room = 2.0**-48 * (own + plane.low.abs() + plane.high.abs()) + 2 * FLUSH
         if self.single:
             room = room + 2 * UNIT * size
         shape = (6, m, *grid(layer.shape))
         for passage in self.passages:
             # rows' products with the slopes, which are float32 numbers, and sums where branches meet
-            unit = (_SPARE + max(self.network.readers[i] for i in sources)) * passage.unit
+            unit = (SPARE + max(self.network.readers[i] for i in sources)) * passage.unit
             give = room + unit * (alpha.abs() * x.width + beta.abs() * y.width)
-            low = self._outward(plane.low + base - give, -1.0, passage)
-            high = self._outward(plane.high + base + give, 1.0, passage)
+            low = passage.outward(plane.low + base - give, -1.0)
+            high = passage.outward(plane.high + base + give, 1.0)
             none = torch.zeros_like(low)
             passage.products[k] = tuple(
                 torch.stack([slope, *ends, slope, *reversed(ends)]).reshape(shape).numpy()
@@ -698,17 +500,17 @@ class _Cells:
         half = half + room + 2.0**-50 * middle.abs() + 2.0**-44 * moved
         radius = (alpha.abs() * x.r + beta.abs() * y.r) * (1.0 + 2.0**-40) + half
         c, a = alpha * x.c + beta * y.c + middle, alpha[:, None] * x.a + beta[:, None] * y.a
-        form = _Form.ranged(reference, c, a, radius, x.active & y.active)
+        form = Form.ranged(reference, c, a, radius, x.active & y.active)
         for f in (x, y):
-            lost = int(np.prod(layer.shape)) * 2 * _FLUSH
+            lost = int(np.prod(layer.shape)) * 2 * FLUSH
             self.flush += lost * f.width.reshape(m, -1).amax(1).numpy()
-        if float(size.amax()) >= _OVERFLOW:
-            self.good &= (size.reshape(m, -1).amax(1) < _OVERFLOW).numpy()
+        if float(size.amax()) >= OVERFLOW:
+            self.good &= (size.reshape(m, -1).amax(1) < OVERFLOW).numpy()
         ends = torch.stack([u * v for u in first for v in second]) - reference
         room = room + 2.0**-50 * (size + reference.abs())
         return self._within(form, ends.amin(0) - room, ends.amax(0) + room)
 
-    def _maximum(self, k: int, source: int, layer: MaxPool, x: _Form) -> _Form:
+    def _maximum(self, k: int, source: int, layer: MaxPool, x: Form) -> Form:
         """Maxima over windows (N12); the reference is that of the number which the lower plane follows."""
         m, shape = self.count, layer.shape
         interval = x.interval
@@ -721,7 +523,7 @@ class _Cells:
         reference, c, r, width = (chosen(v) for v in (x.reference, x.c, x.r, x.width))
         a = torch.stack([chosen(x.a[:, i]) for i in range(self.d)], 1)
         # sums of rows where windows overlap
-        units = [(_SPARE + layer.overlaps + self.network.readers[source]) * passage.unit for passage in self.passages]
+        units = [(SPARE + layer.overlaps + self.network.readers[source]) * passage.unit for passage in self.passages]
         gives = [unit * width for unit in units]
         offsets = [torch.stack([-give, give, give, -give], 0) for give in gives]
         rivals = upper.scatter(2, winner, -torch.inf).amax(2)
@@ -729,7 +531,7 @@ class _Cells:
         where = (rivals > chosen(interval.lower)).nonzero()
         which = torch.full(reference.shape, -1, dtype=torch.int64)
         slopes: list[Tensor] = []
-        step = max(1, _ROWS_AT_ONCE // (8 * len(layer.steps) ** 2 * 4))
+        step = max(1, ROWS_AT_ONCE // (8 * len(layer.steps) ** 2 * 4))
         for part in where.split(step):
             tilted = self._tilted(source, layer, x, interval, winner[:, :, 0], part)
             if tilted is None:
@@ -764,8 +566,8 @@ class _Cells:
         rows_of_slopes = which.reshape(grown).numpy().astype(np.int32)
         for passage, offset in zip(self.passages, offsets, strict=True):
             sides = zip(offset, (-1.0, 1.0, 1.0, -1.0), strict=True)
-            outward = [self._outward(v, side, passage) for v, side in sides]
-            passage.maxima[k] = _Maxima(
+            outward = [passage.outward(v, side) for v, side in sides]
+            passage.maxima[k] = Maxima(
                 followed,
                 rows_of_slopes,
                 chosen_slopes.to(passage.dtype).numpy(),
@@ -773,15 +575,15 @@ class _Cells:
             )
         active = (layer.taps(x.active.double(), 0.0).amax(2) > 0.0).reshape(grown)
         reference, c, r = (v.reshape(grown) for v in (reference, c, r))
-        form = _Form.ranged(reference, c, a.reshape(m, self.d, *shape), r, active)
-        lost = int(np.prod(shape)) * 2 * len(layer.steps) * _FLUSH
+        form = Form.ranged(reference, c, a.reshape(m, self.d, *shape), r, active)
+        lost = int(np.prod(shape)) * 2 * len(layer.steps) * FLUSH
         self.flush += lost * x.width.reshape(m, -1).amax(1).numpy()
         room = 2.0**-50 * (reference.abs() + form.width)
         least = lower.amax(2).reshape(grown)
         return self._within(form, least - reference - room, most.reshape(grown) - reference + room)
 
     def _tilted(
-        self, source: int, layer: MaxPool, x: _Form, interval: _Interval, winner: Tensor, where: Tensor
+        self, source: int, layer: MaxPool, x: Form, interval: Interval, winner: Tensor, where: Tensor
     ) -> _Tilted | None:
         """Planes above those windows of ``where`` [n, 3] in which something may be above the ``winner``; None: none."""
         cell, channel, window = where.T
@@ -849,7 +651,7 @@ class _Cells:
         """Bound differences of (window, number, number) by rows, in ``apart``; how many second ones are never above."""
         channels = self.network.shape(source)[0]
         extent = layer.steps.max(0) + 1
-        step = max(1, _ROWS_AT_ONCE // (16 * channels * int(np.prod(extent))))
+        step = max(1, ROWS_AT_ONCE // (16 * channels * int(np.prod(extent))))
         closed = 0
         for part in np.array_split(pairs, max(1, -(-len(pairs) // step))):
             if not len(part):
@@ -866,7 +668,7 @@ class _Cells:
             ahead = (near[0] - near[1]).numpy()
             room = 2.0**-50 * (near[0].abs() + near[1].abs()).numpy()
             rows = Rows(value, y * layer.stride[0] - layer.pads[0], x * layer.stride[1] - layer.pads[1])
-            enough = _Enough(_Goal(), room - ahead, np.zeros(len(part), bool))
+            enough = Enough(Goal(), room - ahead, np.zeros(len(part), bool))
             found = self._backward(source, rows, np.ascontiguousarray(cell), enough, None, cut)
             above, below = torch.from_numpy(room - ahead - found.lower), torch.from_numpy(room + ahead + found.upper)
             apart[window, other, one] = torch.minimum(apart[window, other, one], above)
@@ -874,7 +676,7 @@ class _Cells:
             closed += int((above <= 0.0).sum())
         return closed
 
-    def _stop(self, index: int, form: _Form) -> Columns:
+    def _stop(self, index: int, form: Form) -> Columns:
         """What is known of node ``index``, for rows that arrive there."""
         m, d, shape = self.count, self.d, grid(self.network.shape(index))
         room = 2.0**-48 * (form.c.abs() + form.r)
@@ -885,8 +687,8 @@ class _Cells:
         return columns_of(*(t.reshape(size).numpy() for t, size in found))
 
     def _known_better(
-        self, index: int, form: _Form, open_: Tensor, apart: Tensor | None, layer: Activation | None = None
-    ) -> _Form:
+        self, index: int, form: Form, open_: Tensor, apart: Tensor | None, layer: Activation | None = None
+    ) -> Form:
         """The form of node ``index`` with better bounds of what is open before an activation or a product (None)."""
         if self.network.depth[index] < 2:
             return form
@@ -898,7 +700,7 @@ class _Cells:
             return self._renew(index, form, open_, layer)
         return self._tighten(index, form, open_, isinstance(layer, LeakyRelu))
 
-    def _bent(self, index: int, form: _Form, open_: Tensor, apart: Tensor) -> tuple[_Form, Tensor]:
+    def _bent(self, index: int, form: Form, open_: Tensor, apart: Tensor) -> tuple[Form, Tensor]:
         """The form with some numbers bounded by rows, and what is worth rows by what these have shown (N6).
 
         Lines that are close beside the form's width may be far apart beside what rows leave of it.
@@ -920,7 +722,7 @@ class _Cells:
             return found, open_
         return found, open_ | (likely & (apart > _BENT * kept))
 
-    def _tighten(self, index: int, form: _Form, open_: Tensor, decides: bool) -> _Form:
+    def _tighten(self, index: int, form: Form, open_: Tensor, decides: bool) -> Form:
         """Better bounds of the numbers of node ``index`` that are open; a sign may be all that is asked (N6)."""
         item = self.network.shape(index)
         shape = grid(item)
@@ -943,9 +745,9 @@ class _Cells:
                 return found
             form, open_ = found, open_ & ~first
             where = open_.nonzero().numpy()
-        return self._bounded(index, form, where, _Goal() if decides else None, decides)
+        return self._bounded(index, form, where, Goal() if decides else None, decides)
 
-    def _renew(self, index: int, form: _Form, open_: Tensor, layer: Activation | None) -> _Form:
+    def _renew(self, index: int, form: Form, open_: Tensor, layer: Activation | None) -> Form:
         """Better bounds of a deep network's node, within the work allowed; of closed numbers, too (N13, N17).
 
         Rows for numbers that are open are all that the lines ask for. But forms forget what neighbours share: behind
@@ -964,7 +766,7 @@ class _Cells:
         whole = self.schedule.renews(count / open_.numel(), int(matters.sum()) * cost)
         if not (count or whole):
             return form
-        opened, signs = open_.nonzero().numpy(), _Goal() if decides else None
+        opened, signs = open_.nonzero().numpy(), Goal() if decides else None
         chosen = matters.nonzero().numpy() if whole else opened
         if len(chosen) * cost > self.schedule.left:
             chosen, whole = opened, False
@@ -1003,7 +805,7 @@ class _Cells:
                 self.stops[at] = self._stop(at, form)
         return way.cut
 
-    def _planned(self, index: int, form: _Form, open_: Tensor, layer: Activation | None) -> _Form:
+    def _planned(self, index: int, form: Form, open_: Tensor, layer: Activation | None) -> Form:
         """Better bounds of all numbers of a node that matter, by rows as long as the network is worth (N18)."""
         shape = grid(self.network.shape(index))
         matters = torch.from_numpy(self.good).reshape(-1, 1, 1, 1) & torch.ones((self.count, *shape), dtype=torch.bool)
@@ -1028,16 +830,16 @@ class _Cells:
         self.schedule.left -= len(chosen) * best.price
         return self._bounded(index, form, chosen, None, True, best.cut)
 
-    def _goal(self, form: _Form, products: float, layer: Activation | None) -> _Goal | None:
+    def _goal(self, form: Form, products: float, layer: Activation | None) -> Goal | None:
         """What rows for all numbers of a node, which take so many products to the image, are to find out (N17)."""
         part = self.schedule.suffices(products)
         if not part:
             return None
         size = float(form.reference.abs().median())
         relu = isinstance(layer, LeakyRelu)
-        return _Goal(part * size, relu, relu and layer.alpha == 0.0)
+        return Goal(part * size, relu, relu and layer.alpha == 0.0)
 
-    def _bounded(self, index: int, form: _Form, where: Int64, goal: _Goal | None, decides: bool, cut: int = 0) -> _Form:
+    def _bounded(self, index: int, form: Form, where: Int64, goal: Goal | None, decides: bool, cut: int = 0) -> Form:
         """The form with bounds by rows of the numbers ``where`` [R, (cell, channel, row, column)] of node ``index``.
 
         ``goal``: rows end where it is reached; ``decides``: the other side is not asked for where a sign is found out;
@@ -1050,8 +852,8 @@ class _Cells:
         reference = form.reference.flatten(1)[at].numpy()
         sign = np.where(reference + form.c.flatten(1)[at].numpy() >= 0.0, 1.0, -1.0)
 
-        def enough(part: Int64, sign: Float64) -> _Enough | None:
-            return None if goal is None else _Enough(goal, -sign * reference[part], sign < 0.0)
+        def enough(part: Int64, sign: Float64) -> Enough | None:
+            return None if goal is None else Enough(goal, -sign * reference[part], sign < 0.0)
 
         found = self._one_hot(index, where, sign, enough(np.arange(len(where)), sign), cut)
         found.turn(sign < 0.0)
@@ -1071,7 +873,7 @@ class _Cells:
         r[at] = torch.where(better, radius, r[at])
         lower[at] = torch.maximum(lower[at], torch.from_numpy(found.lower))
         upper[at] = torch.minimum(upper[at], torch.from_numpy(found.upper))
-        tight = _Form(
+        tight = Form(
             form.reference,
             c.reshape(-1, *item),
             a.movedim(-1, 1).reshape(self.count, self.d, *item),
@@ -1084,17 +886,17 @@ class _Cells:
 
     # ------------------------------------------------------------ backwards
 
-    def _one_hot(self, index: int, where: Int64, sign: Float64, enough: _Enough | None, cut: int = 0) -> _Reached:
+    def _one_hot(self, index: int, where: Int64, sign: Float64, enough: Enough | None, cut: int = 0) -> Reached:
         """Bounds of ``sign`` [R] times single numbers [R, (cell, channel, row, column)] of node ``index``."""
         channels = grid(self.network.shape(index))[0]
-        found = _Reached.unknown(len(where), self.d)
-        step = min(self.most_rows, max(1, _ROWS_AT_ONCE // (16 * channels)))
+        found = Reached.unknown(len(where), self.d)
+        step = min(self.most_rows, max(1, ROWS_AT_ONCE // (16 * channels)))
         threads = torch.get_num_threads() if self.schedule.deep else 1
         if threads > 1:
             # as many rows as stay together to the image
             step = min(step, max(16, -(-len(where) // (4 * threads))))
 
-        def bound(first: int) -> tuple[Int64, _Reached, Trace | None]:
+        def bound(first: int) -> tuple[Int64, Reached, Trace | None]:
             number = np.arange(first, min(len(where), first + step))
             cell, channel, y, x = (np.ascontiguousarray(v) for v in where[number].T)
             value = np.zeros((len(cell), channels, 1, 1), np.float32)
@@ -1125,32 +927,30 @@ class _Cells:
         index: int,
         rows: Rows,
         cell: Int64,
-        enough: _Enough | None = None,
+        enough: Enough | None = None,
         trace: Trace | None = None,
         cut: int = 0,
-    ) -> _Reached:
+    ) -> Reached:
         """Bounds of rows on node ``index``, relative to the reference.
 
         Those of which ``enough`` is known may stop before the image; ``trace`` takes in what rows are on the way.
         All of them end on the nodes up to ``cut`` (N18).
         """
-        found = _Reached.unknown(len(cell), self.d)
+        found = Reached.unknown(len(cell), self.d)
         passage = next(passage for passage in self.passages if passage.takes(rows))
         batch = _Batch({index: rows}, cell, np.zeros((len(cell), 2)), np.arange(len(cell)), passage)
         batch.trace = trace
         self._descend(index, index, batch, found, enough, cut)
         return found
 
-    def _descend(
-        self, start: int, at: int, batch: _Batch, found: _Reached, enough: _Enough | None, cut: int = 0
-    ) -> None:
+    def _descend(self, start: int, at: int, batch: _Batch, found: Reached, enough: Enough | None, cut: int = 0) -> None:
         """Pass a batch from node ``at`` on to the image, or to the nodes up to ``cut``."""
         checkpoint()
         while at > cut:
             if at not in batch.waiting:
                 at -= 1
                 continue
-            if batch.bytes > min(_ROWS_AT_ONCE, self.memory // 16) and len(batch.cell) > 1:
+            if batch.bytes > min(ROWS_AT_ONCE, self.memory // 16) and len(batch.cell) > 1:
                 half = len(batch.cell) // 2
                 for part in (slice(0, half), slice(half, None)):
                     self._descend(start, at, batch[part], found, enough, cut)
@@ -1184,7 +984,7 @@ class _Cells:
                 pass_activation(here.value, here.y, here.x, which, lines, batch.total)
                 parts = [here]
             elif isinstance(node.layer, MaxPool):
-                parts = [batch.passage.maxima[at].backward(here, node.layer, batch)]
+                parts = [batch.passage.maxima[at].backward(here, node.layer, batch.cell, batch.total)]
             elif isinstance(node.layer, Product):
                 # every reader changes its rows in place
                 parts = [here, Rows(here.value.copy(), here.y, here.x)]
@@ -1219,7 +1019,7 @@ class _Cells:
         layer = self.network.nodes[at - 1].layer
         return isinstance(layer, Activation) or (isinstance(layer, Linear) and at != start and at not in self.folded)
 
-    def _bound_rows(self, at: int, batch: _Batch, known: Columns, found: _Reached) -> None:
+    def _bound_rows(self, at: int, batch: _Batch, known: Columns, found: Reached) -> None:
         """Bounds of a batch whose rows are all on node ``at``."""
         count = len(batch.cell)
         plane, box = np.zeros((count, 2, self.d + 1)), np.zeros((count, 2))
@@ -1233,7 +1033,7 @@ class _Cells:
         box += lost
         found.improve(batch.number, plane, box)
 
-    def _rest_rows(self, batch: _Batch, found: _Reached) -> None:
+    def _rest_rows(self, batch: _Batch, found: Reached) -> None:
         """Bounds of a batch whose rows rest on several nodes, of which forms are known (N18)."""
         count, total = len(batch.cell), batch.total
         plane, box = np.zeros((count, 2, self.d + 1)), np.zeros((count, 2))
@@ -1252,7 +1052,7 @@ class _Cells:
         box += lost
         found.improve(batch.number, plane, box)
 
-    def _climb(self, index: int, rows: Rows, cell: Int64, need: Float64) -> tuple[_Reached, Int64]:
+    def _climb(self, index: int, rows: Rows, cell: Int64, need: Float64) -> tuple[Reached, Int64]:
         """Bounds below of rows on node ``index``, with the best slopes and multipliers that were tried (N14, N16).
 
         Where signs are assumed, a cell whose rows are above ``need`` [R] is done. Also returns `OutputBounds.loosest`
@@ -1276,7 +1076,7 @@ class _Cells:
                 if self.assumed is not None and bool((best.lower[own] > need[own]).all()):
                     break
                 chosen = ascent.lines(lines, k)
-                found = _Reached.unknown(len(own), self.d)
+                found = Reached.unknown(len(own), self.d)
                 # rows are changed in place
                 part = Rows(start.value[own], start.y[own], start.x[own])
                 total, number = np.zeros((len(own), 2)), np.arange(len(own))
@@ -1315,7 +1115,7 @@ class _Cells:
         return found
 
     def _derivatives(
-        self, cell: int, chosen: Chosen, found: _Reached, units: Mapping[int, OpenUnits]
+        self, cell: int, chosen: Chosen, found: Reached, units: Mapping[int, OpenUnits]
     ) -> tuple[dict[int, Float64], dict[int, Float64]]:
         """How the bounds of a cell's rows change with slopes and with multipliers."""
         planes, held = self.image, self.held[cell]
@@ -1356,7 +1156,7 @@ class _Cells:
         need = -offset + _SURE * (1.0 + np.abs(offset))
         for top, left, height, width, number in _windows(stored.reshape(k, *shape)):
             part = stored.reshape(k, *shape)[:, :, top : top + height, left : left + width]
-            step = max(1, _ROWS_AT_ONCE // (stored.itemsize * shape[0] * height * width))
+            step = max(1, ROWS_AT_ONCE // (stored.itemsize * shape[0] * height * width))
             for first in range(0, m * len(number), step):
                 which = np.arange(first, min(m * len(number), first + step))
                 cell, row = which // len(number), number[which % len(number)]
@@ -1372,7 +1172,7 @@ class _Cells:
         return OutputBounds(lower, np.where(usable[..., None], a, 0.0), np.where(usable, b, -np.inf), loosest)
 
 
-def _tilted(slope: Tensor, z: _Form, line: tuple[Tensor, Tensor, Tensor]) -> tuple[Tensor, Tensor, Tensor]:
+def _tilted(slope: Tensor, z: Form, line: tuple[Tensor, Tensor, Tensor]) -> tuple[Tensor, Tensor, Tensor]:
     """(low, high, tilt [m, d, *shape]): an activation less ``slope`` times its input is between low and high + tilt p.
 
     ``line``: slope and offsets of lines on both sides of it; the input is followed in between.
@@ -1411,7 +1211,7 @@ def _windows(rows: np.ndarray) -> list[tuple[int, int, int, int, Int64]]:
     return [(*window, np.array(number)) for window, number in groups.items()]
 
 
-class _Planes(NamedTuple):
+class ImagePlanes(NamedTuple):
     """What is known of a node, as rows want it.
 
     Attributes:
@@ -1424,36 +1224,6 @@ class _Planes(NamedTuple):
     offsets: Float64
     lower: Float64
     upper: Float64
-
-
-@dataclass
-class _Passage:
-    """What rows of one type take on their way through the nodes, with what they lose themselves (N2).
-
-    Attributes:
-        dtype: Of rows, slopes and offsets.
-        unit: Its unit roundoff.
-        lines: By activation, [6, m, C, H, W] as `pass_activation` takes them.
-        products: By product: the same for its first and its second factor.
-        maxima: By maximum.
-        noise: By linear layer: rounding of the network and of rows, [m, *shape] float64.
-    """
-
-    dtype: torch.dtype
-    unit: float
-    lines: dict[int, np.ndarray] = field(default_factory=dict)
-    products: dict[int, tuple[np.ndarray, ...]] = field(default_factory=dict)
-    maxima: dict[int, _Maxima] = field(default_factory=dict)
-    noise: dict[int, Tensor] = field(default_factory=dict)
-
-    @property
-    def number(self) -> type[np.floating[Any]]:
-        """The type as numpy has it."""
-        return np.float32 if self.dtype == torch.float32 else np.float64
-
-    def takes(self, rows: Rows) -> bool:
-        """Whether rows are of this type."""
-        return rows.value.dtype == self.number
 
 
 class _Tilted(NamedTuple):
@@ -1474,85 +1244,6 @@ class _Tilted(NamedTuple):
     planes: Planes
 
 
-class _Maxima(NamedTuple):
-    """Planes of a maximum's windows, as rows want them (N12).
-
-    Attributes:
-        winner: [m, C, H, W] int16, the number that the lower plane follows.
-        which: [m, C, H, W] int32, rows of ``slopes``; -1 where the winner is the maximum.
-        slopes: [U, K] of upper planes; of the rows' type, as offsets are.
-        offsets: [4, m, C, H, W]: lower and upper for coefficients that are not negative, upper and lower
-            for negative ones.
-    """
-
-    winner: np.ndarray
-    which: np.ndarray
-    slopes: np.ndarray
-    offsets: np.ndarray
-
-    def forward(self, layer: MaxPool, cell: int, rows: Tensor, inputs: list[Tensor]) -> Tensor:
-        """The planes that ``rows`` [R, C, H, W] take, of inputs [R, C, H', W'] of one cell."""
-        taps = layer.taps(inputs[0], 0.0)
-        winner = torch.from_numpy(self.winner[cell].astype(np.int64)).flatten(1)[None, :, None]
-        value = taps.gather(2, winner.expand(len(taps), -1, -1, -1))[:, :, 0]
-        offsets = torch.from_numpy(self.offsets[:, cell]).flatten(2)
-        which = torch.from_numpy(self.which[cell].astype(np.int64)).flatten(1)
-        a = rows.flatten(2)
-        if len(self.slopes):
-            slopes = torch.from_numpy(self.slopes)[which.clamp(min=0)].movedim(2, 1)
-            value = torch.where((a >= 0.0) | (which < 0), value, (taps * slopes).sum(2))
-        return value + torch.where(a >= 0.0, offsets[0], offsets[2])
-
-    def backward(self, rows: Rows, layer: MaxPool, batch: _Batch) -> Rows:
-        """Rows on the input; what they gather on the way goes to the batch."""
-        height, width = rows.value.shape[2:]
-        (down, right), extent = layer.stride, layer.steps.max(0) + 1
-        size = (height - 1) * down + int(extent[0]), (width - 1) * right + int(extent[1])
-        target = np.zeros((*rows.value.shape[:2], *size), rows.value.dtype)
-        pass_maximum(rows.value, rows.y, rows.x, batch.cell, *self, layer.steps, layer.stride, batch.total, target)
-        return Rows(target, rows.y * down - layer.pads[0], rows.x * right - layer.pads[1])
-
-
-class _Offered(NamedTuple):
-    """An activation beside slopes of another cell's rows (N15).
-
-    Attributes:
-        lines: [6, m, C, H, W] float32 as `pass_activation` takes them.
-        tilts: [2, m, d, n] slopes in the parameters of what is between the offsets, for rows of either sign.
-    """
-
-    lines: np.ndarray
-    tilts: Float64
-
-
-class Trace:
-    """What rows of one call of `_Cells._backward` are on their way to the image.
-
-    Args:
-        count: Rows R.
-        short: Whether only what they are on the image is kept.
-
-    Attributes:
-        rows: By node: [R, n] float32 rows on outputs of nodes at which they gather what depends on the cell's ranges,
-            and on the image (0).
-        fixed: [R, 2] what they gather at nodes of which they are not kept, at least and at most.
-        reached: [R] which of them reach the image.
-    """
-
-    def __init__(self, count: int, short: bool) -> None:
-        self.short = short
-        self.rows: dict[int, NDArray[np.float32]] = {}
-        self.fixed = np.zeros((count, 2))
-        self.reached = np.zeros(count, bool)
-
-    def keep(self, at: int, rows: Rows, shape: tuple[int, ...], number: Int64) -> None:
-        """Remember rows ``number`` on the output of node ``at``."""
-        if at not in self.rows:
-            self.rows[at] = np.zeros((len(self.fixed), int(np.prod(shape))), np.float32)
-        whole = full(rows, shape, force=True)
-        self.rows[at][number] = whole.value.reshape(len(number), -1)
-
-
 @dataclass
 class _Batch:
     """Rows under way.
@@ -1571,7 +1262,7 @@ class _Batch:
     cell: Int64
     total: Float64
     number: Int64
-    passage: _Passage
+    passage: Passage
     chosen: Chosen | None = None
     trace: Trace | None = None
 
@@ -1584,114 +1275,3 @@ class _Batch:
     @property
     def bytes(self) -> int:
         return sum(rows.value.nbytes for rows in self.waiting.values())
-
-
-class _Goal(NamedTuple):
-    """What rows of a node's numbers are to find out; a matter of tightness alone (N6, N17).
-
-    Attributes:
-        width: How far apart a number's bounds may be; None: its sign is all that is asked.
-        kink: Whether the sign is asked for.
-        cut: Whether a number that is certainly not positive may have any bounds.
-    """
-
-    width: float | None = None
-    kink: bool = True
-    cut: bool = True
-
-
-@dataclass(frozen=True)
-class _Enough:
-    """When rows of single numbers need not go on to the image.
-
-    Attributes:
-        goal: What is asked for.
-        zero: [R] what a row is where its number is zero.
-        negative: [R] whether a row is its number's negative.
-    """
-
-    goal: _Goal
-    zero: Float64
-    negative: np.ndarray
-
-    def __getitem__(self, chosen: Any) -> _Enough:
-        return replace(self, zero=self.zero[chosen], negative=self.negative[chosen])
-
-    def done(self, found: _Reached, number: Int64) -> np.ndarray:
-        """Which of the rows ``number`` are done."""
-        zero, lower, upper = self.zero[number], found.lower[number], found.upper[number]
-        if self.goal.width is None:
-            # the other side is asked for by another row
-            return lower >= zero
-        tight = upper - lower <= self.goal.width
-        if not self.goal.kink:
-            return tight
-        off = np.where(self.negative[number], lower >= zero, upper <= zero) & self.goal.cut
-        return off | (tight & ((lower >= zero) | (upper <= zero)))
-
-
-@dataclass
-class _Reached:
-    """What rows are at least and at most.
-
-    Attributes:
-        plane: [R, 2, d + 1] slopes and offset of a plane below and one above; NaN if unknown.
-        lower, upper: [R]; infinite if unknown.
-        ended: [R] the node at which they ended; 0 is the image.
-    """
-
-    plane: Float64
-    lower: Float64
-    upper: Float64
-    ended: Int64
-
-    @staticmethod
-    def unknown(count: int, d: int) -> _Reached:
-        infinite = np.full(count, np.inf)
-        return _Reached(np.full((count, 2, d + 1), np.nan), -infinite, infinite, np.zeros(count, np.int64))
-
-    def put(self, number: Int64, other: _Reached) -> None:
-        self.plane[number], self.lower[number], self.upper[number] = other.plane, other.lower, other.upper
-        self.ended[number] = other.ended
-
-    def turn(self, mask: np.ndarray) -> None:
-        """Negate the rows of ``mask``."""
-        self.plane[mask] = -self.plane[mask][:, ::-1]
-        self.lower[mask], self.upper[mask] = -self.upper[mask], -self.lower[mask]
-
-    def meet(self, number: Int64, other: _Reached, below: np.ndarray) -> None:
-        """Take in other bounds of the rows ``number``, and their planes below or above."""
-        side = np.where(below, 0, 1)
-        self.plane[number, side] = other.plane[np.arange(len(number)), side]
-        self.lower[number] = np.maximum(self.lower[number], other.lower)
-        self.upper[number] = np.minimum(self.upper[number], other.upper)
-
-    def middle(self) -> tuple[Tensor, Tensor]:
-        """[R, d + 1] the plane between, and [R] how far the others are from it at most."""
-        low, high = self.plane[:, 0], self.plane[:, 1]
-        gap = high - low
-        radius = 0.5 * (gap[:, -1] + np.abs(gap[:, :-1]).sum(1))
-        radius = np.maximum(radius, 0.0) + 2.0**-48 * (np.abs(low).sum(1) + np.abs(high).sum(1))
-        return torch.from_numpy(0.5 * (low + high)), torch.from_numpy(radius)
-
-    def improve(self, number: Int64, plane: Float64, box: Float64) -> None:
-        """Planes of the latest node; the best numbers of all: a plane's extremes or what the box says."""
-        slopes = np.abs(plane[:, :, :-1]).sum(-1)
-        room = 2.0**-50 * (np.abs(plane[:, :, -1]) + slopes)
-        self.plane[number] = plane
-        least = np.fmax(plane[:, 0, -1] - slopes[:, 0] - room[:, 0], box[:, 0])
-        most = np.fmin(plane[:, 1, -1] + slopes[:, 1] + room[:, 1], box[:, 1])
-        self.lower[number] = np.fmax(self.lower[number], least)
-        self.upper[number] = np.fmin(self.upper[number], most)
-
-
-def _gamma(count: Any, unit: float | None = None) -> Any:
-    """What ``count`` roundings, in float32 unless said otherwise, may change, relatively."""
-    unit = UNIT if unit is None else unit
-    return count * unit / (1.0 - count * unit)
-
-
-def _outward(value: Tensor, side: float) -> Tensor:
-    """The float32 neighbour on one side, half a unit away at least; zero stays."""
-    near = value.float()
-    return torch.where(value == 0.0, near, torch.nextafter(near, torch.full_like(near, side * torch.inf)))

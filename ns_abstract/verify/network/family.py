@@ -11,21 +11,15 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ns_abstract.verify.network.bounds import (
-    Float64,
-    ImageSets,
-    Int64,
-    OutputBounds,
-    Trace,
-    _Cells,
-    _Form,
-    bound_outputs,
-)
+from ns_abstract.verify.network.bounds import _Cells, bound_outputs
+from ns_abstract.verify.network.forms import Form
 from ns_abstract.verify.network.graph import Network, NetworkArithmetic
 from ns_abstract.verify.network.layers import Activation, LeakyRelu
 from ns_abstract.verify.network.maxima import MaxPool
 from ns_abstract.verify.network.products import Product
-from ns_abstract.verify.network.rows import grid
+from ns_abstract.verify.network.reached import Trace
+from ns_abstract.verify.network.rows import Float64, Int64, grid
+from ns_abstract.verify.network.sets import ImageSets, OutputBounds
 
 #: Unit roundoff of the products of rows and columns, and the smallest normal number of float32.
 _UNIT, _FLUSH = 2.0**-24, 2.0**-126
@@ -161,8 +155,8 @@ class _First(_Cells):
         return winner
 
     def _known_better(
-        self, index: int, form: _Form, open_: Tensor, apart: Tensor | None, layer: Activation | None = None
-    ) -> _Form:
+        self, index: int, form: Form, open_: Tensor, apart: Tensor | None, layer: Activation | None = None
+    ) -> Form:
         if isinstance(layer, LeakyRelu):
             # they may be open elsewhere
             lower, upper = form.interval
@@ -223,11 +217,11 @@ class _Other(_Cells):
         reference = self.first.references[k]
         return reference.expand(self.count, *reference.shape[1:])
 
-    def _sized(self, form: _Form) -> _Form:
+    def _sized(self, form: Form) -> Form:
         # neighbours are of one size: rounding is charged by all of them at once
         ends = form.lower.amin(0, keepdim=True), form.upper.amax(0, keepdim=True)
         active = form.active.any(0, keepdim=True)
-        return _Form(form.reference[:1], form.c[:1], form.a[:1], form.r[:1], *ends, active)
+        return Form(form.reference[:1], form.c[:1], form.a[:1], form.r[:1], *ends, active)
 
     def _winner(self, k: int, winner: Tensor) -> Tensor:
         return self.first.winners[k].expand_as(winner).contiguous()
@@ -326,8 +320,8 @@ class _Other(_Cells):
         return _Said(np.moveaxis(slopes, 0, -1) * lent.sign[:, None], middle * lent.sign, half, *ends)
 
     def _known_better(
-        self, index: int, form: _Form, open_: Tensor, apart: Tensor | None, layer: Activation | None = None
-    ) -> _Form:
+        self, index: int, form: Form, open_: Tensor, apart: Tensor | None, layer: Activation | None = None
+    ) -> Form:
         form = self._borrowed(index, form)
         if layer is not None:
             open_, apart = layer.open(*form.interval), layer.apart(*form.interval)
@@ -338,7 +332,7 @@ class _Other(_Cells):
             open_, apart = open_ & ~known.reshape(form.reference.shape[1:]), None
         return super()._known_better(index, form, open_, apart, layer)
 
-    def _borrowed(self, index: int, form: _Form) -> _Form:
+    def _borrowed(self, index: int, form: Form) -> Form:
         """The form with what the first cell's rows say."""
         if index not in self.first.lent:
             return form
@@ -368,7 +362,7 @@ class _Other(_Cells):
             c[:, at] = np.where(better, center, c[:, at])
             r[:, at] = np.where(better, radius, r[:, at])
             a[:, :, at] = np.where(better[:, None], tilt.transpose(0, 2, 1), a[:, :, at])
-        found = _Form(
+        found = Form(
             form.reference,
             torch.from_numpy(c).reshape(shape),
             torch.from_numpy(a).reshape(form.a.shape),

@@ -242,7 +242,7 @@ def pass_maximum(value, y, x, cell, winner, which, slopes, offsets, steps, strid
 
     Args:
         value, y, x, cell: Rows and which cell each belongs to [R].
-        winner, which, slopes, offsets: See `ns_abstract.verify.network.bounds._Maxima`.
+        winner, which, slopes, offsets: See `ns_abstract.verify.network.passages.Maxima`.
         steps: [K, 2] rows and columns of a window's numbers, from its first.
         stride: Rows and columns from one window to the next.
         total: [R, 2] gathers what the rows are at least and at most.

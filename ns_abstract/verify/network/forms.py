@@ -1,0 +1,65 @@
+"""What is known of a node's numbers: affine forms in the parameters, and intervals (docs/design.md, N0, N1)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+
+class Interval(NamedTuple):
+    """What a node's numbers are at least and at most, [m, *shape]."""
+
+    lower: Tensor
+    upper: Tensor
+
+    @property
+    def size(self) -> Tensor:
+        return torch.maximum(self.lower.abs(), self.upper.abs())
+
+    @property
+    def spread(self) -> Tensor:
+        """What they are above and below zero, together."""
+        return self.upper.clamp(min=0.0) - self.lower.clamp(max=0.0)
+
+
+@dataclass
+class Form:
+    """``z = reference + c + a p + e`` with |e| <= r: what is known of a node in every cell (N1).
+
+    Attributes:
+        reference: [m, *shape]: the node's exact values are near it; all that follows is relative to it.
+        c, r: [m, *shape].
+        a: [m, d, *shape].
+        lower, upper: [m, *shape]; what ``z - reference`` is at least and at most.
+        active: [m, *shape]; False where z is exactly zero.
+    """
+
+    reference: Tensor
+    c: Tensor
+    a: Tensor
+    r: Tensor
+    lower: Tensor
+    upper: Tensor
+    active: Tensor
+
+    @property
+    def width(self) -> Tensor:
+        """How far z may be from the reference."""
+        return torch.maximum(self.lower.abs(), self.upper.abs())
+
+    @property
+    def interval(self) -> Interval:
+        """What z is at least and at most."""
+        room = 2.0**-50 * self.reference.abs()
+        low = self.reference + self.lower - room - 2.0**-50 * self.lower.abs()
+        return Interval(low, self.reference + self.upper + room + 2.0**-50 * self.upper.abs())
+
+    @staticmethod
+    def ranged(reference: Tensor, c: Tensor, a: Tensor, r: Tensor, active: Tensor | None = None) -> Form:
+        """With the range of the form itself."""
+        radius = (a.abs().sum(1) + r) * (1.0 + 2.0**-40) + c.abs() * 2.0**-50
+        active = torch.ones_like(c, dtype=torch.bool) if active is None else active
+        return Form(reference, c, a, r, c - radius, c + radius, active)

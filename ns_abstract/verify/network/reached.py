@@ -1,0 +1,140 @@
+"""What rows are found to be, when that is enough, and what they are on the way (docs/design.md, N5, N6, N15, N17)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from ns_abstract.verify.network.rows import Float64, Int64, Rows, full
+
+
+@dataclass
+class Reached:
+    """What rows are at least and at most.
+
+    Attributes:
+        plane: [R, 2, d + 1] slopes and offset of a plane below and one above; NaN if unknown.
+        lower, upper: [R]; infinite if unknown.
+        ended: [R] the node at which they ended; 0 is the image.
+    """
+
+    plane: Float64
+    lower: Float64
+    upper: Float64
+    ended: Int64
+
+    @staticmethod
+    def unknown(count: int, d: int) -> Reached:
+        infinite = np.full(count, np.inf)
+        return Reached(np.full((count, 2, d + 1), np.nan), -infinite, infinite, np.zeros(count, np.int64))
+
+    def put(self, number: Int64, other: Reached) -> None:
+        self.plane[number], self.lower[number], self.upper[number] = other.plane, other.lower, other.upper
+        self.ended[number] = other.ended
+
+    def turn(self, mask: np.ndarray) -> None:
+        """Negate the rows of ``mask``."""
+        self.plane[mask] = -self.plane[mask][:, ::-1]
+        self.lower[mask], self.upper[mask] = -self.upper[mask], -self.lower[mask]
+
+    def meet(self, number: Int64, other: Reached, below: np.ndarray) -> None:
+        """Take in other bounds of the rows ``number``, and their planes below or above."""
+        side = np.where(below, 0, 1)
+        self.plane[number, side] = other.plane[np.arange(len(number)), side]
+        self.lower[number] = np.maximum(self.lower[number], other.lower)
+        self.upper[number] = np.minimum(self.upper[number], other.upper)
+
+    def middle(self) -> tuple[Tensor, Tensor]:
+        """[R, d + 1] the plane between, and [R] how far the others are from it at most."""
+        low, high = self.plane[:, 0], self.plane[:, 1]
+        gap = high - low
+        radius = 0.5 * (gap[:, -1] + np.abs(gap[:, :-1]).sum(1))
+        radius = np.maximum(radius, 0.0) + 2.0**-48 * (np.abs(low).sum(1) + np.abs(high).sum(1))
+        return torch.from_numpy(0.5 * (low + high)), torch.from_numpy(radius)
+
+    def improve(self, number: Int64, plane: Float64, box: Float64) -> None:
+        """Planes of the latest node; the best numbers of all: a plane's extremes or what the box says."""
+        slopes = np.abs(plane[:, :, :-1]).sum(-1)
+        room = 2.0**-50 * (np.abs(plane[:, :, -1]) + slopes)
+        self.plane[number] = plane
+        least = np.fmax(plane[:, 0, -1] - slopes[:, 0] - room[:, 0], box[:, 0])
+        most = np.fmin(plane[:, 1, -1] + slopes[:, 1] + room[:, 1], box[:, 1])
+        self.lower[number] = np.fmax(self.lower[number], least)
+        self.upper[number] = np.fmin(self.upper[number], most)
+
+
+class Goal(NamedTuple):
+    """What rows of a node's numbers are to find out; a matter of tightness alone (N6, N17).
+
+    Attributes:
+        width: How far apart a number's bounds may be; None: its sign is all that is asked.
+        kink: Whether the sign is asked for.
+        cut: Whether a number that is certainly not positive may have any bounds.
+    """
+
+    width: float | None = None
+    kink: bool = True
+    cut: bool = True
+
+
+@dataclass(frozen=True)
+class Enough:
+    """When rows of single numbers need not go on to the image.
+
+    Attributes:
+        goal: What is asked for.
+        zero: [R] what a row is where its number is zero.
+        negative: [R] whether a row is its number's negative.
+    """
+
+    goal: Goal
+    zero: Float64
+    negative: np.ndarray
+
+    def __getitem__(self, chosen: Any) -> Enough:
+        return replace(self, zero=self.zero[chosen], negative=self.negative[chosen])
+
+    def done(self, found: Reached, number: Int64) -> np.ndarray:
+        """Which of the rows ``number`` are done."""
+        zero, lower, upper = self.zero[number], found.lower[number], found.upper[number]
+        if self.goal.width is None:
+            # the other side is asked for by another row
+            return lower >= zero
+        tight = upper - lower <= self.goal.width
+        if not self.goal.kink:
+            return tight
+        off = np.where(self.negative[number], lower >= zero, upper <= zero) & self.goal.cut
+        return off | (tight & ((lower >= zero) | (upper <= zero)))
+
+
+class Trace:
+    """What rows of one call of `Backward.bounded` are on their way to the image.
+
+    Args:
+        count: Rows R.
+        short: Whether only what they are on the image is kept.
+
+    Attributes:
+        rows: By node: [R, n] float32 rows on outputs of nodes at which they gather what depends on the cell's ranges,
+            and on the image (0).
+        fixed: [R, 2] what they gather at nodes of which they are not kept, at least and at most.
+        reached: [R] which of them reach the image.
+    """
+
+    def __init__(self, count: int, short: bool) -> None:
+        self.short = short
+        self.rows: dict[int, NDArray[np.float32]] = {}
+        self.fixed = np.zeros((count, 2))
+        self.reached = np.zeros(count, bool)
+
+    def keep(self, at: int, rows: Rows, shape: tuple[int, ...], number: Int64) -> None:
+        """Remember rows ``number`` on the output of node ``at``."""
+        if at not in self.rows:
+            self.rows[at] = np.zeros((len(self.fixed), int(np.prod(shape))), np.float32)
+        whole = full(rows, shape, force=True)
+        self.rows[at][number] = whole.value.reshape(len(number), -1)
