@@ -164,13 +164,13 @@ def test_products_of_rows_are_charged(local: str, tmp_path: Path) -> None:
     family, cells = Family(net, images, arithmetic="real"), others(images, local)
     other = _Other(family._first, cells, 1 << 30, "real", False)
     m, off = cells.count, []
-    slopes, offsets = other.image.slopes.reshape(m, 2, -1, 2), other.image.offsets.reshape(m, 2, -1)
+    slopes, offsets = other.known.image.slopes.reshape(m, 2, -1, 2), other.known.image.offsets.reshape(m, 2, -1)
     for index, lent in family._first.lent.items():
         said = other._said(index)
-        tilt, noise = np.zeros((m, len(lent.flat), 2)), other.flush[:, None]
+        tilt, noise = np.zeros((m, len(lent.flat), 2)), other.known.flush[:, None]
         low, high = (np.repeat(v[None], m, 0) for v in lent.fixed.T)
-        if index in other.passages[0].noise:
-            noise = noise + other.passages[0].noise[index].reshape(m, -1).numpy()[:, lent.flat]
+        if index in other.known.passages[0].noise:
+            noise = noise + other.known.passages[0].noise[index].reshape(m, -1).numpy()[:, lent.flat]
         for at, rows in lent.rows.items():
             values = rows.astype(np.float64)
             one, two = np.maximum(values, 0.0), np.minimum(values, 0.0)
@@ -180,13 +180,13 @@ def test_products_of_rows_are_charged(local: str, tmp_path: Path) -> None:
                 half = 0.5 * (offsets[:, 1] - offsets[:, 0]) + 0.5 * np.abs(slopes[:, 1] - slopes[:, 0]).sum(-1)
                 low = low + middle @ values.T - half @ np.abs(values).T
                 high = high + middle @ values.T + half @ np.abs(values).T
-            elif at in other.offered:
-                offered = other.offered[at]
+            elif at in other.known.offered:
+                offered = other.known.offered[at]
                 _, below, above, _, top, bottom = offered.lines.reshape(6, m, -1).astype(np.float64)
                 tilt = tilt + one @ np.moveaxis(offered.tilts[0], 1, 2) + two @ np.moveaxis(offered.tilts[1], 1, 2)
                 low, high = low + below @ one.T + top @ two.T, high + above @ one.T + bottom @ two.T
             else:
-                noise = noise + other.passages[0].noise[at].reshape(m, -1).numpy() @ np.abs(values).T
+                noise = noise + other.known.passages[0].noise[at].reshape(m, -1).numpy() @ np.abs(values).T
         charged = said.half - 0.5 * (high - low) - noise
         for p in ((1.0, 1.0), (-1.0, 1.0), (0.0, 0.0)):
             exactly = (tilt @ p + 0.5 * (low + high)) * lent.sign
@@ -203,9 +203,9 @@ def test_parts_have_the_references_and_winners_of_the_whole(tmp_path: Path) -> N
     family, parts = Family(net, images, arithmetic="real"), halved(images)
     part = _Other(family._first, parts, 1 << 30, "real", False)
     alone = _Cells(net, parts, "everywhere", 1 << 30, "real")
-    (at,) = family._first.passages[0].maxima
-    assert (part.passages[0].maxima[at].winner == family._first.passages[0].maxima[at].winner).all()
-    assert (alone.passages[0].maxima[at].winner != family._first.passages[0].maxima[at].winner).any()
+    (at,) = family._first.known.passages[0].maxima
+    assert (part.known.passages[0].maxima[at].winner == family._first.known.passages[0].maxima[at].winner).all()
+    assert (alone.known.passages[0].maxima[at].winner != family._first.known.passages[0].maxima[at].winner).any()
     assert torch.equal(part.last.reference, family._first.last.reference.expand_as(part.last.reference))
 
 
@@ -217,7 +217,7 @@ def test_rounding_is_charged_by_all_parts_at_once(tmp_path: Path, monkeypatch: p
     together = _Other(family._first, cells, 1 << 30, "float32", False)
     monkeypatch.setattr(_Other, "_sized", lambda self, form: form)
     alone = _Other(family._first, cells, 1 << 30, "float32", False)
-    charged, singly = together.passages[0].noise, alone.passages[0].noise
+    charged, singly = together.known.passages[0].noise, alone.known.passages[0].noise
     assert len(charged) > 3
     for k, noise in charged.items():
         each = singly[k]
@@ -225,7 +225,7 @@ def test_rounding_is_charged_by_all_parts_at_once(tmp_path: Path, monkeypatch: p
         # what rounding leaves is read again, further on
         assert (noise >= (1.0 - 1e-5) * each).all()
         assert noise[0].sum() < 1.2 * each.amax(0).sum()
-    assert (together.flush >= (1.0 - 1e-5) * alone.flush).all()
+    assert (together.known.flush >= (1.0 - 1e-5) * alone.known.flush).all()
 
 
 def test_rows_of_a_cell_say_as_much_of_it_as_its_bounds(tmp_path: Path) -> None:

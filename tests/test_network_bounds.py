@@ -20,12 +20,16 @@ from ns_abstract.verify.network import (
     ImageSets,
     Network,
     NetworkArithmetic,
+    backward,
     bound_outputs,
+    known,
     load_network,
+    outputs,
     rounding,
     schedule,
 )
 from ns_abstract.verify.network import bounds as module
+from ns_abstract.verify.network.known import Known
 from ns_abstract.verify.network.layers import Convolution
 from ns_abstract.verify.network.reached import Enough, Goal, Reached
 from ns_abstract.verify.network.rows import columns_of, concretize
@@ -252,13 +256,13 @@ def planned(monkeypatch: pytest.MonkeyPatch, which: int | None = None) -> list[s
 
         monkeypatch.setattr(schedule.Schedule, "ways", ways)
     used: list[schedule.Way] = []
-    ready = module._Cells._ready
+    ready = Known.ready
 
-    def heard(cells: Any, way: schedule.Way) -> int:
+    def heard(known: Known, way: schedule.Way) -> int:
         used.append(way)
-        return ready(cells, way)
+        return ready(known, way)
 
-    monkeypatch.setattr(module._Cells, "_ready", heard)
+    monkeypatch.setattr(Known, "ready", heard)
     return used
 
 
@@ -329,7 +333,7 @@ def test_rows_that_rest_on_several_nodes(
     leave = module._Cells._leave
 
     def left(cells: Any, index: int) -> None:
-        forms[index] = cells.forms[index]
+        forms[index] = cells.known.forms[index]
         leave(cells, index)
 
     monkeypatch.setattr(module._Cells, "_leave", left)
@@ -510,7 +514,7 @@ def test_early_rows_keep_later_ones_exact(tmp_path: Path, monkeypatch: pytest.Mo
         monkeypatch.setattr(schedule, "_CHEAP", cheap)
         cells = module._Cells(network, images, "everywhere", 1 << 30, "real")
         # rows of outputs in float64 lose next to nothing of themselves
-        cells.passages.pop()
+        cells.known.passages.pop()
         gaps.append((middle.T - cells.outputs(rows, np.zeros(3)).lower).mean())
     assert 0.0 < gaps[1] < 0.5 * gaps[0]
 
@@ -726,7 +730,8 @@ def test_parts_change_nothing_but_rounding(tmp_path: Path, monkeypatch: pytest.M
     rows[:3] = np.eye(3, network.output_size, 4)
     whole = bound_outputs(network, images, rows, np.zeros(6))
     tiny = bound_outputs(network, images, rows, np.zeros(6), memory=1)
-    monkeypatch.setattr(module, "ROWS_AT_ONCE", 1)
+    for part in (module, backward, outputs):
+        monkeypatch.setattr(part, "ROWS_AT_ONCE", 1)
     single = bound_outputs(network, images, rows, np.zeros(6))
     one = [bound_outputs(network, images[k : k + 1], rows[[0, 4]], np.zeros(2)).lower[0] for k in range(5)]
     for other in (tiny.lower, single.lower):
@@ -790,7 +795,7 @@ def test_float32_rounding_is_needed(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     rows = np.concatenate([np.eye(4), -np.eye(4)])
     for charged in (True, False):
         if not charged:
-            for part in (module, rounding):
+            for part in (module, known, rounding):
                 monkeypatch.setattr(part, "UNIT", 0.0)
         lower = bound_outputs(network, images, rows, np.zeros(8)).lower
         broken[charged] = int((lower > y @ rows.T).sum())

@@ -304,7 +304,7 @@ def test_rounding_of_rows_over_sets(double: bool, tmp_path: Path) -> None:
         for sign in (1.0, -1.0):
             cells = _Cells(network, images, "everywhere", 1 << 30, "real")
             if not double:
-                cells.passages.pop()
+                cells.known.passages.pop()
             found = cells.outputs(sign * np.eye(5), np.zeros(5))
             corners = [np.array(p) for p in itertools.product([-1.0, 1.0], repeat=3)]
             for k in range(5):
@@ -342,7 +342,7 @@ def test_rows_of_outputs_in_float64_are_tighter(blocks: int, tmp_path: Path) -> 
     for double in (False, True):
         cells = _Cells(network, images, "everywhere", 1 << 30, "real")
         if not double:
-            cells.passages.pop()
+            cells.known.passages.pop()
         found = cells.outputs(rows, np.zeros(6))
         rng = np.random.default_rng(0)
         for p in rng.choice([-1.0, 1.0], (50, 2)):

@@ -36,7 +36,8 @@ _SHARED = "test_cover.py::test_rows_of_one_cell_hold_every_value"
 CERTIFICATES = (
     Fault(
         "families: parts are taken about their own reference",
-        _FAMILY, "_Other._about", "np.repeat(self.first.middle, len(middle), axis=0)", "middle", _SHARED + "[product]",
+        _FAMILY, "_Other._about", "np.repeat(self.first.known.middle, len(middle), axis=0)", "middle",
+        _SHARED + "[product]",
     ),
     Fault(
         "families: parts follow their own winners of windows",

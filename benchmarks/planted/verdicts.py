@@ -5,6 +5,7 @@ from planted.fault import Fault
 _SEARCH = "verify/search.py"
 _VNNLIB = "verify/vnnlib.py"
 _NETWORK = "verify/network/bounds.py"
+_BACKWARD, _KNOWN = "verify/network/backward.py", "verify/network/known.py"
 _REACHED, _ROUNDING = "verify/network/reached.py", "verify/network/rounding.py"
 _RESPONSE = "verify/response.py"
 _MAPS = "report/verdict_maps.py"
@@ -100,8 +101,8 @@ VERDICTS = (
     ),
     Fault(
         "network: float32 rows are charged by float64's unit roundoff",
-        _NETWORK,
-        "_Cells.__init__",
+        _KNOWN,
+        "Known.__init__",
         "Passage(torch.float32, UNIT, sums)",
         "Passage(torch.float32, DOUBLE_UNIT, sums)",
         "test_network_rounding.py::test_rounding_of_rows_over_sets[False]",
@@ -172,8 +173,8 @@ VERDICTS = (
     ),
     Fault(
         "network: rows that end on the way forget what their stop is not sure of",
-        _NETWORK,
-        "_Cells._stop",
+        _KNOWN,
+        "Known.stop",
         "form.c - form.r - room",
         "form.c - room",
         "test_network_bounds.py::test_rows_that_end_on_the_way_lie_below_the_exact_minimum[1000000000.0]",
@@ -196,16 +197,16 @@ VERDICTS = (
     ),
     Fault(
         "network: rows that rest on several nodes count the last alone",
-        _NETWORK,
-        "_Cells._rest_rows",
+        _BACKWARD,
+        "Backward._rest_rows",
         "box += two",
         "box = two",
         "test_network_bounds.py::test_rows_that_rest_on_several_nodes[residual-0]",
     ),
     Fault(
         "network: what rows gather on the way is lost where they end by plan",
-        _NETWORK,
-        "_Cells._rest_rows",
+        _BACKWARD,
+        "Backward._rest_rows",
         "batch.total",
         "0.0 * batch.total",
         "test_network_bounds.py::test_rows_that_end_by_plan_lie_below_the_exact_minimum[1]",
@@ -244,8 +245,8 @@ VERDICTS = (
     ),
     Fault(
         "network: rows under way are never parted",
-        _NETWORK,
-        "_Cells._descend",
+        _BACKWARD,
+        "Backward.descend",
         "batch.bytes > min(ROWS_AT_ONCE, self.memory // 16)",
         "batch.bytes > 1 << 62",
         "test_network_bounds.py::test_rows_that_end_by_plan_keep_within_memory",

@@ -2,40 +2,35 @@
 
 from __future__ import annotations
 
-import functools
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from ns_abstract.execution.ending import checkpoint
+from ns_abstract.verify.network.backward import ROWS_AT_ONCE, Backward
 from ns_abstract.verify.network.forms import Form, Interval
 from ns_abstract.verify.network.graph import Network, NetworkArithmetic
+from ns_abstract.verify.network.image import finite, middle_of, planes_of
+from ns_abstract.verify.network.known import Known
 from ns_abstract.verify.network.layers import Activation, LeakyRelu, Linear, Sum
 from ns_abstract.verify.network.maxima import Candidates, MaxPool, Planes, upper_planes
+from ns_abstract.verify.network.outputs import Outputs
 from ns_abstract.verify.network.passages import Maxima, Offered, Passage
 from ns_abstract.verify.network.products import Product
 from ns_abstract.verify.network.reached import Enough, Goal, Reached, Trace
-from ns_abstract.verify.network.rounding import DOUBLE_UNIT, FLUSH, OVERFLOW, SPARE, UNIT, Rounding, gamma
+from ns_abstract.verify.network.rounding import FLUSH, OVERFLOW, SPARE, UNIT, Rounding, gamma
 from ns_abstract.verify.network.rows import (
-    Columns,
     Float64,
     Int64,
     Rows,
-    charge,
-    columns_of,
-    concretize,
-    full,
     grid,
-    join,
-    pass_activation,
 )
-from ns_abstract.verify.network.schedule import TRIALS, Schedule, Way, on_threads
+from ns_abstract.verify.network.schedule import TRIALS, Schedule, on_threads
 from ns_abstract.verify.network.sets import ImageSets, OutputBounds, Signs, Substitution
-from ns_abstract.verify.network.slopes import Ascent, Chosen, Held, OpenUnits, derivatives
+from ns_abstract.verify.network.slopes import Held, OpenUnits
 
 #: So many open numbers of a node are tightened only if some of them gain by it: if not so large a part of these
 #: keeps so large a part of its width.
@@ -50,10 +45,6 @@ _STRAIGHT, _BENT = 2.0**-20, 2.0**-5
 _CLOSES = 0.1
 #: Room for rounding of lines relative to references and sizes.
 _REFERENCES = 2.0**-46
-#: Room for rounding above zero where nothing better is looked for.
-_SURE = 1e-9
-#: Bytes of rows that are worked on at a time: they should stay in a processor's cache.
-ROWS_AT_ONCE = 24 << 20
 
 
 def bound_outputs(
@@ -120,58 +111,26 @@ class _Cells:
         slope_steps: int = 0,
         assumed: Sequence[Mapping[int, Signs]] | None = None,
     ) -> None:
+        fields, good = finite(images)
+        middle = self._about(middle_of(fields))
+        image = planes_of(fields, middle, network.input_shape, substitution)
         self.network = network
+        self.known = Known(network, image, middle, good, arithmetic, assumed)
         self.slope_steps = slope_steps
-        self.assumed = assumed
-        #: by cell and node: what rows take of signs that are assumed
-        self.held: list[dict[int, Held]] = [{} for _ in range(images.count)]
-        #: cells without an image that has the signs assumed
-        self.vacant = np.zeros(images.count, bool)
-        #: units whose lower lines may have other slopes
-        self.open: dict[int, OpenUnits] = {}
-        self.count, self.d = images.count, images.dimensions
-        self.memory = memory
-        self.single = arithmetic == "float32"
         self.schedule = Schedule(network)
-        self.good = np.ones(self.count, bool)
-        self.flush = np.zeros(self.count)
-        fields = self._fields(images)
-        self._planes(fields, substitution)
-        # every number is passed by a few times at most
-        numbers = sum(int(np.prod(network.shape(k))) for k in range(len(network.nodes) + 1))
-        sums = 4.0 * DOUBLE_UNIT * (numbers + len(network.nodes))
-        #: what rows take on their way; rows of outputs take the last, the others the first
-        self.passages = [Passage(torch.float32, UNIT, sums)]
-        if not self.single:
-            # beside the rounding of a float32 network that of rows is little
-            self.passages.append(Passage(torch.float64, DOUBLE_UNIT, sums))
-        #: lines with slopes of another cell's rows
-        self.offered: dict[int, Offered] = {}
+        self.backward = Backward(self.known, memory, self.schedule.deep)
         self.rounding = Rounding(network)
-        #: nodes whose rounding is in that of their only reader
-        self.folded: set[int] = set()
-        #: what rows may stop at
-        self.stops: dict[int, Columns] = {}
-        #: what is known of nodes, while other nodes read them
-        self.forms: list[Form | None] = []
         #: products that rows have not taken because they ended on the way
         self.spared = 0.0
         #: part of the latest ReLU's inputs whose signs have not been found out
         self.unsure = 0.0
         self.last = self._forward()
         if substitution == "end":
-            self._planes(fields, "everywhere")
+            self.known.see(planes_of(fields, middle, network.input_shape, "everywhere"))
 
-    def _fields(self, images: ImageSets) -> list[np.ndarray]:
-        """Image sets without numbers that are not finite: such a cell is given up."""
-        fields = [np.asarray(getattr(images, name), np.float64) for name in images.__dataclass_fields__]
-        finite = np.logical_and.reduce([np.isfinite(f).reshape(self.count, -1).all(axis=1) for f in fields])
-        finite &= (fields[4] <= fields[5]).all(axis=1)
-        self.good &= finite
-        fields = [np.where(finite.reshape(-1, *[1] * (f.ndim - 1)), f, 0.0) for f in fields]
-        #: the images' reference
-        self.middle = self._about(0.5 * (np.maximum(fields[1], fields[4]) + np.minimum(fields[3], fields[5])))
-        return fields
+    def outputs(self, rows: Any, offset: Float64) -> OutputBounds:
+        """Bounds of ``rows @ y + offset`` in every cell."""
+        return Outputs(self.known, self.backward, self.slope_steps).bound(self.last, rows, offset)
 
     def _about(self, middle: Float64) -> Float64:
         """[m, n] pictures that all is relative to, for the sets' middles: any will do."""
@@ -189,70 +148,12 @@ class _Cells:
         """[m, C, 1, W] numbers of windows that are followed from below at node ``k``: any will do."""
         return winner
 
-    def _planes(self, fields: list[np.ndarray], substitution: Substitution) -> None:
-        """Image sets as rows want them, relative to the reference."""
-        shape = grid(self.network.input_shape)
-        a_lower, b_lower, a_upper, b_upper, lower, upper = fields
-        if substitution != "everywhere":
-            a_lower, b_lower, a_upper, b_upper = np.zeros_like(a_lower), lower, np.zeros_like(a_upper), upper
-        c = self.middle
-        b_lower, lower = (v - c - 2.0**-51 * (np.abs(v) + np.abs(c)) for v in (b_lower, lower))
-        b_upper, upper = (v - c + 2.0**-51 * (np.abs(v) + np.abs(c)) for v in (b_upper, upper))
-        # numpy keeps the order of axes in memory that the images came with
-        self.image = ImagePlanes(
-            np.ascontiguousarray(np.stack([a_lower, a_upper], 1)).reshape(self.count, 2, *shape, self.d),
-            np.ascontiguousarray(np.stack([b_lower, b_upper], 1)).reshape(self.count, 2, *shape),
-            np.ascontiguousarray(lower).reshape(self.count, *shape),
-            np.ascontiguousarray(upper).reshape(self.count, *shape),
-        )
-        self.columns = columns_of(*self.image)
-
-    def _image(self) -> Form:
-        """The image as a form: the middle of its planes."""
-        shape = self.network.input_shape
-        slopes, offsets = torch.from_numpy(self.image.slopes), torch.from_numpy(self.image.offsets)
-        a = slopes.mean(1).movedim(-1, 1).reshape(self.count, self.d, *shape)
-        c = offsets.mean(1)
-        spread = 0.5 * (offsets[:, 1] - offsets[:, 0]) + 0.5 * (slopes[:, 1] - slopes[:, 0]).abs().sum(-1)
-        spread = spread.clamp(min=0.0) + 2.0**-50 * (offsets.abs().amax(1) + slopes.abs().amax(1).sum(-1))
-        c, spread = c.reshape(-1, *shape), spread.reshape(-1, *shape)
-        reference = torch.from_numpy(self.middle).reshape(-1, *shape)
-        form = Form.ranged(reference, c, a, spread)
-        lower, upper = torch.from_numpy(self.image.lower), torch.from_numpy(self.image.upper)
-        return self._within(form, lower.reshape(-1, *shape), upper.reshape(-1, *shape))
-
-    def _within(self, form: Form, lower: Tensor, upper: Tensor) -> Form:
-        """The form with bounds that are known besides; a cell without values in it is given up."""
-        low, high = torch.maximum(form.lower, lower), torch.minimum(form.upper, upper)
-        fine = low <= high
-        for known in (form.reference, form.c, form.r, form.a):
-            # sums are finite unless a number, or they, are not
-            if not bool(torch.isfinite(known.sum())):
-                finite = torch.isfinite(known)
-                fine = fine & (finite.all(1) if known.ndim > fine.ndim else finite)
-        good = fine.reshape(self.count, -1).all(1)
-        if self.assumed is not None and not bool(good.all()):
-            # bounds that hold for all images with these signs contradict each other: there are none (N16)
-            crossed = torch.isfinite(low) & torch.isfinite(high) & (low > high)
-            told = np.array([len(signs) > 0 for signs in self.assumed]) & self.good
-            self.vacant |= told & crossed.reshape(self.count, -1).any(1).numpy()
-        self.good &= good.numpy()
-        found = Form(form.reference, form.c, form.a, form.r, low, high, form.active)
-        if bool(good.all()):
-            return found
-
-        # what is given up must not slow the others down with NaN
-        def clear(t: Tensor) -> Tensor:
-            return torch.where(good.reshape(-1, *[1] * (t.ndim - 1)), t, torch.zeros_like(t))
-
-        return Form(*(clear(getattr(found, name)) for name in Form.__dataclass_fields__))
-
     # ------------------------------------------------------------ forwards
 
     def _forward(self) -> Form:
         """Lines and rounding of every node; returns what is known of the last one."""
-        forms: list[Form | None] = [self._image()]
-        self.forms = forms
+        forms: list[Form | None] = [self.known.first()]
+        self.known.forms = forms
         if self.schedule.planned:
             self._learn(0, False)
         left = list(self.network.readers)
@@ -274,7 +175,7 @@ class _Cells:
                     self.unsure = float(node.layer.open(*inputs[0].interval).double().mean())
                 forms.append(self._activate(k, source, node.layer, inputs[0]))
                 if self.network.depth[source] > 1:
-                    self.stops[source] = self._stop(source, inputs[0])
+                    self.known.stops[source] = self.known.stop(source, inputs[0])
             elif isinstance(node.layer, Product):
                 intervals = inputs[0].interval, inputs[1].interval
                 open_, apart = node.layer.open(*intervals), node.layer.apart(*intervals)
@@ -295,12 +196,12 @@ class _Cells:
                     self._leave(index)
         end = forms[last]
         assert end is not None
-        self.forms = []
+        self.known.forms = []
         return end
 
     def _learn(self, index: int, cut: bool) -> None:
         """Tell the schedule how wide bounds of node ``index`` are; ``cut``: those of numbers that are not cut off."""
-        form = self.forms[index]
+        form = self.known.forms[index]
         assert form is not None
         r = form.r
         if cut:
@@ -310,24 +211,24 @@ class _Cells:
 
     def _leave(self, index: int) -> None:
         """Node ``index`` has been read; rows of later ones may end there (N18)."""
-        form, self.forms[index] = self.forms[index], None
-        if index in self.schedule.rests and index not in self.stops:
+        form, self.known.forms[index] = self.known.forms[index], None
+        if index in self.schedule.rests and index not in self.known.stops:
             assert form is not None
-            self.stops[index] = self._stop(index, form)
+            self.known.stops[index] = self.known.stop(index, form)
 
     def _assume(self, source: int, z: Form) -> Form:
         """What is known of node ``source`` where its numbers have the signs that are assumed (N16)."""
-        if self.assumed is None or not any(source in signs for signs in self.assumed):
+        if self.known.assumed is None or not any(source in signs for signs in self.known.assumed):
             return z
         lower, upper = (v.flatten(1).clone() for v in (z.lower, z.upper))
         least, most = (v.flatten(1).numpy() for v in z.interval)
         reference, width = z.reference.flatten(1), z.width.flatten(1).numpy()
-        for cell, signs in enumerate(self.assumed):
-            if source not in signs or not self.good[cell]:
+        for cell, signs in enumerate(self.known.assumed):
+            if source not in signs or not self.known.good[cell]:
                 continue
             flat, side = signs[source]
             if bool(np.where(side > 0.0, most[cell, flat] < 0.0, least[cell, flat] > 0.0).any()):
-                self.vacant[cell] = True
+                self.known.vacant[cell] = True
                 continue
             at, positive = torch.from_numpy(flat), torch.from_numpy(side > 0.0)
             zero = -reference[cell, at]
@@ -335,14 +236,14 @@ class _Cells:
             lower[cell, at] = torch.where(positive, torch.minimum(torch.maximum(low, zero), high), low)
             upper[cell, at] = torch.where(positive, high, torch.maximum(torch.minimum(high, zero), low))
             noise = UNIT * (SPARE + self.network.readers[source]) * width[cell, flat]
-            if self._rounds(source):
-                noise = noise + self.passages[0].noise[source].flatten(1).numpy()[cell, flat]
-            self.held[cell][source] = Held(flat, side, -zero.numpy(), noise)
+            if self.known.rounds(source):
+                noise = noise + self.known.passages[0].noise[source].flatten(1).numpy()[cell, flat]
+            self.known.held[cell][source] = Held(flat, side, -zero.numpy(), noise)
         return replace(z, lower=lower.reshape(z.lower.shape), upper=upper.reshape(z.upper.shape))
 
     def _combine(self, k: int, sources: tuple[int, ...], layer: Linear, inputs: list[Form]) -> Form:
         """A linear layer (N1, N2)."""
-        m, d = self.count, self.d
+        m, d = self.known.count, self.known.d
         reference = self._reference(k, lambda: layer([f.reference for f in inputs]))
         stacks = [torch.cat([f.c[:, None], f.a], 1).flatten(0, 1) for f in inputs]
         moved = layer.apply(stacks).reshape(m, 1 + d, *layer.shape)
@@ -366,7 +267,7 @@ class _Cells:
             active = layer.magnitude([f.active.double() for f in inputs]) != 0.0
             if layer.bias is not None:
                 active = active | (layer.bias != 0.0)
-        elif self.single:
+        elif self.known.single:
 
             def end(moves: Tensor = moves) -> Tensor:
                 return (reference + moved[:, 0]).abs() + moved[:, 1:].abs().sum(1) + radius + moves
@@ -375,24 +276,22 @@ class _Cells:
         roundings = layer.row_terms + SPARE + max(self.network.readers[i] for i in sources)
         form = Form.ranged(reference, moved[:, 0], moved[:, 1:], radius + moves, active)
         if float(size.amax()) >= OVERFLOW:
-            self.good &= (size.flatten(1).amax(1) < OVERFLOW).numpy()
+            self.known.good &= (size.flatten(1).amax(1) < OVERFLOW).numpy()
         for sized, shape in zip(known, layer.input_shapes, strict=True):
             lost = int(np.prod(shape)) * (layer.row_terms + 2) * FLUSH
-            self.flush += lost * sized.width.flatten(1).amax(1).numpy()
-        folded = [i for i in sources if isinstance(layer, Sum) and self._rounds(i) and self.network.readers[i] == 1]
-        self.folded.update(folded)
-        for passage in self.passages:
+            self.known.flush += lost * sized.width.flatten(1).amax(1).numpy()
+        folded = [
+            i for i in sources if isinstance(layer, Sum) and self.known.rounds(i) and self.network.readers[i] == 1
+        ]
+        self.known.folded.update(folded)
+        for passage in self.known.passages:
             rows = gamma(roundings, passage.unit)
             noise = ((moves + rows * width) * (1.0 + 2.0**-40)).expand(m, *layer.shape)
             for source in folded:
                 # one charge instead of several
                 noise = noise + passage.noise[source]
             passage.noise[k] = noise * (1.0 + 2.0**-40 + passage.sums)
-        return self._within(form, form.lower, form.upper)
-
-    def _rounds(self, source: int) -> bool:
-        """Whether rows are charged on node ``source``."""
-        return source in self.passages[0].noise
+        return self.known.within(form, form.lower, form.upper)
 
     def _activate(self, k: int, source: int, layer: Activation, z: Form) -> Form:
         """An activation (N3, N4)."""
@@ -400,7 +299,7 @@ class _Cells:
         size = z.interval.size
         reference = self._reference(k, lambda: layer.function(z.reference))
         room = layer.missing(lower, upper) + 2.0**-48 * reference.abs()
-        if self.single:
+        if self.known.single:
             room = room + layer.error(lower, upper)
         band = layer.band(lower, upper)
         s = band.lower_slope
@@ -414,7 +313,7 @@ class _Cells:
         if isinstance(layer, LeakyRelu) and layer.alpha == 0.0:
             form.active = upper > 0.0
         lines = layer.lines(lower, upper)
-        fold = self._rounds(source) and self.network.readers[source] == 1
+        fold = self.known.rounds(source) and self.network.readers[source] == 1
 
         def stored(chosen: Sequence[tuple[Tensor, Tensor, Tensor]], passage: Passage) -> np.ndarray:
             """As `pass_activation` wants slope, lower and upper offset for rows of either sign."""
@@ -432,17 +331,17 @@ class _Cells:
                     passage.outward(high + base + give, 1.0),
                 )
                 found += [rounded.to(passage.dtype), *(ends if side < 0.0 else reversed(ends))]
-            return torch.stack(found).reshape(6, self.count, *grid(layer.shape)).numpy()
+            return torch.stack(found).reshape(6, self.known.count, *grid(layer.shape)).numpy()
 
         # the other sides of lines with these slopes are the band's
         above = layer.offsets(lines.lower_slope, lower, upper, band)[1]
         below = layer.offsets(lines.upper_slope, lower, upper, band)[0]
         own = (lines.lower_slope, lines.lower_offset, above), (lines.upper_slope, below, lines.upper_offset)
-        for passage in self.passages:
+        for passage in self.known.passages:
             passage.lines[k] = stored(own, passage)
         lent = self._lent(k)
         if lent is not None:
-            slopes = [torch.from_numpy(v).double().expand(self.count, *layer.shape) for v in lent]
+            slopes = [torch.from_numpy(v).double().expand(self.known.count, *layer.shape) for v in lent]
             plain = [layer.offsets(slope, lower, upper, band) for slope in slopes]
             tilted = [_tilted(slope, z, line) for slope, line in zip(slopes, own, strict=True)]
             # each is there for one side
@@ -451,20 +350,22 @@ class _Cells:
             for slope, ends, (low, high, tilt), use in zip(slopes, plain, tilted, better, strict=True):
                 offsets.append((slope, torch.where(use, low, ends[0]), torch.where(use, high, ends[1])))
                 tilts.append(torch.where(use[:, None], tilt, torch.zeros_like(tilt)))
-            self.offered[k] = Offered(stored(offsets, self.passages[0]), torch.stack(tilts).flatten(3).numpy())
+            self.known.offered[k] = Offered(
+                stored(offsets, self.known.passages[0]), torch.stack(tilts).flatten(3).numpy()
+            )
         if fold:
-            self.folded.add(source)
+            self.known.folded.add(source)
         if self.slope_steps and isinstance(layer, LeakyRelu):
-            first = self.passages[0]
+            first = self.known.passages[0]
             loose = (SPARE + self.network.readers[source]) * first.unit * z.width
             loose = loose + (first.noise[source] if fold else 0.0)
             given = (lower, upper, z.reference, reference, loose, room + torch.zeros_like(lower))
-            self.open[k] = _open_units(layer, given)
+            self.known.open[k] = _open_units(layer, given)
         lost = int(np.prod(layer.shape)) * 2 * FLUSH
-        self.flush += lost * z.width.reshape(self.count, -1).amax(1).numpy()
+        self.known.flush += lost * z.width.reshape(self.known.count, -1).amax(1).numpy()
         ends = layer.range(lower, upper)
         room = room + 2.0**-48 * (ends[0].abs() + ends[1].abs())
-        return self._within(form, ends[0] - reference - room, ends[1] - reference + room)
+        return self.known.within(form, ends[0] - reference - room, ends[1] - reference + room)
 
     def _lent(self, k: int) -> tuple[np.ndarray, np.ndarray] | None:
         """Slopes [1, *shape] of rows of another cell on node ``k``, not negative and negative ones."""
@@ -472,7 +373,7 @@ class _Cells:
 
     def _multiply(self, k: int, sources: tuple[int, ...], layer: Product, x: Form, y: Form) -> Form:
         """A product of two nodes (N9)."""
-        m, first, second = self.count, x.interval, y.interval
+        m, first, second = self.known.count, x.interval, y.interval
         size = first.size * second.size
         reference = self._reference(k, lambda: x.reference * y.reference)
         plane = layer.plane(first, second)
@@ -481,10 +382,10 @@ class _Cells:
         # roundings of the plane relative to the references, and the network's
         own = alpha.abs() * x.reference.abs() + beta.abs() * y.reference.abs() + reference.abs()
         room = 2.0**-48 * (own + plane.low.abs() + plane.high.abs()) + 2 * FLUSH
-        if self.single:
+        if self.known.single:
             room = room + 2 * UNIT * size
         shape = (6, m, *grid(layer.shape))
-        for passage in self.passages:
+        for passage in self.known.passages:
             # rows' products with the slopes, which are float32 numbers, and sums where branches meet
             unit = (SPARE + max(self.network.readers[i] for i in sources)) * passage.unit
             give = room + unit * (alpha.abs() * x.width + beta.abs() * y.width)
@@ -503,16 +404,16 @@ class _Cells:
         form = Form.ranged(reference, c, a, radius, x.active & y.active)
         for f in (x, y):
             lost = int(np.prod(layer.shape)) * 2 * FLUSH
-            self.flush += lost * f.width.reshape(m, -1).amax(1).numpy()
+            self.known.flush += lost * f.width.reshape(m, -1).amax(1).numpy()
         if float(size.amax()) >= OVERFLOW:
-            self.good &= (size.reshape(m, -1).amax(1) < OVERFLOW).numpy()
+            self.known.good &= (size.reshape(m, -1).amax(1) < OVERFLOW).numpy()
         ends = torch.stack([u * v for u in first for v in second]) - reference
         room = room + 2.0**-50 * (size + reference.abs())
-        return self._within(form, ends.amin(0) - room, ends.amax(0) + room)
+        return self.known.within(form, ends.amin(0) - room, ends.amax(0) + room)
 
     def _maximum(self, k: int, source: int, layer: MaxPool, x: Form) -> Form:
         """Maxima over windows (N12); the reference is that of the number which the lower plane follows."""
-        m, shape = self.count, layer.shape
+        m, shape = self.known.count, layer.shape
         interval = x.interval
         lower, upper = (layer.taps(v, -torch.inf) for v in interval)
         winner = self._winner(k, layer.taps(x.reference + x.c, -torch.inf).argmax(2, keepdim=True))
@@ -521,9 +422,11 @@ class _Cells:
             return layer.taps(v, 0.0).gather(2, winner)[:, :, 0]
 
         reference, c, r, width = (chosen(v) for v in (x.reference, x.c, x.r, x.width))
-        a = torch.stack([chosen(x.a[:, i]) for i in range(self.d)], 1)
+        a = torch.stack([chosen(x.a[:, i]) for i in range(self.known.d)], 1)
         # sums of rows where windows overlap
-        units = [(SPARE + layer.overlaps + self.network.readers[source]) * passage.unit for passage in self.passages]
+        units = [
+            (SPARE + layer.overlaps + self.network.readers[source]) * passage.unit for passage in self.known.passages
+        ]
         gives = [unit * width for unit in units]
         offsets = [torch.stack([-give, give, give, -give], 0) for give in gives]
         rivals = upper.scatter(2, winner, -torch.inf).amax(2)
@@ -540,7 +443,7 @@ class _Cells:
             which[at] = torch.arange(len(top)) + sum(map(len, slopes))
             base = (planes.slopes * known.reference).sum(1) - reference[at]
             room = _REFERENCES * ((planes.slopes * known.reference.abs()).sum(1) + reference[at].abs())
-            for passage, unit, give, offset in zip(self.passages, units, gives, offsets, strict=True):
+            for passage, unit, give, offset in zip(self.known.passages, units, gives, offsets, strict=True):
                 rounded = (planes.slopes.to(passage.dtype).double() - planes.slopes).abs()
                 lost = (rounded * near + unit * planes.slopes * near).sum(1) + room
                 offset[1][at] = give[at] + top
@@ -564,7 +467,7 @@ class _Cells:
         chosen_slopes = torch.cat(slopes) if slopes else torch.zeros((0, len(layer.steps)))
         followed = winner[:, :, 0].reshape(grown).numpy().astype(np.int16)
         rows_of_slopes = which.reshape(grown).numpy().astype(np.int32)
-        for passage, offset in zip(self.passages, offsets, strict=True):
+        for passage, offset in zip(self.known.passages, offsets, strict=True):
             sides = zip(offset, (-1.0, 1.0, 1.0, -1.0), strict=True)
             outward = [passage.outward(v, side) for v, side in sides]
             passage.maxima[k] = Maxima(
@@ -575,12 +478,12 @@ class _Cells:
             )
         active = (layer.taps(x.active.double(), 0.0).amax(2) > 0.0).reshape(grown)
         reference, c, r = (v.reshape(grown) for v in (reference, c, r))
-        form = Form.ranged(reference, c, a.reshape(m, self.d, *shape), r, active)
+        form = Form.ranged(reference, c, a.reshape(m, self.known.d, *shape), r, active)
         lost = int(np.prod(shape)) * 2 * len(layer.steps) * FLUSH
-        self.flush += lost * x.width.reshape(m, -1).amax(1).numpy()
+        self.known.flush += lost * x.width.reshape(m, -1).amax(1).numpy()
         room = 2.0**-50 * (reference.abs() + form.width)
         least = lower.amax(2).reshape(grown)
-        return self._within(form, least - reference - room, most.reshape(grown) - reference + room)
+        return self.known.within(form, least - reference - room, most.reshape(grown) - reference + room)
 
     def _tilted(
         self, source: int, layer: MaxPool, x: Form, interval: Interval, winner: Tensor, where: Tensor
@@ -599,7 +502,7 @@ class _Cells:
             reference=gathered(x.reference),
             middle=gathered(x.c),
             radius=gathered(x.r),
-            slopes=torch.stack([gathered(x.a[:, i]) for i in range(self.d)], 2),
+            slopes=torch.stack([gathered(x.a[:, i]) for i in range(self.known.d)], 2),
             lower=gathered(interval.lower),
             upper=gathered(interval.upper),
             winner=winner[at],
@@ -630,7 +533,7 @@ class _Cells:
             way = self.schedule.nearest(source, len(pairs))
             if way is None:
                 return apart
-            cut = self._ready(way)
+            cut = self.known.ready(way)
         elif self.schedule.deep and not self.schedule.takes(len(pairs) * self.schedule.costs.row(source)):
             return apart
         if len(pairs) > _SOME:
@@ -669,22 +572,12 @@ class _Cells:
             room = 2.0**-50 * (near[0].abs() + near[1].abs()).numpy()
             rows = Rows(value, y * layer.stride[0] - layer.pads[0], x * layer.stride[1] - layer.pads[1])
             enough = Enough(Goal(), room - ahead, np.zeros(len(part), bool))
-            found = self._backward(source, rows, np.ascontiguousarray(cell), enough, None, cut)
+            found = self.backward.bound(source, rows, np.ascontiguousarray(cell), enough, None, cut)
             above, below = torch.from_numpy(room - ahead - found.lower), torch.from_numpy(room + ahead + found.upper)
             apart[window, other, one] = torch.minimum(apart[window, other, one], above)
             apart[window, one, other] = torch.minimum(apart[window, one, other], below)
             closed += int((above <= 0.0).sum())
         return closed
-
-    def _stop(self, index: int, form: Form) -> Columns:
-        """What is known of node ``index``, for rows that arrive there."""
-        m, d, shape = self.count, self.d, grid(self.network.shape(index))
-        room = 2.0**-48 * (form.c.abs() + form.r)
-        slopes = form.a.movedim(1, -1).reshape(m, 1, *shape, d).expand(m, 2, *shape, d)
-        offsets = torch.stack([form.c - form.r - room, form.c + form.r + room], 1)
-        sizes = (m, 2, *shape, d), (m, 2, *shape), (m, *shape), (m, *shape)
-        found = zip((slopes, offsets, form.lower, form.upper), sizes, strict=True)
-        return columns_of(*(t.reshape(size).numpy() for t, size in found))
 
     def _known_better(
         self, index: int, form: Form, open_: Tensor, apart: Tensor | None, layer: Activation | None = None
@@ -705,9 +598,9 @@ class _Cells:
 
         Lines that are close beside the form's width may be far apart beside what rows leave of it.
         """
-        known = torch.from_numpy(self.good).reshape(-1, *[1] * (open_.ndim - 1))
+        known = torch.from_numpy(self.known.good).reshape(-1, *[1] * (open_.ndim - 1))
         likely = (apart > _STRAIGHT) & ~open_ & known
-        where = likely.reshape(self.count, *grid(self.network.shape(index))).nonzero().numpy()
+        where = likely.reshape(self.known.count, *grid(self.network.shape(index))).nonzero().numpy()
         if not len(where):
             return form, open_
         some = where[:: -(-len(where) // _PROBED)]
@@ -715,7 +608,7 @@ class _Cells:
             return form, open_
         found = self._bounded(index, form, some, None, False)
         at = tuple(torch.from_numpy(some.T))
-        shape = self.count, *grid(self.network.shape(index))
+        shape = self.known.count, *grid(self.network.shape(index))
         before, after = ((f.upper - f.lower).reshape(shape)[at] for f in (form, found))
         kept = float((after / before).nan_to_num(nan=1.0).median())
         if kept > _HALF:
@@ -726,7 +619,7 @@ class _Cells:
         """Better bounds of the numbers of node ``index`` that are open; a sign may be all that is asked (N6)."""
         item = self.network.shape(index)
         shape = grid(item)
-        open_ = open_.reshape(self.count, *shape) & torch.from_numpy(self.good).reshape(-1, 1, 1, 1)
+        open_ = open_.reshape(self.known.count, *shape) & torch.from_numpy(self.known.good).reshape(-1, 1, 1, 1)
         where = open_.nonzero().numpy()
         if not len(where):
             return form
@@ -755,10 +648,10 @@ class _Cells:
         that matter further on, so that forms start again from there.
         """
         shape = grid(self.network.shape(index))
-        open_ = open_.reshape(self.count, *shape) & torch.from_numpy(self.good).reshape(-1, 1, 1, 1)
+        open_ = open_.reshape(self.known.count, *shape) & torch.from_numpy(self.known.good).reshape(-1, 1, 1, 1)
         count = int(open_.sum())
         decides = isinstance(layer, LeakyRelu)
-        matters = torch.from_numpy(self.good).reshape(-1, 1, 1, 1) & torch.ones_like(open_)
+        matters = torch.from_numpy(self.known.good).reshape(-1, 1, 1, 1) & torch.ones_like(open_)
         if isinstance(layer, LeakyRelu) and layer.alpha == 0.0:
             # what is certainly cut off is exact behind the layer
             matters &= form.interval.upper.reshape(open_.shape) > 0.0
@@ -796,19 +689,12 @@ class _Cells:
         self.schedule.spares((self.spared - spared) * (1.0 if decides else 0.5))
         return found
 
-    def _ready(self, way: Way) -> int:
-        """Where rows of a way end, when all is known that they end on."""
-        for at, _ in way.rests:
-            if at and at not in self.stops:
-                form = self.forms[at]
-                assert form is not None
-                self.stops[at] = self._stop(at, form)
-        return way.cut
-
     def _planned(self, index: int, form: Form, open_: Tensor, layer: Activation | None) -> Form:
         """Better bounds of all numbers of a node that matter, by rows as long as the network is worth (N18)."""
         shape = grid(self.network.shape(index))
-        matters = torch.from_numpy(self.good).reshape(-1, 1, 1, 1) & torch.ones((self.count, *shape), dtype=torch.bool)
+        matters = torch.from_numpy(self.known.good).reshape(-1, 1, 1, 1) & torch.ones(
+            (self.known.count, *shape), dtype=torch.bool
+        )
         if isinstance(layer, LeakyRelu) and layer.alpha == 0.0:
             matters &= form.interval.upper.reshape(matters.shape) > 0.0
         chosen = matters.nonzero().numpy()
@@ -820,7 +706,7 @@ class _Cells:
         # a row says enough of the other side of its number
         best, least = None, float(form.r.reshape(matters.shape)[at].mean().log())
         for way in ways:
-            found = self._bounded(index, form, some, None, True, self._ready(way))
+            found = self._bounded(index, form, some, None, True, self.known.ready(way))
             radius = float(found.r.reshape(matters.shape)[at].mean().log())
             score = radius + rate * len(chosen) * way.price
             if score < least:
@@ -876,20 +762,20 @@ class _Cells:
         tight = Form(
             form.reference,
             c.reshape(-1, *item),
-            a.movedim(-1, 1).reshape(self.count, self.d, *item),
+            a.movedim(-1, 1).reshape(self.known.count, self.known.d, *item),
             r.reshape(-1, *item),
             lower.reshape(-1, *item),
             upper.reshape(-1, *item),
             form.active,
         )
-        return self._within(tight, tight.lower, tight.upper)
+        return self.known.within(tight, tight.lower, tight.upper)
 
     # ------------------------------------------------------------ backwards
 
     def _one_hot(self, index: int, where: Int64, sign: Float64, enough: Enough | None, cut: int = 0) -> Reached:
         """Bounds of ``sign`` [R] times single numbers [R, (cell, channel, row, column)] of node ``index``."""
         channels = grid(self.network.shape(index))[0]
-        found = Reached.unknown(len(where), self.d)
+        found = Reached.unknown(len(where), self.known.d)
         step = min(self.most_rows, max(1, ROWS_AT_ONCE // (16 * channels)))
         threads = torch.get_num_threads() if self.schedule.deep else 1
         if threads > 1:
@@ -903,7 +789,7 @@ class _Cells:
             value[np.arange(len(cell)), channel, 0, 0] = sign[number]
             trace = self._trace(len(cell))
             asked = None if enough is None else enough[number]
-            part = self._backward(index, Rows(value, y, x), cell, asked, trace, cut)
+            part = self.backward.bound(index, Rows(value, y, x), cell, asked, trace, cut)
             return number, part, trace
 
         for number, part, trace in on_threads(bound, range(0, len(where), step), threads):
@@ -921,255 +807,6 @@ class _Cells:
 
     def _keep(self, index: int, where: Int64, sign: Float64, trace: Trace) -> None:
         """Take notice of rows of ``sign`` times single numbers of node ``index``."""
-
-    def _backward(
-        self,
-        index: int,
-        rows: Rows,
-        cell: Int64,
-        enough: Enough | None = None,
-        trace: Trace | None = None,
-        cut: int = 0,
-    ) -> Reached:
-        """Bounds of rows on node ``index``, relative to the reference.
-
-        Those of which ``enough`` is known may stop before the image; ``trace`` takes in what rows are on the way.
-        All of them end on the nodes up to ``cut`` (N18).
-        """
-        found = Reached.unknown(len(cell), self.d)
-        passage = next(passage for passage in self.passages if passage.takes(rows))
-        batch = _Batch({index: rows}, cell, np.zeros((len(cell), 2)), np.arange(len(cell)), passage)
-        batch.trace = trace
-        self._descend(index, index, batch, found, enough, cut)
-        return found
-
-    def _descend(self, start: int, at: int, batch: _Batch, found: Reached, enough: Enough | None, cut: int = 0) -> None:
-        """Pass a batch from node ``at`` on to the image, or to the nodes up to ``cut``."""
-        checkpoint()
-        while at > cut:
-            if at not in batch.waiting:
-                at -= 1
-                continue
-            if batch.bytes > min(ROWS_AT_ONCE, self.memory // 16) and len(batch.cell) > 1:
-                half = len(batch.cell) // 2
-                for part in (slice(0, half), slice(half, None)):
-                    self._descend(start, at, batch[part], found, enough, cut)
-                return
-            ends = enough is not None and (batch.trace is None or self.schedule.deep)
-            if enough is not None and ends and at != start and at in self.stops and len(batch.waiting) == 1:
-                self._bound_rows(at, batch, self.stops[at], found)
-                going_on = ~enough.done(found, batch.number)
-                if going_on.mean() < 0.75:
-                    found.ended[batch.number[~going_on]] = at
-                    batch = batch[going_on]
-                if not len(batch.cell):
-                    return
-            here = batch.waiting.pop(at)
-            node = self.network.nodes[at - 1]
-            if batch.chosen is not None and at in batch.chosen.paid:
-                flat, gained, offset = batch.chosen.paid[at]
-                here = full(here, node.layer.shape, force=True)
-                here.value.reshape(len(here.value), -1)[:, flat] += gained[batch.number]
-                batch.total[:, 0] += offset[batch.number]
-            if batch.chosen is not None and not isinstance(node.layer, Linear):
-                here = full(here, node.layer.shape, force=True)
-                batch.chosen.keep(at, here.value, batch.number, len(found.lower))
-            gathered = batch.total.copy() if batch.trace is not None else batch.total
-            if batch.trace is not None and not batch.trace.short and self._depends(start, at):
-                batch.trace.keep(at, here, node.layer.shape, batch.number)
-            if isinstance(node.layer, Activation):
-                lines, which = batch.passage.lines[at], batch.cell
-                if batch.chosen is not None and at in batch.chosen.lines:
-                    lines, which = batch.chosen.lines[at], batch.number
-                pass_activation(here.value, here.y, here.x, which, lines, batch.total)
-                parts = [here]
-            elif isinstance(node.layer, MaxPool):
-                parts = [batch.passage.maxima[at].backward(here, node.layer, batch.cell, batch.total)]
-            elif isinstance(node.layer, Product):
-                # every reader changes its rows in place
-                parts = [here, Rows(here.value.copy(), here.y, here.x)]
-                for part, lines in zip(parts, batch.passage.products[at], strict=True):
-                    pass_activation(part.value, part.y, part.x, batch.cell, lines, batch.total)
-            else:
-                if at == start or at not in self.folded:
-                    shape = grid(node.layer.shape)
-                    noise = batch.passage.noise[at].reshape(self.count, *shape).contiguous().numpy()
-                    charge(here.value, here.y, here.x, batch.cell, noise, batch.total)
-                parts = node.layer.backward(here)
-            if batch.trace is not None and (batch.trace.short or isinstance(node.layer, (MaxPool, Product))):
-                batch.trace.fixed[batch.number] += batch.total - gathered
-            for source, part in zip(node.inputs, parts, strict=True):
-                known = batch.waiting.get(source)
-                shape = self.network.shape(source)
-                batch.waiting[source] = full(part, shape) if known is None else join(known, part, shape)
-        if cut:
-            self._rest_rows(batch, found)
-            return
-        if batch.chosen is not None and 0 in batch.waiting:
-            whole = full(batch.waiting[0], self.network.input_shape, force=True)
-            batch.chosen.keep(0, whole.value, batch.number, len(found.lower))
-        if batch.trace is not None:
-            batch.trace.reached[batch.number] = True
-            if 0 in batch.waiting:
-                batch.trace.keep(0, batch.waiting[0], self.network.input_shape, batch.number)
-        self._bound_rows(0, batch, self.columns, found)
-
-    def _depends(self, start: int, at: int) -> bool:
-        """Whether what rows that start at node ``start`` gather at another one depends on the cell's ranges (N15)."""
-        layer = self.network.nodes[at - 1].layer
-        return isinstance(layer, Activation) or (isinstance(layer, Linear) and at != start and at not in self.folded)
-
-    def _bound_rows(self, at: int, batch: _Batch, known: Columns, found: Reached) -> None:
-        """Bounds of a batch whose rows are all on node ``at``."""
-        count = len(batch.cell)
-        plane, box = np.zeros((count, 2, self.d + 1)), np.zeros((count, 2))
-        rows = batch.waiting.get(at)
-        if rows is None:
-            plane[:, :, -1] = box[:] = batch.total
-        else:
-            concretize(rows.value, rows.y, rows.x, batch.cell, known, batch.total, plane, box)
-        lost = self.flush[batch.cell][:, None] * np.array([-1.0, 1.0])
-        plane[:, :, -1] += lost
-        box += lost
-        found.improve(batch.number, plane, box)
-
-    def _rest_rows(self, batch: _Batch, found: Reached) -> None:
-        """Bounds of a batch whose rows rest on several nodes, of which forms are known (N18)."""
-        count, total = len(batch.cell), batch.total
-        plane, box = np.zeros((count, 2, self.d + 1)), np.zeros((count, 2))
-        sizes = np.zeros(count)
-        for at, rows in batch.waiting.items():
-            known = self.stops[at] if at else self.columns
-            one, two = np.zeros_like(plane), np.zeros_like(box)
-            concretize(rows.value, rows.y, rows.x, batch.cell, known, total, one, two)
-            plane += one
-            box += two
-            sizes += np.abs(one).sum((1, 2)) + np.abs(two).sum(1)
-            total = np.zeros_like(total)
-        lost = self.flush[batch.cell] + 2.0**-52 * len(batch.waiting) * sizes
-        lost = lost[:, None] * np.array([-1.0, 1.0])
-        plane[:, :, -1] += lost
-        box += lost
-        found.improve(batch.number, plane, box)
-
-    def _climb(self, index: int, rows: Rows, cell: Int64, need: Float64) -> tuple[Reached, Int64]:
-        """Bounds below of rows on node ``index``, with the best slopes and multipliers that were tried (N14, N16).
-
-        Where signs are assumed, a cell whose rows are above ``need`` [R] is done. Also returns `OutputBounds.loosest`
-        of the rows.
-        """
-        loosest = np.full((len(cell), 2), -1, np.int64)
-        if not self.slope_steps:
-            return self._backward(index, rows, cell), loosest
-        # slopes are chosen in float32
-        start = Rows(rows.value.astype(np.float32), rows.y, rows.x)
-        best, lines = self._backward(index, rows, cell), self.passages[0].lines
-        for k in np.unique(cell):
-            units = {at: opened.of(k) for at, opened in self.open.items()}
-            units = {at: opened for at, opened in units.items() if len(opened.flat)}
-            own, held = np.flatnonzero(cell == k), self.held[k]
-            if not (units or held) or not self.good[k]:
-                continue
-            first = {at: lines[at][0, k].reshape(-1)[opened.flat] for at, opened in units.items()}
-            ascent = Ascent(units, first, len(own), held)
-            for _ in range(self.slope_steps + 1):
-                if self.assumed is not None and bool((best.lower[own] > need[own]).all()):
-                    break
-                chosen = ascent.lines(lines, k)
-                found = Reached.unknown(len(own), self.d)
-                # rows are changed in place
-                part = Rows(start.value[own], start.y[own], start.x[own])
-                total, number = np.zeros((len(own), 2)), np.arange(len(own))
-                self._descend(
-                    index, index, _Batch({index: part}, cell[own], total, number, self.passages[0], chosen), found, None
-                )
-                better = found.lower > best.lower[own]
-                best.lower[own[better]], best.plane[own[better]] = found.lower[better], found.plane[better]
-                slopes, forces = self._derivatives(k, chosen, found, units)
-                ascent.climb(slopes, forces, {at: self._size(chosen, at) for at in held})
-            else:
-                loosest[own] = self._loosest(chosen, units, len(own))
-        return best, loosest
-
-    def _size(self, chosen: Chosen, source: int) -> float:
-        """What coefficients of rows on the readers of node ``source`` are about."""
-        found = [
-            float(np.abs(chosen.trace[k]).mean())
-            for k, node in enumerate(self.network.nodes, 1)
-            if source in node.inputs and k in chosen.trace
-        ]
-        return max(found, default=0.0)
-
-    def _loosest(self, chosen: Chosen, units: Mapping[int, OpenUnits], count: int) -> Int64:
-        """[R, 2] the node and place of the input of the open unit that costs each row most."""
-        found, most = np.full((count, 2), -1, np.int64), np.full(count, -1.0)
-        for k, opened in units.items():
-            if k not in chosen.trace:
-                continue
-            losses = opened.losses(chosen.trace[k].reshape(count, -1)[:, opened.flat])
-            at = losses.argmax(1)
-            value = losses[np.arange(count), at]
-            here = value > most
-            most[here] = value[here]
-            found[here, 0], found[here, 1] = self.network.nodes[k - 1].inputs[0], opened.flat[at[here]]
-        return found
-
-    def _derivatives(
-        self, cell: int, chosen: Chosen, found: Reached, units: Mapping[int, OpenUnits]
-    ) -> tuple[dict[int, Float64], dict[int, Float64]]:
-        """How the bounds of a cell's rows change with slopes and with multipliers."""
-        planes, held = self.image, self.held[cell]
-        rows = chosen.trace.get(0)
-        if rows is None:
-            rows = np.zeros((len(found.lower), *grid(self.network.input_shape)), np.float32)
-        p = -np.sign(np.nan_to_num(found.plane[:, 0, :-1]))
-        ends = np.einsum("schwd,rd->srchw", planes.slopes[cell], p) + planes.offsets[cell][:, None]
-        image = np.where(rows >= 0.0, ends[0], ends[1]).astype(np.float32)
-        others: dict[int, Any] = {}
-        for k, (one, two) in self.passages[0].products.items():
-            others[k] = functools.partial(_product, torch.from_numpy(one[:, cell]), torch.from_numpy(two[:, cell]))
-        for k, maxima in self.passages[0].maxima.items():
-            layer = self.network.nodes[k - 1].layer
-            assert isinstance(layer, MaxPool)
-            others[k] = functools.partial(maxima.forward, layer, cell)
-
-        def lines(k: int) -> np.ndarray:
-            return chosen.lines[k] if k in chosen.lines else self.passages[0].lines[k][:, cell : cell + 1]
-
-        shaped = torch.from_numpy(image).reshape(-1, *self.network.input_shape)
-        return derivatives(self.network, shaped, chosen.trace, lines, units, others, held)
-
-    def outputs(self, rows: Any, offset: Float64) -> OutputBounds:
-        """Bounds of ``rows @ y + offset`` in every cell."""
-        index = len(self.network.nodes)
-        m, k = self.count, len(offset)
-        plane, lower = np.zeros((m, k, self.d + 1)), np.zeros((m, k))
-        loosest = np.zeros((m, k, 2), np.int64)
-        shape = grid(self.network.shape(index))
-        dense = np.asarray(rows.toarray() if hasattr(rows, "toarray") else rows, np.float64)
-        stored = dense.astype(self.passages[-1].number)
-        size = self.last.width.reshape(m, -1).numpy()
-        reference = self.last.reference.reshape(m, -1).numpy()
-        missing = size @ np.abs(dense - stored).T
-        missing += 2.0**-52 * (dense.shape[1] + 2) * (np.abs(reference) @ np.abs(dense).T)
-        offset = reference @ dense.T + offset
-        need = -offset + _SURE * (1.0 + np.abs(offset))
-        for top, left, height, width, number in _windows(stored.reshape(k, *shape)):
-            part = stored.reshape(k, *shape)[:, :, top : top + height, left : left + width]
-            step = max(1, ROWS_AT_ONCE // (stored.itemsize * shape[0] * height * width))
-            for first in range(0, m * len(number), step):
-                which = np.arange(first, min(m * len(number), first + step))
-                cell, row = which // len(number), number[which % len(number)]
-                rows = Rows(np.ascontiguousarray(part[row]), np.full(len(which), top), np.full(len(which), left))
-                found, loosest[cell, row] = self._climb(index, rows, cell, need[cell, row])
-                plane[cell, row], lower[cell, row] = found.plane[:, 0], found.lower
-        room = 2.0**-48 * (np.abs(plane).sum(-1) + np.abs(offset) + missing) + missing
-        lower, b = lower + offset - room, plane[..., -1] + offset - room
-        a = plane[..., :-1]
-        known = self.good[:, None] & np.isfinite(lower)
-        usable = self.good[:, None] & np.isfinite(b) & np.isfinite(a).all(-1)
-        lower = np.where(self.vacant[:, None], np.inf, np.where(known, lower, -np.inf))
-        return OutputBounds(lower, np.where(usable[..., None], a, 0.0), np.where(usable, b, -np.inf), loosest)
 
 
 def _tilted(slope: Tensor, z: Form, line: tuple[Tensor, Tensor, Tensor]) -> tuple[Tensor, Tensor, Tensor]:
@@ -1193,39 +830,6 @@ def _open_units(layer: LeakyRelu, given: tuple[Tensor, Tensor, Tensor, Tensor, T
     return OpenUnits(cell, flat, lower, upper, reference, image, loose, room, layer.alpha)
 
 
-def _product(one: Tensor, two: Tensor, rows: Tensor, inputs: list[Tensor]) -> Tensor:
-    """The planes that ``rows`` take of a product's factors."""
-    x, y = (v.reshape(rows.shape) for v in inputs)
-    offset = torch.where(rows >= 0.0, one[1] + two[1], one[4] + two[4])
-    return one[0] * x + two[0] * y + offset
-
-
-def _windows(rows: np.ndarray) -> list[tuple[int, int, int, int, Int64]]:
-    """Windows (top, left, height, width) of rows [k, C, H, W] that are zero elsewhere, and which rows they hold."""
-    used = (rows != 0.0).any(axis=1)
-    groups: dict[tuple[int, int, int, int], list[int]] = {}
-    for k, mask in enumerate(used):
-        ys, xs = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
-        window = (ys[0], xs[0], ys[-1] - ys[0] + 1, xs[-1] - xs[0] + 1) if len(ys) else (0, 0, 1, 1)
-        groups.setdefault(tuple(map(int, window)), []).append(k)  # type: ignore[arg-type]
-    return [(*window, np.array(number)) for window, number in groups.items()]
-
-
-class ImagePlanes(NamedTuple):
-    """What is known of a node, as rows want it.
-
-    Attributes:
-        slopes: [m, 2, C, H, W, d] of the lower and the upper plane.
-        offsets: [m, 2, C, H, W].
-        lower, upper: [m, C, H, W].
-    """
-
-    slopes: Float64
-    offsets: Float64
-    lower: Float64
-    upper: Float64
-
-
 class _Tilted(NamedTuple):
     """Windows whose winner may be exceeded, and planes above them.
 
@@ -1242,36 +846,3 @@ class _Tilted(NamedTuple):
     known: Candidates
     near: Tensor
     planes: Planes
-
-
-@dataclass
-class _Batch:
-    """Rows under way.
-
-    Attributes:
-        waiting: By node.
-        cell: [R] of every row.
-        total: [R, 2] what rows gathered so far, at least and at most.
-        number: [R] positions in the result.
-        passage: What they take.
-        chosen: Lines of rows' own, and a place for what rows are on the way.
-        trace: A place for what rows are on the way.
-    """
-
-    waiting: dict[int, Rows]
-    cell: Int64
-    total: Float64
-    number: Int64
-    passage: Passage
-    chosen: Chosen | None = None
-    trace: Trace | None = None
-
-    def __getitem__(self, part: Any) -> _Batch:
-        waiting = {k: rows[part] for k, rows in self.waiting.items()}
-        return _Batch(
-            waiting, self.cell[part], self.total[part], self.number[part], self.passage, self.chosen, self.trace
-        )
-
-    @property
-    def bytes(self) -> int:
-        return sum(rows.value.nbytes for rows in self.waiting.values())

@@ -84,7 +84,7 @@ class Family:
             fresh: Whether all that is open before the last activation or product has rows of the cell's own.
         """
         offset = np.asarray(offset, np.float64)
-        if not self._first.good[0]:
+        if not self._first.known.good[0]:
             return bound_outputs(self.network, images, rows, offset, memory=self.memory, arithmetic=self.arithmetic)
         by_cell = _numbers(self.network) * 8 * (3 * images.dimensions + 18)
         step = max(1, int(0.25 * self.memory) // by_cell)
@@ -211,11 +211,11 @@ class _Other(_Cells):
 
     def _about(self, middle: Float64) -> Float64:
         # what rows gathered at maxima and products is relative to the first cell's references
-        return np.repeat(self.first.middle, len(middle), axis=0)
+        return np.repeat(self.first.known.middle, len(middle), axis=0)
 
     def _reference(self, k: int, passed_on: Callable[[], Tensor]) -> Tensor:
         reference = self.first.references[k]
-        return reference.expand(self.count, *reference.shape[1:])
+        return reference.expand(self.known.count, *reference.shape[1:])
 
     def _sized(self, form: Form) -> Form:
         # neighbours are of one size: rounding is charged by all of them at once
@@ -228,7 +228,7 @@ class _Other(_Cells):
 
     def _lent(self, k: int) -> tuple[np.ndarray, np.ndarray]:
         shape = self.network.shape(k)
-        lines = self.first.passages[0].lines[k]
+        lines = self.first.known.passages[0].lines[k]
         return lines[0, 0].reshape(shape), lines[3, 0].reshape(shape)
 
     def _column(self, at: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
@@ -239,18 +239,21 @@ class _Other(_Cells):
         linear layers. The last column of sizes is that of all that is added up, in any cell.
         """
         if at not in self._columns:
-            m, d = self.count, self.d
+            m, d = self.known.count, self.known.d
             signed: list[Float64] = []
             if at == 0:
-                slopes, offsets = self.image.slopes.reshape(m, 2, -1, d), self.image.offsets.reshape(m, 2, -1)
+                slopes, offsets = (
+                    self.known.image.slopes.reshape(m, 2, -1, d),
+                    self.known.image.offsets.reshape(m, 2, -1),
+                )
                 half = 0.5 * (offsets[:, 1] - offsets[:, 0]) + 0.5 * np.abs(slopes[:, 1] - slopes[:, 0]).sum(-1)
                 half = np.maximum(half, 0.0) + _ROOM * (np.abs(offsets).max(1) + np.abs(slopes).max(1).sum(-1))
-                low, high = self.image.lower.reshape(m, -1), self.image.upper.reshape(m, -1)
+                low, high = self.known.image.lower.reshape(m, -1), self.known.image.upper.reshape(m, -1)
                 box = 0.5 * (high - low) + _ROOM * (np.abs(low) + np.abs(high))
                 signed = [*np.moveaxis(slopes.mean(1), -1, 0), offsets.mean(1), 0.5 * (low + high)]
                 sized = [half, box]
-            elif at in self.offered:
-                offered = self.offered[at]
+            elif at in self.known.offered:
+                offered = self.known.offered[at]
                 _, low, high, _, above, below = offered.lines.reshape(6, m, -1).astype(np.float64)
                 one, two = np.moveaxis(offered.tilts, 2, 1)
                 # a row a gathers (a + |a|) / 2 times what stands first and (a - |a|) / 2 times the other
@@ -259,7 +262,7 @@ class _Other(_Cells):
                 signed = [*(0.5 * (x + y) for x, y in pairs), 0.5 * (half - least)]
                 sized = [*(0.5 * (x - y) for x, y in pairs), 0.5 * (half + least)]
             else:
-                sized = [self.passages[0].noise[at].reshape(m, -1).numpy()]
+                sized = [self.known.passages[0].noise[at].reshape(m, -1).numpy()]
             most = np.sum([np.abs(v) for v in (*signed, *sized)], axis=0).max(axis=0)
             n = len(most)
             one, two = (np.reshape(v, (-1, n)).T for v in (signed, sized))
@@ -269,7 +272,7 @@ class _Other(_Cells):
 
     def _said(self, index: int) -> _Said:
         """What the first cell's rows say of node ``index`` here."""
-        m, d = self.count, self.d
+        m, d = self.known.count, self.known.d
         lent = self.first.lent[index]
         count = len(lent.flat)
         # what intervals alone say has no slopes but those of what is between an activation's offsets
@@ -288,7 +291,7 @@ class _Other(_Cells):
                 if at == 0:
                     signed[here] += sums
                     half[here] += sizes
-                elif at in self.offered:
+                elif at in self.known.offered:
                     tilted[here] += sums[:, :-1]
                     tilted[here] += sizes[:, :-1]
                     spread[here] += sums[:, -1]
@@ -303,10 +306,10 @@ class _Other(_Cells):
         tilts, gathered = tilted[:d], tilted[d]
         slopes, middle, moved = signed[:d] + tilts, signed[d] + gathered, signed[d + 1] + gathered
         low, high = lent.fixed.T
-        if self._rounds(index):
+        if self.known.rounds(index):
             # what a row gathers where it starts
-            lost += self.passages[0].noise[index].reshape(m, -1).numpy()[:, lent.flat]
-        spread = spread + 0.5 * (high - low) + lost + self.flush[:, None]
+            lost += self.known.passages[0].noise[index].reshape(m, -1).numpy()[:, lent.flat]
+        spread = spread + 0.5 * (high - low) + lost + self.known.flush[:, None]
         middle, moved = middle + 0.5 * (low + high), moved + 0.5 * (low + high)
         half, box = half[0] + spread, half[1] + spread + np.abs(tilts).sum(0)
         for known, center in ((half, middle), (box, moved)):
@@ -338,7 +341,7 @@ class _Other(_Cells):
             return form
         flat, sign = self.first.lent[index].flat, self.first.lent[index].sign
         slopes, middle, half, least, most = self._said(index)
-        m, d, shape = self.count, self.d, form.reference.shape
+        m, d, shape = self.known.count, self.known.d, form.reference.shape
         lower, upper, c, r = (np.array(v.reshape(m, -1).numpy()) for v in (form.lower, form.upper, form.c, form.r))
         a = np.array(form.a.reshape(m, d, -1).numpy())
         order = np.argsort(flat, kind="stable")
@@ -371,4 +374,4 @@ class _Other(_Cells):
             torch.from_numpy(upper).reshape(shape),
             form.active,
         )
-        return self._within(found, found.lower, found.upper)
+        return self.known.within(found, found.lower, found.upper)

@@ -1,0 +1,210 @@
+"""Rows passed back through a network, to the image or to nodes on the way (docs/design.md, N5, N17, N18)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from ns_abstract.execution.ending import checkpoint
+from ns_abstract.verify.network.known import Known
+from ns_abstract.verify.network.layers import Activation, Linear
+from ns_abstract.verify.network.maxima import MaxPool
+from ns_abstract.verify.network.passages import Passage
+from ns_abstract.verify.network.products import Product
+from ns_abstract.verify.network.reached import Enough, Reached, Trace
+from ns_abstract.verify.network.rows import (
+    Columns,
+    Float64,
+    Int64,
+    Rows,
+    charge,
+    concretize,
+    full,
+    grid,
+    join,
+    pass_activation,
+)
+from ns_abstract.verify.network.slopes import Chosen
+
+#: Bytes of rows that are worked on at a time: they should stay in a processor's cache.
+ROWS_AT_ONCE = 24 << 20
+
+
+@dataclass
+class Batch:
+    """Rows under way.
+
+    Attributes:
+        waiting: By node.
+        cell: [R] of every row.
+        total: [R, 2] what rows gathered so far, at least and at most.
+        number: [R] positions in the result.
+        passage: What they take.
+        chosen: Lines of rows' own, and a place for what rows are on the way.
+        trace: A place for what rows are on the way.
+    """
+
+    waiting: dict[int, Rows]
+    cell: Int64
+    total: Float64
+    number: Int64
+    passage: Passage
+    chosen: Chosen | None = None
+    trace: Trace | None = None
+
+    def __getitem__(self, part: Any) -> Batch:
+        waiting = {k: rows[part] for k, rows in self.waiting.items()}
+        return Batch(
+            waiting, self.cell[part], self.total[part], self.number[part], self.passage, self.chosen, self.trace
+        )
+
+    @property
+    def bytes(self) -> int:
+        return sum(rows.value.nbytes for rows in self.waiting.values())
+
+
+class Backward:
+    """Passes rows back over what is known of the nodes; changes nothing of it.
+
+    Args:
+        known: What is known so far.
+        memory: Bytes to stay within, roughly.
+        deep: Whether the network's rows are rationed (N13); then those that are kept may end on the way, too.
+    """
+
+    def __init__(self, known: Known, memory: int, deep: bool) -> None:
+        self.known, self.network = known, known.network
+        self.memory, self.deep = memory, deep
+
+    def bound(
+        self,
+        index: int,
+        rows: Rows,
+        cell: Int64,
+        enough: Enough | None = None,
+        trace: Trace | None = None,
+        cut: int = 0,
+    ) -> Reached:
+        """Bounds of rows on node ``index``, relative to the reference.
+
+        Those of which ``enough`` is known may stop before the image; ``trace`` takes in what rows are on the way.
+        All of them end on the nodes up to ``cut`` (N18).
+        """
+        found = Reached.unknown(len(cell), self.known.d)
+        passage = next(passage for passage in self.known.passages if passage.takes(rows))
+        batch = Batch({index: rows}, cell, np.zeros((len(cell), 2)), np.arange(len(cell)), passage)
+        batch.trace = trace
+        self.descend(index, index, batch, found, enough, cut)
+        return found
+
+    def descend(self, start: int, at: int, batch: Batch, found: Reached, enough: Enough | None, cut: int = 0) -> None:
+        """Pass a batch from node ``at`` on to the image, or to the nodes up to ``cut``."""
+        checkpoint()
+        while at > cut:
+            if at not in batch.waiting:
+                at -= 1
+                continue
+            if batch.bytes > min(ROWS_AT_ONCE, self.memory // 16) and len(batch.cell) > 1:
+                half = len(batch.cell) // 2
+                for part in (slice(0, half), slice(half, None)):
+                    self.descend(start, at, batch[part], found, enough, cut)
+                return
+            ends = enough is not None and (batch.trace is None or self.deep)
+            if enough is not None and ends and at != start and at in self.known.stops and len(batch.waiting) == 1:
+                self._bound_rows(at, batch, self.known.stops[at], found)
+                going_on = ~enough.done(found, batch.number)
+                if going_on.mean() < 0.75:
+                    found.ended[batch.number[~going_on]] = at
+                    batch = batch[going_on]
+                if not len(batch.cell):
+                    return
+            here = batch.waiting.pop(at)
+            node = self.network.nodes[at - 1]
+            if batch.chosen is not None and at in batch.chosen.paid:
+                flat, gained, offset = batch.chosen.paid[at]
+                here = full(here, node.layer.shape, force=True)
+                here.value.reshape(len(here.value), -1)[:, flat] += gained[batch.number]
+                batch.total[:, 0] += offset[batch.number]
+            if batch.chosen is not None and not isinstance(node.layer, Linear):
+                here = full(here, node.layer.shape, force=True)
+                batch.chosen.keep(at, here.value, batch.number, len(found.lower))
+            gathered = batch.total.copy() if batch.trace is not None else batch.total
+            if batch.trace is not None and not batch.trace.short and self._depends(start, at):
+                batch.trace.keep(at, here, node.layer.shape, batch.number)
+            if isinstance(node.layer, Activation):
+                lines, which = batch.passage.lines[at], batch.cell
+                if batch.chosen is not None and at in batch.chosen.lines:
+                    lines, which = batch.chosen.lines[at], batch.number
+                pass_activation(here.value, here.y, here.x, which, lines, batch.total)
+                parts = [here]
+            elif isinstance(node.layer, MaxPool):
+                parts = [batch.passage.maxima[at].backward(here, node.layer, batch.cell, batch.total)]
+            elif isinstance(node.layer, Product):
+                # every reader changes its rows in place
+                parts = [here, Rows(here.value.copy(), here.y, here.x)]
+                for part, lines in zip(parts, batch.passage.products[at], strict=True):
+                    pass_activation(part.value, part.y, part.x, batch.cell, lines, batch.total)
+            else:
+                if at == start or at not in self.known.folded:
+                    shape = grid(node.layer.shape)
+                    noise = batch.passage.noise[at].reshape(self.known.count, *shape).contiguous().numpy()
+                    charge(here.value, here.y, here.x, batch.cell, noise, batch.total)
+                parts = node.layer.backward(here)
+            if batch.trace is not None and (batch.trace.short or isinstance(node.layer, (MaxPool, Product))):
+                batch.trace.fixed[batch.number] += batch.total - gathered
+            for source, part in zip(node.inputs, parts, strict=True):
+                known = batch.waiting.get(source)
+                shape = self.network.shape(source)
+                batch.waiting[source] = full(part, shape) if known is None else join(known, part, shape)
+        if cut:
+            self._rest_rows(batch, found)
+            return
+        if batch.chosen is not None and 0 in batch.waiting:
+            whole = full(batch.waiting[0], self.network.input_shape, force=True)
+            batch.chosen.keep(0, whole.value, batch.number, len(found.lower))
+        if batch.trace is not None:
+            batch.trace.reached[batch.number] = True
+            if 0 in batch.waiting:
+                batch.trace.keep(0, batch.waiting[0], self.network.input_shape, batch.number)
+        self._bound_rows(0, batch, self.known.columns, found)
+
+    def _depends(self, start: int, at: int) -> bool:
+        """Whether what rows that start at node ``start`` gather at another one depends on the cell's ranges (N15)."""
+        layer = self.network.nodes[at - 1].layer
+        charged = isinstance(layer, Linear) and at != start and at not in self.known.folded
+        return charged or isinstance(layer, Activation)
+
+    def _bound_rows(self, at: int, batch: Batch, known: Columns, found: Reached) -> None:
+        """Bounds of a batch whose rows are all on node ``at``."""
+        count = len(batch.cell)
+        plane, box = np.zeros((count, 2, self.known.d + 1)), np.zeros((count, 2))
+        rows = batch.waiting.get(at)
+        if rows is None:
+            plane[:, :, -1] = box[:] = batch.total
+        else:
+            concretize(rows.value, rows.y, rows.x, batch.cell, known, batch.total, plane, box)
+        lost = self.known.flush[batch.cell][:, None] * np.array([-1.0, 1.0])
+        plane[:, :, -1] += lost
+        box += lost
+        found.improve(batch.number, plane, box)
+
+    def _rest_rows(self, batch: Batch, found: Reached) -> None:
+        """Bounds of a batch whose rows rest on several nodes, of which forms are known (N18)."""
+        count, total = len(batch.cell), batch.total
+        plane, box = np.zeros((count, 2, self.known.d + 1)), np.zeros((count, 2))
+        sizes = np.zeros(count)
+        for at, rows in batch.waiting.items():
+            known = self.known.stops[at] if at else self.known.columns
+            one, two = np.zeros_like(plane), np.zeros_like(box)
+            concretize(rows.value, rows.y, rows.x, batch.cell, known, total, one, two)
+            plane += one
+            box += two
+            sizes += np.abs(one).sum((1, 2)) + np.abs(two).sum(1)
+            total = np.zeros_like(total)
+        lost = self.known.flush[batch.cell] + 2.0**-52 * len(batch.waiting) * sizes
+        lost = lost[:, None] * np.array([-1.0, 1.0])
+        plane[:, :, -1] += lost
+        box += lost
+        found.improve(batch.number, plane, box)

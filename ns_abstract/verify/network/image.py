@@ -1,0 +1,74 @@
+"""Sets of images as rows and forms want them, relative to a reference (docs/design.md, N, N0)."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+import torch
+
+from ns_abstract.verify.network.forms import Form
+from ns_abstract.verify.network.rows import Float64, grid
+from ns_abstract.verify.network.sets import ImageSets, Substitution
+
+
+class ImagePlanes(NamedTuple):
+    """What is known of the image, as rows want it.
+
+    Attributes:
+        slopes: [m, 2, C, H, W, d] of the lower and the upper plane.
+        offsets: [m, 2, C, H, W].
+        lower, upper: [m, C, H, W].
+    """
+
+    slopes: Float64
+    offsets: Float64
+    lower: Float64
+    upper: Float64
+
+
+def finite(images: ImageSets) -> tuple[list[Float64], np.ndarray]:
+    """The fields of image sets without numbers that are not finite, and [m] which cells have no such numbers."""
+    fields = [np.asarray(getattr(images, name), np.float64) for name in images.__dataclass_fields__]
+    good = np.logical_and.reduce([np.isfinite(f).reshape(images.count, -1).all(axis=1) for f in fields])
+    good &= (fields[4] <= fields[5]).all(axis=1)
+    return [np.where(good.reshape(-1, *[1] * (f.ndim - 1)), f, 0.0) for f in fields], good
+
+
+def middle_of(fields: list[Float64]) -> Float64:
+    """[m, n] pictures in the middle of the sets."""
+    return 0.5 * (np.maximum(fields[1], fields[4]) + np.minimum(fields[3], fields[5]))
+
+
+def planes_of(
+    fields: list[Float64], middle: Float64, input_shape: tuple[int, ...], substitution: Substitution
+) -> ImagePlanes:
+    """Image sets as rows want them, relative to the reference ``middle``."""
+    m, _, d = fields[0].shape
+    shape = grid(input_shape)
+    a_lower, b_lower, a_upper, b_upper, lower, upper = fields
+    if substitution != "everywhere":
+        a_lower, b_lower, a_upper, b_upper = np.zeros_like(a_lower), lower, np.zeros_like(a_upper), upper
+    c = middle
+    b_lower, lower = (v - c - 2.0**-51 * (np.abs(v) + np.abs(c)) for v in (b_lower, lower))
+    b_upper, upper = (v - c + 2.0**-51 * (np.abs(v) + np.abs(c)) for v in (b_upper, upper))
+    # numpy keeps the order of axes in memory that the images came with
+    return ImagePlanes(
+        np.ascontiguousarray(np.stack([a_lower, a_upper], 1)).reshape(m, 2, *shape, d),
+        np.ascontiguousarray(np.stack([b_lower, b_upper], 1)).reshape(m, 2, *shape),
+        np.ascontiguousarray(lower).reshape(m, *shape),
+        np.ascontiguousarray(upper).reshape(m, *shape),
+    )
+
+
+def form_of(planes: ImagePlanes, middle: Float64, input_shape: tuple[int, ...]) -> Form:
+    """The image as a form: the middle of its planes."""
+    m, d = len(middle), planes.slopes.shape[-1]
+    slopes, offsets = torch.from_numpy(planes.slopes), torch.from_numpy(planes.offsets)
+    a = slopes.mean(1).movedim(-1, 1).reshape(m, d, *input_shape)
+    c = offsets.mean(1)
+    spread = 0.5 * (offsets[:, 1] - offsets[:, 0]) + 0.5 * (slopes[:, 1] - slopes[:, 0]).abs().sum(-1)
+    spread = spread.clamp(min=0.0) + 2.0**-50 * (offsets.abs().amax(1) + slopes.abs().amax(1).sum(-1))
+    c, spread = c.reshape(-1, *input_shape), spread.reshape(-1, *input_shape)
+    reference = torch.from_numpy(middle).reshape(-1, *input_shape)
+    return Form.ranged(reference, c, a, spread)

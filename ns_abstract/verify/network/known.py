@@ -1,0 +1,132 @@
+"""What is known of a network's nodes over some cells: forms, and what rows take (docs/design.md, N1, N16, N18)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ns_abstract.verify.network.forms import Form
+from ns_abstract.verify.network.graph import Network, NetworkArithmetic
+from ns_abstract.verify.network.image import ImagePlanes, form_of
+from ns_abstract.verify.network.passages import Offered, Passage
+from ns_abstract.verify.network.rounding import DOUBLE_UNIT, UNIT
+from ns_abstract.verify.network.rows import Columns, Float64, columns_of, grid
+from ns_abstract.verify.network.schedule import Way
+from ns_abstract.verify.network.sets import Signs
+from ns_abstract.verify.network.slopes import Held, OpenUnits
+
+
+class Known:
+    """What is known so far; passing forms forwards adds to it, and rows that are passed back read it.
+
+    Args:
+        network: The network.
+        image: What is known of the image.
+        middle: [m, n] the images' reference.
+        good: [m] cells that are not given up; changed in place.
+        arithmetic, assumed: As in `ns_abstract.verify.network.bound_outputs`.
+
+    Attributes:
+        count, d: Cells m and parameters d.
+        single: Whether the network's evaluation in float32 is bounded.
+        image, columns: The image as planes, and as rows are bounded on it.
+        vacant: [m] cells without an image that has the signs assumed.
+        flush: [m] what flushes to zero may lose on the way of any row.
+        passages: What rows take on their way; rows of outputs take the last, the others the first.
+        folded: Nodes whose rounding is in that of their only reader.
+        forms: By node: what is known of it, while other nodes read it.
+        stops: By node: what rows may stop at.
+        open: By node: units whose lower lines may have other slopes.
+        held: By cell and node: what rows take of signs that are assumed.
+        offered: By node: lines with slopes of another cell's rows.
+    """
+
+    def __init__(
+        self,
+        network: Network,
+        image: ImagePlanes,
+        middle: Float64,
+        good: np.ndarray,
+        arithmetic: NetworkArithmetic,
+        assumed: Sequence[Mapping[int, Signs]] | None,
+    ) -> None:
+        self.network, self.middle, self.good, self.assumed = network, middle, good, assumed
+        self.count, self.d = len(middle), image.slopes.shape[-1]
+        self.single = arithmetic == "float32"
+        self.vacant, self.flush = np.zeros(self.count, bool), np.zeros(self.count)
+        self.see(image)
+        # every number is passed by a few times at most
+        numbers = sum(int(np.prod(network.shape(k))) for k in range(len(network.nodes) + 1))
+        sums = 4.0 * DOUBLE_UNIT * (numbers + len(network.nodes))
+        self.passages = [Passage(torch.float32, UNIT, sums)]
+        if not self.single:
+            # beside the rounding of a float32 network that of rows is little
+            self.passages.append(Passage(torch.float64, DOUBLE_UNIT, sums))
+        self.folded: set[int] = set()
+        self.forms: list[Form | None] = []
+        self.stops: dict[int, Columns] = {}
+        self.open: dict[int, OpenUnits] = {}
+        self.held: list[dict[int, Held]] = [{} for _ in range(self.count)]
+        self.offered: dict[int, Offered] = {}
+
+    def see(self, image: ImagePlanes) -> None:
+        """Take this for what is known of the image."""
+        self.image, self.columns = image, columns_of(*image)
+
+    def first(self) -> Form:
+        """The image as a form."""
+        form = form_of(self.image, self.middle, self.network.input_shape)
+        lower, upper = torch.from_numpy(self.image.lower), torch.from_numpy(self.image.upper)
+        return self.within(form, lower.reshape(form.c.shape), upper.reshape(form.c.shape))
+
+    def rounds(self, source: int) -> bool:
+        """Whether rows are charged on node ``source``."""
+        return source in self.passages[0].noise
+
+    def within(self, form: Form, lower: Tensor, upper: Tensor) -> Form:
+        """The form with bounds that are known besides; a cell without values in it is given up."""
+        low, high = torch.maximum(form.lower, lower), torch.minimum(form.upper, upper)
+        fine = low <= high
+        for known in (form.reference, form.c, form.r, form.a):
+            # sums are finite unless a number, or they, are not
+            if not bool(torch.isfinite(known.sum())):
+                finite = torch.isfinite(known)
+                fine = fine & (finite.all(1) if known.ndim > fine.ndim else finite)
+        good = fine.reshape(self.count, -1).all(1)
+        if self.assumed is not None and not bool(good.all()):
+            # bounds that hold for all images with these signs contradict each other: there are none (N16)
+            crossed = torch.isfinite(low) & torch.isfinite(high) & (low > high)
+            told = np.array([len(signs) > 0 for signs in self.assumed]) & self.good
+            self.vacant |= told & crossed.reshape(self.count, -1).any(1).numpy()
+        self.good &= good.numpy()
+        found = Form(form.reference, form.c, form.a, form.r, low, high, form.active)
+        if bool(good.all()):
+            return found
+
+        # what is given up must not slow the others down with NaN
+        def clear(t: Tensor) -> Tensor:
+            return torch.where(good.reshape(-1, *[1] * (t.ndim - 1)), t, torch.zeros_like(t))
+
+        return Form(*(clear(getattr(found, name)) for name in Form.__dataclass_fields__))
+
+    def stop(self, index: int, form: Form) -> Columns:
+        """What is known of node ``index``, for rows that arrive there."""
+        m, d, shape = self.count, self.d, grid(self.network.shape(index))
+        room = 2.0**-48 * (form.c.abs() + form.r)
+        slopes = form.a.movedim(1, -1).reshape(m, 1, *shape, d).expand(m, 2, *shape, d)
+        offsets = torch.stack([form.c - form.r - room, form.c + form.r + room], 1)
+        sizes = (m, 2, *shape, d), (m, 2, *shape), (m, *shape), (m, *shape)
+        found = zip((slopes, offsets, form.lower, form.upper), sizes, strict=True)
+        return columns_of(*(t.reshape(size).numpy() for t, size in found))
+
+    def ready(self, way: Way) -> int:
+        """Where rows of a way end, when all is known that they end on."""
+        for at, _ in way.rests:
+            if at and at not in self.stops:
+                form = self.forms[at]
+                assert form is not None
+                self.stops[at] = self.stop(at, form)
+        return way.cut
