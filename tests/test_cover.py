@@ -26,6 +26,7 @@ from ns_abstract.verify.network import Family, ImageSets, Network, bound_outputs
 from ns_abstract.verify.network import family as family_module
 from ns_abstract.verify.network.bounds import _Cells
 from ns_abstract.verify.network.family import _Other, _Said
+from ns_abstract.verify.network.known import Known
 from ns_abstract.verify.properties import Query
 from ns_abstract.verify.search import Search
 
@@ -126,11 +127,11 @@ def test_rows_of_one_cell_hold_every_value(local: str, tmp_path: Path, monkeypat
         monkeypatch.setattr(family_module, "_MOST_TRACED", 100)
     borrowed = _Other._borrowed
 
-    def watched(self: _Other, index: int, form: Any) -> Any:
+    def watched(self: _Other, known: Known, index: int, form: Any) -> Any:
         if index in self.first.lent:
             reference = form.reference.flatten(1).numpy()[:, self.first.lent[index].flat]
-            found[index] = self._said(index), reference
-        return borrowed(self, index, form)
+            found[index] = self._said(known, index), reference
+        return borrowed(self, known, index, form)
 
     monkeypatch.setattr(_Other, "_borrowed", watched)
     for seed in range(2):
@@ -166,7 +167,7 @@ def test_products_of_rows_are_charged(local: str, tmp_path: Path) -> None:
     m, off = cells.count, []
     slopes, offsets = other.known.image.slopes.reshape(m, 2, -1, 2), other.known.image.offsets.reshape(m, 2, -1)
     for index, lent in family._first.lent.items():
-        said = other._said(index)
+        said = other._said(other.known, index)
         tilt, noise = np.zeros((m, len(lent.flat), 2)), other.known.flush[:, None]
         low, high = (np.repeat(v[None], m, 0) for v in lent.fixed.T)
         if index in other.known.passages[0].noise:
@@ -206,7 +207,7 @@ def test_parts_have_the_references_and_winners_of_the_whole(tmp_path: Path) -> N
     (at,) = family._first.known.passages[0].maxima
     assert (part.known.passages[0].maxima[at].winner == family._first.known.passages[0].maxima[at].winner).all()
     assert (alone.known.passages[0].maxima[at].winner != family._first.known.passages[0].maxima[at].winner).any()
-    assert torch.equal(part.last.reference, family._first.last.reference.expand_as(part.last.reference))
+    assert torch.equal(part.cells.last.reference, family._first.cells.last.reference.expand_as(part.cells.last.reference))
 
 
 def test_rounding_is_charged_by_all_parts_at_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -215,7 +216,7 @@ def test_rounding_is_charged_by_all_parts_at_once(tmp_path: Path, monkeypatch: p
     images = image_sets(SHAPE, 1, 2, 0.3, 1e-3)
     family, cells = Family(net, images), halved(images)
     together = _Other(family._first, cells, 1 << 30, "float32", False)
-    monkeypatch.setattr(_Other, "_sized", lambda self, form: form)
+    monkeypatch.setattr(_Other, "sized", lambda self, form: form)
     alone = _Other(family._first, cells, 1 << 30, "float32", False)
     charged, singly = together.known.passages[0].noise, alone.known.passages[0].noise
     assert len(charged) > 3

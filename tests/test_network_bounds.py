@@ -22,13 +22,20 @@ from ns_abstract.verify.network import (
     NetworkArithmetic,
     backward,
     bound_outputs,
+    forward,
+    intermediate,
     known,
     load_network,
     outputs,
+    pooling,
+    propagation,
     rounding,
     schedule,
+    selection,
 )
-from ns_abstract.verify.network import bounds as module
+from ns_abstract.verify.network.bounds import _Cells
+from ns_abstract.verify.network.forward import Forward
+from ns_abstract.verify.network.intermediate import Intermediate
 from ns_abstract.verify.network.known import Known
 from ns_abstract.verify.network.layers import Convolution
 from ns_abstract.verify.network.reached import Enough, Goal, Reached
@@ -206,7 +213,7 @@ def test_rows_that_end_on_the_way_lie_below_the_exact_minimum(
     monkeypatch.setattr(schedule, "_RENEW", -1.0)
     monkeypatch.setattr(schedule, "_ENOUGH", enough)
     ended, said, gaps, spans = 0, {}, 0.0, 0.0
-    one_hot, bounded = module._Cells._one_hot, module._Cells._bounded
+    one_hot, bounded = Intermediate._one_hot, Intermediate.bounded
 
     def watched(*arguments: Any) -> Any:
         nonlocal ended
@@ -214,12 +221,12 @@ def test_rows_that_end_on_the_way_lie_below_the_exact_minimum(
         ended += int((found.ended > 0).sum())
         return found
 
-    def heard(cells: Any, index: int, *arguments: Any) -> Any:
-        said[index] = bounded(cells, index, *arguments)
+    def heard(numbers: Intermediate, index: int, *arguments: Any) -> Any:
+        said[index] = bounded(numbers, index, *arguments)
         return said[index]
 
-    monkeypatch.setattr(module._Cells, "_one_hot", watched)
-    monkeypatch.setattr(module._Cells, "_bounded", heard)
+    monkeypatch.setattr(Intermediate, "_one_hot", watched)
+    monkeypatch.setattr(Intermediate, "bounded", heard)
     for seed in range(3):
         network, layers, _ = mlp(tmp_path, seed, sizes=(3, 6, 6, 6, 2))
         rng = np.random.default_rng(seed)
@@ -271,13 +278,13 @@ def test_rows_that_end_by_plan_lie_below_the_exact_minimum(
     which: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     used = planned(monkeypatch, which)
-    bounded, said = module._Cells._bounded, {}
+    bounded, said = Intermediate.bounded, {}
 
-    def heard(cells: Any, index: int, *arguments: Any) -> Any:
-        said[index] = bounded(cells, index, *arguments)
+    def heard(numbers: Intermediate, index: int, *arguments: Any) -> Any:
+        said[index] = bounded(numbers, index, *arguments)
         return said[index]
 
-    monkeypatch.setattr(module._Cells, "_bounded", heard)
+    monkeypatch.setattr(Intermediate, "bounded", heard)
     gaps = spans = 0.0
     for seed in range(3):
         network, layers, _ = mlp(tmp_path, seed, sizes=(3, 6, 6, 6, 6, 2))
@@ -330,13 +337,13 @@ def test_rows_that_rest_on_several_nodes(
     reach = np.abs(a).sum(-1) + slack
     images = ImageSets(a, b - slack, a, b + slack, b - reach, b + reach)
     forms: dict[int, Any] = {}
-    leave = module._Cells._leave
+    leave = Forward._leave
 
-    def left(cells: Any, index: int) -> None:
-        forms[index] = cells.known.forms[index]
-        leave(cells, index)
+    def left(forward: Forward, index: int) -> None:
+        forms[index] = forward.known.forms[index]
+        leave(forward, index)
 
-    monkeypatch.setattr(module._Cells, "_leave", left)
+    monkeypatch.setattr(Forward, "_leave", left)
     found = []
     threads = torch.get_num_threads()
     try:
@@ -512,7 +519,7 @@ def test_early_rows_keep_later_ones_exact(tmp_path: Path, monkeypatch: pytest.Mo
     gaps = []
     for cheap in (0.0, 0.03):
         monkeypatch.setattr(schedule, "_CHEAP", cheap)
-        cells = module._Cells(network, images, "everywhere", 1 << 30, "real")
+        cells = _Cells(network, images, "everywhere", 1 << 30, "real")
         # rows of outputs in float64 lose next to nothing of themselves
         cells.known.passages.pop()
         gaps.append((middle.T - cells.outputs(rows, np.zeros(3)).lower).mean())
@@ -608,7 +615,7 @@ def test_curves_are_bounded_by_what_rows_leave(deep: bool, tmp_path: Path, monke
         monkeypatch.setattr(schedule, "_CHEAP", 0.0)
     found = bound_outputs(network, images, rows, np.zeros(3), arithmetic="real").lower
     with monkeypatch.context() as patch:
-        patch.setattr(module, "_HALF", -1.0)
+        patch.setattr(selection, "_HALF", -1.0)
         without = bound_outputs(network, images, rows, np.zeros(3), arithmetic="real").lower
     middle = network(torch.from_numpy(0.5 * (images.lower + images.upper)).reshape(2, *shape)).numpy()
     assert (found <= middle).all()
@@ -730,7 +737,7 @@ def test_parts_change_nothing_but_rounding(tmp_path: Path, monkeypatch: pytest.M
     rows[:3] = np.eye(3, network.output_size, 4)
     whole = bound_outputs(network, images, rows, np.zeros(6))
     tiny = bound_outputs(network, images, rows, np.zeros(6), memory=1)
-    for part in (module, backward, outputs):
+    for part in (backward, intermediate, outputs, pooling):
         monkeypatch.setattr(part, "ROWS_AT_ONCE", 1)
     single = bound_outputs(network, images, rows, np.zeros(6))
     one = [bound_outputs(network, images[k : k + 1], rows[[0, 4]], np.zeros(2)).lower[0] for k in range(5)]
@@ -795,7 +802,7 @@ def test_float32_rounding_is_needed(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     rows = np.concatenate([np.eye(4), -np.eye(4)])
     for charged in (True, False):
         if not charged:
-            for part in (module, known, rounding):
+            for part in (forward, known, propagation, rounding):
                 monkeypatch.setattr(part, "UNIT", 0.0)
         lower = bound_outputs(network, images, rows, np.zeros(8)).lower
         broken[charged] = int((lower > y @ rows.T).sum())

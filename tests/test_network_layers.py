@@ -11,8 +11,7 @@ import pytest
 import torch
 from onnx_files import OnnxFile, attack, image_sets, session
 
-from ns_abstract.verify.network import ImageSets, bound_outputs, load_network
-from ns_abstract.verify.network import bounds as module
+from ns_abstract.verify.network import ImageSets, bound_outputs, load_network, pooling
 from ns_abstract.verify.network.layers import Convolution, LeakyRelu, Matrix, Scale, Sum
 from ns_abstract.verify.network.maxima import Candidates
 from ns_abstract.verify.network.passages import Maxima
@@ -407,8 +406,8 @@ def _level_too_low(monkeypatch: pytest.MonkeyPatch) -> None:
         found = original(window, apart)
         return found._replace(high=found.high - 0.5 * (found.high - found.low))
 
-    original = module.upper_planes
-    monkeypatch.setattr(module, "upper_planes", planes)
+    original = pooling.upper_planes
+    monkeypatch.setattr(pooling, "upper_planes", planes)
 
 
 def _rivals_forgotten(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -36,12 +36,12 @@ _SHARED = "test_cover.py::test_rows_of_one_cell_hold_every_value"
 CERTIFICATES = (
     Fault(
         "families: parts are taken about their own reference",
-        _FAMILY, "_Other._about", "np.repeat(self.first.known.middle, len(middle), axis=0)", "middle",
+        _FAMILY, "_Other.about", "np.repeat(self.first.known.middle, len(middle), axis=0)", "middle",
         _SHARED + "[product]",
     ),
     Fault(
         "families: parts follow their own winners of windows",
-        _FAMILY, "_Other._winner", "self.first.winners[k].expand_as(winner).contiguous()", "winner",
+        _FAMILY, "_Other.winner", "self.first.winners[k].expand_as(winner).contiguous()", "winner",
         "test_cover.py::test_parts_have_the_references_and_winners_of_the_whole",
     ),
     Fault(
@@ -69,7 +69,7 @@ CERTIFICATES = (
     ),
     Fault(
         "families: rounding is charged by the first part's sizes",
-        _FAMILY, "_Other._sized", "form.upper.amax(0, keepdim=True)", "form.upper[:1]",
+        _FAMILY, "_Other.sized", "form.upper.amax(0, keepdim=True)", "form.upper[:1]",
         "test_cover.py::test_rounding_is_charged_by_all_parts_at_once",
     ),
     Fault(
@@ -78,11 +78,11 @@ CERTIFICATES = (
     ),
     Fault(
         "families: what follows the parameters has no width",
-        "verify/network/bounds.py", "_tilted", "z.r * (1.0 + 2.0**-40)", "0.0 * z.r", _SHARED + "[]",
+        "verify/network/propagation.py", "_tilted", "z.r * (1.0 + 2.0**-40)", "0.0 * z.r", _SHARED + "[]",
     ),
     Fault(
         "families: what is between the offsets does not follow the parameters",
-        "verify/network/bounds.py", "_tilted", "t[:, None] * z.a", "0.0 * t[:, None] * z.a", _SHARED + "[]",
+        "verify/network/propagation.py", "_tilted", "t[:, None] * z.a", "0.0 * t[:, None] * z.a", _SHARED + "[]",
     ),
     Fault(
         "parts: joined sets forget that slopes differ",
@@ -285,7 +285,7 @@ CERTIFICATES = (
     ),
     Fault(
         "branching: signs of the other side are assumed",
-        "verify/network/bounds.py", "_Cells._assume", "torch.from_numpy(side > 0.0)", "torch.from_numpy(side < 0.0)",
+        "verify/network/forward.py", "Forward._assume", "torch.from_numpy(side > 0.0)", "torch.from_numpy(side < 0.0)",
         _BRANCHES,
     ),
     Fault(

@@ -4,8 +4,8 @@ from planted.fault import Fault
 
 _SEARCH = "verify/search.py"
 _VNNLIB = "verify/vnnlib.py"
-_NETWORK = "verify/network/bounds.py"
 _BACKWARD, _KNOWN = "verify/network/backward.py", "verify/network/known.py"
+_PROPAGATION, _SELECTION = "verify/network/propagation.py", "verify/network/selection.py"
 _REACHED, _ROUNDING = "verify/network/reached.py", "verify/network/rounding.py"
 _RESPONSE = "verify/response.py"
 _MAPS = "report/verdict_maps.py"
@@ -69,32 +69,32 @@ VERDICTS = (
     ),
     Fault(
         "network: the first layer's rounding is dropped",
-        _NETWORK,
-        "_Cells._combine",
+        _PROPAGATION,
+        "Propagation.linear",
         "moves + rows * width",
         "(moves if k > 1 else 0.0 * moves) + rows * width",
         "test_network_rounding.py::test_sums_that_lose_as_much_as_they_can[2]",
     ),
     Fault(
         "network: rounding before an activation is dropped",
-        _NETWORK,
-        "_Cells._activate",
+        _PROPAGATION,
+        "Propagation.activation",
         "rounded.abs()",
         "0.0",
         "test_network_rounding.py::test_sums_that_lose_as_much_as_they_can[3]",
     ),
     Fault(
         "network: rounding is charged at the middle of a set alone",
-        _NETWORK,
-        "_Cells._combine",
+        _PROPAGATION,
+        "Propagation.linear",
         "torch.maximum(sized.interval.spread, sized.reference.abs())",
         "sized.reference.abs() + 0.0 * sized.interval.spread",
         "test_network_rounding.py::test_rounding_counts_the_largest_image_of_a_set",
     ),
     Fault(
         "network: rows' own rounding is dropped",
-        _NETWORK,
-        "_Cells._combine",
+        _PROPAGATION,
+        "Propagation.linear",
         "rows",
         "0.0",
         "test_network_rounding.py::test_rounding_of_rows_over_sets[False]",
@@ -117,8 +117,8 @@ VERDICTS = (
     ),
     Fault(
         "network: references' own rounding is dropped",
-        _NETWORK,
-        "_Cells._combine",
+        _PROPAGATION,
+        "Propagation.linear",
         "(layer.terms + len(inputs) + 8) * 2.0**-52",
         "0.0",
         "test_network_rounding.py::test_exact_network_at_single_images[1024.0-False]",
@@ -165,8 +165,8 @@ VERDICTS = (
     ),
     Fault(
         "network: rows are asked for where forms are good, and not where they are loose",
-        _NETWORK,
-        "_Cells._bent",
+        _SELECTION,
+        "Selection._bent",
         "kept > _HALF",
         "kept < _HALF",
         "test_network_bounds.py::test_curves_are_bounded_by_what_rows_leave[False]",
@@ -269,8 +269,8 @@ VERDICTS = (
     ),
     Fault(
         "network: units that may be on count as zeros",
-        _NETWORK,
-        "_Cells._activate",
+        _PROPAGATION,
+        "Propagation.activation",
         "upper > 0.0",
         "lower > 0.0",
         "test_network_rounding.py::test_units_that_may_be_on_are_terms",

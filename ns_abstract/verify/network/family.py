@@ -14,12 +14,14 @@ from torch import Tensor
 from ns_abstract.verify.network.bounds import _Cells, bound_outputs
 from ns_abstract.verify.network.forms import Form
 from ns_abstract.verify.network.graph import Network, NetworkArithmetic
+from ns_abstract.verify.network.known import Known
 from ns_abstract.verify.network.layers import Activation, LeakyRelu
 from ns_abstract.verify.network.maxima import MaxPool
 from ns_abstract.verify.network.products import Product
 from ns_abstract.verify.network.reached import Trace
 from ns_abstract.verify.network.rows import Float64, Int64, grid
 from ns_abstract.verify.network.sets import ImageSets, OutputBounds
+from ns_abstract.verify.network.sharing import Sharing
 
 #: Unit roundoff of the products of rows and columns, and the smallest normal number of float32.
 _UNIT, _FLUSH = 2.0**-24, 2.0**-126
@@ -72,7 +74,7 @@ class Family:
 
     def first(self, rows: Any, offset: Float64) -> OutputBounds:
         """Lower bounds of ``rows @ y + offset`` over the first cell."""
-        return self._first.outputs(rows, np.asarray(offset, np.float64))
+        return self._first.cells.outputs(rows, np.asarray(offset, np.float64))
 
     def others(self, images: ImageSets, rows: Any, offset: Float64, *, fresh: bool = False) -> OutputBounds:
         """Lower bounds of ``rows @ y + offset`` over other cells.
@@ -91,7 +93,7 @@ class Family:
         found = []
         for first in range(0, images.count, step):
             part = _Other(self._first, images[first : first + step], self.memory, self.arithmetic, fresh)
-            found.append(part.outputs(rows, offset))
+            found.append(part.cells.outputs(rows, offset))
         return OutputBounds(*(np.concatenate([getattr(part, name) for part in found]) for name in ("lower", "a", "b")))
 
 
@@ -128,10 +130,11 @@ class _Lent:
         )  # fmt: skip
 
 
-class _First(_Cells):
+class _First(Sharing):
     """One cell that remembers rows of numbers before activations and products."""
 
     def __init__(self, network: Network, images: ImageSets, memory: int, arithmetic: NetworkArithmetic) -> None:
+        self.network = network
         #: by node
         self.lent: dict[int, _Lent] = {}
         self._left = _ROWS_SHARE * memory
@@ -144,30 +147,37 @@ class _First(_Cells):
         #: what all is relative to, by node, and what is followed at maxima
         self.references: dict[int, Tensor] = {}
         self.winners: dict[int, Tensor] = {}
-        super().__init__(network, images, "everywhere", memory, arithmetic)
+        self.cells = _Cells(network, images, "everywhere", memory, arithmetic, sharing=self)
+        self.known = self.cells.known
 
-    def _reference(self, k: int, passed_on: Callable[[], Tensor]) -> Tensor:
+    def reference(self, k: int, passed_on: Callable[[], Tensor]) -> Tensor:
         self.references[k] = passed_on()
         return self.references[k]
 
-    def _winner(self, k: int, winner: Tensor) -> Tensor:
+    def winner(self, k: int, winner: Tensor) -> Tensor:
         self.winners[k] = winner
         return winner
 
-    def _known_better(
-        self, index: int, form: Form, open_: Tensor, apart: Tensor | None, layer: Activation | None = None
-    ) -> Form:
+    def wanted(
+        self,
+        known: Known,
+        index: int,
+        form: Form,
+        open_: Tensor,
+        apart: Tensor | None,
+        layer: Activation | None,
+    ) -> tuple[Form, Tensor, Tensor | None]:
         if isinstance(layer, LeakyRelu):
             # they may be open elsewhere
             lower, upper = form.interval
             near = _NEARLY * (upper - lower)
             open_ = (lower < near) & (upper > -near)
-        return super()._known_better(index, form, open_, apart, layer)
+        return form, open_, apart
 
-    def _trace(self, count: int) -> Trace | None:
+    def trace(self, count: int) -> Trace | None:
         return Trace(count, self._short) if self._keeps and count * self._by_row <= self._left else None
 
-    def _keep(self, index: int, where: Int64, sign: Float64, trace: Trace) -> None:
+    def keep(self, index: int, where: Int64, sign: Float64, trace: Trace) -> None:
         size = sum(rows.nbytes for rows in trace.rows.values())
         if not trace.reached.any():
             return
@@ -198,7 +208,7 @@ class _Said(NamedTuple):
     upper: Float64
 
 
-class _Other(_Cells):
+class _Other(Sharing):
     """Cells that are bounded by rows of another one (N15)."""
 
     def __init__(
@@ -207,31 +217,33 @@ class _Other(_Cells):
         self.first = first
         self._last = max(first.lent, default=0) if fresh else None
         self._columns: dict[int, tuple[NDArray[np.float32], NDArray[np.float32]]] = {}
-        super().__init__(first.network, images, "everywhere", memory, arithmetic)
+        self._count = images.count
+        self.cells = _Cells(first.network, images, "everywhere", memory, arithmetic, sharing=self)
+        self.known = self.cells.known
 
-    def _about(self, middle: Float64) -> Float64:
+    def about(self, middle: Float64) -> Float64:
         # what rows gathered at maxima and products is relative to the first cell's references
         return np.repeat(self.first.known.middle, len(middle), axis=0)
 
-    def _reference(self, k: int, passed_on: Callable[[], Tensor]) -> Tensor:
+    def reference(self, k: int, passed_on: Callable[[], Tensor]) -> Tensor:
         reference = self.first.references[k]
-        return reference.expand(self.known.count, *reference.shape[1:])
+        return reference.expand(self._count, *reference.shape[1:])
 
-    def _sized(self, form: Form) -> Form:
+    def sized(self, form: Form) -> Form:
         # neighbours are of one size: rounding is charged by all of them at once
         ends = form.lower.amin(0, keepdim=True), form.upper.amax(0, keepdim=True)
         active = form.active.any(0, keepdim=True)
         return Form(form.reference[:1], form.c[:1], form.a[:1], form.r[:1], *ends, active)
 
-    def _winner(self, k: int, winner: Tensor) -> Tensor:
+    def winner(self, k: int, winner: Tensor) -> Tensor:
         return self.first.winners[k].expand_as(winner).contiguous()
 
-    def _lent(self, k: int) -> tuple[np.ndarray, np.ndarray]:
-        shape = self.network.shape(k)
+    def slopes(self, k: int) -> tuple[np.ndarray, np.ndarray]:
+        shape = self.first.network.shape(k)
         lines = self.first.known.passages[0].lines[k]
         return lines[0, 0].reshape(shape), lines[3, 0].reshape(shape)
 
-    def _column(self, at: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    def _column(self, known: Known, at: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """What rows on the output of node ``at`` are multiplied by, [n, m k], and what their sizes are, [n, m l + 1].
 
         Columns of one kind stand together. Rows: slopes [d], middle, and of intervals alone; sizes: half and that of
@@ -239,21 +251,18 @@ class _Other(_Cells):
         linear layers. The last column of sizes is that of all that is added up, in any cell.
         """
         if at not in self._columns:
-            m, d = self.known.count, self.known.d
+            m, d = known.count, known.d
             signed: list[Float64] = []
             if at == 0:
-                slopes, offsets = (
-                    self.known.image.slopes.reshape(m, 2, -1, d),
-                    self.known.image.offsets.reshape(m, 2, -1),
-                )
+                slopes, offsets = known.image.slopes.reshape(m, 2, -1, d), known.image.offsets.reshape(m, 2, -1)
                 half = 0.5 * (offsets[:, 1] - offsets[:, 0]) + 0.5 * np.abs(slopes[:, 1] - slopes[:, 0]).sum(-1)
                 half = np.maximum(half, 0.0) + _ROOM * (np.abs(offsets).max(1) + np.abs(slopes).max(1).sum(-1))
-                low, high = self.known.image.lower.reshape(m, -1), self.known.image.upper.reshape(m, -1)
+                low, high = known.image.lower.reshape(m, -1), known.image.upper.reshape(m, -1)
                 box = 0.5 * (high - low) + _ROOM * (np.abs(low) + np.abs(high))
                 signed = [*np.moveaxis(slopes.mean(1), -1, 0), offsets.mean(1), 0.5 * (low + high)]
                 sized = [half, box]
-            elif at in self.known.offered:
-                offered = self.known.offered[at]
+            elif at in known.offered:
+                offered = known.offered[at]
                 _, low, high, _, above, below = offered.lines.reshape(6, m, -1).astype(np.float64)
                 one, two = np.moveaxis(offered.tilts, 2, 1)
                 # a row a gathers (a + |a|) / 2 times what stands first and (a - |a|) / 2 times the other
@@ -262,7 +271,7 @@ class _Other(_Cells):
                 signed = [*(0.5 * (x + y) for x, y in pairs), 0.5 * (half - least)]
                 sized = [*(0.5 * (x - y) for x, y in pairs), 0.5 * (half + least)]
             else:
-                sized = [self.known.passages[0].noise[at].reshape(m, -1).numpy()]
+                sized = [known.passages[0].noise[at].reshape(m, -1).numpy()]
             most = np.sum([np.abs(v) for v in (*signed, *sized)], axis=0).max(axis=0)
             n = len(most)
             one, two = (np.reshape(v, (-1, n)).T for v in (signed, sized))
@@ -270,9 +279,9 @@ class _Other(_Cells):
             self._columns[at] = one.astype(np.float32, order="C"), two.astype(np.float32, order="C")
         return self._columns[at]
 
-    def _said(self, index: int) -> _Said:
+    def _said(self, known: Known, index: int) -> _Said:
         """What the first cell's rows say of node ``index`` here."""
-        m, d = self.known.count, self.known.d
+        m, d = known.count, known.d
         lent = self.first.lent[index]
         count = len(lent.flat)
         # what intervals alone say has no slopes but those of what is between an activation's offsets
@@ -281,7 +290,7 @@ class _Other(_Cells):
         for at, rows in lent.rows.items():
             n = rows.shape[1]
             gamma = (n + 4) * _UNIT / (1.0 - (n + 4) * _UNIT)
-            one, two = self._column(at)
+            one, two = self._column(known, at)
             tiny = n * _FLUSH * (1.0 + float(np.abs(rows).max(initial=0.0)))
             for first in range(0, count, _ROWS_AT_ONCE):
                 part, here = rows[first : first + _ROWS_AT_ONCE], slice(first, first + _ROWS_AT_ONCE)
@@ -291,7 +300,7 @@ class _Other(_Cells):
                 if at == 0:
                     signed[here] += sums
                     half[here] += sizes
-                elif at in self.known.offered:
+                elif at in known.offered:
                     tilted[here] += sums[:, :-1]
                     tilted[here] += sizes[:, :-1]
                     spread[here] += sums[:, -1]
@@ -306,14 +315,14 @@ class _Other(_Cells):
         tilts, gathered = tilted[:d], tilted[d]
         slopes, middle, moved = signed[:d] + tilts, signed[d] + gathered, signed[d + 1] + gathered
         low, high = lent.fixed.T
-        if self.known.rounds(index):
+        if known.rounds(index):
             # what a row gathers where it starts
-            lost += self.known.passages[0].noise[index].reshape(m, -1).numpy()[:, lent.flat]
-        spread = spread + 0.5 * (high - low) + lost + self.known.flush[:, None]
+            lost += known.passages[0].noise[index].reshape(m, -1).numpy()[:, lent.flat]
+        spread = spread + 0.5 * (high - low) + lost + known.flush[:, None]
         middle, moved = middle + 0.5 * (low + high), moved + 0.5 * (low + high)
         half, box = half[0] + spread, half[1] + spread + np.abs(tilts).sum(0)
-        for known, center in ((half, middle), (box, moved)):
-            known += _ROOM * (np.abs(low) + np.abs(high) + np.abs(center) + np.abs(slopes).sum(0) + known + lost)
+        for width, center in ((half, middle), (box, moved)):
+            width += _ROOM * (np.abs(low) + np.abs(high) + np.abs(center) + np.abs(slopes).sum(0) + width + lost)
         np.maximum(half, 0.0, out=half)
         reach = half + np.abs(slopes).sum(0)
         reach += _ROOM * (reach + np.abs(middle))
@@ -322,26 +331,32 @@ class _Other(_Cells):
         ends = np.where(turned, -upper, lower), np.where(turned, -lower, upper)
         return _Said(np.moveaxis(slopes, 0, -1) * lent.sign[:, None], middle * lent.sign, half, *ends)
 
-    def _known_better(
-        self, index: int, form: Form, open_: Tensor, apart: Tensor | None, layer: Activation | None = None
-    ) -> Form:
-        form = self._borrowed(index, form)
+    def wanted(
+        self,
+        known: Known,
+        index: int,
+        form: Form,
+        open_: Tensor,
+        apart: Tensor | None,
+        layer: Activation | None,
+    ) -> tuple[Form, Tensor, Tensor | None]:
+        form = self._borrowed(known, index, form)
         if layer is not None:
             open_, apart = layer.open(*form.interval), layer.apart(*form.interval)
         if index in self.first.lent and index != self._last:
             # rows of the cell's own for what has none
-            known = torch.zeros(form.reference[0].numel(), dtype=torch.bool)
-            known[torch.from_numpy(self.first.lent[index].flat)] = True
-            open_, apart = open_ & ~known.reshape(form.reference.shape[1:]), None
-        return super()._known_better(index, form, open_, apart, layer)
+            bounded = torch.zeros(form.reference[0].numel(), dtype=torch.bool)
+            bounded[torch.from_numpy(self.first.lent[index].flat)] = True
+            open_, apart = open_ & ~bounded.reshape(form.reference.shape[1:]), None
+        return form, open_, apart
 
-    def _borrowed(self, index: int, form: Form) -> Form:
+    def _borrowed(self, known: Known, index: int, form: Form) -> Form:
         """The form with what the first cell's rows say."""
         if index not in self.first.lent:
             return form
         flat, sign = self.first.lent[index].flat, self.first.lent[index].sign
-        slopes, middle, half, least, most = self._said(index)
-        m, d, shape = self.known.count, self.known.d, form.reference.shape
+        slopes, middle, half, least, most = self._said(known, index)
+        m, d, shape = known.count, known.d, form.reference.shape
         lower, upper, c, r = (np.array(v.reshape(m, -1).numpy()) for v in (form.lower, form.upper, form.c, form.r))
         a = np.array(form.a.reshape(m, d, -1).numpy())
         order = np.argsort(flat, kind="stable")
@@ -374,4 +389,4 @@ class _Other(_Cells):
             torch.from_numpy(upper).reshape(shape),
             form.active,
         )
-        return self.known.within(found, found.lower, found.upper)
+        return known.within(found, found.lower, found.upper)

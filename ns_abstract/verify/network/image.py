@@ -49,9 +49,8 @@ def planes_of(
     a_lower, b_lower, a_upper, b_upper, lower, upper = fields
     if substitution != "everywhere":
         a_lower, b_lower, a_upper, b_upper = np.zeros_like(a_lower), lower, np.zeros_like(a_upper), upper
-    c = middle
-    b_lower, lower = (v - c - 2.0**-51 * (np.abs(v) + np.abs(c)) for v in (b_lower, lower))
-    b_upper, upper = (v - c + 2.0**-51 * (np.abs(v) + np.abs(c)) for v in (b_upper, upper))
+    b_lower, lower = (v - middle - 2.0**-51 * (np.abs(v) + np.abs(middle)) for v in (b_lower, lower))
+    b_upper, upper = (v - middle + 2.0**-51 * (np.abs(v) + np.abs(middle)) for v in (b_upper, upper))
     # numpy keeps the order of axes in memory that the images came with
     return ImagePlanes(
         np.ascontiguousarray(np.stack([a_lower, a_upper], 1)).reshape(m, 2, *shape, d),

@@ -76,7 +76,7 @@ class Known:
         """Take this for what is known of the image."""
         self.image, self.columns = image, columns_of(*image)
 
-    def first(self) -> Form:
+    def image_form(self) -> Form:
         """The image as a form."""
         form = form_of(self.image, self.middle, self.network.input_shape)
         lower, upper = torch.from_numpy(self.image.lower), torch.from_numpy(self.image.upper)

@@ -1,0 +1,129 @@
+"""The pass forwards over all nodes: forms, better bounds of what is open, and signs (docs/design.md, N1, N16, N18)."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import torch
+
+from ns_abstract.verify.network.forms import Form
+from ns_abstract.verify.network.known import Known
+from ns_abstract.verify.network.layers import Activation, LeakyRelu
+from ns_abstract.verify.network.maxima import MaxPool
+from ns_abstract.verify.network.pooling import Pooling
+from ns_abstract.verify.network.products import Product
+from ns_abstract.verify.network.propagation import Propagation
+from ns_abstract.verify.network.rounding import SPARE, UNIT
+from ns_abstract.verify.network.schedule import Schedule
+from ns_abstract.verify.network.selection import Selection
+from ns_abstract.verify.network.slopes import Held
+
+
+class Forward:
+    """Takes the nodes in order.
+
+    Args:
+        known: What is known, to begin with of the image alone.
+        propagation, pooling: Pass forms through a node.
+        selection: Bounds its inputs better before.
+        schedule: Learns how wide bounds are.
+    """
+
+    def __init__(
+        self, known: Known, propagation: Propagation, pooling: Pooling, selection: Selection, schedule: Schedule
+    ) -> None:
+        self.known, self.network = known, known.network
+        self.propagation, self.pooling, self.selection = propagation, pooling, selection
+        self.schedule = schedule
+
+    def run(self) -> Form:
+        """Lines and rounding of every node; returns what is known of the last one."""
+        forms: list[Form | None] = [self.known.image_form()]
+        self.known.forms = forms
+        if self.schedule.planned:
+            self._learn(0, False)
+        left = list(self.network.readers)
+        last = len(self.network.nodes)
+        for k, node in enumerate(self.network.nodes, 1):
+            inputs = []
+            for index in node.inputs:
+                form = forms[index]
+                assert form is not None
+                inputs.append(form)
+            if isinstance(node.layer, Activation):
+                # what is known better of the input is also known to its other readers
+                source = node.inputs[0]
+                inputs[0] = self._assume(source, inputs[0])
+                open_, apart = node.layer.open(*inputs[0].interval), node.layer.apart(*inputs[0].interval)
+                better = self.selection.better(source, inputs[0], open_, apart, node.layer)
+                forms[source] = inputs[0] = self._assume(source, better)
+                if isinstance(node.layer, LeakyRelu):
+                    self.selection.unsure = float(node.layer.open(*inputs[0].interval).double().mean())
+                forms.append(self.propagation.activation(k, source, node.layer, inputs[0]))
+                if self.network.depth[source] > 1:
+                    self.known.stops[source] = self.known.stop(source, inputs[0])
+            elif isinstance(node.layer, Product):
+                intervals = inputs[0].interval, inputs[1].interval
+                open_, apart = node.layer.open(*intervals), node.layer.apart(*intervals)
+                for position, source in enumerate(node.inputs):
+                    forms[source] = inputs[position] = self.selection.better(source, inputs[position], open_, apart)
+                forms.append(self.propagation.product(k, node.inputs, node.layer, inputs[0], inputs[1]))
+            elif isinstance(node.layer, MaxPool):
+                forms.append(self.pooling.maximum(k, node.inputs[0], node.layer, inputs[0]))
+            else:
+                forms.append(self.propagation.linear(k, node.inputs, node.layer, inputs))
+            if self.schedule.planned:
+                for index in node.inputs:
+                    self._learn(index, isinstance(node.layer, LeakyRelu) and node.layer.alpha == 0.0)
+                self._learn(k, False)
+            for index in node.inputs:
+                left[index] -= 1
+                if not left[index] and index != last:
+                    self._leave(index)
+        end = forms[last]
+        assert end is not None
+        self.known.forms = []
+        return end
+
+    def _learn(self, index: int, cut: bool) -> None:
+        """Tell the schedule how wide bounds of node ``index`` are; ``cut``: those of numbers that are not cut off."""
+        form = self.known.forms[index]
+        assert form is not None
+        r = form.r
+        if cut:
+            above = form.interval.upper > 0.0
+            r = r[above] if bool(above.any()) else r
+        self.schedule.learns(index, float(r.mean()), float(form.reference.abs().mean()))
+
+    def _leave(self, index: int) -> None:
+        """Node ``index`` has been read; rows of later ones may end there (N18)."""
+        form, self.known.forms[index] = self.known.forms[index], None
+        if index in self.schedule.rests and index not in self.known.stops:
+            assert form is not None
+            self.known.stops[index] = self.known.stop(index, form)
+
+    def _assume(self, source: int, z: Form) -> Form:
+        """What is known of node ``source`` where its numbers have the signs that are assumed (N16)."""
+        if self.known.assumed is None or not any(source in signs for signs in self.known.assumed):
+            return z
+        lower, upper = (v.flatten(1).clone() for v in (z.lower, z.upper))
+        least, most = (v.flatten(1).numpy() for v in z.interval)
+        reference, width = z.reference.flatten(1), z.width.flatten(1).numpy()
+        for cell, signs in enumerate(self.known.assumed):
+            if source not in signs or not self.known.good[cell]:
+                continue
+            flat, side = signs[source]
+            if bool(np.where(side > 0.0, most[cell, flat] < 0.0, least[cell, flat] > 0.0).any()):
+                self.known.vacant[cell] = True
+                continue
+            at, positive = torch.from_numpy(flat), torch.from_numpy(side > 0.0)
+            zero = -reference[cell, at]
+            low, high = lower[cell, at], upper[cell, at]
+            lower[cell, at] = torch.where(positive, torch.minimum(torch.maximum(low, zero), high), low)
+            upper[cell, at] = torch.where(positive, high, torch.maximum(torch.minimum(high, zero), low))
+            noise = UNIT * (SPARE + self.network.readers[source]) * width[cell, flat]
+            if self.known.rounds(source):
+                noise = noise + self.known.passages[0].noise[source].flatten(1).numpy()[cell, flat]
+            self.known.held[cell][source] = Held(flat, side, -zero.numpy(), noise)
+        return replace(z, lower=lower.reshape(z.lower.shape), upper=upper.reshape(z.upper.shape))

@@ -1,0 +1,225 @@
+"""How forms and rows pass maxima over windows, and which differences in them rows bound (docs/design.md, N12)."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ns_abstract.verify.network.backward import ROWS_AT_ONCE, Backward
+from ns_abstract.verify.network.forms import Form, Interval
+from ns_abstract.verify.network.known import Known
+from ns_abstract.verify.network.maxima import Candidates, MaxPool, Planes, upper_planes
+from ns_abstract.verify.network.passages import Maxima
+from ns_abstract.verify.network.reached import Enough, Goal
+from ns_abstract.verify.network.rounding import FLUSH, SPARE
+from ns_abstract.verify.network.rows import Int64, Rows
+from ns_abstract.verify.network.schedule import Schedule
+from ns_abstract.verify.network.sharing import Sharing
+
+#: Differences in windows are bounded by rows if so large a part of so many, which are tried first, is decided by it.
+_TRIED, _CLOSES = 64, 0.1
+#: Room for rounding of lines relative to references and sizes.
+_REFERENCES = 2.0**-46
+
+
+class _Exceeded(NamedTuple):
+    """Windows whose winner may be exceeded, and planes above them.
+
+    Attributes:
+        at: Their cells, channels and numbers, [n] each.
+        top: [n] what may be above the winner.
+        known: Their numbers.
+        near: [n, K] how far these may be from their references.
+        planes: One above each.
+    """
+
+    at: tuple[Tensor, ...]
+    top: Tensor
+    known: Candidates
+    near: Tensor
+    planes: Planes
+
+
+class Pooling:
+    """Passes maxima over windows.
+
+    Args:
+        known: What is known so far; rows that pass the maxima find their planes there.
+        backward: Passes rows of differences back over it.
+        schedule: What rows cost.
+        sharing: Whose winners are followed.
+    """
+
+    def __init__(self, known: Known, backward: Backward, schedule: Schedule, sharing: Sharing) -> None:
+        self.known, self.network, self.backward = known, known.network, backward
+        self.schedule, self.sharing = schedule, sharing
+
+    def maximum(self, k: int, source: int, layer: MaxPool, x: Form) -> Form:
+        """Maxima over windows (N12); the reference is that of the number which the lower plane follows."""
+        m, shape = self.known.count, layer.shape
+        interval = x.interval
+        lower, upper = (layer.taps(v, -torch.inf) for v in interval)
+        winner = self.sharing.winner(k, layer.taps(x.reference + x.c, -torch.inf).argmax(2, keepdim=True))
+
+        def chosen(v: Tensor) -> Tensor:
+            return layer.taps(v, 0.0).gather(2, winner)[:, :, 0]
+
+        reference, c, r, width = (chosen(v) for v in (x.reference, x.c, x.r, x.width))
+        a = torch.stack([chosen(x.a[:, i]) for i in range(self.known.d)], 1)
+        # sums of rows where windows overlap
+        count = SPARE + layer.overlaps + self.network.readers[source]
+        units = [count * passage.unit for passage in self.known.passages]
+        gives = [unit * width for unit in units]
+        offsets = [torch.stack([-give, give, give, -give], 0) for give in gives]
+        rivals = upper.scatter(2, winner, -torch.inf).amax(2)
+        most, own_upper = upper.amax(2), chosen(interval.upper)
+        where = (rivals > chosen(interval.lower)).nonzero()
+        which = torch.full(reference.shape, -1, dtype=torch.int64)
+        slopes: list[Tensor] = []
+        step = max(1, ROWS_AT_ONCE // (8 * len(layer.steps) ** 2 * 4))
+        for part in where.split(step):
+            exceeded = self._exceeded(source, layer, x, interval, winner[:, :, 0], part)
+            if exceeded is None:
+                continue
+            at, top, known, near, planes = exceeded
+            which[at] = torch.arange(len(top)) + sum(map(len, slopes))
+            base = (planes.slopes * known.reference).sum(1) - reference[at]
+            room = _REFERENCES * ((planes.slopes * known.reference.abs()).sum(1) + reference[at].abs())
+            for passage, unit, give, offset in zip(self.known.passages, units, gives, offsets, strict=True):
+                rounded = (planes.slopes.to(passage.dtype).double() - planes.slopes).abs()
+                lost = (rounded * near + unit * planes.slopes * near).sum(1) + room
+                offset[1][at] = give[at] + top
+                offset[2][at] = planes.high + base + lost
+                offset[3][at] = planes.low + base - lost
+            slopes.append(planes.slopes)
+            # the form between the planes, or the winner and what may be above it
+            low, high = planes.low + base - room, planes.high + base + room
+            middle = (planes.slopes * known.middle).sum(1) + 0.5 * (low + high)
+            radius = (planes.slopes * known.radius).sum(1) + 0.5 * (high - low)
+            radius = (radius + _REFERENCES * (planes.slopes * known.size).sum(1)) * (1.0 + 2.0**-40)
+            own = r[at] + 0.5 * top
+            better = radius < own
+            rows = (planes.slopes[:, :, None] * known.slopes).sum(1)
+            c[at] = torch.where(better, middle, c[at] + 0.5 * top)
+            r[at] = torch.where(better, radius, own * (1.0 + 2.0**-40) + _REFERENCES * c[at].abs())
+            cells, channels, windows = at
+            a[cells, :, channels, windows] = torch.where(better[:, None], rows, a[cells, :, channels, windows])
+            most[at] = torch.minimum(most[at], own_upper[at] + top)
+        grown = (m, *shape)
+        chosen_slopes = torch.cat(slopes) if slopes else torch.zeros((0, len(layer.steps)))
+        followed = winner[:, :, 0].reshape(grown).numpy().astype(np.int16)
+        rows_of_slopes = which.reshape(grown).numpy().astype(np.int32)
+        for passage, offset in zip(self.known.passages, offsets, strict=True):
+            sides = zip(offset, (-1.0, 1.0, 1.0, -1.0), strict=True)
+            outward = [passage.outward(v, side) for v, side in sides]
+            passage.maxima[k] = Maxima(
+                followed,
+                rows_of_slopes,
+                chosen_slopes.to(passage.dtype).numpy(),
+                torch.stack(outward).reshape(4, *grown).numpy(),
+            )
+        active = (layer.taps(x.active.double(), 0.0).amax(2) > 0.0).reshape(grown)
+        reference, c, r = (v.reshape(grown) for v in (reference, c, r))
+        form = Form.ranged(reference, c, a.reshape(m, self.known.d, *shape), r, active)
+        lost = int(np.prod(shape)) * 2 * len(layer.steps) * FLUSH
+        self.known.flush += lost * x.width.reshape(m, -1).amax(1).numpy()
+        room = 2.0**-50 * (reference.abs() + form.width)
+        least = lower.amax(2).reshape(grown)
+        return self.known.within(form, least - reference - room, most.reshape(grown) - reference + room)
+
+    def _exceeded(
+        self, source: int, layer: MaxPool, x: Form, interval: Interval, winner: Tensor, where: Tensor
+    ) -> _Exceeded | None:
+        """Planes above those windows of ``where`` [n, 3] in which something may be above the ``winner``; None: none."""
+        cell, channel, window = where.T
+        at = cell, channel, window
+        places = layer.places[:, window].T
+        inside, number = places >= 0, channel[:, None] * x.c[0, 0].numel() + places.clamp(min=0)
+
+        def gathered(v: Tensor) -> Tensor:
+            return v.flatten(1)[cell[:, None], number]
+
+        known = Candidates(
+            inside,
+            reference=gathered(x.reference),
+            middle=gathered(x.c),
+            radius=gathered(x.r),
+            slopes=torch.stack([gathered(x.a[:, i]) for i in range(self.known.d)], 2),
+            lower=gathered(interval.lower),
+            upper=gathered(interval.upper),
+            winner=winner[at],
+        )
+        apart = self._apart(source, layer, where, known)
+        top = apart[torch.arange(len(where)), :, known.winner].amax(1)
+        left = top > 0.0
+        if not bool(left.any()):
+            return None
+        known = Candidates(*(v[left] for v in known))
+        return _Exceeded(
+            tuple(v[left] for v in at), top[left], known, gathered(x.width)[left], upper_planes(known, apart[left])
+        )
+
+    def _apart(self, source: int, layer: MaxPool, where: Tensor, known: Candidates) -> Tensor:
+        """How far numbers of windows may be above one another, by forms and by rows where these help."""
+        apart = known.apart()
+        at, winner = np.arange(len(apart)), known.winner.numpy()
+
+        def rivals() -> np.ndarray:
+            return apart.numpy()[at, :, winner] > 0.0
+
+        # (window, number, number)
+        window, number = rivals().nonzero()
+        pairs = np.stack([window, winner[window], number], 1)
+        cut = 0
+        if self.schedule.planned:
+            way = self.schedule.nearest(source, len(pairs))
+            if way is None:
+                return apart
+            cut = self.known.ready(way)
+        elif self.schedule.deep and not self.schedule.takes(len(pairs) * self.schedule.costs.row(source)):
+            return apart
+        if len(pairs) > _TRIED:
+            first = np.arange(0, len(pairs), len(pairs) // _TRIED)
+            if self._differences(source, layer, where.numpy(), known, pairs[first], apart, cut) < _CLOSES * len(first):
+                return apart
+            pairs = np.delete(pairs, first, 0)
+        self._differences(source, layer, where.numpy(), known, pairs, apart, cut)
+        # what may be above the winner, among itself
+        left = rivals()
+        both = np.triu(left[:, :, None] & left[:, None, :], 1)
+        self._differences(source, layer, where.numpy(), known, np.argwhere(both), apart, cut)
+        return apart
+
+    def _differences(
+        self, source: int, layer: MaxPool, where: Int64, known: Candidates, pairs: Int64, apart: Tensor, cut: int
+    ) -> int:
+        """Bound differences of (window, number, number) by rows, in ``apart``; how many second ones are never above."""
+        channels = self.network.shape(source)[0]
+        extent = layer.steps.max(0) + 1
+        step = max(1, ROWS_AT_ONCE // (16 * channels * int(np.prod(extent))))
+        closed = 0
+        for part in np.array_split(pairs, max(1, -(-len(pairs) // step))):
+            if not len(part):
+                continue
+            window, one, other = part.T
+            cell, channel, place = where[window].T
+            y, x = np.divmod(place, layer.shape[2])
+            value = np.zeros((len(part), channels, *extent), np.float32)
+            row = np.arange(len(part))
+            for chosen, sign in ((one, 1.0), (other, -1.0)):
+                i, j = layer.steps[chosen].T
+                value[row, channel, i, j] = sign
+            near = known.reference[window, one], known.reference[window, other]
+            ahead = (near[0] - near[1]).numpy()
+            room = 2.0**-50 * (near[0].abs() + near[1].abs()).numpy()
+            rows = Rows(value, y * layer.stride[0] - layer.pads[0], x * layer.stride[1] - layer.pads[1])
+            enough = Enough(Goal(), room - ahead, np.zeros(len(part), bool))
+            found = self.backward.bound(source, rows, np.ascontiguousarray(cell), enough, None, cut)
+            above, below = torch.from_numpy(room - ahead - found.lower), torch.from_numpy(room + ahead + found.upper)
+            apart[window, other, one] = torch.minimum(apart[window, other, one], above)
+            apart[window, one, other] = torch.minimum(apart[window, one, other], below)
+            closed += int((above <= 0.0).sum())
+        return closed

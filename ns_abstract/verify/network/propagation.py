@@ -1,0 +1,219 @@
+"""How forms pass linear layers, activations and products, and what rows take there (docs/design.md, N1-N4, N9)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ns_abstract.verify.network.forms import Form
+from ns_abstract.verify.network.known import Known
+from ns_abstract.verify.network.layers import Activation, LeakyRelu, Linear, Sum
+from ns_abstract.verify.network.passages import Offered, Passage
+from ns_abstract.verify.network.products import Product
+from ns_abstract.verify.network.rounding import FLUSH, OVERFLOW, SPARE, UNIT, Rounding, gamma
+from ns_abstract.verify.network.rows import grid
+from ns_abstract.verify.network.sharing import Sharing
+from ns_abstract.verify.network.slopes import OpenUnits
+
+
+class Propagation:
+    """Passes forms through single nodes.
+
+    Args:
+        known: What is known so far; rows that pass the nodes find lines and rounding there.
+        sharing: References, sizes and slopes of other cells.
+        chooses: Whether rows of outputs choose slopes of their own (N14).
+    """
+
+    def __init__(self, known: Known, sharing: Sharing, chooses: bool) -> None:
+        self.known, self.network, self.sharing = known, known.network, sharing
+        self.chooses = chooses
+        self.rounding = Rounding(known.network)
+
+    def linear(self, k: int, sources: tuple[int, ...], layer: Linear, inputs: list[Form]) -> Form:
+        """A linear layer (N1, N2)."""
+        m, d = self.known.count, self.known.d
+        reference = self.sharing.reference(k, lambda: layer([f.reference for f in inputs]))
+        stacks = [torch.cat([f.c[:, None], f.a], 1).flatten(0, 1) for f in inputs]
+        moved = layer.apply(stacks).reshape(m, 1 + d, *layer.shape)
+        # float64's rounding is relative to forms and references, float32's of rows to distances from
+        # references, that of the network to its values
+        own = (layer.terms + len(inputs) + 8) * 2.0**-52
+        known = [self.sharing.sized(f) for f in inputs]
+        radii, sizes = [], []
+        for f, sized in zip(inputs, known, strict=True):
+            # at least what an input may be on one side of zero and on the other together
+            size = torch.maximum(sized.interval.spread, sized.reference.abs())
+            sizes.append(size)
+            radii.append(torch.cat([f.r + own * (f.c.abs() + f.a.abs().sum(1)), sized.width, size]))
+        found = layer.magnitude(radii) * (1.0 + 2.0**-28)
+        radius, width, size = found.split([m, *[len(sizes[0])] * 2])
+        if layer.bias is not None:
+            size = size + layer.bias.abs()
+        moves = own * size + (layer.terms + 1) * FLUSH
+        active = None
+        if not layer.terms:
+            active = layer.magnitude([f.active.double() for f in inputs]) != 0.0
+            if layer.bias is not None:
+                active = active | (layer.bias != 0.0)
+        elif self.known.single:
+
+            def end(moves: Tensor = moves) -> Tensor:
+                return (reference + moved[:, 0]).abs() + moved[:, 1:].abs().sum(1) + radius + moves
+
+            moves = moves + self.rounding.charge(k, sources, layer, known, size, end) + layer.spare(sizes)
+        roundings = layer.row_terms + SPARE + max(self.network.readers[i] for i in sources)
+        form = Form.ranged(reference, moved[:, 0], moved[:, 1:], radius + moves, active)
+        if float(size.amax()) >= OVERFLOW:
+            self.known.good &= (size.flatten(1).amax(1) < OVERFLOW).numpy()
+        for sized, shape in zip(known, layer.input_shapes, strict=True):
+            lost = int(np.prod(shape)) * (layer.row_terms + 2) * FLUSH
+            self.known.flush += lost * sized.width.flatten(1).amax(1).numpy()
+        alone = [i for i in sources if self.known.rounds(i) and self.network.readers[i] == 1]
+        folded = alone if isinstance(layer, Sum) else []
+        self.known.folded.update(folded)
+        for passage in self.known.passages:
+            rows = gamma(roundings, passage.unit)
+            noise = ((moves + rows * width) * (1.0 + 2.0**-40)).expand(m, *layer.shape)
+            for source in folded:
+                # one charge instead of several
+                noise = noise + passage.noise[source]
+            passage.noise[k] = noise * (1.0 + 2.0**-40 + passage.sums)
+        return self.known.within(form, form.lower, form.upper)
+
+    def activation(self, k: int, source: int, layer: Activation, z: Form) -> Form:
+        """An activation (N3, N4)."""
+        lower, upper = z.interval
+        size = z.interval.size
+        reference = self.sharing.reference(k, lambda: layer.function(z.reference))
+        room = layer.missing(lower, upper) + 2.0**-48 * reference.abs()
+        if self.known.single:
+            room = room + layer.error(lower, upper)
+        band = layer.band(lower, upper)
+        s = band.lower_slope
+        base = s * z.reference - reference
+        middle = 0.5 * (band.lower_offset + band.upper_offset) + base
+        half = 0.5 * (band.upper_offset - band.lower_offset) + 2.0**-50 * middle.abs() + room
+        half = half + 2.0**-50 * (band.lower_offset.abs() + band.upper_offset.abs() + s.abs() * z.reference.abs())
+        half = half + 2.0**-48 * s.abs() * (z.c.abs() + z.a.abs().sum(1))
+        radius = s.abs() * z.r * (1.0 + 2.0**-40) + half
+        form = Form.ranged(reference, s * z.c + middle, s[:, None] * z.a, radius)
+        if isinstance(layer, LeakyRelu) and layer.alpha == 0.0:
+            form.active = upper > 0.0
+        lines = layer.lines(lower, upper)
+        fold = self.known.rounds(source) and self.network.readers[source] == 1
+
+        def stored(chosen: Sequence[tuple[Tensor, Tensor, Tensor]], passage: Passage) -> np.ndarray:
+            """As `pass_activation` wants slope, lower and upper offset for rows of either sign."""
+            # the slope as stored, rows' products with it and sums where branches meet
+            found, unit = [], (SPARE + self.network.readers[source]) * passage.unit
+            for (slope, low, high), side in zip(chosen, (-1.0, 1.0), strict=True):
+                rounded = slope.to(passage.dtype).double()
+                base, apart = slope * z.reference - reference, band.lower_slope - slope
+                give = ((rounded - slope).abs() + unit * slope.abs()) * z.width + 2.0**-48 * apart.abs() * size + room
+                give = give + 2.0**-48 * (low.abs() + high.abs() + slope.abs() * z.reference.abs())
+                if fold:
+                    give = give + rounded.abs() * passage.noise[source]
+                ends = (
+                    passage.outward(low + base - give, -1.0),
+                    passage.outward(high + base + give, 1.0),
+                )
+                found += [rounded.to(passage.dtype), *(ends if side < 0.0 else reversed(ends))]
+            return torch.stack(found).reshape(6, self.known.count, *grid(layer.shape)).numpy()
+
+        # the other sides of lines with these slopes are the band's
+        above = layer.offsets(lines.lower_slope, lower, upper, band)[1]
+        below = layer.offsets(lines.upper_slope, lower, upper, band)[0]
+        own = (lines.lower_slope, lines.lower_offset, above), (lines.upper_slope, below, lines.upper_offset)
+        for passage in self.known.passages:
+            passage.lines[k] = stored(own, passage)
+        lent = self.sharing.slopes(k)
+        if lent is not None:
+            slopes = [torch.from_numpy(v).double().expand(self.known.count, *layer.shape) for v in lent]
+            plain = [layer.offsets(slope, lower, upper, band) for slope in slopes]
+            tilted = [_tilted(slope, z, line) for slope, line in zip(slopes, own, strict=True)]
+            # each is there for one side
+            better = tilted[0][0] > plain[0][0], tilted[1][1] < plain[1][1]
+            offsets, tilts = [], []
+            for slope, ends, (low, high, tilt), use in zip(slopes, plain, tilted, better, strict=True):
+                offsets.append((slope, torch.where(use, low, ends[0]), torch.where(use, high, ends[1])))
+                tilts.append(torch.where(use[:, None], tilt, torch.zeros_like(tilt)))
+            offered = stored(offsets, self.known.passages[0])
+            self.known.offered[k] = Offered(offered, torch.stack(tilts).flatten(3).numpy())
+        if fold:
+            self.known.folded.add(source)
+        if self.chooses and isinstance(layer, LeakyRelu):
+            first = self.known.passages[0]
+            loose = (SPARE + self.network.readers[source]) * first.unit * z.width
+            loose = loose + (first.noise[source] if fold else 0.0)
+            given = (lower, upper, z.reference, reference, loose, room + torch.zeros_like(lower))
+            self.known.open[k] = _open_units(layer, given)
+        lost = int(np.prod(layer.shape)) * 2 * FLUSH
+        self.known.flush += lost * z.width.reshape(self.known.count, -1).amax(1).numpy()
+        ends = layer.range(lower, upper)
+        room = room + 2.0**-48 * (ends[0].abs() + ends[1].abs())
+        return self.known.within(form, ends[0] - reference - room, ends[1] - reference + room)
+
+    def product(self, k: int, sources: tuple[int, ...], layer: Product, x: Form, y: Form) -> Form:
+        """A product of two nodes (N9)."""
+        m, first, second = self.known.count, x.interval, y.interval
+        size = first.size * second.size
+        reference = self.sharing.reference(k, lambda: x.reference * y.reference)
+        plane = layer.plane(first, second)
+        alpha, beta = plane.first, plane.second
+        base = alpha * x.reference + beta * y.reference - reference
+        # roundings of the plane relative to the references, and the network's
+        own = alpha.abs() * x.reference.abs() + beta.abs() * y.reference.abs() + reference.abs()
+        room = 2.0**-48 * (own + plane.low.abs() + plane.high.abs()) + 2 * FLUSH
+        if self.known.single:
+            room = room + 2 * UNIT * size
+        shape = (6, m, *grid(layer.shape))
+        for passage in self.known.passages:
+            # rows' products with the slopes, which are float32 numbers, and sums where branches meet
+            unit = (SPARE + max(self.network.readers[i] for i in sources)) * passage.unit
+            give = room + unit * (alpha.abs() * x.width + beta.abs() * y.width)
+            low = passage.outward(plane.low + base - give, -1.0)
+            high = passage.outward(plane.high + base + give, 1.0)
+            none = torch.zeros_like(low)
+            passage.products[k] = tuple(
+                torch.stack([slope, *ends, slope, *reversed(ends)]).reshape(shape).numpy()
+                for slope, ends in ((alpha.to(passage.dtype), (low, high)), (beta.to(passage.dtype), (none, none)))
+            )
+        middle, half = 0.5 * (plane.low + plane.high) + base, 0.5 * (plane.high - plane.low)
+        moved = alpha.abs() * (x.c.abs() + x.a.abs().sum(1)) + beta.abs() * (y.c.abs() + y.a.abs().sum(1))
+        half = half + room + 2.0**-50 * middle.abs() + 2.0**-44 * moved
+        radius = (alpha.abs() * x.r + beta.abs() * y.r) * (1.0 + 2.0**-40) + half
+        c, a = alpha * x.c + beta * y.c + middle, alpha[:, None] * x.a + beta[:, None] * y.a
+        form = Form.ranged(reference, c, a, radius, x.active & y.active)
+        for f in (x, y):
+            lost = int(np.prod(layer.shape)) * 2 * FLUSH
+            self.known.flush += lost * f.width.reshape(m, -1).amax(1).numpy()
+        if float(size.amax()) >= OVERFLOW:
+            self.known.good &= (size.reshape(m, -1).amax(1) < OVERFLOW).numpy()
+        ends = torch.stack([u * v for u in first for v in second]) - reference
+        room = room + 2.0**-50 * (size + reference.abs())
+        return self.known.within(form, ends.amin(0) - room, ends.amax(0) + room)
+
+
+def _tilted(slope: Tensor, z: Form, line: tuple[Tensor, Tensor, Tensor]) -> tuple[Tensor, Tensor, Tensor]:
+    """(low, high, tilt [m, d, *shape]): an activation less ``slope`` times its input is between low and high + tilt p.
+
+    ``line``: slope and offsets of lines on both sides of it; the input is followed in between.
+    """
+    own, below, above = line
+    t = own - slope
+    middle, size = t * (z.reference + z.c), z.reference.abs() + z.c.abs() + z.a.abs().sum(1)
+    half = t.abs() * (z.r * (1.0 + 2.0**-40) + 2.0**-48 * size)
+    return below + middle - half, above + middle + half, t[:, None] * z.a
+
+
+def _open_units(layer: LeakyRelu, given: tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]) -> OpenUnits:
+    """The units [m, *shape] of a ReLU that are open, with what `OpenUnits` holds of them."""
+    where = layer.open(given[0], given[1]).flatten(1).nonzero()
+    at = where[:, 0], where[:, 1]
+    lower, upper, reference, image, loose, room = (v.flatten(1)[at].numpy() for v in given)
+    cell, flat = (v.numpy() for v in at)
+    return OpenUnits(cell, flat, lower, upper, reference, image, loose, room, layer.alpha)

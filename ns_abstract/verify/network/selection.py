@@ -1,0 +1,193 @@
+"""Which numbers of a node rows bound before an activation or a product (docs/design.md, N6, N13, N17, N18)."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from ns_abstract.verify.network.forms import Form
+from ns_abstract.verify.network.intermediate import Intermediate
+from ns_abstract.verify.network.known import Known
+from ns_abstract.verify.network.layers import Activation, LeakyRelu
+from ns_abstract.verify.network.reached import Goal
+from ns_abstract.verify.network.rows import grid
+from ns_abstract.verify.network.schedule import TRIALS, Schedule
+from ns_abstract.verify.network.sharing import Sharing
+
+#: So many open numbers of a node are tightened only if some of them gain by it: if not so large a part of these
+#: keeps so large a part of its width.
+_MANY, _SOME, _GAIN = 1024, 64, 0.95
+#: Signs of many units are given up if so few of some are found out, and so many of the layer before were not.
+_UNSURE = 0.25
+#: Numbers of a node that are probed by rows, and the part of widths past which forms are good enough.
+_PROBED, _HALF = 32, 0.5
+#: Lines that are apart by so small a part of a width are one line; by so large a part of what rows leave of it, open.
+_STRAIGHT, _BENT = 2.0**-20, 2.0**-5
+
+
+class Selection:
+    """Decides which numbers are bounded better; a matter of tightness alone.
+
+    Args:
+        known: What is known so far.
+        intermediate: Bounds the numbers that are chosen.
+        schedule: What rows cost, and how many of them a deep network is worth.
+        sharing: What other cells say of a node before.
+
+    Attributes:
+        unsure: Part of the latest ReLU's inputs whose signs have not been found out.
+    """
+
+    def __init__(self, known: Known, intermediate: Intermediate, schedule: Schedule, sharing: Sharing) -> None:
+        self.known, self.network, self.intermediate = known, known.network, intermediate
+        self.schedule, self.sharing = schedule, sharing
+        self.unsure = 0.0
+
+    def better(
+        self, index: int, form: Form, open_: Tensor, apart: Tensor | None, layer: Activation | None = None
+    ) -> Form:
+        """The form of node ``index`` with better bounds of what is open before an activation or a product (None).
+
+        ``apart``: how far lines of an activation are apart, relative to the form's width; None where that is no matter.
+        """
+        form, open_, apart = self.sharing.wanted(self.known, index, form, open_, apart, layer)
+        if self.network.depth[index] < 2:
+            return form
+        if self.schedule.planned:
+            return self._planned(index, form, open_, layer)
+        if apart is not None:
+            form, open_ = self._bent(index, form, open_, apart)
+        if self.schedule.deep:
+            return self._renew(index, form, open_, layer)
+        return self._tighten(index, form, open_, isinstance(layer, LeakyRelu))
+
+    def _bent(self, index: int, form: Form, open_: Tensor, apart: Tensor) -> tuple[Form, Tensor]:
+        """The form with some numbers bounded by rows, and what is worth rows by what these have shown (N6).
+
+        Lines that are close beside the form's width may be far apart beside what rows leave of it.
+        """
+        known = torch.from_numpy(self.known.good).reshape(-1, *[1] * (open_.ndim - 1))
+        likely = (apart > _STRAIGHT) & ~open_ & known
+        where = likely.reshape(self.known.count, *grid(self.network.shape(index))).nonzero().numpy()
+        if not len(where):
+            return form, open_
+        some = where[:: -(-len(where) // _PROBED)]
+        if self.schedule.deep and not self.schedule.takes(len(some) * self.schedule.costs.row(index)):
+            return form, open_
+        found = self.intermediate.bounded(index, form, some, None, False)
+        at = tuple(torch.from_numpy(some.T))
+        shape = self.known.count, *grid(self.network.shape(index))
+        before, after = ((f.upper - f.lower).reshape(shape)[at] for f in (form, found))
+        kept = float((after / before).nan_to_num(nan=1.0).median())
+        if kept > _HALF:
+            return found, open_
+        return found, open_ | (likely & (apart > _BENT * kept))
+
+    def _tighten(self, index: int, form: Form, open_: Tensor, decides: bool) -> Form:
+        """Better bounds of the numbers of node ``index`` that are open; a sign may be all that is asked (N6)."""
+        item = self.network.shape(index)
+        shape = grid(item)
+        open_ = open_.reshape(self.known.count, *shape) & torch.from_numpy(self.known.good).reshape(-1, 1, 1, 1)
+        where = open_.nonzero().numpy()
+        if not len(where):
+            return form
+        if len(where) >= _MANY:
+            # some first: where they gain nothing, the others are not worth their rows
+            some = tuple(torch.from_numpy(where[:: len(where) // _SOME].T))
+            first = torch.zeros_like(open_)
+            first[some] = True
+            before, found = form, self._tighten(index, form, first, decides)
+            widths = [(f.upper - f.lower).reshape(open_.shape)[some] for f in (before, found)]
+            if bool((widths[1] > _GAIN * widths[0]).double().mean() > _GAIN):
+                return found
+            lower, upper = (v.reshape(open_.shape)[some] for v in found.interval)
+            if decides and self.unsure > _UNSURE and float(((lower < 0.0) & (upper > 0.0)).double().mean()) > _GAIN:
+                # hardly any sign is found out, nor was it in the layer before: what follows is not worth it
+                return found
+            form, open_ = found, open_ & ~first
+            where = open_.nonzero().numpy()
+        return self.intermediate.bounded(index, form, where, Goal() if decides else None, decides)
+
+    def _renew(self, index: int, form: Form, open_: Tensor, layer: Activation | None) -> Form:
+        """Better bounds of a deep network's node, within the work allowed; of closed numbers, too (N13, N17).
+
+        Rows for numbers that are open are all that the lines ask for. But forms forget what neighbours share: behind
+        two or three layers they leave nearly everything open. Where they leave much open, rows bound all numbers
+        that matter further on, so that forms start again from there.
+        """
+        shape = grid(self.network.shape(index))
+        open_ = open_.reshape(self.known.count, *shape) & torch.from_numpy(self.known.good).reshape(-1, 1, 1, 1)
+        count = int(open_.sum())
+        decides = isinstance(layer, LeakyRelu)
+        matters = torch.from_numpy(self.known.good).reshape(-1, 1, 1, 1) & torch.ones_like(open_)
+        if isinstance(layer, LeakyRelu) and layer.alpha == 0.0:
+            # what is certainly cut off is exact behind the layer
+            matters &= form.interval.upper.reshape(open_.shape) > 0.0
+        cost = self.schedule.costs.row(index)
+        whole = self.schedule.renews(count / open_.numel(), int(matters.sum()) * cost)
+        if not (count or whole):
+            return form
+        opened, signs = open_.nonzero().numpy(), Goal() if decides else None
+        chosen = matters.nonzero().numpy() if whole else opened
+        if len(chosen) * cost > self.schedule.left:
+            chosen, whole = opened, False
+        goal = self._goal(form, len(chosen) * cost, layer) if whole else signs
+        if not self.schedule.takes(len(chosen) * cost):
+            return form
+        if len(chosen) >= _MANY:
+            # some first, of the open ones: where they gain nothing, the others are not worth their rows
+            some = opened if count >= _SOME else chosen
+            some = some[:: max(1, len(some) // _SOME)]
+            found = self.intermediate.bounded(index, form, some, None, decides)
+            at = tuple(torch.from_numpy(some.T))
+            widths = [(f.upper - f.lower).reshape(open_.shape)[at] for f in (form, found)]
+            lower, upper = (v.reshape(open_.shape)[at] for v in found.interval)
+            form = found
+            kept = float((widths[1] / widths[0]).median())
+            part = count / open_.numel()
+            undecided = float(((lower < 0.0) & (upper > 0.0)).double().mean()) if decides else 0.0
+            if self.schedule.vain(kept, undecided, part):
+                return form
+            if whole and not self.schedule.gains(kept, part):
+                self.schedule.spares((len(chosen) - count) * cost)
+                chosen, goal = opened, signs
+        spared = self.intermediate.spared
+        found = self.intermediate.bounded(index, form, chosen, goal, decides)
+        # where a sign is not all that is asked, every number has two rows
+        self.schedule.spares((self.intermediate.spared - spared) * (1.0 if decides else 0.5))
+        return found
+
+    def _planned(self, index: int, form: Form, open_: Tensor, layer: Activation | None) -> Form:
+        """Better bounds of all numbers of a node that matter, by rows as long as the network is worth (N18)."""
+        shape = grid(self.network.shape(index))
+        every = torch.ones((self.known.count, *shape), dtype=torch.bool)
+        matters = torch.from_numpy(self.known.good).reshape(-1, 1, 1, 1) & every
+        if isinstance(layer, LeakyRelu) and layer.alpha == 0.0:
+            matters &= form.interval.upper.reshape(matters.shape) > 0.0
+        chosen = matters.nonzero().numpy()
+        ways, rate = self.schedule.ways(index, len(chosen)) if len(chosen) else ([], 0.0)
+        if not ways:
+            return form
+        some = chosen[:: -(-len(chosen) // TRIALS)]
+        at = tuple(torch.from_numpy(some.T))
+        # a row says enough of the other side of its number
+        best, least = None, float(form.r.reshape(matters.shape)[at].mean().log())
+        for way in ways:
+            found = self.intermediate.bounded(index, form, some, None, True, self.known.ready(way))
+            radius = float(found.r.reshape(matters.shape)[at].mean().log())
+            score = radius + rate * len(chosen) * way.price
+            if score < least:
+                best, least = way, score
+        if best is None:
+            return form
+        self.schedule.left -= len(chosen) * best.price
+        return self.intermediate.bounded(index, form, chosen, None, True, best.cut)
+
+    def _goal(self, form: Form, products: float, layer: Activation | None) -> Goal | None:
+        """What rows for all numbers of a node, which take so many products to the image, are to find out (N17)."""
+        part = self.schedule.suffices(products)
+        if not part:
+            return None
+        size = float(form.reference.abs().median())
+        relu = isinstance(layer, LeakyRelu)
+        return Goal(part * size, relu, relu and layer.alpha == 0.0)

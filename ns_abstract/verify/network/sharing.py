@@ -1,0 +1,60 @@
+"""What cells have in common with other cells: by themselves nothing (docs/design.md, N15)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+from torch import Tensor
+
+from ns_abstract.verify.network.forms import Form
+from ns_abstract.verify.network.known import Known
+from ns_abstract.verify.network.layers import Activation
+from ns_abstract.verify.network.reached import Trace
+from ns_abstract.verify.network.rows import Float64, Int64
+
+
+class Sharing:
+    """Cells that are bounded by themselves; others take and give references, slopes and rows here."""
+
+    #: Most rows that are passed back together.
+    most_rows = 1 << 30
+
+    def about(self, middle: Float64) -> Float64:
+        """[m, n] pictures that all is relative to, for the sets' middles: any will do."""
+        return middle
+
+    def reference(self, k: int, passed_on: Callable[[], Tensor]) -> Tensor:
+        """[m, *shape] what is relative to at node ``k``: that of its inputs passed on with float64's rounding."""
+        return passed_on()
+
+    def sized(self, form: Form) -> Form:
+        """The form, or one of more cells, by which rounding is charged: sizes are all that is read of it."""
+        return form
+
+    def winner(self, k: int, winner: Tensor) -> Tensor:
+        """[m, C, 1, W] numbers of windows that are followed from below at node ``k``: any will do."""
+        return winner
+
+    def slopes(self, k: int) -> tuple[np.ndarray, np.ndarray] | None:
+        """Slopes [1, *shape] of rows of another cell on node ``k``, not negative and negative ones."""
+        return None
+
+    def wanted(
+        self,
+        known: Known,
+        index: int,
+        form: Form,
+        open_: Tensor,
+        apart: Tensor | None,
+        layer: Activation | None,
+    ) -> tuple[Form, Tensor, Tensor | None]:
+        """What is known of node ``index``, what of it is open, and how far its lines are apart (see `Selection`)."""
+        return form, open_, apart
+
+    def trace(self, count: int) -> Trace | None:
+        """A place for so many rows that are to be kept (N15)."""
+        return None
+
+    def keep(self, index: int, where: Int64, sign: Float64, trace: Trace) -> None:
+        """Take notice of rows of ``sign`` times single numbers of node ``index``."""
