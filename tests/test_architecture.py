@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import graphlib
 import re
 import shutil
 import subprocess
@@ -79,6 +80,20 @@ def upward(tree: ast.AST, unit: str) -> Iterator[str]:
         parts = name.split(".")
         if parts[0] == "ns_abstract" and len(parts) > 1 and LEVELS.index(parts[1]) > LEVELS.index(unit):
             yield f"line {line}: {unit} imports {name}"
+
+
+def circle(files: list[Path]) -> list[str]:
+    """Modules that import one another in a circle, by their last names."""
+    names = {file.stem for file in files}
+    used = {}
+    for file in files:
+        found = {name.split(".")[-1] for _, name in imported(ast.parse(file.read_text(encoding="utf-8")))}
+        used[file.stem] = found & names
+    try:
+        graphlib.TopologicalSorter(used).prepare()
+    except graphlib.CycleError as error:
+        return error.args[1]
+    return []
 
 
 def unsafe(tree: ast.AST) -> Iterator[str]:
@@ -160,6 +175,11 @@ def test_source_file(file: Path) -> None:
     assert not found
 
 
+def test_modules_of_networks_import_one_way() -> None:
+    files = [file for file in sources() if file.parent == PACKAGE / "verify" / "network" and file.stem != "__init__"]
+    assert len(files) > 20 and circle(files) == []
+
+
 def test_only_the_plug_in_imports_nerfstudio() -> None:
     plug_in = {"nerfstudio", "viser", "torchmetrics", "gsplat"}
     for file in sources():
@@ -219,6 +239,14 @@ def test_rule_finds(name: str) -> None:
 def test_rule_lets_pass(name: str) -> None:
     find, text = GOOD[name]
     assert not list(find(ast.parse(text)))
+
+
+def test_circles_are_found(tmp_path: Path) -> None:
+    for name, other in (("one", "two"), ("two", "three"), ("three", "one")):
+        (tmp_path / f"{name}.py").write_text(f"def f():\n    from ns_abstract.verify.network.{other} import f\n")
+    assert set(circle(sorted(tmp_path.glob("*.py")))) == {"one", "two", "three"}
+    (tmp_path / "three.py").write_text("")
+    assert circle(sorted(tmp_path.glob("*.py"))) == []
 
 
 def test_unfinished_work_is_found() -> None:

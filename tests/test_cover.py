@@ -207,7 +207,8 @@ def test_parts_have_the_references_and_winners_of_the_whole(tmp_path: Path) -> N
     (at,) = family._first.known.passages[0].maxima
     assert (part.known.passages[0].maxima[at].winner == family._first.known.passages[0].maxima[at].winner).all()
     assert (alone.known.passages[0].maxima[at].winner != family._first.known.passages[0].maxima[at].winner).any()
-    assert torch.equal(part.cells.last.reference, family._first.cells.last.reference.expand_as(part.cells.last.reference))
+    found, whole = part.cells.last.reference, family._first.cells.last.reference
+    assert torch.equal(found, whole.expand_as(found))
 
 
 def test_rounding_is_charged_by_all_parts_at_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

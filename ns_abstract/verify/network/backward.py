@@ -155,9 +155,9 @@ class Backward:
             if batch.trace is not None and (batch.trace.short or isinstance(node.layer, (MaxPool, Product))):
                 batch.trace.fixed[batch.number] += batch.total - gathered
             for source, part in zip(node.inputs, parts, strict=True):
-                known = batch.waiting.get(source)
+                there = batch.waiting.get(source)
                 shape = self.network.shape(source)
-                batch.waiting[source] = full(part, shape) if known is None else join(known, part, shape)
+                batch.waiting[source] = full(part, shape) if there is None else join(there, part, shape)
         if cut:
             self._rest_rows(batch, found)
             return
@@ -176,7 +176,7 @@ class Backward:
         charged = isinstance(layer, Linear) and at != start and at not in self.known.folded
         return charged or isinstance(layer, Activation)
 
-    def _bound_rows(self, at: int, batch: Batch, known: Columns, found: Reached) -> None:
+    def _bound_rows(self, at: int, batch: Batch, columns: Columns, found: Reached) -> None:
         """Bounds of a batch whose rows are all on node ``at``."""
         count = len(batch.cell)
         plane, box = np.zeros((count, 2, self.known.d + 1)), np.zeros((count, 2))
@@ -184,7 +184,7 @@ class Backward:
         if rows is None:
             plane[:, :, -1] = box[:] = batch.total
         else:
-            concretize(rows.value, rows.y, rows.x, batch.cell, known, batch.total, plane, box)
+            concretize(rows.value, rows.y, rows.x, batch.cell, columns, batch.total, plane, box)
         lost = self.known.flush[batch.cell][:, None] * np.array([-1.0, 1.0])
         plane[:, :, -1] += lost
         box += lost
@@ -196,9 +196,9 @@ class Backward:
         plane, box = np.zeros((count, 2, self.known.d + 1)), np.zeros((count, 2))
         sizes = np.zeros(count)
         for at, rows in batch.waiting.items():
-            known = self.known.stops[at] if at else self.known.columns
+            columns = self.known.stops[at] if at else self.known.columns
             one, two = np.zeros_like(plane), np.zeros_like(box)
-            concretize(rows.value, rows.y, rows.x, batch.cell, known, total, one, two)
+            concretize(rows.value, rows.y, rows.x, batch.cell, columns, total, one, two)
             plane += one
             box += two
             sizes += np.abs(one).sum((1, 2)) + np.abs(two).sum(1)

@@ -10,8 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ns_abstract.execution.ending import checkpoint
-from ns_abstract.verify.network.bounds import ImageSets, OutputBounds, Signs, bound_outputs
+from ns_abstract.verify.network.bounds import bound_outputs
 from ns_abstract.verify.network.graph import Network, NetworkArithmetic
+from ns_abstract.verify.network.sets import ImageSets, OutputBounds, Signs
 
 #: Branches that are bounded together.
 _TOGETHER = 16

@@ -90,11 +90,11 @@ class Known:
         """The form with bounds that are known besides; a cell without values in it is given up."""
         low, high = torch.maximum(form.lower, lower), torch.minimum(form.upper, upper)
         fine = low <= high
-        for known in (form.reference, form.c, form.r, form.a):
+        for part in (form.reference, form.c, form.r, form.a):
             # sums are finite unless a number, or they, are not
-            if not bool(torch.isfinite(known.sum())):
-                finite = torch.isfinite(known)
-                fine = fine & (finite.all(1) if known.ndim > fine.ndim else finite)
+            if not bool(torch.isfinite(part.sum())):
+                finite = torch.isfinite(part)
+                fine = fine & (finite.all(1) if part.ndim > fine.ndim else finite)
         good = fine.reshape(self.count, -1).all(1)
         if self.assumed is not None and not bool(good.all()):
             # bounds that hold for all images with these signs contradict each other: there are none (N16)

@@ -63,9 +63,9 @@ class Outputs:
         room = 2.0**-48 * (np.abs(plane).sum(-1) + np.abs(offset) + missing) + missing
         lower, b = lower + offset - room, plane[..., -1] + offset - room
         a = plane[..., :-1]
-        known = self.known.good[:, None] & np.isfinite(lower)
+        finite = self.known.good[:, None] & np.isfinite(lower)
         usable = self.known.good[:, None] & np.isfinite(b) & np.isfinite(a).all(-1)
-        lower = np.where(self.known.vacant[:, None], np.inf, np.where(known, lower, -np.inf))
+        lower = np.where(self.known.vacant[:, None], np.inf, np.where(finite, lower, -np.inf))
         return OutputBounds(lower, np.where(usable[..., None], a, 0.0), np.where(usable, b, -np.inf), loosest)
 
     def _climb(self, index: int, rows: Rows, cell: Int64, need: Float64) -> tuple[Reached, Int64]:

@@ -31,14 +31,14 @@ class _Exceeded(NamedTuple):
     Attributes:
         at: Their cells, channels and numbers, [n] each.
         top: [n] what may be above the winner.
-        known: Their numbers.
+        candidates: Their numbers.
         near: [n, K] how far these may be from their references.
         planes: One above each.
     """
 
     at: tuple[Tensor, ...]
     top: Tensor
-    known: Candidates
+    candidates: Candidates
     near: Tensor
     planes: Planes
 
@@ -84,10 +84,10 @@ class Pooling:
             exceeded = self._exceeded(source, layer, x, interval, winner[:, :, 0], part)
             if exceeded is None:
                 continue
-            at, top, known, near, planes = exceeded
+            at, top, candidates, near, planes = exceeded
             which[at] = torch.arange(len(top)) + sum(map(len, slopes))
-            base = (planes.slopes * known.reference).sum(1) - reference[at]
-            room = _REFERENCES * ((planes.slopes * known.reference.abs()).sum(1) + reference[at].abs())
+            base = (planes.slopes * candidates.reference).sum(1) - reference[at]
+            room = _REFERENCES * ((planes.slopes * candidates.reference.abs()).sum(1) + reference[at].abs())
             for passage, unit, give, offset in zip(self.known.passages, units, gives, offsets, strict=True):
                 rounded = (planes.slopes.to(passage.dtype).double() - planes.slopes).abs()
                 lost = (rounded * near + unit * planes.slopes * near).sum(1) + room
@@ -97,12 +97,12 @@ class Pooling:
             slopes.append(planes.slopes)
             # the form between the planes, or the winner and what may be above it
             low, high = planes.low + base - room, planes.high + base + room
-            middle = (planes.slopes * known.middle).sum(1) + 0.5 * (low + high)
-            radius = (planes.slopes * known.radius).sum(1) + 0.5 * (high - low)
-            radius = (radius + _REFERENCES * (planes.slopes * known.size).sum(1)) * (1.0 + 2.0**-40)
+            middle = (planes.slopes * candidates.middle).sum(1) + 0.5 * (low + high)
+            radius = (planes.slopes * candidates.radius).sum(1) + 0.5 * (high - low)
+            radius = (radius + _REFERENCES * (planes.slopes * candidates.size).sum(1)) * (1.0 + 2.0**-40)
             own = r[at] + 0.5 * top
             better = radius < own
-            rows = (planes.slopes[:, :, None] * known.slopes).sum(1)
+            rows = (planes.slopes[:, :, None] * candidates.slopes).sum(1)
             c[at] = torch.where(better, middle, c[at] + 0.5 * top)
             r[at] = torch.where(better, radius, own * (1.0 + 2.0**-40) + _REFERENCES * c[at].abs())
             cells, channels, windows = at
@@ -142,7 +142,7 @@ class Pooling:
         def gathered(v: Tensor) -> Tensor:
             return v.flatten(1)[cell[:, None], number]
 
-        known = Candidates(
+        candidates = Candidates(
             inside,
             reference=gathered(x.reference),
             middle=gathered(x.c),
@@ -152,20 +152,24 @@ class Pooling:
             upper=gathered(interval.upper),
             winner=winner[at],
         )
-        apart = self._apart(source, layer, where, known)
-        top = apart[torch.arange(len(where)), :, known.winner].amax(1)
+        apart = self._apart(source, layer, where, candidates)
+        top = apart[torch.arange(len(where)), :, candidates.winner].amax(1)
         left = top > 0.0
         if not bool(left.any()):
             return None
-        known = Candidates(*(v[left] for v in known))
+        candidates = Candidates(*(v[left] for v in candidates))
         return _Exceeded(
-            tuple(v[left] for v in at), top[left], known, gathered(x.width)[left], upper_planes(known, apart[left])
+            tuple(v[left] for v in at),
+            top[left],
+            candidates,
+            gathered(x.width)[left],
+            upper_planes(candidates, apart[left]),
         )
 
-    def _apart(self, source: int, layer: MaxPool, where: Tensor, known: Candidates) -> Tensor:
+    def _apart(self, source: int, layer: MaxPool, where: Tensor, candidates: Candidates) -> Tensor:
         """How far numbers of windows may be above one another, by forms and by rows where these help."""
-        apart = known.apart()
-        at, winner = np.arange(len(apart)), known.winner.numpy()
+        apart = candidates.apart()
+        at, winner = np.arange(len(apart)), candidates.winner.numpy()
 
         def rivals() -> np.ndarray:
             return apart.numpy()[at, :, winner] > 0.0
@@ -183,18 +187,20 @@ class Pooling:
             return apart
         if len(pairs) > _TRIED:
             first = np.arange(0, len(pairs), len(pairs) // _TRIED)
-            if self._differences(source, layer, where.numpy(), known, pairs[first], apart, cut) < _CLOSES * len(first):
+            if self._differences(source, layer, where.numpy(), candidates, pairs[first], apart, cut) < _CLOSES * len(
+                first
+            ):
                 return apart
             pairs = np.delete(pairs, first, 0)
-        self._differences(source, layer, where.numpy(), known, pairs, apart, cut)
+        self._differences(source, layer, where.numpy(), candidates, pairs, apart, cut)
         # what may be above the winner, among itself
         left = rivals()
         both = np.triu(left[:, :, None] & left[:, None, :], 1)
-        self._differences(source, layer, where.numpy(), known, np.argwhere(both), apart, cut)
+        self._differences(source, layer, where.numpy(), candidates, np.argwhere(both), apart, cut)
         return apart
 
     def _differences(
-        self, source: int, layer: MaxPool, where: Int64, known: Candidates, pairs: Int64, apart: Tensor, cut: int
+        self, source: int, layer: MaxPool, where: Int64, candidates: Candidates, pairs: Int64, apart: Tensor, cut: int
     ) -> int:
         """Bound differences of (window, number, number) by rows, in ``apart``; how many second ones are never above."""
         channels = self.network.shape(source)[0]
@@ -212,7 +218,7 @@ class Pooling:
             for chosen, sign in ((one, 1.0), (other, -1.0)):
                 i, j = layer.steps[chosen].T
                 value[row, channel, i, j] = sign
-            near = known.reference[window, one], known.reference[window, other]
+            near = candidates.reference[window, one], candidates.reference[window, other]
             ahead = (near[0] - near[1]).numpy()
             room = 2.0**-50 * (near[0].abs() + near[1].abs()).numpy()
             rows = Rows(value, y * layer.stride[0] - layer.pads[0], x * layer.stride[1] - layer.pads[1])

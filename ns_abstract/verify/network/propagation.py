@@ -42,9 +42,9 @@ class Propagation:
         # float64's rounding is relative to forms and references, float32's of rows to distances from
         # references, that of the network to its values
         own = (layer.terms + len(inputs) + 8) * 2.0**-52
-        known = [self.sharing.sized(f) for f in inputs]
+        charged = [self.sharing.sized(f) for f in inputs]
         radii, sizes = [], []
-        for f, sized in zip(inputs, known, strict=True):
+        for f, sized in zip(inputs, charged, strict=True):
             # at least what an input may be on one side of zero and on the other together
             size = torch.maximum(sized.interval.spread, sized.reference.abs())
             sizes.append(size)
@@ -64,12 +64,12 @@ class Propagation:
             def end(moves: Tensor = moves) -> Tensor:
                 return (reference + moved[:, 0]).abs() + moved[:, 1:].abs().sum(1) + radius + moves
 
-            moves = moves + self.rounding.charge(k, sources, layer, known, size, end) + layer.spare(sizes)
+            moves = moves + self.rounding.charge(k, sources, layer, charged, size, end) + layer.spare(sizes)
         roundings = layer.row_terms + SPARE + max(self.network.readers[i] for i in sources)
         form = Form.ranged(reference, moved[:, 0], moved[:, 1:], radius + moves, active)
         if float(size.amax()) >= OVERFLOW:
             self.known.good &= (size.flatten(1).amax(1) < OVERFLOW).numpy()
-        for sized, shape in zip(known, layer.input_shapes, strict=True):
+        for sized, shape in zip(charged, layer.input_shapes, strict=True):
             lost = int(np.prod(shape)) * (layer.row_terms + 2) * FLUSH
             self.known.flush += lost * sized.width.flatten(1).amax(1).numpy()
         alone = [i for i in sources if self.known.rounds(i) and self.network.readers[i] == 1]

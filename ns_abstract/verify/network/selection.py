@@ -48,7 +48,7 @@ class Selection:
     ) -> Form:
         """The form of node ``index`` with better bounds of what is open before an activation or a product (None).
 
-        ``apart``: how far lines of an activation are apart, relative to the form's width; None where that is no matter.
+        ``apart``: how far lines or planes are apart, as a part of what is between; None where ``open_`` says all.
         """
         form, open_, apart = self.sharing.wanted(self.known, index, form, open_, apart, layer)
         if self.network.depth[index] < 2:
@@ -66,8 +66,8 @@ class Selection:
 
         Lines that are close beside the form's width may be far apart beside what rows leave of it.
         """
-        known = torch.from_numpy(self.known.good).reshape(-1, *[1] * (open_.ndim - 1))
-        likely = (apart > _STRAIGHT) & ~open_ & known
+        good = torch.from_numpy(self.known.good).reshape(-1, *[1] * (open_.ndim - 1))
+        likely = (apart > _STRAIGHT) & ~open_ & good
         where = likely.reshape(self.known.count, *grid(self.network.shape(index))).nonzero().numpy()
         if not len(where):
             return form, open_
