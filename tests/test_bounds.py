@@ -403,7 +403,7 @@ def test_colors_are_shared_by_cells_that_turn_and_not_by_others():
                     for bounds in (kept, SplatBounds(splats, GSPLAT_1_4_0, FLOAT32))
                 )
                 assert (found.lower == fresh.lower).all() and (found.upper == fresh.upper).all()
-                assert (found.visible == fresh.visible).all() and (found.tile_ranges == fresh.tile_ranges).all()
+                assert (found.visible == fresh.visible).all() and (found.reach == fresh.reach).all()
 
 
 @both_orders

@@ -20,7 +20,15 @@ from ns_abstract.methods.splat.activate import Splats
 from ns_abstract.methods.splat.bounds import SplatBounds
 from ns_abstract.methods.splat.constants import GSPLAT_1_4_0
 from ns_abstract.methods.splat.frame import SplatFrame
-from ns_abstract.methods.splat.lists import depth_order, longest_first, tile_lists, touching
+from ns_abstract.methods.splat.lists import (
+    depth_order,
+    holding,
+    longest_first,
+    marked,
+    pixel_counts,
+    tile_lists,
+    touching,
+)
 
 ACROSS, DOWN = 5, 4
 
@@ -48,6 +56,32 @@ def test_touching_is_what_the_lists_hold(share):
     assert found.tolist() == [i for i in indices if held(tiles[i], wanted)]
     _, entries = tile_lists(indices, tiles, wanted, ACROSS)
     assert set(entries.tolist()) == set(found.tolist())
+
+
+def test_rectangles_hold_the_pixels_that_are_reached_and_no_others():
+    generator, side, count = np.random.default_rng(6), 4, 400
+    tiles = ranges(count, 7)
+    box = np.sort(generator.uniform(-3.0, 23.0, (count, 2, 2)), axis=2)
+    # ends at pixels' middles belong to them; pixels, or everything, may be unknown
+    box[::3] = np.round(box[::3]) + 0.5
+    box[::7, 0, 0], box[3::7, 1, 1], box[5::7] = -np.inf, np.nan, np.nan
+    box = box.reshape(count, 4)
+    marks = (generator.uniform(size=count) < 0.8).astype(np.uint8)
+    numbers, rectangles = marked(marks, np.arange(100, 100 + count), box, tiles, side)
+    assert (numbers == 100 + np.flatnonzero(marks)).all()
+    rows, columns = np.mgrid[: DOWN * side, : ACROSS * side]
+    chosen = generator.uniform(size=rows.shape) < 0.1
+    seen = holding(rectangles, pixel_counts(chosen))
+    for k, (x0, x1, y0, y1), said in zip(np.flatnonzero(marks), rectangles, seen, strict=True):
+        # what is not a number leaves nothing out
+        outside = (columns + 0.5 < box[k, 0]) | (columns + 0.5 > box[k, 1])
+        outside |= (rows + 0.5 < box[k, 2]) | (rows + 0.5 > box[k, 3])
+        left, past, top, end = side * tiles[k]
+        outside |= (columns < left) | (columns >= past) | (rows < top) | (rows >= end)
+        inside = (columns >= x0) & (columns < x1) & (rows >= y0) & (rows < y1)
+        assert (inside == ~outside).all()
+        assert said == (inside & chosen).any()
+    assert 0 < seen.sum() < seen.size
 
 
 def test_lists_are_by_depth_and_equal_depths_by_index():
@@ -249,6 +283,11 @@ def test_wanted_pixels_are_bounded_as_in_the_whole_picture(radii, order, antiali
     inner, fewer = poses.box.split(0, 4)[1], pixels & (random.random(pixels.shape) < 0.5)
     alone, inside = frame.bound(inner, tiles, None, False, fewer), frame.bound(inner, tiles, part.context, False, fewer)
     assert (alone.lower == inside.lower).all() and (alone.upper == inside.upper).all()
+    rest, single = np.zeros_like(pixels), tuple(np.argwhere(pixels)[0])
+    rest[single] = True
+    alone, close = frame.bound(inner, tiles, None, False, rest), frame.bound(inner, tiles, part.context, False, rest)
+    assert (alone.lower == close.lower).all() and (alone.upper == close.upper).all()
+    assert frame._candidates(tiles, part.context, rest).size < 0.5 * part.context.visible.size
     for values in (*poses.box.corners(), *poses.box.sample(8, random)):
         image = frame.render(values, tiles)
         assert (part.lower <= image).all() and (image <= part.upper).all()

@@ -524,6 +524,22 @@ SPLATS = (
         "test_lists.py::test_wanted_pixels_are_bounded_as_in_the_whole_picture[radii0-1-False-arithmetic0]",
     ),
     Fault(
+        "what parts may show ends a pixel early",
+        _LISTS,
+        "marked",
+        "math.floor(box[k, axis + 1] - 0.5) + 1.0",
+        "math.floor(box[k, axis + 1] - 0.5)",
+        "test_lists.py::test_rectangles_hold_the_pixels_that_are_reached_and_no_others",
+    ),
+    Fault(
+        "what parts may show is counted short",
+        _LISTS,
+        "holding",
+        "counts[y1, x1] - counts[y0, x1] - counts[y1, x0] + counts[y0, x0]",
+        "counts[y1, x1] - counts[y0, x1] - counts[y1, x0]",
+        "test_lists.py::test_rectangles_hold_the_pixels_that_are_reached_and_no_others",
+    ),
+    Fault(
         "pixels that the batch has hidden take further layers",
         _FRAGMENTS,
         "collect_fragments",

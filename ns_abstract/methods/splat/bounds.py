@@ -65,7 +65,7 @@ class CellBounds:
         wanted: [t] tile numbers, row-major.
         lower, upper: [t, side, side, 3] float64 enclosures of every image of the cell.
         visible: [n] scene indices of the Gaussians that some pose of the cell may show on the pixels that were wanted.
-        tile_ranges: [n, 4] their ranges of tiles: columns first and past, rows first and past.
+        reach: [n, 4] rectangles of pixels outside of which they are not seen: columns first and past, rows likewise.
         linear: [t, side, side, 3, m + 1] polynomial coefficients and radius, or None.
         layers: [t, side, side, 4] accumulation and expected depth as in `PixelBounds.layers`, or None.
         slopes: [d] mean absolute linear coefficients; 0 where pixels were not wanted.
@@ -77,7 +77,7 @@ class CellBounds:
     lower: np.ndarray
     upper: np.ndarray
     visible: np.ndarray
-    tile_ranges: np.ndarray
+    reach: np.ndarray
     linear: np.ndarray | None
     layers: np.ndarray | None
     slopes: np.ndarray
@@ -217,7 +217,8 @@ class SplatBounds:
             found,
         )
         return CellBounds(
-            wanted, found.lower, found.upper, *marked(found.marks, candidates, gaussians.tiles),
+            wanted, found.lower, found.upper,
+            *marked(found.marks, candidates, gaussians.box, gaussians.tiles, self.side),
             found.linear if keep_linear else None, found.layers if layers else None,
             found.slopes.sum(axis=0) / (max(wanted.size, 1) * self.side**2 * 3),
             found.statistics.sum(axis=0),

@@ -20,7 +20,7 @@ from ns_abstract.methods.splat.activate import Splats
 from ns_abstract.methods.splat.bounds import STAGES, SplatBounds, alone
 from ns_abstract.methods.splat.constants import Rasteriser
 from ns_abstract.methods.splat.depths import ACCUMULATION_HIGH, ACCUMULATION_LOW, DEPTH_HIGH, DEPTH_LOW
-from ns_abstract.methods.splat.lists import tile_mask, touching
+from ns_abstract.methods.splat.lists import holding, pixel_counts
 from ns_abstract.methods.splat.render import Renderer
 from ns_abstract.methods.splat.variations import VariedSplats
 from ns_abstract.perturbation.specification import ROTATIONS
@@ -49,16 +49,16 @@ class Context:
 
     Attributes:
         visible: [n] scene indices.
-        tile_ranges: [n, 4] first and past tile columns, first and past tile rows.
+        reach: [n, 4] int32 first and past columns, first and past rows of the pixels on which they may be seen.
     """
 
     visible: np.ndarray
-    tile_ranges: np.ndarray
+    reach: np.ndarray
 
     @property
     def nbytes(self) -> int:
         """Memory that it holds."""
-        return self.visible.nbytes + self.tile_ranges.nbytes
+        return self.visible.nbytes + self.reach.nbytes
 
     @property
     def shown(self) -> np.ndarray:
@@ -254,7 +254,7 @@ class SplatFrame:
         """See `ns_abstract.refine.protocol.Frame.bound`, and `bound_parts` for ``pixels``."""
         checkpoint()
         forms = self.pose_set.enclosure(box, self.order)
-        candidates = self._candidates(tiles, within)
+        candidates = self._candidates(tiles, within, pixels)
         layers = self.channels > COLORS
         cell = self.bounds.cell(self.camera, forms, tiles, candidates, keep_linear, self._floor, layers, pixels)
         lower, upper = cell.lower, cell.upper
@@ -266,7 +266,7 @@ class SplatFrame:
         lower, upper = outward(lower, upper)
         # hardly smaller: not worth its memory
         kept = within is not None and cell.visible.size > _WORTH_KEEPING * within.visible.size
-        context = within if within is not None and kept else Context(cell.visible, cell.tile_ranges)
+        context = within if within is not None and kept else Context(cell.visible, cell.reach)
         linear = None
         if keep_linear:
             assert cell.linear is not None
@@ -280,13 +280,16 @@ class SplatFrame:
         """See `ns_abstract.refine.protocol.PartsFrame`."""
         return each(lambda box: self.bound(box, tiles, within, keep_linear, pixels), boxes)
 
-    def _candidates(self, tiles: np.ndarray, within: Context | None) -> np.ndarray | None:
+    def _candidates(self, tiles: np.ndarray, within: Context | None, pixels: np.ndarray | None) -> np.ndarray | None:
+        """What may be seen on ``pixels`` of ``tiles`` in a cell ``within`` another; None: everything."""
         if within is None:
             return None
-        if tiles.size == self.tile_count:
+        if tiles.size == self.tile_count and pixels is None:
             return within.visible
-        mask = tile_mask(tiles, self.tile_count)
-        return within.visible[touching(np.arange(within.visible.size), within.tile_ranges, mask, self.across)]
+        chosen = np.zeros((self.down, self.across, self.side, self.side), bool)
+        chosen.reshape(-1, self.side, self.side)[tiles] = True if pixels is None else pixels
+        counts = pixel_counts(chosen.swapaxes(1, 2).reshape(self.down * self.side, self.across * self.side))
+        return within.visible[holding(within.reach, counts)]
 
     def _shear(self) -> dict[str, dict[str, float]]:
         """For each rotation, how much of it undoes what one unit of another parameter moves typical Gaussians by."""

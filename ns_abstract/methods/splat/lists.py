@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -83,20 +84,52 @@ def touching(indices, tiles, wanted, tiles_x):
 
 
 @njit(cache=True, error_model="numpy")
-def marked(marks, numbers, tiles):
-    """Those of ``numbers`` whose mark is not 0, and the first four columns of their ``tiles``."""
+def marked(marks, numbers, box, tiles, side):
+    """Those of ``numbers`` whose mark is not 0, and the rectangles of pixels that they may be drawn on.
+
+    Args:
+        marks, numbers: [n].
+        box: [n, 4] least and largest x, least and largest y that they reach, pixels; NaN: not known.
+        tiles: [n, >= 4] their ranges of tiles, see `tile_lists`; what they reach elsewhere is not drawn.
+        side: Of a tile.
+
+    Returns:
+        [k], and [k, 4] int32 columns first and past, rows first and past.
+    """
     count = 0
     for k in range(marks.size):
         count += marks[k] != 0
-    found, ranges = np.empty(count, numbers.dtype), np.empty((count, 4), tiles.dtype)
+    found, pixels = np.empty(count, numbers.dtype), np.empty((count, 4), np.int32)
     count = 0
     for k in range(marks.size):
-        if marks[k] != 0:
-            found[count] = numbers[k]
-            for column in range(4):
-                ranges[count, column] = tiles[k, column]
-            count += 1
-    return found, ranges
+        if marks[k] == 0:
+            continue
+        found[count] = numbers[k]
+        for axis in range(0, 4, 2):
+            first, past = tiles[k, axis] * side, tiles[k, axis + 1] * side
+            # a pixel's middle lies half a pixel behind its number
+            low, high = math.ceil(box[k, axis] - 0.5), math.floor(box[k, axis + 1] - 0.5) + 1.0
+            pixels[count, axis] = int(low) if first < low < past else (past if low >= past else first)
+            pixels[count, axis + 1] = int(high) if first < high < past else (first if high <= first else past)
+        count += 1
+    return found, pixels
+
+
+def pixel_counts(chosen):
+    """[rows + 1, columns + 1] int32 how many of the pixels ``chosen`` [rows, columns] lie above and left of each."""
+    counts = np.zeros((chosen.shape[0] + 1, chosen.shape[1] + 1), np.int32)
+    counts[1:, 1:] = np.cumsum(np.cumsum(chosen, axis=0, dtype=np.int32), axis=1, dtype=np.int32)
+    return counts
+
+
+@njit(cache=True, error_model="numpy")
+def holding(rectangles, counts):
+    """[n] whether ``rectangles`` [n, 4] of pixels hold one that was chosen; see `marked` and `pixel_counts`."""
+    out = np.empty(rectangles.shape[0], np.bool_)
+    for k in range(rectangles.shape[0]):
+        x0, x1, y0, y1 = rectangles[k]
+        out[k] = x0 < x1 and y0 < y1 and counts[y1, x1] - counts[y0, x1] - counts[y1, x0] + counts[y0, x0] > 0
+    return out
 
 
 @njit(cache=True, error_model="numpy")
