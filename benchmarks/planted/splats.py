@@ -527,8 +527,8 @@ SPLATS = (
         "what parts may show ends a pixel early",
         _LISTS,
         "marked",
-        "math.floor(box[k, axis + 1] - 0.5) + 1.0",
-        "math.floor(box[k, axis + 1] - 0.5)",
+        "int(math.floor(max(high, first - 1.0))) + 1",
+        "int(math.floor(max(high, first - 1.0)))",
         "test_lists.py::test_rectangles_hold_the_pixels_that_are_reached_and_no_others",
     ),
     Fault(

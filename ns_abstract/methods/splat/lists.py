@@ -107,10 +107,13 @@ def marked(marks, numbers, box, tiles, side):
         found[count] = numbers[k]
         for axis in range(0, 4, 2):
             first, past = tiles[k, axis] * side, tiles[k, axis + 1] * side
-            # a pixel's middle lies half a pixel behind its number
-            low, high = math.ceil(box[k, axis] - 0.5), math.floor(box[k, axis + 1] - 0.5) + 1.0
-            pixels[count, axis] = int(low) if first < low < past else (past if low >= past else first)
-            pixels[count, axis + 1] = int(high) if first < high < past else (first if high <= first else past)
+            # a pixel's middle lies half a pixel behind its number; what is not a number leaves nothing out
+            low, high = box[k, axis] - 0.5, box[k, axis + 1] - 0.5
+            pixels[count, axis], pixels[count, axis + 1] = first, past
+            if low > first:
+                pixels[count, axis] = int(math.ceil(min(low, float(past))))
+            if high < past:
+                pixels[count, axis + 1] = int(math.floor(max(high, first - 1.0))) + 1
         count += 1
     return found, pixels
 
