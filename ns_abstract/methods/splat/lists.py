@@ -85,7 +85,7 @@ def touching(indices, tiles, wanted, tiles_x):
 
 @njit(cache=True, error_model="numpy")
 def marked(marks, numbers, box, tiles, side):
-    """Those of ``numbers`` whose mark is not 0, and the rectangles of pixels that they may be drawn on.
+    """Those of ``numbers`` whose mark is not 0, and the rectangles of pixels that they may be drawn on (design.md, R2).
 
     Args:
         marks, numbers: [n].
