@@ -22,10 +22,9 @@ from ns_abstract.methods.splat.constants import GSPLAT_1_4_0
 from ns_abstract.methods.splat.frame import SplatFrame
 from ns_abstract.methods.splat.lists import (
     depth_order,
-    holding,
     longest_first,
     marked,
-    pixel_counts,
+    summed_area,
     tile_lists,
     touching,
 )
@@ -52,7 +51,7 @@ def test_touching_is_what_the_lists_hold(share):
     tiles = ranges(300, 1)
     wanted = (np.random.default_rng(2).uniform(size=ACROSS * DOWN) < share).astype(np.uint8)
     indices = np.random.default_rng(3).permutation(300)[:200]
-    found = touching(indices, tiles, wanted, ACROSS)
+    found = touching(indices, tiles, summed_area(wanted.reshape(DOWN, ACROSS)))
     assert found.tolist() == [i for i in indices if held(tiles[i], wanted)]
     _, entries = tile_lists(indices, tiles, wanted, ACROSS)
     assert set(entries.tolist()) == set(found.tolist())
@@ -71,7 +70,7 @@ def test_rectangles_hold_the_pixels_that_are_reached_and_no_others():
     assert (numbers == 100 + np.flatnonzero(marks)).all()
     rows, columns = np.mgrid[: DOWN * side, : ACROSS * side]
     chosen = generator.uniform(size=rows.shape) < 0.1
-    seen = holding(rectangles, pixel_counts(chosen))
+    seen = np.isin(np.arange(numbers.size), touching(np.arange(numbers.size), rectangles, summed_area(chosen)))
     for k, (x0, x1, y0, y1), said in zip(np.flatnonzero(marks), rectangles, seen, strict=True):
         # what is not a number leaves nothing out
         outside = (columns + 0.5 < box[k, 0]) | (columns + 0.5 > box[k, 1])

@@ -534,9 +534,9 @@ SPLATS = (
     Fault(
         "what parts may show is counted short",
         _LISTS,
-        "holding",
-        "counts[y1, x1] - counts[y0, x1] - counts[y1, x0] + counts[y0, x0]",
-        "counts[y1, x1] - counts[y0, x1] - counts[y1, x0]",
+        "touching",
+        "table[y1, x1] - table[y0, x1] - table[y1, x0] + table[y0, x0]",
+        "table[y1, x1] - table[y0, x1] - table[y1, x0]",
         "test_lists.py::test_rectangles_hold_the_pixels_that_are_reached_and_no_others",
     ),
     Fault(

@@ -13,7 +13,6 @@ import tyro
 from ns_abstract.cli.common import DONE, INTERRUPTED, Stop, run
 from ns_abstract.cli.sets import GivenSet, given_set
 from ns_abstract.io.errors import InputError
-from ns_abstract.io.memory import allowed_memory
 
 #: Seconds where no time budget is given.
 _SECONDS = 1800.0
@@ -99,8 +98,6 @@ def certify(options: Certify) -> int:
     """
     if options.time_budget is not None and not 0.0 < options.time_budget < float("inf"):
         raise InputError(f"found {options.time_budget}", field="--time-budget", fix="give a positive number")
-    # before anything is opened
-    allowed_memory(options.memory_limit)
     if options.workers is not None and options.workers < 1:
         raise InputError(f"found {options.workers}", field="--workers", fix="give a number of at least 1")
     if options.engine == "local" and options.scheduler_address is not None:

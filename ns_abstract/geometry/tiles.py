@@ -23,8 +23,13 @@ def in_tiles(image: np.ndarray, side: int) -> np.ndarray:
 
 def assemble(tiles: np.ndarray, camera: Camera) -> np.ndarray:
     """The image [H, W, ...] from all its tiles [T, side, side, ...] in row-major order."""
-    side = tiles.shape[1]
-    across, down = tile_grid(camera, side)
-    rest = tiles.shape[3:]
+    across, _ = tile_grid(camera, tiles.shape[1])
+    return np.ascontiguousarray(laid_out(tiles, across)[: camera.height, : camera.width])
+
+
+def laid_out(tiles: np.ndarray, across: int) -> np.ndarray:
+    """All pixels [rows, columns, ...] of all tiles [T, side, side, ...], of which so many are in a row."""
+    side, rest = tiles.shape[1], tiles.shape[3:]
+    down = len(tiles) // across
     grid = tiles.reshape(down, across, side, side, *rest).swapaxes(1, 2)
-    return np.ascontiguousarray(grid.reshape(down * side, across * side, *rest)[: camera.height, : camera.width])
+    return grid.reshape(down * side, across * side, *rest)

@@ -15,12 +15,12 @@ from ns_abstract.execution.ending import checkpoint
 from ns_abstract.execution.threads import each
 from ns_abstract.geometry.box import ParameterBox
 from ns_abstract.geometry.poses import PoseSet, translation_only
-from ns_abstract.geometry.tiles import tile_grid
+from ns_abstract.geometry.tiles import laid_out, tile_grid
 from ns_abstract.methods.splat.activate import Splats
 from ns_abstract.methods.splat.bounds import STAGES, SplatBounds, alone
 from ns_abstract.methods.splat.constants import Rasteriser
 from ns_abstract.methods.splat.depths import ACCUMULATION_HIGH, ACCUMULATION_LOW, DEPTH_HIGH, DEPTH_LOW
-from ns_abstract.methods.splat.lists import holding, pixel_counts
+from ns_abstract.methods.splat.lists import summed_area, touching
 from ns_abstract.methods.splat.render import Renderer
 from ns_abstract.methods.splat.variations import VariedSplats
 from ns_abstract.perturbation.specification import ROTATIONS
@@ -252,9 +252,23 @@ class SplatFrame:
         pixels: np.ndarray | None = None,
     ) -> TileBounds:  # fmt: skip
         """See `ns_abstract.refine.protocol.Frame.bound`, and `bound_parts` for ``pixels``."""
+        return self._bound(box, tiles, within, self._candidates(tiles, within, pixels), keep_linear, pixels)
+
+    def bound_parts(
+        self, boxes: Sequence[ParameterBox], tiles: np.ndarray, within: Context | None, keep_linear: bool,
+        pixels: np.ndarray | None,
+    ) -> list[TileBounds]:  # fmt: skip
+        """See `ns_abstract.refine.protocol.PartsFrame`."""
+        candidates = self._candidates(tiles, within, pixels)
+        return each(lambda box: self._bound(box, tiles, within, candidates, keep_linear, pixels), boxes)
+
+    def _bound(
+        self, box: ParameterBox, tiles: np.ndarray, within: Context | None, candidates: np.ndarray | None,
+        keep_linear: bool, pixels: np.ndarray | None,
+    ) -> TileBounds:  # fmt: skip
+        """`bound`, given what may be seen there."""
         checkpoint()
         forms = self.pose_set.enclosure(box, self.order)
-        candidates = self._candidates(tiles, within, pixels)
         layers = self.channels > COLORS
         cell = self.bounds.cell(self.camera, forms, tiles, candidates, keep_linear, self._floor, layers, pixels)
         lower, upper = cell.lower, cell.upper
@@ -273,23 +287,16 @@ class SplatFrame:
             linear = linear_sets(cell.linear, cell.lower, cell.upper, box.dimensions)
         return TileBounds(lower, upper, cell.slopes, context, linear, int(cell.statistics[3]))
 
-    def bound_parts(
-        self, boxes: Sequence[ParameterBox], tiles: np.ndarray, within: Context | None, keep_linear: bool,
-        pixels: np.ndarray | None,
-    ) -> list[TileBounds]:  # fmt: skip
-        """See `ns_abstract.refine.protocol.PartsFrame`."""
-        return each(lambda box: self.bound(box, tiles, within, keep_linear, pixels), boxes)
-
     def _candidates(self, tiles: np.ndarray, within: Context | None, pixels: np.ndarray | None) -> np.ndarray | None:
         """What may be seen on ``pixels`` of ``tiles`` in a cell ``within`` another; None: everything."""
         if within is None:
             return None
         if tiles.size == self.tile_count and pixels is None:
             return within.visible
-        chosen = np.zeros((self.down, self.across, self.side, self.side), bool)
-        chosen.reshape(-1, self.side, self.side)[tiles] = True if pixels is None else pixels
-        counts = pixel_counts(chosen.swapaxes(1, 2).reshape(self.down * self.side, self.across * self.side))
-        return within.visible[holding(within.reach, counts)]
+        chosen = np.zeros((self.tile_count, self.side, self.side), bool)
+        chosen[tiles] = True if pixels is None else pixels
+        table = summed_area(laid_out(chosen, self.across))
+        return within.visible[touching(np.arange(within.visible.size), within.reach, table)]
 
     def _shear(self) -> dict[str, dict[str, float]]:
         """For each rotation, how much of it undoes what one unit of another parameter moves typical Gaussians by."""

@@ -65,19 +65,27 @@ def pixel_sets(chosen):
     return np.packbits(by_block, axis=-1, bitorder="little").view("<i8")[..., 0]
 
 
+def summed_area(chosen):
+    """[rows + 1, columns + 1] int32 how many of the places ``chosen`` [rows, columns] lie above and left of each."""
+    table = np.zeros((chosen.shape[0] + 1, chosen.shape[1] + 1), np.int32)
+    table[1:, 1:] = np.cumsum(np.cumsum(chosen, axis=0, dtype=np.int32), axis=1, dtype=np.int32)
+    return table
+
+
 @njit(cache=True, error_model="numpy")
-def touching(indices, tiles, wanted, tiles_x):
-    """Those of ``indices`` whose range of ``tiles`` holds one of which ``wanted`` is not 0; see `tile_lists`."""
+def touching(indices, rectangles, table):
+    """Those of ``indices`` whose rectangle holds a place that was chosen.
+
+    Args:
+        indices: Rows of ``rectangles``.
+        rectangles: [n, >= 4] columns first and past, rows first and past, of tiles or pixels.
+        table: `summed_area` of what was chosen of these.
+    """
     out = np.empty_like(indices)
     count = 0
     for i in indices:
-        hit = False
-        for ty in range(tiles[i, 2], tiles[i, 3]):
-            for tx in range(tiles[i, 0], tiles[i, 1]):
-                hit = hit or wanted[ty * tiles_x + tx] != 0
-            if hit:
-                break
-        if hit:
+        x0, x1, y0, y1 = rectangles[i, 0], rectangles[i, 1], rectangles[i, 2], rectangles[i, 3]
+        if x0 < x1 and y0 < y1 and table[y1, x1] - table[y0, x1] - table[y1, x0] + table[y0, x0] > 0:
             out[count] = i
             count += 1
     return out[:count]
@@ -116,23 +124,6 @@ def marked(marks, numbers, box, tiles, side):
                 pixels[count, axis + 1] = int(math.floor(max(high, first - 1.0))) + 1
         count += 1
     return found, pixels
-
-
-def pixel_counts(chosen):
-    """[rows + 1, columns + 1] int32 how many of the pixels ``chosen`` [rows, columns] lie above and left of each."""
-    counts = np.zeros((chosen.shape[0] + 1, chosen.shape[1] + 1), np.int32)
-    counts[1:, 1:] = np.cumsum(np.cumsum(chosen, axis=0, dtype=np.int32), axis=1, dtype=np.int32)
-    return counts
-
-
-@njit(cache=True, error_model="numpy")
-def holding(rectangles, counts):
-    """[n] whether ``rectangles`` [n, 4] of pixels hold one that was chosen; see `marked` and `pixel_counts`."""
-    out = np.empty(rectangles.shape[0], np.bool_)
-    for k in range(rectangles.shape[0]):
-        x0, x1, y0, y1 = rectangles[k]
-        out[k] = x0 < x1 and y0 < y1 and counts[y1, x1] - counts[y0, x1] - counts[y1, x0] + counts[y0, x0] > 0
-    return out
 
 
 @njit(cache=True, error_model="numpy")

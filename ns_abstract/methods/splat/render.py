@@ -28,6 +28,7 @@ from ns_abstract.methods.splat.lists import (
     block_lists,
     depth_order,
     longest_first,
+    summed_area,
     tile_lists,
     tile_mask,
     touching,
@@ -405,7 +406,7 @@ class Renderer:
         mask = tile_mask(wanted, across * down)
         seen = np.flatnonzero(found.visible)
         if not mask.all():
-            seen = touching(seen, found.tiles, mask, across)
+            seen = touching(seen, found.tiles, summed_area(mask.reshape(down, across)))
         offsets, entries = tile_lists(depth_order(seen, found.depth), found.tiles, mask, across)
         return TileLists(np.asarray(wanted, np.int64), offsets, entries)
 
