@@ -26,7 +26,6 @@ from ns_abstract.verify.network import Family, ImageSets, Network, bound_outputs
 from ns_abstract.verify.network import family as family_module
 from ns_abstract.verify.network.bounds import _Cells
 from ns_abstract.verify.network.family import _Other, _Said
-from ns_abstract.verify.network.known import Known
 from ns_abstract.verify.properties import Query
 from ns_abstract.verify.search import Search
 
@@ -127,11 +126,11 @@ def test_rows_of_one_cell_hold_every_value(local: str, tmp_path: Path, monkeypat
         monkeypatch.setattr(family_module, "_MOST_TRACED", 100)
     borrowed = _Other._borrowed
 
-    def watched(self: _Other, known: Known, index: int, form: Any) -> Any:
+    def watched(self: _Other, index: int, form: Any) -> Any:
         if index in self.first.lent:
             reference = form.reference.flatten(1).numpy()[:, self.first.lent[index].flat]
-            found[index] = self._said(known, index), reference
-        return borrowed(self, known, index, form)
+            found[index] = self._said(index), reference
+        return borrowed(self, index, form)
 
     monkeypatch.setattr(_Other, "_borrowed", watched)
     for seed in range(2):
@@ -167,7 +166,7 @@ def test_products_of_rows_are_charged(local: str, tmp_path: Path) -> None:
     m, off = cells.count, []
     slopes, offsets = other.known.image.slopes.reshape(m, 2, -1, 2), other.known.image.offsets.reshape(m, 2, -1)
     for index, lent in family._first.lent.items():
-        said = other._said(other.known, index)
+        said = other._said(index)
         tilt, noise = np.zeros((m, len(lent.flat), 2)), other.known.flush[:, None]
         low, high = (np.repeat(v[None], m, 0) for v in lent.fixed.T)
         if index in other.known.passages[0].noise:

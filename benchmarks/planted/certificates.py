@@ -64,7 +64,7 @@ CERTIFICATES = (
     ),
     Fault(
         "families: what float32 products lose is not charged",
-        _FAMILY, "_Other._said", "gamma / (1.0 - gamma)", "0.0",
+        _FAMILY, "_Other._said", "loses / (1.0 - loses)", "0.0",
         "test_cover.py::test_products_of_rows_are_charged[]",
     ),
     Fault(

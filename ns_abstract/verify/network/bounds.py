@@ -94,7 +94,7 @@ class _Cells:
         fields, good = finite(images)
         middle = sharing.about(middle_of(fields))
         image = planes_of(fields, middle, network.input_shape, substitution)
-        self.known = known = Known(network, image, middle, good, arithmetic, assumed)
+        self.known = known = sharing.known = Known(network, image, middle, good, arithmetic, assumed)
         schedule = Schedule(network)
         backward = Backward(known, memory, schedule.deep)
         intermediate = Intermediate(known, backward, schedule, sharing)

@@ -14,17 +14,15 @@ from torch import Tensor
 from ns_abstract.verify.network.bounds import _Cells, bound_outputs
 from ns_abstract.verify.network.forms import Form
 from ns_abstract.verify.network.graph import Network, NetworkArithmetic
-from ns_abstract.verify.network.known import Known
 from ns_abstract.verify.network.layers import Activation, LeakyRelu
 from ns_abstract.verify.network.maxima import MaxPool
 from ns_abstract.verify.network.products import Product
 from ns_abstract.verify.network.reached import Trace
+from ns_abstract.verify.network.rounding import FLUSH, gamma
 from ns_abstract.verify.network.rows import Float64, Int64, grid
 from ns_abstract.verify.network.sets import ImageSets, OutputBounds
 from ns_abstract.verify.network.sharing import Sharing
 
-#: Unit roundoff of the products of rows and columns, and the smallest normal number of float32.
-_UNIT, _FLUSH = 2.0**-24, 2.0**-126
 #: Largest images of which rows are kept: their sums' rounding must stay small. Most numbers of all nodes together for
 #: rows to be kept on the way; bytes of rows that are passed back together.
 _MOST_NUMBERS, _MOST_TRACED, _TOGETHER = 1 << 19, 1 << 16, 16 << 20
@@ -148,7 +146,6 @@ class _First(Sharing):
         self.references: dict[int, Tensor] = {}
         self.winners: dict[int, Tensor] = {}
         self.cells = _Cells(network, images, "everywhere", memory, arithmetic, sharing=self)
-        self.known = self.cells.known
 
     def reference(self, k: int, passed_on: Callable[[], Tensor]) -> Tensor:
         self.references[k] = passed_on()
@@ -160,7 +157,6 @@ class _First(Sharing):
 
     def wanted(
         self,
-        known: Known,
         index: int,
         form: Form,
         open_: Tensor,
@@ -219,7 +215,6 @@ class _Other(Sharing):
         self._columns: dict[int, tuple[NDArray[np.float32], NDArray[np.float32]]] = {}
         self._count = images.count
         self.cells = _Cells(first.network, images, "everywhere", memory, arithmetic, sharing=self)
-        self.known = self.cells.known
 
     def about(self, middle: Float64) -> Float64:
         # what rows gathered at maxima and products is relative to the first cell's references
@@ -243,7 +238,7 @@ class _Other(Sharing):
         lines = self.first.known.passages[0].lines[k]
         return lines[0, 0].reshape(shape), lines[3, 0].reshape(shape)
 
-    def _column(self, known: Known, at: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    def _column(self, at: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """What rows on the output of node ``at`` are multiplied by, [n, m k], and what their sizes are, [n, m l + 1].
 
         Columns of one kind stand together. Rows: slopes [d], middle, and of intervals alone; sizes: half and that of
@@ -251,6 +246,7 @@ class _Other(Sharing):
         linear layers. The last column of sizes is that of all that is added up, in any cell.
         """
         if at not in self._columns:
+            known = self.known
             m, d = known.count, known.d
             signed: list[Float64] = []
             if at == 0:
@@ -279,8 +275,9 @@ class _Other(Sharing):
             self._columns[at] = one.astype(np.float32, order="C"), two.astype(np.float32, order="C")
         return self._columns[at]
 
-    def _said(self, known: Known, index: int) -> _Said:
+    def _said(self, index: int) -> _Said:
         """What the first cell's rows say of node ``index`` here."""
+        known = self.known
         m, d = known.count, known.d
         lent = self.first.lent[index]
         count = len(lent.flat)
@@ -289,9 +286,9 @@ class _Other(Sharing):
         half, spread, lost = np.zeros((count, 2, m)), np.zeros((count, m)), np.zeros((count, m))
         for at, rows in lent.rows.items():
             n = rows.shape[1]
-            gamma = (n + 4) * _UNIT / (1.0 - (n + 4) * _UNIT)
-            one, two = self._column(known, at)
-            tiny = n * _FLUSH * (1.0 + float(np.abs(rows).max(initial=0.0)))
+            loses = gamma(n + 4)
+            one, two = self._column(at)
+            tiny = n * FLUSH * (1.0 + float(np.abs(rows).max(initial=0.0)))
             for first in range(0, count, _ROWS_AT_ONCE):
                 part, here = rows[first : first + _ROWS_AT_ONCE], slice(first, first + _ROWS_AT_ONCE)
                 sums, sizes = part @ one, np.abs(part) @ two
@@ -308,7 +305,7 @@ class _Other(Sharing):
                 else:
                     spread[here] += sizes[:, 0]
                 # what float32 sums lose is relative to the products' sizes
-                lost[here] += gamma / (1.0 - gamma) * most
+                lost[here] += loses / (1.0 - loses) * most
                 lost[here] += tiny * (d + 5)
         signed, tilted, half = (np.moveaxis(v, (1, 2), (0, 1)) for v in (signed, tilted, half))
         spread, lost = spread.T, lost.T
@@ -333,14 +330,13 @@ class _Other(Sharing):
 
     def wanted(
         self,
-        known: Known,
         index: int,
         form: Form,
         open_: Tensor,
         apart: Tensor | None,
         layer: Activation | None,
     ) -> tuple[Form, Tensor, Tensor | None]:
-        form = self._borrowed(known, index, form)
+        form = self._borrowed(index, form)
         if layer is not None:
             open_, apart = layer.open(*form.interval), layer.apart(*form.interval)
         if index in self.first.lent and index != self._last:
@@ -350,13 +346,13 @@ class _Other(Sharing):
             open_, apart = open_ & ~bounded.reshape(form.reference.shape[1:]), None
         return form, open_, apart
 
-    def _borrowed(self, known: Known, index: int, form: Form) -> Form:
+    def _borrowed(self, index: int, form: Form) -> Form:
         """The form with what the first cell's rows say."""
         if index not in self.first.lent:
             return form
         flat, sign = self.first.lent[index].flat, self.first.lent[index].sign
-        slopes, middle, half, least, most = self._said(known, index)
-        m, d, shape = known.count, known.d, form.reference.shape
+        slopes, middle, half, least, most = self._said(index)
+        m, d, shape = self.known.count, self.known.d, form.reference.shape
         lower, upper, c, r = (np.array(v.reshape(m, -1).numpy()) for v in (form.lower, form.upper, form.c, form.r))
         a = np.array(form.a.reshape(m, d, -1).numpy())
         order = np.argsort(flat, kind="stable")
@@ -389,4 +385,4 @@ class _Other(Sharing):
             torch.from_numpy(upper).reshape(shape),
             form.active,
         )
-        return known.within(found, found.lower, found.upper)
+        return self.known.within(found, found.lower, found.upper)

@@ -113,7 +113,7 @@ class Enough:
 
 
 class Trace:
-    """What rows of one call of `Backward.bounded` are on their way to the image.
+    """What rows of one call of `Backward.bound` are on their way to the image.
 
     Args:
         count: Rows R.

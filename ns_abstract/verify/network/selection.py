@@ -50,7 +50,7 @@ class Selection:
 
         ``apart``: how far lines or planes are apart, as a part of what is between; None where ``open_`` says all.
         """
-        form, open_, apart = self.sharing.wanted(self.known, index, form, open_, apart, layer)
+        form, open_, apart = self.sharing.wanted(index, form, open_, apart, layer)
         if self.network.depth[index] < 2:
             return form
         if self.schedule.planned:

@@ -15,8 +15,13 @@ from ns_abstract.verify.network.rows import Float64, Int64
 
 
 class Sharing:
-    """Cells that are bounded by themselves; others take and give references, slopes and rows here."""
+    """Cells that are bounded by themselves; others take and give references, slopes and rows here.
 
+    Attributes:
+        known: What is known of the cells, before anything but `about` is asked.
+    """
+
+    known: Known
     #: Most rows that are passed back together.
     most_rows = 1 << 30
 
@@ -42,7 +47,6 @@ class Sharing:
 
     def wanted(
         self,
-        known: Known,
         index: int,
         form: Form,
         open_: Tensor,
