@@ -23,6 +23,7 @@ from ns_abstract.cli.common import DONE
 from ns_abstract.io.errors import InputError
 from ns_abstract.methods.splat.activate import activate
 from ns_abstract.methods.splat.constants import PAPER
+from ns_abstract.methods.splat.frame import SplatFrame
 from ns_abstract.paper import splat as paper
 
 
@@ -81,13 +82,14 @@ def test_plan_changes_nothing(job: PathJob) -> None:
 
 
 def test_a_plan_that_loses_something_is_noticed(job: PathJob, monkeypatch: pytest.MonkeyPatch) -> None:
-    whole = plan._EveryGaussian.bound
+    whole = SplatFrame._bound
 
-    def wider(self, *arguments, **options):
-        found = whole(self, *arguments, **options)
-        return replace(found, upper=found.upper + np.float32(0.01))
+    def wider(self, box, tiles, within, candidates, *rest):
+        found = whole(self, box, tiles, within, candidates, *rest)
+        every = within is not None and candidates is None
+        return replace(found, upper=found.upper + np.float32(0.01)) if every else found
 
-    monkeypatch.setattr(plan._EveryGaussian, "bound", wider)
+    monkeypatch.setattr(SplatFrame, "_bound", wider)
     rows = plan.without(job, "x", 0, 6)
     assert rows[0]["looser by"] == 0.0 and rows[1]["looser by"] > 0.005
 

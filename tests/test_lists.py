@@ -286,7 +286,7 @@ def test_wanted_pixels_are_bounded_as_in_the_whole_picture(radii, order, antiali
     rest[single] = True
     alone, close = frame.bound(inner, tiles, None, False, rest), frame.bound(inner, tiles, part.context, False, rest)
     assert (alone.lower == close.lower).all() and (alone.upper == close.upper).all()
-    assert frame._candidates(tiles, part.context, rest).size < 0.5 * part.context.visible.size
+    assert frame.candidates(tiles, part.context, rest).size < 0.5 * part.context.visible.size
     for values in (*poses.box.corners(), *poses.box.sample(8, random)):
         image = frame.render(values, tiles)
         assert (part.lower <= image).all() and (image <= part.upper).all()

@@ -10,10 +10,9 @@ import numpy as np
 
 from ns_abstract.api.files import PathJob
 from ns_abstract.bench.sets import pose_set, splat_of
-from ns_abstract.geometry.box import ParameterBox
 from ns_abstract.geometry.poses import PoseSet
 from ns_abstract.methods.splat.activate import activate
-from ns_abstract.methods.splat.frame import Context, SplatFrame, TileBounds
+from ns_abstract.methods.splat.frame import Context, SplatFrame
 from ns_abstract.refine.engine import Goal, Refinement
 from ns_abstract.refine.result import FrameResult
 
@@ -24,11 +23,8 @@ _LONG = 1e6
 class _EveryGaussian(SplatFrame):
     """Looks at every Gaussian in every cell, whatever the cell around it shows."""
 
-    def bound(
-        self, box: ParameterBox, tiles: np.ndarray, within: Context | None = None, keep_linear: bool = False,
-        pixels: np.ndarray | None = None,
-    ) -> TileBounds:  # fmt: skip
-        return super().bound(box, tiles, None, keep_linear, pixels)
+    def candidates(self, tiles: np.ndarray, within: Context | None, pixels: np.ndarray | None) -> np.ndarray | None:
+        return None
 
 
 def _refined(frame: SplatFrame, index: int, cells: int, seed: int) -> tuple[FrameResult, float]:

@@ -252,14 +252,14 @@ class SplatFrame:
         pixels: np.ndarray | None = None,
     ) -> TileBounds:  # fmt: skip
         """See `ns_abstract.refine.protocol.Frame.bound`, and `bound_parts` for ``pixels``."""
-        return self._bound(box, tiles, within, self._candidates(tiles, within, pixels), keep_linear, pixels)
+        return self._bound(box, tiles, within, self.candidates(tiles, within, pixels), keep_linear, pixels)
 
     def bound_parts(
         self, boxes: Sequence[ParameterBox], tiles: np.ndarray, within: Context | None, keep_linear: bool,
         pixels: np.ndarray | None,
     ) -> list[TileBounds]:  # fmt: skip
         """See `ns_abstract.refine.protocol.PartsFrame`."""
-        candidates = self._candidates(tiles, within, pixels)
+        candidates = self.candidates(tiles, within, pixels)
         return each(lambda box: self._bound(box, tiles, within, candidates, keep_linear, pixels), boxes)
 
     def _bound(
@@ -287,7 +287,7 @@ class SplatFrame:
             linear = linear_sets(cell.linear, cell.lower, cell.upper, box.dimensions)
         return TileBounds(lower, upper, cell.slopes, context, linear, int(cell.statistics[3]))
 
-    def _candidates(self, tiles: np.ndarray, within: Context | None, pixels: np.ndarray | None) -> np.ndarray | None:
+    def candidates(self, tiles: np.ndarray, within: Context | None, pixels: np.ndarray | None) -> np.ndarray | None:
         """What may be seen on ``pixels`` of ``tiles`` in a cell ``within`` another; None: everything."""
         if within is None:
             return None
