@@ -25,8 +25,9 @@ from ns_abstract.geometry.box import ParameterBox
 from ns_abstract.io.errors import InputError
 from ns_abstract.refine.engine import Goal, groups, shared_goal
 from ns_abstract.refine.result import FrameResult, Layer, Leaves, PartResult, TracePoint
-from ns_abstract.report.figures import metrics
+from ns_abstract.report.figures import interval, metrics, number
 from ns_abstract.report.files import save_frame
+from ns_abstract.report.notebook import frame_html
 
 #: Shortest time that a frame is given once it is begun.
 LEAST_SECONDS = 0.01
@@ -355,9 +356,15 @@ class BoundResult:
         save_frame(path, self.frame, status=self.status, about=self.about)
 
     def _repr_html_(self) -> str:
-        from ns_abstract.api.notebook import bound_html
-
-        return bound_html(self)
+        box = self.parameters
+        sides = [interval(*side) for side in zip(box.names, box.units, box.lower, box.upper, strict=True)]
+        known = f"mean gap {number(self.mpg)}, largest {number(self.xpg)}, ratio to real renders {number(self.ratio)}"
+        lines = [
+            known if self.bounded else "no bounds but [0, 1] yet",
+            f"{self.guarantee}; {self.cell_count} cells, {self.seconds:.1f} s; {self.status}",
+            "; ".join(sides) or "one camera pose",
+        ]
+        return frame_html(self.frame, lines)
 
 
 def bound(

@@ -41,12 +41,12 @@ from ns_abstract.verify.model import NetworkModel, parametric
 from ns_abstract.verify.network import NetworkArithmetic, load_network
 from ns_abstract.verify.pixel_costs import pixel_costs
 from ns_abstract.verify.properties import Claim, LinearClaim, Property, parse_property
+from ns_abstract.verify.protocol import Model as SearchedModel
+from ns_abstract.verify.protocol import Scene as SearchedScene
 from ns_abstract.verify.registration import RegisteredModel, RegisteredScene
 from ns_abstract.verify.response import Response, shown_sets
 from ns_abstract.verify.scene_margin import Kind, Settle, Settled
 from ns_abstract.verify.search import BLOCK, ContradictionError, Findings, Search
-from ns_abstract.verify.search import Model as SearchedModel
-from ns_abstract.verify.search import Scene as SearchedScene
 
 if TYPE_CHECKING:
     from ns_abstract.verify.interop import Form

@@ -32,7 +32,8 @@ from ns_abstract.io.errors import InputError
 from ns_abstract.io.memory import allowed_memory
 from ns_abstract.report.cameras import Cameras, cameras_entry, cell_cameras, standing
 from ns_abstract.report.certificate import CertifiedRun, LastReport, certificate_document, coverage, verdict
-from ns_abstract.report.certificate_page import Closer, certificate_page
+from ns_abstract.report.certificate_page import Closer, certificate_page, percent
+from ns_abstract.report.notebook import verdicts_html
 from ns_abstract.report.outside import Outside
 from ns_abstract.report.picture import preview, to_bytes
 from ns_abstract.report.record import file_stamp
@@ -647,9 +648,13 @@ class Certificate:
         return self.state == "interrupted"
 
     def _repr_html_(self) -> str:
-        from ns_abstract.api.notebook import certificate_html
-
-        return certificate_html(self)
+        shares = {"certified": self.certified, "falsified": self.falsified, "unknown": self.unknown}
+        lines = [
+            f"{self.verdict}: on every image {self.sentence}",
+            ", ".join(f"{kind} {percent(share)}" for kind, share in shares.items()),
+            f"{self.guarantee}; {len(self.cells)} cells, {self.seconds:.1f} s; {self.state}",
+        ]
+        return verdicts_html(shares, lines)
 
 
 def certify(

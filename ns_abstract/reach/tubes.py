@@ -156,7 +156,7 @@ class View(Protocol):
         ...
 
     def sets(self, box: ParameterBox) -> tuple[tuple[np.ndarray, ...], np.ndarray, np.ndarray, np.ndarray]:
-        """Linear sets, lower, upper and slopes of a box of poses, as `ns_abstract.verify.search.Scene` has them."""
+        """Linear sets, lower, upper and slopes of a box of poses, as `ns_abstract.verify.protocol.Scene` has them."""
         ...
 
 

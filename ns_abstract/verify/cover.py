@@ -11,18 +11,14 @@ import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 
 from ns_abstract.execution.ending import checkpoint
 from ns_abstract.geometry.box import ParameterBox
-from ns_abstract.verify.properties import Claim
-
-if TYPE_CHECKING:
-    from ns_abstract.verify.network import ImageSets, OutputBounds
-    from ns_abstract.verify.properties import Query
-    from ns_abstract.verify.search import Model, Scene
+from ns_abstract.verify.network import ImageSets, OutputBounds
+from ns_abstract.verify.properties import Claim, Query
+from ns_abstract.verify.protocol import Model, Scene, SharedBounds, SharingModel
 
 #: The power of the width that sets cost.
 _POWER = 1.6
@@ -52,34 +48,9 @@ _NEAR = 0.5
 _ROOM = 2.0**-44
 
 
-class SharedBounds(Protocol):
-    """Bounds of a cell, and of others by its rows; see `ns_abstract.verify.network.family.Family`."""
-
-    def first(self, query: Query) -> OutputBounds:
-        """Bounds of the query's rows over the cell."""
-        ...
-
-    def others(self, images: ImageSets, query: Query, *, fresh: bool = False) -> OutputBounds:
-        """The same over other cells."""
-        ...
-
-
-class SharingModel(Protocol):
-    """A network whose rows can be shared."""
-
-    @property
-    def lends_anywhere(self) -> bool:
-        """Whether rows of a cell serve for others that are no parts of it."""
-        ...
-
-    def family(self, images: ImageSets) -> SharedBounds:
-        """Bounds of one cell, whose rows are to serve for others."""
-        ...
-
-
 @dataclass(frozen=True)
 class PictureSets:
-    """Linear sets of a box: what `ns_abstract.verify.search.Scene.sets` gives."""
+    """Linear sets of a box: what `ns_abstract.verify.protocol.Scene.sets` gives."""
 
     box: ParameterBox
     linear: tuple[np.ndarray, ...]

@@ -109,7 +109,7 @@ class NetworkModel:
 
 @dataclasses.dataclass(frozen=True)
 class ModelFamily:
-    """A cell and others; see `ns_abstract.verify.cover.SharedBounds`."""
+    """A cell and others; see `ns_abstract.verify.protocol.SharedBounds`."""
 
     family: Family
 

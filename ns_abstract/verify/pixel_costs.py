@@ -2,16 +2,12 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 import torch
 
 from ns_abstract.geometry.box import ParameterBox
 from ns_abstract.verify.properties import Claim
-
-if TYPE_CHECKING:
-    from ns_abstract.verify.search import Model, Scene
+from ns_abstract.verify.protocol import Model, Scene
 
 
 def pixel_costs(scene: Scene, model: Model, claim: Claim, box: ParameterBox) -> np.ndarray | None:

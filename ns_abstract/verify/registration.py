@@ -9,7 +9,6 @@ from __future__ import annotations
 import itertools
 from collections.abc import Iterator
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -18,16 +17,14 @@ from ns_abstract.geometry.box import ParameterBox
 from ns_abstract.refine.protocol import Frame, Member, Score
 from ns_abstract.verify.network import ImageSets, OutputBounds, Substitution
 from ns_abstract.verify.properties import Query
-
-if TYPE_CHECKING:
-    from ns_abstract.verify.search import Model, Scene
+from ns_abstract.verify.protocol import Model, Scene
 
 #: Parameters of where a scene stands.
 PLACE = 3
 
 
 class RegisteredScene:
-    """Pictures of poses, each for all places of the scene; see `ns_abstract.verify.search.Scene`.
+    """Pictures of poses, each for all places of the scene; see `ns_abstract.verify.protocol.Scene`.
 
     Args:
         scene: Pictures of a set of `PoseSet.registered`: its last parameters tell where the scene stands.
@@ -110,7 +107,7 @@ def _sign(leaf: torch.Tensor) -> np.ndarray:
 
 
 class RegisteredModel:
-    """A network behind such pictures; see `ns_abstract.verify.search.Model`.
+    """A network behind such pictures; see `ns_abstract.verify.protocol.Model`.
 
     Args:
         model: The network.

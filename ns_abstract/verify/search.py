@@ -11,7 +11,7 @@ import math
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Any, Literal, Protocol
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -22,10 +22,8 @@ from ns_abstract.io.errors import InputError
 from ns_abstract.refine.protocol import Member
 from ns_abstract.verify.cells import Cell, Grid
 from ns_abstract.verify.cover import Cover, PictureSets, Weights
-from ns_abstract.verify.properties import Claim, LinearClaim, Query
-
-if TYPE_CHECKING:
-    from ns_abstract.verify.network import ImageSets, OutputBounds, Substitution
+from ns_abstract.verify.properties import Claim, LinearClaim
+from ns_abstract.verify.protocol import Model, Scene
 
 Verdict = Literal["certified", "falsified", "unknown"]
 
@@ -58,52 +56,6 @@ NO_NUMBER = "the margin of a picture is no finite number"
 _BRANCHES, _NEAR = 256, 3.0
 #: A scene among so many, in their order, attacks a proof.
 _ATTACKERS = 24
-
-
-class Scene(Protocol):
-    """One frame's pictures, at the network's resolution."""
-
-    box: ParameterBox
-
-    def image(self, values: np.ndarray, member: Member | None = None) -> np.ndarray:
-        """Concrete picture [H, W, 3] float32 at parameter values [d], of another scene of the set if one is named."""
-        ...
-
-    def members(self, seed: int) -> Iterator[Member]:
-        """Other scenes of the set, without end; none where only poses vary."""
-        ...
-
-    def sets(self, box: ParameterBox) -> tuple[tuple[np.ndarray, ...], np.ndarray, np.ndarray, np.ndarray]:
-        """(A_lower, b_lower, A_upper, b_upper) [H, W, 3, d] and [H, W, 3], lower, upper, and slopes [d]."""
-        ...
-
-    def differentiable(self, values: torch.Tensor) -> torch.Tensor:
-        """Picture [H, W, 3] at parameter values [d], differentiable."""
-        ...
-
-
-class Model(Protocol):
-    """A network with its preprocessing."""
-
-    def outputs(self, images: np.ndarray) -> np.ndarray:
-        """[B, n] outputs that the deployed program gives for pictures [B, H, W, 3]."""
-        ...
-
-    def differentiable(self, images: torch.Tensor) -> torch.Tensor:
-        """[B, n] outputs for pictures [B, H, W, 3], differentiable."""
-        ...
-
-    def input_sets(self, linear: tuple[np.ndarray, ...], lower: np.ndarray, upper: np.ndarray) -> ImageSets:
-        """Sets of the network's input; see `ns_abstract.verify.preprocess.Preprocess.sets`."""
-        ...
-
-    def bound(self, images: ImageSets, query: Query, substitution: Substitution = "everywhere") -> OutputBounds:
-        """Bounds of the query's rows over the sets."""
-        ...
-
-    def branch(self, images: ImageSets, query: Query, groups: Sequence[Sequence[int]], most: int) -> float:
-        """A lower bound of the margin of a linear claim over one set, by at most so many branches."""
-        ...
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,85 @@
+"""What a search asks of its pictures and its network (docs/design.md, V6, V15)."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from typing import Protocol
+
+import numpy as np
+import torch
+
+from ns_abstract.geometry.box import ParameterBox
+from ns_abstract.refine.protocol import Member
+from ns_abstract.verify.network import ImageSets, OutputBounds, Substitution
+from ns_abstract.verify.properties import Query
+
+
+class Scene(Protocol):
+    """One frame's pictures, at the network's resolution."""
+
+    box: ParameterBox
+
+    def image(self, values: np.ndarray, member: Member | None = None) -> np.ndarray:
+        """Concrete picture [H, W, 3] float32 at parameter values [d], of another scene of the set if one is named."""
+        ...
+
+    def members(self, seed: int) -> Iterator[Member]:
+        """Other scenes of the set, without end; none where only poses vary."""
+        ...
+
+    def sets(self, box: ParameterBox) -> tuple[tuple[np.ndarray, ...], np.ndarray, np.ndarray, np.ndarray]:
+        """(A_lower, b_lower, A_upper, b_upper) [H, W, 3, d] and [H, W, 3], lower, upper, and slopes [d]."""
+        ...
+
+    def differentiable(self, values: torch.Tensor) -> torch.Tensor:
+        """Picture [H, W, 3] at parameter values [d], differentiable."""
+        ...
+
+
+class Model(Protocol):
+    """A network with its preprocessing."""
+
+    def outputs(self, images: np.ndarray) -> np.ndarray:
+        """[B, n] outputs that the deployed program gives for pictures [B, H, W, 3]."""
+        ...
+
+    def differentiable(self, images: torch.Tensor) -> torch.Tensor:
+        """[B, n] outputs for pictures [B, H, W, 3], differentiable."""
+        ...
+
+    def input_sets(self, linear: tuple[np.ndarray, ...], lower: np.ndarray, upper: np.ndarray) -> ImageSets:
+        """Sets of the network's input; see `ns_abstract.verify.preprocess.Preprocess.sets`."""
+        ...
+
+    def bound(self, images: ImageSets, query: Query, substitution: Substitution = "everywhere") -> OutputBounds:
+        """Bounds of the query's rows over the sets."""
+        ...
+
+    def branch(self, images: ImageSets, query: Query, groups: Sequence[Sequence[int]], most: int) -> float:
+        """A lower bound of the margin of a linear claim over one set, by at most so many branches."""
+        ...
+
+
+class SharedBounds(Protocol):
+    """Bounds of a cell, and of others by its rows; see `ns_abstract.verify.network.family.Family`."""
+
+    def first(self, query: Query) -> OutputBounds:
+        """Bounds of the query's rows over the cell."""
+        ...
+
+    def others(self, images: ImageSets, query: Query, *, fresh: bool = False) -> OutputBounds:
+        """The same over other cells."""
+        ...
+
+
+class SharingModel(Protocol):
+    """A network whose rows can be shared."""
+
+    @property
+    def lends_anywhere(self) -> bool:
+        """Whether rows of a cell serve for others that are no parts of it."""
+        ...
+
+    def family(self, images: ImageSets) -> SharedBounds:
+        """Bounds of one cell, whose rows are to serve for others."""
+        ...
