@@ -14,11 +14,14 @@ from ns_abstract.arithmetic.elementary import exp_kernel, fma
 from ns_abstract.arithmetic.outward import outward
 from ns_abstract.arithmetic.simd.intrinsics import advanced, pointer, signed
 from ns_abstract.arithmetic.simd.lanes import (
+    LINE,
     bits,
     load4,
     load8,
+    load_line,
     maximum,
     minimum,
+    muladd,
     root,
     scatter_columns,
     spans,
@@ -100,6 +103,49 @@ def test_fma_rounds_once() -> None:
     exact = np.array([float(Fraction(a) * Fraction(b) + Fraction(c)) for a, b, c in zip(x, y, z, strict=True)])
     assert np.abs(exact).max() > 0.0
     assert same(wide, exact) and same(narrow, exact)
+
+
+@njit(error_model="numpy")
+def added(x_, y_, z_, lanes_, narrow):
+    x, y, z, lanes = pointer(x_), pointer(y_), pointer(z_), pointer(lanes_)
+    for q in range(0, x_.size, LINE // x_.itemsize):
+        store(lanes, q, muladd(load_line(x, q), load_line(y, q), load_line(z, q)))
+    for q in range(x_.size):
+        narrow[q] = x[q] * y[q] + z[q]
+
+
+@pytest.mark.parametrize("kind", [np.float64, np.float32])
+def test_lines_of_either_kind(kind: type) -> None:
+    """Products that are added are rounded once or twice, lane by lane."""
+    rng = np.random.default_rng(8)
+    x, y, z = (rng.uniform(0.5, 2.0, 256).astype(kind) for _ in range(3))
+    z[::2] = -(x[::2] * y[::2])
+    lanes, twice = np.empty_like(x), np.empty_like(x)
+    added(x, y, z, lanes, twice)
+    once = np.array(
+        [kind(Fraction(float(a)) * Fraction(float(b)) + Fraction(float(c))) for a, b, c in zip(x, y, z, strict=True)]
+    )
+    assert ((lanes == once) | (lanes == twice)).all()
+
+
+@njit(error_model="numpy")
+def single(x_, y_, out_):
+    x, y, out = pointer(x_), pointer(y_), pointer(out_)
+    for q in range(0, x_.size, 16):
+        a, b = load_line(x, q), load_line(y, q)
+        results = (a + b, a - b, a * b, a / b, abs(a), maximum(a, b), minimum(a, b), where(a < b, a, b), a * x[0])
+        for k, result in enumerate(results):
+            store(out, k * x_.size + q, result)
+
+
+def test_single_precision() -> None:
+    with np.errstate(all="ignore"):
+        x, y = (side.astype(np.float32) for side in operands())
+        found = np.empty((9, x.size), np.float32)
+        single(x, y, found)
+        chosen = np.where(y > x, y, x), np.where(y < x, y, x), np.where(x < y, x, y)
+        for k, expected in enumerate((x + y, x - y, x * y, x / y, abs(x), *chosen, x * x[0])):
+            assert np.array_equal(found[k], expected, equal_nan=True), k
 
 
 @njit(error_model="numpy")

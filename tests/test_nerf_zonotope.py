@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from fractions import Fraction
 
 import numpy as np
 import pytest
 import torch
 from nerfs import raw_outputs, tiny_weights
 
+from ns_abstract.arithmetic.simd.lanes import LINE
 from ns_abstract.methods.nerf import zonotope
-from ns_abstract.methods.nerf.bounds import basis_of, opacity
-from ns_abstract.methods.nerf.layer_kernel import Product, Terms, linear
+from ns_abstract.methods.nerf.bounds import basis_of, greatest, opacity
+from ns_abstract.methods.nerf.layer_kernel import BLOCK, Product, Terms, linear
 from ns_abstract.methods.nerf.scene import Encoding, FieldWeights, Layer
 from ns_abstract.methods.nerf.zonotope import Affine, FieldBounds
 
@@ -258,9 +260,9 @@ def test_columns_beyond_float32_fail() -> None:
 @pytest.mark.parametrize("kind", [np.float64, np.float32])
 @pytest.mark.parametrize(("inputs", "live", "outputs"), [(5, 0, 3), (1, 1, 1), (7, 6, 3), (96, 71, 40), (64, 64, 1)])
 def test_products_leave_out_what_is_off(kind: type, inputs: int, live: int, outputs: int) -> None:
-    """Pieces with no, one and several columns; what is off holds no numbers."""
+    """Pieces with no, one and many columns; what is off, and what fills up a row's last line, holds no numbers."""
     rng, batch, m = np.random.default_rng(inputs), 3, 5
-    counts, new_counts = np.array([0, 1, 6]), np.array([2, 0, 1]) * (live > 0)
+    counts, new_counts = np.array([0, 1, BLOCK + 6]), np.array([2, 0, 1]) * (live > 0)
     off = np.ones((batch, inputs), bool)
     for row in off:
         row[rng.permutation(inputs)[:live]] = False
@@ -278,7 +280,9 @@ def test_products_leave_out_what_is_off(kind: type, inputs: int, live: int, outp
     )  # fmt: skip
     begin, new_begin = (np.concatenate([[0], np.cumsum(c)]) for c in (counts, new_counts))
     terms = Terms(columns, begin, slope, new_begin, neuron, sizes)
-    linear(poly, np.where(off, 0.0, 1.0), terms, wide, wide.astype(kind), out)
+    lines = np.full((inputs, outputs + -outputs % (LINE // 4)), np.nan)
+    lines[:, :outputs] = wide
+    linear(poly, np.where(off, 0.0, 1.0), terms, lines, lines.astype(kind), out)
     np.testing.assert_allclose(out.poly, np.where(off[:, None], 0.0, poly) @ wide, atol=1e-12)
     for b in range(batch):
         old = np.where(off[b], 0.0, columns[owner == b] * slope[b]).astype(np.float64) @ wide
@@ -391,6 +395,29 @@ def test_planted_faults_are_found(monkeypatch: pytest.MonkeyPatch, fault, half: 
 
 
 # ---------------------------------------------------------------- opacities
+
+
+def test_greatest_values_on_whole_cells() -> None:
+    """Never below what a piece reaches, and reached where coefficients do not alternate."""
+    basis, rng = basis_of(1), np.random.default_rng(3)
+    poly = rng.normal(size=(40, basis.size, 2)) * 10.0 ** rng.uniform(-3, 3, (40, 1, 2))
+    poly[:8] = np.abs(poly[:8])
+    poly[8:12, 0] *= 1e12
+    spread, box = rng.uniform(0.0, 2.0, (2, 40, 2)) * (rng.uniform(size=(40, 1)) < 0.7)
+    nothing = torch.zeros(40, dtype=torch.int64)
+    value = Affine(
+        torch.from_numpy(poly), torch.zeros(0, 2), nothing[:0], torch.from_numpy(spread), torch.from_numpy(box),
+        nothing > 0, nothing,
+    )  # fmt: skip
+    found = greatest(value).numpy()
+    for b, n in np.ndindex(40, 2):
+        # exact values at the ends, where T_k is 1 or (-1)^k
+        coefficients = [Fraction(c) for c in poly[b, :, n].tolist()]
+        ends = [sum(coefficients), sum(c * (-1) ** k for k, c in enumerate(coefficients))]
+        reached = max(ends) + Fraction(spread[b, n]) + Fraction(box[b, n])
+        assert Fraction(found[b, n]) >= reached
+        if b < 8:
+            assert found[b, n] <= float(reached) * (1.0 + 1e-10)
 
 
 def test_opacities_are_monotone_bounds() -> None:

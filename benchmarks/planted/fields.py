@@ -45,22 +45,26 @@ FIELDS = (
     ),
     Fault(
         "layers: columns in float32 are not charged",
-        _ZONOTOPE, "FieldBounds._linear", "(steps * (1.0 + 2.0**-10) * UNIT32) * pieces.spread + UNDERFLOW_COLUMNS",
-        "UNDERFLOW_COLUMNS", _NARROW + "[1.0]",
+        _ZONOTOPE, "FieldBounds._linear",
+        "radius.addcmul_(steps * (1.0 + 2.0**-10) * UNIT32, pieces.spread).add_(UNDERFLOW_COLUMNS)",
+        "radius.add_(UNDERFLOW_COLUMNS)", _NARROW + "[1.0]",
     ),
     Fault(
         "layers: the sum of error terms forgets those that are new",
         _ZONOTOPE, "FieldBounds._relu", "spread[which, neuron] += error", "pass", _UNITS + "[1-True]",
     ),
     Fault(
-        "layers: what fills the last step of a product is not nothing",
-        _LAYER, "linear", "packed_wide[count], packed[count] = 0.0, 0.0",
-        "packed_wide[count], packed[count] = 1.0, 1.0",
-        _PRODUCTS,
+        "layers: all rows of a block are its first four",
+        _LAYER, "multiply", "four_rows(f, (r0 - begin) * k, places, k, w, c, stride, nothing)",
+        "four_rows(f, 0, places, k, w, c, stride, nothing)", _PRODUCTS,
     ),
     Fault(
-        "layers: a product begins anew with every block of inputs",
-        _LAYER, "multiply", "out[min(r0 + r, count - 1), j] if begin else 0.0", "0.0", _PRODUCTS,
+        "layers: the end of a product's row is its last line's beginning",
+        _LAYER, "multiply", "rest[r - r0, j - c]", "rest[r - r0, 0]", _PRODUCTS,
+    ),
+    Fault(
+        "layers: a product takes the first rows of the weight, not those of what is live",
+        "arithmetic/simd/products.py", "four_rows", "at + stride * lines[i]", "at + stride * i", _PRODUCTS,
     ),
     Fault(
         "layers: open neurons are left out as those that are off",
@@ -97,6 +101,21 @@ FIELDS = (
         "fields: what is no number does not fail",
         _ZONOTOPE, "FieldBounds._relu", "z.failed | (count > self.limit) | ~torch.isfinite(size).all(dim=1)",
         "z.failed | (count > self.limit)", "test_nerf_zonotope.py::test_numbers_that_are_none_fail", True,
+    ),
+    Fault(
+        "compiled units: values on the grid are without the highest degrees",
+        _RELU, "_multiply", "four_rows(factors, ROWS * count * block, lines, count, elements, c, LANES, nothing)",
+        "four_rows(factors, ROWS * count * block, lines, count - 4, elements, c, LANES, nothing)", _UNITS + "[1-True]",
+    ),
+    Fault(
+        "fields: what is left of a dim cell is its polynomial's alone",
+        _BOUNDS, "greatest", "value.radius + 4.0 * CHEBYSHEV_ROUNDING * size", "4.0 * CHEBYSHEV_ROUNDING * size",
+        "test_nerf_zonotope.py::test_greatest_values_on_whole_cells",
+    ),
+    Fault(
+        "fields: rounding of a dim cell's sum is not charged",
+        _BOUNDS, "greatest", "4.0 * CHEBYSHEV_ROUNDING * size", "0.0",
+        "test_nerf_zonotope.py::test_greatest_values_on_whole_cells",
     ),
     Fault(
         "compiled units: the line's error is a quarter of what it is",

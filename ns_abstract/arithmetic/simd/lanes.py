@@ -1,9 +1,9 @@
-"""Several doubles side by side: explicit vectors for compiled kernels.
+"""Several floats side by side: explicit vectors for compiled kernels.
 
-`load8` and `load4` take 8 or 4 neighbours in memory as one value. ``+ - * /``, comparisons, ``abs``, and the
-functions below work lane by lane on such values and on floats, which stand for all lanes; every lane is rounded as
-float64 arithmetic is. Loops that a compiler turns into vector code work on at most half as wide vectors, and lose more
-than they gain where they are short.
+`load8` and `load4` take 8 or 4 doubles that are neighbours in memory as one value, `load_line` 8 doubles or 16 float32.
+``+ - * /``, comparisons, ``abs``, and the functions below work lane by lane on such values and on floats of their type,
+which stand for all lanes; every lane is rounded as that type's arithmetic is. Loops that a compiler turns into vector
+code work on at most half as wide vectors, and lose more than they gain where they are short.
 
 Interpreted (without compilation), lanes are arrays.
 """
@@ -21,16 +21,20 @@ from numba.core import cgutils
 from numba.core.typing.templates import ConcreteTemplate, infer_global, signature
 from numba.extending import intrinsic, lower_builtin, models, register_model
 
-_DOUBLE = ir.DoubleType()
+_FLOATS = {types.float64: ir.DoubleType(), types.float32: ir.FloatType()}
+_SUFFIXES = {ir.DoubleType(): "f64", ir.FloatType(): "f32"}
 _INT32 = ir.IntType(32)
+
+#: Bytes of a cache line, and of the longest lanes.
+LINE = 64
 
 
 class LanesType(types.Type):
-    """``width`` doubles."""
+    """``width`` floats of the type ``element``."""
 
-    def __init__(self, width: int) -> None:
-        self.width = width
-        super().__init__(name=f"Lanes({width})")
+    def __init__(self, width: int, element: types.Float = types.float64) -> None:
+        self.width, self.element = width, element
+        super().__init__(name=f"Lanes({width} {element})")
 
 
 class MaskType(types.Type):
@@ -44,7 +48,7 @@ class MaskType(types.Type):
 @register_model(LanesType)
 class _LanesModel(models.PrimitiveModel):
     def __init__(self, manager, kind):
-        super().__init__(manager, kind, ir.VectorType(_DOUBLE, kind.width))
+        super().__init__(manager, kind, ir.VectorType(_FLOATS[kind.element], kind.width))
 
 
 @register_model(MaskType)
@@ -53,7 +57,11 @@ class _MaskModel(models.PrimitiveModel):
         super().__init__(manager, kind, ir.VectorType(ir.IntType(1), kind.width))
 
 
-_KINDS = {width: (LanesType(width), MaskType(width)) for width in (4, 8)}
+#: Lanes and masks by width, which tells the type of the elements.
+_KINDS = {
+    width: (LanesType(width, element), MaskType(width))
+    for width, element in ((4, types.float64), (8, types.float64), (16, types.float32))
+}
 
 
 def _width(*kinds: types.Type) -> int:
@@ -92,7 +100,7 @@ def _register(function: Callable, arguments: int, masks: bool, build: Callable) 
         result = mask if masks else lanes
         cases.append(signature(result, *[lanes] * arguments))
         if arguments == 2:
-            cases += [signature(result, lanes, types.float64), signature(result, types.float64, lanes)]
+            cases += [signature(result, lanes, lanes.element), signature(result, lanes.element, lanes)]
 
     _typed(function, cases)
 
@@ -118,7 +126,7 @@ _register(operator.ne, 2, True, lambda builder, a, b: builder.fcmp_unordered("!=
 def by_intrinsic(name: str, builder, *values):
     """LLVM's function ``name`` of floats or lanes, all of one type."""
     kind = values[0].type
-    suffix = f"v{kind.count}f64" if isinstance(kind, ir.VectorType) else "f64"
+    suffix = f"v{kind.count}{_SUFFIXES[kind.element]}" if isinstance(kind, ir.VectorType) else _SUFFIXES[kind]
     function = ir.FunctionType(kind, [kind] * len(values))
     return builder.call(cgutils.get_or_insert_function(builder.module, function, f"llvm.{name}.{suffix}"), values)
 
@@ -143,6 +151,16 @@ def common_type(*kinds: types.Type) -> types.Type:
     """Lanes where one of ``kinds`` is, else float64."""
     width = _width(*kinds)
     return _KINDS[width][0] if width else types.float64
+
+
+@intrinsic
+def muladd(typingctx, x, y, z):  # pyright: ignore[reportRedeclaration]
+    """``x * y + z``, rounded once or twice, whichever the processor does faster."""
+
+    def codegen(context, builder, sig, args):
+        return by_intrinsic("fmuladd", builder, *operands(builder, sig, args))
+
+    return common_type(x, y, z)(x, y, z), codegen
 
 
 def _choice(sign: str):
@@ -213,24 +231,27 @@ def spans(typingctx, first, last):  # pyright: ignore[reportRedeclaration]
     return types.int64(_KINDS[8][0], _KINDS[8][0]), codegen
 
 
-def _address(builder, elements, at, width: int):
-    address = builder.gep(elements, [at], source_etype=_DOUBLE)
-    return builder.bitcast(address, ir.VectorType(_DOUBLE, width).as_pointer())
+def _address(builder, elements, at, kind: LanesType):
+    element = _FLOATS[kind.element]
+    address = builder.gep(elements, [at], source_etype=element)
+    return builder.bitcast(address, ir.VectorType(element, kind.width).as_pointer())
 
 
-def _check(elements) -> None:
-    if elements != types.CPointer(types.float64):
-        raise TypeError(f"lanes are read and written through pointer(float64 array), not {elements}")
+def _check(elements, kind: LanesType) -> None:
+    if elements != types.CPointer(kind.element):
+        raise TypeError(f"{kind} are read and written through pointer({kind.element} array), not {elements}")
 
 
 def _loader(elements, width: int):
-    _check(elements)
+    kind = _KINDS[width][0]
+    _check(elements, kind)
 
     def codegen(context, builder, sig, args):
-        address = _address(builder, args[0], args[1], width)
-        return builder.load(address, align=8, typ=ir.VectorType(_DOUBLE, width))
+        address = _address(builder, args[0], args[1], kind)
+        vector = ir.VectorType(_FLOATS[kind.element], width)
+        return builder.load(address, align=kind.element.bitwidth // 8, typ=vector)
 
-    return _KINDS[width][0](elements, types.intp), codegen
+    return kind(elements, types.intp), codegen
 
 
 @intrinsic
@@ -246,12 +267,21 @@ def load4(typingctx, elements, at):  # pyright: ignore[reportRedeclaration]
 
 
 @intrinsic
+def load_line(typingctx, elements, at):  # pyright: ignore[reportRedeclaration]
+    """`LINE` bytes of a `compiled.pointer` to float64 or float32 from ``elements[at]`` on as lanes."""
+    if not isinstance(elements, types.CPointer) or elements.dtype not in _FLOATS:
+        raise TypeError(f"lanes are read through pointer(float64 or float32 array), not {elements}")
+    return _loader(elements, 8 * LINE // elements.dtype.bitwidth)
+
+
+@intrinsic
 def store(typingctx, elements, at, lanes):  # pyright: ignore[reportRedeclaration]
     """Write the lanes to ``elements[at : ...]`` of a `compiled.pointer`."""
-    _check(elements)
+    _check(elements, lanes)
 
     def codegen(context, builder, sig, args):
-        builder.store(args[2], _address(builder, args[0], args[1], sig.args[2].width), align=8)
+        kind = sig.args[2]
+        builder.store(args[2], _address(builder, args[0], args[1], kind), align=kind.element.bitwidth // 8)
         return context.get_dummy_value()
 
     return types.void(elements, types.intp, lanes), codegen
@@ -279,12 +309,12 @@ def _transposed(builder, rows):
 @intrinsic
 def store_columns(typingctx, elements, at, stride, rows):  # pyright: ignore[reportRedeclaration]
     """Write lane k of the eight ``rows`` side by side to ``elements[at + stride k : ...]`` of a `compiled.pointer`."""
-    _check(elements)
+    _check(elements, _KINDS[8][0])
 
     def codegen(context, builder, sig, args):
         for k, row in enumerate(_transposed(builder, cgutils.unpack_tuple(builder, args[3]))):
             at = builder.add(args[1], builder.mul(args[2], args[2].type(k)))
-            builder.store(row, _address(builder, args[0], at, 8), align=8)
+            builder.store(row, _address(builder, args[0], at, _KINDS[8][0]), align=8)
         return context.get_dummy_value()
 
     return types.void(elements, types.intp, types.intp, rows), codegen
@@ -296,7 +326,7 @@ def scatter_columns(typingctx, elements, places, first, stride, shift, rows):  #
 
     ``elements`` and ``places`` (int64) are `compiled.pointer`.
     """
-    _check(elements)
+    _check(elements, _KINDS[8][0])
     if places != types.CPointer(types.int64):
         raise TypeError(f"places are read through pointer(int64 array), not {places}")
 
@@ -305,7 +335,7 @@ def scatter_columns(typingctx, elements, places, first, stride, shift, rows):  #
         for k, row in enumerate(_transposed(builder, cgutils.unpack_tuple(builder, args[5]))):
             address = builder.gep(args[1], [builder.add(args[2], int64(k))], source_etype=int64)
             at = builder.add(builder.mul(builder.load(address, typ=int64), args[3]), args[4])
-            builder.store(row, _address(builder, args[0], at, 8), align=8)
+            builder.store(row, _address(builder, args[0], at, _KINDS[8][0]), align=8)
         return context.get_dummy_value()
 
     return types.void(elements, places, types.intp, types.intp, types.intp, rows), codegen
@@ -338,6 +368,10 @@ if config.DISABLE_JIT:  # pyright: ignore[reportAttributeAccessIssue]
         runs = [max(0, (1 << math.floor(b) + 1) - (1 << math.ceil(a))) for a, b in zip(first, last, strict=True)]
         return sum(run << 8 * k for k, run in enumerate(runs))
 
+    def muladd(x, y, z):
+        """``x * y + z``, rounded twice."""
+        return x * y + z
+
     def load8(elements, at):
         """``elements[at : at + 8]``."""
         return elements[at : at + 8].copy()
@@ -345,6 +379,10 @@ if config.DISABLE_JIT:  # pyright: ignore[reportAttributeAccessIssue]
     def load4(elements, at):
         """``elements[at : at + 4]``."""
         return elements[at : at + 4].copy()
+
+    def load_line(elements, at):
+        """`LINE` bytes from ``elements[at]`` on."""
+        return elements[at : at + LINE // elements.itemsize].copy()
 
     def store(elements, at, lanes):
         """Write the lanes to ``elements[at : ...]``."""

@@ -34,11 +34,11 @@ _DEGREES = {0: (1, 2), 1: (28, 112), 2: (6, 20), 3: (4, 10)}
 #: Degree of the Taylor models of poses.
 _TAYLOR = 6
 #: Cells bounded at once.
-_BATCH = 64
+_BATCH = 128
 #: Samples of a ray that are bounded before the light that is left is looked at.
 _BLOCK = 8
 #: Halvings below cells of the starting width, by number of parameters (one level may concern any axis).
-_DEEPER = {0: 0, 1: 4}
+_DEEPER = {0: 0, 1: 2}
 _DEEPER_MORE = 6
 #: Halvings of the deepest cells into parts, by axis; the cells of a line have two or three parts as it is.
 _FINER = {2: 1}
@@ -53,6 +53,8 @@ _LOST = 0.5
 _LOST_SHARES = ((0.25, 0.6), (0.04, 0.87))
 #: The share below which they begin wider, and the factor: this costs little, as the shares rise steeply with the width.
 _FEW_LOST, _WIDER = 0.01, 1.08
+#: Opacities of at most this share of the tolerance are not told apart by parts of a cell.
+_ALIKE = 2.0**-9
 #: Light that a sample may leave open before compositing has shown where it matters.
 _COARSE = 0.1
 #: A sample is worth halving if it can take away this share of what a part has too much.
@@ -379,8 +381,8 @@ class NerfBounds:
             self._bernstein[parts] = torch.from_numpy(self.basis.bernstein(parts)).to(self.device)
         return self._bernstein[parts]
 
-    def division(self, moves: np.ndarray, most: int = _PARTS) -> Division | None:
-        """Levels for samples that move by ``moves`` [n, samples, d].
+    def division(self, moves: np.ndarray, most: int = _PARTS, deeper: int | None = None) -> Division | None:
+        """Levels for samples that move by ``moves`` [n, samples, d]; the last ``deeper`` are for refinement.
 
         None where that would be more than ``most`` parts and narrower boxes would need fewer.
         """
@@ -390,7 +392,7 @@ class NerfBounds:
         widest = moves.reshape(-1, d).max(axis=0)
         if not np.isfinite(widest).all():
             return None
-        deeper = _DEEPER.get(d, _DEEPER_MORE)
+        deeper = _DEEPER.get(d, _DEEPER_MORE) if deeper is None else deeper
         finer = _FINER.get(d, 0)
         levels = (most // 3 if d == 1 else most).bit_length() - 1 - deeper - d * finer
         axes: list[int] = []
@@ -691,6 +693,11 @@ class _Work:
         encoded = field.encode(nodes, torch.from_numpy(radius).to(device), field.position)
         pieces = field.base(*encoded)
         density = field.density(pieces)
+        halve, lost = np.zeros((2, len(items)), bool)
+        seen = np.flatnonzero(~self._leave_alike(level, items, density))
+        if not seen.size:
+            return halve, lost
+        items, sure, density = items.take(seen), sure[seen], density.without_columns(torch.from_numpy(seen).to(device))
         low, high, error = _parts(density, bernstein)
         length = torch.from_numpy(self.owner.lengths[items.sample]).to(device)[:, None]
         alpha_low, alpha_high = opacity(low[..., 0], length, up=False), opacity(high[..., 0], length, up=True)
@@ -709,36 +716,42 @@ class _Work:
         self._keep(self.alpha_low, self.alpha_high, rows, low_a, high_a)
         self.open[rows] = np.minimum(self.open[rows], open_)
         self.level[rows] = level
-        halve = (open_ * light).max(axis=1) > coarse
+        halved = (open_ * light).max(axis=1) > coarse
+        halve[seen], lost[seen] = halved, halved & (open_.min(axis=1) > _LOST)
         shines = (high_a * light).max(axis=1) > self._negligible
         # what is halved gets its colours from the halves, if there are any
-        final = ~halve | (self.division.below[level] < 0)
+        final = ~halved | (self.division.below[level] < 0)
         coloured = np.flatnonzero(shines & final & ~density.failed.cpu().numpy())
         if coloured.size:
-            self._color(pieces, items.take(coloured), coloured, there, bernstein, rows)
-        return halve, halve & (open_.min(axis=1) > _LOST)
+            which = torch.from_numpy(seen[coloured]).to(device)
+            self._color(level, items.take(coloured), pieces.select(which), there[which])
+        return halve, lost
 
-    def _color(
-        self,
-        pieces: Pieces,
-        items: _Items,
-        which: np.ndarray,
-        there: Tensor,
-        bernstein: Tensor,
-        rows: tuple[np.ndarray, np.ndarray, np.ndarray],
-    ) -> None:
-        """Bound the colours of the pieces ``which``."""
+    def _leave_alike(self, level: int, items: _Items, density: Affine) -> np.ndarray:
+        """[k] whether next to nothing is seen of an item: that is all that is found out about it then."""
+        length = torch.from_numpy(self.owner.lengths[items.sample]).to(density.poly.device)
+        most = opacity(greatest(density)[:, 0], length, up=True)
+        alike = ((most <= _ALIKE * self.tolerance) & ~density.failed).cpu().numpy()
+        gone, high = items.take(alike), most.cpu().numpy()[alike, None]
+        rows = gone.sample[:, None], gone.ray[:, None], self._level(level)[2][gone.cell]
+        self.alpha_high[rows] = np.minimum(self.alpha_high[rows], high)
+        self.open[rows] = np.minimum(self.open[rows], high)
+        self.level[rows] = level
+        return alike
+
+    def _color(self, level: int, items: _Items, pieces: Pieces, there: Tensor) -> None:
+        """Bound the colours of ``pieces``, those of ``items``; ``there``: monomials at their nodes."""
         device, field = self.owner.device, self.field
-        index = torch.from_numpy(which).to(device)
-        direction = there[index] @ torch.from_numpy(self.pencil.direction[items.ray]).to(device)
+        _, bernstein, members = self._level(level)
+        direction = there @ torch.from_numpy(self.pencil.direction[items.ray]).to(device)
         radius = self.pencil.direction_radius[items.ray] + 96.0 * UNIT64
         encoded = field.encode(direction, torch.from_numpy(radius).to(device), field.direction)
-        color = field.color(pieces.select(index), *encoded)
+        color = field.color(pieces, *encoded)
         low, high, error = _parts(color, bernstein)
         bad = color.failed[:, None, None]
         low = torch.where(bad, 0.0, torch.sigmoid(low) * (1.0 - COMPOSITE_ROUNDING)).cpu().numpy()
         high = torch.where(bad, 1.0, (torch.sigmoid(high) * (1.0 + COMPOSITE_ROUNDING)).clamp(max=1.0)).cpu().numpy()
-        where = rows[0][which], rows[1][which], rows[2][which]
+        where = items.sample[:, None], items.ray[:, None], members[items.cell]
         self._keep(self.color_low, self.color_high, where, low, high)
         slack = 2.0 * torch.tanh(0.25 * error.amax(dim=1))
         slack = torch.where(color.failed, 1.0, slack).cpu().numpy()
@@ -817,6 +830,13 @@ class _Work:
         slack = 4.0 * COMPOSITE_ROUNDING * (self.alpha_low.shape[0] + self.owner.sampling.importance + 5)
         low, high = low - rest - slack, high + rest + slack
         return np.clip(low, 0.0, 1.0), np.clip(high, 0.0, 1.0)
+
+
+def greatest(value: Affine) -> Tensor:
+    """Upper bounds [B, n] of an affine batch on whole cells."""
+    size = value.poly.abs().sum(dim=1)
+    middle = value.poly[:, 0]
+    return middle + (size - middle.abs()) + (value.radius + 4.0 * CHEBYSHEV_ROUNDING * size)
 
 
 def _parts(value: Affine, bernstein: Tensor) -> tuple[Tensor, Tensor, Tensor]:

@@ -12,6 +12,9 @@ from numba import njit
 
 from ns_abstract.arithmetic.chebyshev import ChebyshevBasis
 from ns_abstract.arithmetic.rounding import CHEBYSHEV_ROUNDING, FIELD_UP, UNIT64
+from ns_abstract.arithmetic.simd.intrinsics import pointer
+from ns_abstract.arithmetic.simd.lanes import LINE, load_line, store
+from ns_abstract.arithmetic.simd.products import ROWS, four_rows
 
 #: Neurons side by side.
 LANES = 32
@@ -23,9 +26,10 @@ class Grid(NamedTuple):
     """The first half of a symmetric grid of g points, its middle included, and how a polynomial is fitted there.
 
     Attributes:
-        points: (g + 1) / 2; rows and columns of the matrices behind them are zeros, to a multiple of four.
-        even, odd: [points, .] values of the basis' even and odd degrees.
-        fit_even, fit_odd: [., points] the fit of even and odd degrees.
+        points: (g + 1) / 2.
+        even, odd: Values [points, .] of the basis' even and odd degrees, as `_packed` has them.
+        fit_even, fit_odd: The fit [., points] of even and odd degrees, likewise.
+        order: 0, 1, 2, ..., for as many as these matrices have columns.
         chord: [m].
         norming: See `ChebyshevBasis.norming`.
     """
@@ -35,52 +39,57 @@ class Grid(NamedTuple):
     odd: np.ndarray
     fit_even: np.ndarray
     fit_odd: np.ndarray
+    order: np.ndarray
     chord: np.ndarray
     norming: float
 
 
-def _padded(matrix: np.ndarray) -> np.ndarray:
-    """``matrix`` with zeros behind it, so that both sides are multiples of four."""
+def _packed(matrix: np.ndarray) -> np.ndarray:
+    """[., columns, ROWS] of a ``matrix``: so many rows side by side, with rows of zeros behind the last."""
     rows, columns = matrix.shape
-    out = np.zeros((rows + -rows % 4, columns + -columns % 4))
-    out[:rows, :columns] = matrix
-    return out
+    whole = np.zeros((rows + -rows % ROWS, columns))
+    whole[:rows] = matrix
+    return np.ascontiguousarray(whole.reshape(-1, ROWS, columns).transpose(0, 2, 1))
 
 
 def grid_of(basis: ChebyshevBasis) -> Grid:
     """The grid of a ``basis`` of one variable, whose ``grid`` is even."""
     points = basis.grid // 2 + 1
     values, fit = basis.evaluation[:points], basis.fit[:, :points]
-    even, odd, fit_even, fit_odd = map(_padded, (values[:, 0::2], values[:, 1::2], fit[0::2], fit[1::2]))
-    return Grid(points, even, odd, fit_even, fit_odd, basis.chord, basis.norming)
+    even, odd, fit_even, fit_odd = map(_packed, (values[:, 0::2], values[:, 1::2], fit[0::2], fit[1::2]))
+    return Grid(points, even, odd, fit_even, fit_odd, np.arange(max(points, basis.size)), basis.chord, basis.norming)
 
 
 @njit(cache=True, error_model="numpy")
-def _multiply(matrix, lanes, out):
-    """``out = matrix @ lanes``, [R, LANES] of [R, K] and [K, LANES]; R and K are multiples of four."""
-    for r in range(0, matrix.shape[0], 4):
-        t0, t1, t2, t3 = out[r], out[r + 1], out[r + 2], out[r + 3]
-        for c in range(LANES):
-            t0[c] = t1[c] = t2[c] = t3[c] = 0.0
-        for i in range(0, matrix.shape[1], 4):
-            p0, p1, p2, p3 = lanes[i], lanes[i + 1], lanes[i + 2], lanes[i + 3]
-            a00, a01, a02, a03 = matrix[r, i], matrix[r, i + 1], matrix[r, i + 2], matrix[r, i + 3]
-            a10, a11, a12, a13 = matrix[r + 1, i], matrix[r + 1, i + 1], matrix[r + 1, i + 2], matrix[r + 1, i + 3]
-            a20, a21, a22, a23 = matrix[r + 2, i], matrix[r + 2, i + 1], matrix[r + 2, i + 2], matrix[r + 2, i + 3]
-            a30, a31, a32, a33 = matrix[r + 3, i], matrix[r + 3, i + 1], matrix[r + 3, i + 2], matrix[r + 3, i + 3]
-            for c in range(LANES):
-                x0, x1, x2, x3 = p0[c], p1[c], p2[c], p3[c]
-                t0[c] += a00 * x0 + a01 * x1 + (a02 * x2 + a03 * x3)
-                t1[c] += a10 * x0 + a11 * x1 + (a12 * x2 + a13 * x3)
-                t2[c] += a20 * x0 + a21 * x1 + (a22 * x2 + a23 * x3)
-                t3[c] += a30 * x0 + a31 * x1 + (a32 * x2 + a33 * x3)
+def _multiply(matrix, order, lanes, out):
+    """``out = matrix @ lanes``, [R, LANES] of a `_packed` [R, K] and [K, LANES]; ``order``: see `Grid`."""
+    blocks, count, _ = matrix.shape
+    factors, elements, results = pointer(matrix), pointer(lanes), pointer(out)
+    lines, step = pointer(order), LINE // lanes.itemsize
+    out[0] = 0.0
+    nothing = load_line(results, 0)
+    for block in range(blocks):
+        for c in range(0, LANES, step):
+            t0, t1, t2, t3 = four_rows(factors, ROWS * count * block, lines, count, elements, c, LANES, nothing)
+            at = ROWS * LANES * block + c
+            store(results, at, t0)
+            store(results, at + LANES, t1)
+            store(results, at + 2 * LANES, t2)
+            store(results, at + 3 * LANES, t3)
+
+
+@njit(cache=True, error_model="numpy")
+def _scratch(grid):
+    """Zeros for coefficients of even and odd degrees, and room for their sums, [., LANES]."""
+    degrees = np.zeros((ROWS * grid.fit_even.shape[0], LANES)), np.zeros((ROWS * grid.fit_odd.shape[0], LANES))
+    return (*degrees, np.empty((ROWS * grid.even.shape[0], LANES)), np.empty((ROWS * grid.odd.shape[0], LANES)))
 
 
 @njit(cache=True, error_model="numpy")
 def _on_grid(even, odd, grid, sum_even, sum_odd, values):
     """``values`` [g, LANES] of polynomials with coefficients ``even`` and ``odd``."""
-    _multiply(grid.even, even, sum_even)
-    _multiply(grid.odd, odd, sum_odd)
+    _multiply(grid.even, grid.order, even, sum_even)
+    _multiply(grid.odd, grid.order, odd, sum_odd)
     last = values.shape[0] - 1
     for i in range(grid.points):
         for c in range(LANES):
@@ -169,8 +178,7 @@ def _decide(poly, rho, box, grid, slope, size, which, neuron, found, low, high):
 
     What is not a number stays open, and fails in `relu`.
     """
-    even, odd = np.zeros((grid.even.shape[1], LANES)), np.zeros((grid.odd.shape[1], LANES))
-    sum_even, sum_odd = np.empty((grid.even.shape[0], LANES)), np.empty((grid.odd.shape[0], LANES))
+    even, odd, sum_even, sum_odd = _scratch(grid)
     values = np.empty((2 * grid.points - 1, LANES))
     absolute, least, most = np.empty(LANES), np.empty(LANES), np.empty(LANES)
     left = 0
@@ -209,10 +217,8 @@ def _series(values, grid, sum_even, sum_odd, even, odd):
         middle = values[grid.points - 1, c]
         sum_even[grid.points - 1, c] = middle if middle > 0.0 else 0.0
         sum_odd[grid.points - 1, c] = 0.0
-    sum_even[grid.points :] = 0.0
-    sum_odd[grid.points :] = 0.0
-    _multiply(grid.fit_even, sum_even, even)
-    _multiply(grid.fit_odd, sum_odd, odd)
+    _multiply(grid.fit_even, grid.order, sum_even, even)
+    _multiply(grid.fit_odd, grid.order, sum_odd, odd)
 
 
 @njit(cache=True, error_model="numpy")
@@ -265,9 +271,8 @@ def relu(poly, rho, box, failed, grid, slope, size, which, neuron, error):
     found = _certain(poly, rho, box, failed, slope, size, which, neuron)
     lows, highs = np.empty(found), np.empty(found)
     found = _decide(poly, rho, box, grid, slope, size, which, neuron, found, lows, highs)
-    even, odd = np.zeros((grid.even.shape[1], LANES)), np.zeros((grid.odd.shape[1], LANES))
-    even_q, odd_q = np.empty((grid.fit_even.shape[0], LANES)), np.empty((grid.fit_odd.shape[0], LANES))
-    sum_even, sum_odd = np.empty((grid.even.shape[0], LANES)), np.empty((grid.odd.shape[0], LANES))
+    even, odd, sum_even, sum_odd = _scratch(grid)
+    even_q, odd_q = np.zeros_like(even), np.zeros_like(odd)
     values, fitted = np.empty((2 * grid.points - 1, LANES)), np.empty((2 * grid.points - 1, LANES))
     absolute, absolute_q, above, below, least, most = np.empty((6, LANES))
     for first in range(0, found, LANES):

@@ -32,6 +32,8 @@ _SWEPT = 8.0
 _FINER_LINE, _FINER = 4, 2
 #: Most parts of a strip: with one parameter, and with more.
 _PARTS_LINE, _PARTS = 512, 2048
+#: Halvings of a strip's first cells, with one parameter: planes are made of its parts, and of fine ones tighter.
+_DEEPER_LINE = 4
 #: Most strips along an axis.
 _MOST = 1 << 20
 #: Parts of the range of hues or saturations, of the first level and from level to level.
@@ -132,7 +134,9 @@ class Strips:
             box = self._strip(counts, [n // 2 for n in counts])
             pencil = Pencil(self.geometry, box, pixels, self.bounds.taylor, self.bounds.swept)
             moves = pencil.displacement(self.bounds.distances, self.bounds.lengths)
-            division = self.bounds.division(moves, _PARTS_LINE if moves.shape[2] < 2 else _PARTS)
+            line = moves.shape[2] == 1
+            most, deeper = (_PARTS_LINE, _DEEPER_LINE) if line else (_PARTS, None)
+            division = self.bounds.division(moves, most, deeper)
             if division is not None or max(counts, default=_MOST) >= _MOST:
                 break
             widest = np.nan_to_num(moves[..., :d].reshape(-1, d).max(axis=0), nan=np.inf)

@@ -18,6 +18,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 from torch import Tensor
+from torch.nn import functional
 
 from ns_abstract.arithmetic.chebyshev import ChebyshevBasis
 from ns_abstract.arithmetic.rounding import (
@@ -28,6 +29,7 @@ from ns_abstract.arithmetic.rounding import (
     UNIT64,
     gamma,
 )
+from ns_abstract.arithmetic.simd.lanes import LINE
 from ns_abstract.methods.nerf.layer_kernel import Product, Terms, linear
 from ns_abstract.methods.nerf.relu_kernel import LEAST_SLOPE, Grid, grid_of, relu
 from ns_abstract.methods.nerf.scene import Encoding, FieldWeights, Layer, Waves
@@ -121,17 +123,25 @@ class Affine:
         """[B, n] columns and box together."""
         return (self.spread * FIELD_UP + self.box) * FIELD_UP
 
+    def without_columns(self, which: Tensor) -> Affine:
+        """The pieces ``which`` [k], all but their columns."""
+        parts = (self.poly, self.spread, self.box, self.failed, self.count)
+        poly, spread, box, failed, count = (part[which] for part in parts)
+        return Affine(poly, self.columns[:0], self.owner[:0], spread, box, failed, count)
+
 
 @dataclass(frozen=True)
 class _Linear:
     """A linear layer: transposed ``weight`` [in, out], its ``absolute`` value and ``bias`` [out], all float64.
 
-    ``narrow``: the weight in float32, which it is exactly, where columns are multiplied in that.
+    For compiled products: ``lines``, the weight with zeros behind its rows to whole lines, and ``narrow``, the same in
+    float32, which it is exactly, where columns are multiplied in that.
     """
 
     weight: Tensor
     absolute: Tensor
     bias: Tensor
+    lines: Tensor
     narrow: Tensor | None
 
 
@@ -184,7 +194,8 @@ class FieldBounds:
         bias = torch.from_numpy(layer.bias).to(self.device, torch.float64)
         # only the compiled product gains by float32
         narrow &= self._compiled
-        return _Linear(weight, weight.abs(), bias, weight.float() if narrow else None)
+        lines = functional.pad(weight, (0, -weight.shape[1] % (LINE // 4))) if self._compiled else weight
+        return _Linear(weight, weight.abs(), bias, lines, lines.float() if narrow else None)
 
     # --- encodings -----------------------------------------------------------------------------
 
@@ -230,10 +241,10 @@ class FieldBounds:
         """A linear layer on ``pieces``, after ``first`` (polynomials, remainders) in the order of its inputs (F4)."""
         count = 0 if first is None else first[0].shape[-1]
         rounding = _rounding(layer.weight.shape[0])
-        radius = pieces.box + rounding * (pieces.size + pieces.box)
+        radius = (pieces.size + pieces.box).mul_(rounding).add_(pieces.box)
         if layer.narrow is not None:
-            steps = (pieces.size != 0.0).sum(dim=1, keepdim=True) + _NARROW_STEPS
-            radius += (steps * (1.0 + 2.0**-10) * UNIT32) * pieces.spread + UNDERFLOW_COLUMNS
+            steps = (pieces.size != 0.0).sum(dim=1, keepdim=True, dtype=torch.float64) + _NARROW_STEPS
+            radius.addcmul_(steps * (1.0 + 2.0**-10) * UNIT32, pieces.spread).add_(UNDERFLOW_COLUMNS)
         box = radius @ layer.absolute[count:] + (0.0 if layer.narrow is None else UNDERFLOW_COLUMNS)
         poly, columns, owner, spread = self._product(pieces, layer, count)
         if first is not None:
@@ -252,7 +263,8 @@ class FieldBounds:
             columns = torch.cat([columns, weight[pieces.new_neuron] * pieces.new_size[:, None]])
             owner = torch.cat([pieces.owner, pieces.new_owner])
             return pieces.poly @ weight, columns, owner, column_sums(columns, owner, batch)
-        kind = weight if layer.narrow is None else layer.narrow[count:]
+        wide = layer.lines[count:]
+        kind = wide if layer.narrow is None else layer.narrow[count:]
         total = pieces.columns.shape[0] + pieces.new_owner.shape[0]
         poly, spread = torch.empty(batch, m, n, dtype=torch.float64), torch.empty(batch, n, dtype=torch.float64)
         columns, owner = torch.empty(total, n, dtype=kind.dtype), torch.empty(total, dtype=torch.int64)
@@ -262,7 +274,7 @@ class FieldBounds:
             torch.searchsorted(pieces.new_owner, places), pieces.new_neuron, pieces.new_size,
         )  # fmt: skip
         linear(
-            pieces.poly.numpy(), pieces.size.numpy(), Terms(*(a.numpy() for a in before)), weight.numpy(),
+            pieces.poly.numpy(), pieces.size.numpy(), Terms(*(a.numpy() for a in before)), wide.numpy(),
             kind.numpy(), Product(*(a.numpy() for a in (poly, columns, owner, spread))),
         )  # fmt: skip
         return poly, columns, owner, spread
