@@ -47,16 +47,15 @@ def sources() -> list[Path]:
 
 
 def imported(tree: ast.AST) -> Iterator[tuple[int, str]]:
-    """Line and dotted name of every absolute import."""
+    """Line and dotted name of every absolute import, down to what is taken from a module."""
     for node in ast.walk(tree):
         if isinstance(node, ast.Import):
             yield from ((node.lineno, alias.name) for alias in node.names)
         elif isinstance(node, ast.ImportFrom):
             assert node.level == 0, f"line {node.lineno}: relative import"
             assert node.module is not None
-            # "from ns_abstract import errors" names a module, too
-            names = [f"{node.module}.{a.name}" for a in node.names] if node.module == "ns_abstract" else [node.module]
-            yield from ((node.lineno, name) for name in names)
+            # "from ns_abstract.io import errors" names a module, too
+            yield from ((node.lineno, f"{node.module}.{alias.name}") for alias in node.names)
 
 
 def dotted(node: ast.AST) -> str:
@@ -92,14 +91,8 @@ def circle(texts: dict[str, str]) -> list[str]:
     """Modules that import one another in a circle, given their texts; what is imported for types alone counts, too."""
     used = {}
     for name, text in texts.items():
-        tree = ast.parse(text)
-        found = {which for _, which in imported(tree)}
-        for node in ast.walk(tree):
-            # "from ns_abstract.io import errors" names a module, too
-            if isinstance(node, ast.ImportFrom):
-                inner = {f"{node.module}.{alias.name}" for alias in node.names}
-                found = (found - {node.module} if inner & texts.keys() else found) | inner
-        used[name] = (found & texts.keys()) - {name}
+        found = {which for _, which in imported(ast.parse(text))}
+        used[name] = {w if w in texts else w.rpartition(".")[0] for w in found} & texts.keys()
     try:
         graphlib.TopologicalSorter(used).prepare()
     except graphlib.CycleError as error:

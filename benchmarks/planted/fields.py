@@ -109,12 +109,13 @@ FIELDS = (
     ),
     Fault(
         "fields: what is left of a dim cell is its polynomial's alone",
-        _BOUNDS, "greatest", "value.radius + 4.0 * CHEBYSHEV_ROUNDING * size", "4.0 * CHEBYSHEV_ROUNDING * size",
+        _BOUNDS, "greatest", "value.radius + CHEBYSHEV_ROUNDING * (middle.abs() + spread)",
+        "CHEBYSHEV_ROUNDING * (middle.abs() + spread)",
         "test_nerf_zonotope.py::test_greatest_values_on_whole_cells",
     ),
     Fault(
         "fields: rounding of a dim cell's sum is not charged",
-        _BOUNDS, "greatest", "4.0 * CHEBYSHEV_ROUNDING * size", "0.0",
+        _BOUNDS, "greatest", "CHEBYSHEV_ROUNDING * (middle.abs() + spread)", "0.0",
         "test_nerf_zonotope.py::test_greatest_values_on_whole_cells",
     ),
     Fault(

@@ -515,6 +515,10 @@ class _Work:
             )
         return self._levels[level]
 
+    def _rows(self, level: int, items: _Items) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Where the parts [k, parts of a cell] of ``items`` stand in the arrays by sample, ray and part."""
+        return items.sample[:, None], items.ray[:, None], self._level(level)[2][items.cell]
+
     def _bound_block(self, block: np.ndarray) -> None:
         """Bound the samples ``block`` of all rays."""
         waiting: dict[int, list[_Items]] = {}
@@ -669,7 +673,7 @@ class _Work:
         empty, sure = self.owner.occupancy.look(*ends)
         gone = items.take(empty)
         if len(gone):
-            rows = gone.sample[:, None], gone.ray[:, None], self._level(level)[2][gone.cell]
+            rows = self._rows(level, gone)
             self.alpha_low[rows] = self.alpha_high[rows] = 0.0
             self.open[rows] = self.vague[rows] = 0.0
             self.level[rows] = self.division.levels
@@ -686,7 +690,7 @@ class _Work:
     ) -> tuple[np.ndarray, np.ndarray]:
         """`_bound_batch` by the network; where it is not ``sure`` [k], density may also be 0."""
         device, field = self.owner.device, self.field
-        monomials, bernstein, members = self._level(level)
+        monomials, bernstein, _ = self._level(level)
         self.cells += len(items)
         there = monomials[torch.from_numpy(items.cell).to(device)]
         nodes = there @ torch.from_numpy(lines).to(device)
@@ -711,7 +715,7 @@ class _Work:
         if not sure.all():
             low_a = np.where(sure[:, None], low_a, 0.0)
             open_ = np.where(sure[:, None], open_, high_a)
-        rows = items.sample[:, None], items.ray[:, None], members[items.cell]
+        rows = self._rows(level, items)
         light = self.before[rows]
         self._keep(self.alpha_low, self.alpha_high, rows, low_a, high_a)
         self.open[rows] = np.minimum(self.open[rows], open_)
@@ -733,7 +737,7 @@ class _Work:
         most = opacity(greatest(density)[:, 0], length, up=True)
         alike = ((most <= _ALIKE * self.tolerance) & ~density.failed).cpu().numpy()
         gone, high = items.take(alike), most.cpu().numpy()[alike, None]
-        rows = gone.sample[:, None], gone.ray[:, None], self._level(level)[2][gone.cell]
+        rows = self._rows(level, gone)
         self.alpha_high[rows] = np.minimum(self.alpha_high[rows], high)
         self.open[rows] = np.minimum(self.open[rows], high)
         self.level[rows] = level
@@ -742,7 +746,7 @@ class _Work:
     def _color(self, level: int, items: _Items, pieces: Pieces, there: Tensor) -> None:
         """Bound the colours of ``pieces``, those of ``items``; ``there``: monomials at their nodes."""
         device, field = self.owner.device, self.field
-        _, bernstein, members = self._level(level)
+        bernstein = self._level(level)[1]
         direction = there @ torch.from_numpy(self.pencil.direction[items.ray]).to(device)
         radius = self.pencil.direction_radius[items.ray] + 96.0 * UNIT64
         encoded = field.encode(direction, torch.from_numpy(radius).to(device), field.direction)
@@ -751,7 +755,7 @@ class _Work:
         bad = color.failed[:, None, None]
         low = torch.where(bad, 0.0, torch.sigmoid(low) * (1.0 - COMPOSITE_ROUNDING)).cpu().numpy()
         high = torch.where(bad, 1.0, (torch.sigmoid(high) * (1.0 + COMPOSITE_ROUNDING)).clamp(max=1.0)).cpu().numpy()
-        where = items.sample[:, None], items.ray[:, None], members[items.cell]
+        where = self._rows(level, items)
         self._keep(self.color_low, self.color_high, where, low, high)
         slack = 2.0 * torch.tanh(0.25 * error.amax(dim=1))
         slack = torch.where(color.failed, 1.0, slack).cpu().numpy()
@@ -834,9 +838,8 @@ class _Work:
 
 def greatest(value: Affine) -> Tensor:
     """Upper bounds [B, n] of an affine batch on whole cells."""
-    size = value.poly.abs().sum(dim=1)
-    middle = value.poly[:, 0]
-    return middle + (size - middle.abs()) + (value.radius + 4.0 * CHEBYSHEV_ROUNDING * size)
+    middle, spread = value.poly[:, 0], value.poly[:, 1:].abs().sum(dim=1)
+    return middle + spread + (value.radius + CHEBYSHEV_ROUNDING * (middle.abs() + spread))
 
 
 def _parts(value: Affine, bernstein: Tensor) -> tuple[Tensor, Tensor, Tensor]:

@@ -20,8 +20,8 @@ BLOCK = 32
 
 
 @njit(cache=True, error_model="numpy")
-def multiply(x, live, scale, weight, factors, rest, out, sums):
-    """``out[r] = sum_i x[r, live[i]] scale[i] weight[live[i]]``, and ``sums`` grows by its absolute values.
+def multiply(x, live, scale, weight, factors, rest, out):
+    """``out[r] = sum_i x[r, live[i]] scale[i] weight[live[i]]``.
 
     Args:
         x: [R, inputs].
@@ -30,7 +30,6 @@ def multiply(x, live, scale, weight, factors, rest, out, sums):
         factors: [BLOCK inputs] scratch.
         rest: [ROWS, a line] scratch.
         out: [R, n].
-        sums: [n] float64.
     """
     (count, n), stride, lanes, k = out.shape, weight.shape[1], LINE // weight.itemsize, live.shape[0]
     w, f, o, s, places = pointer(weight), pointer(factors), pointer(out), pointer(rest), pointer(live)
@@ -62,9 +61,6 @@ def multiply(x, live, scale, weight, factors, rest, out, sums):
                 for r in range(r0, min(r0 + ROWS, count)):
                     for j in range(c, n):
                         out[r, j] = rest[r - r0, j - c]
-    for r in range(count):
-        for j in range(n):
-            sums[j] += abs(out[r, j])
 
 
 class Terms(NamedTuple):
@@ -116,7 +112,6 @@ def linear(poly, size, terms, wide, weight, out):
     factors, factors_wide = np.empty(BLOCK * inputs, weight.dtype), np.empty(BLOCK * inputs, np.float64)
     rest = np.empty((ROWS, LINE // weight.itemsize), weight.dtype)
     rest_wide = np.empty((ROWS, LINE // wide.itemsize), np.float64)
-    unused = np.zeros(n)
     place = 0
     for b in range(poly.shape[0]):
         count = 0
@@ -124,15 +119,18 @@ def linear(poly, size, terms, wide, weight, out):
             if size[b, j] != 0.0:
                 live[count], gain[count] = j, terms.slope[b, j]
                 count += 1
-        multiply(poly[b], live[:count], ones, wide, factors_wide, rest_wide, out.poly[b], unused)
-        sums, first = out.sums[b], place
-        sums[:] = 0.0
+        multiply(poly[b], live[:count], ones, wide, factors_wide, rest_wide, out.poly[b])
+        first = place
         columns = terms.columns[terms.begin[b] : terms.begin[b + 1]]
         place += columns.shape[0]
-        multiply(columns, live[:count], gain, weight, factors, rest, out.columns[first:place], sums)
+        multiply(columns, live[:count], gain, weight, factors, rest, out.columns[first:place])
         for c in range(terms.new_begin[b], terms.new_begin[b + 1]):
             for j in range(n):
                 out.columns[place, j] = terms.new_size[c] * wide[terms.new_neuron[c], j]
-                sums[j] += abs(out.columns[place, j])
             place += 1
+        sums = out.sums[b]
+        sums[:] = 0.0
+        for c in range(first, place):
+            for j in range(n):
+                sums[j] += abs(out.columns[c, j])
         out.owner[first:place] = b
