@@ -203,7 +203,7 @@ def test_linear_layers_are_enclosed(compiled: bool, narrow: bool) -> None:
     if not narrow:
         layer = replace(layer, narrow=None)
     if not compiled:
-        field._compiled, field._grid = False, None
+        field.compiled, field._grid = False, None
     pieces = field._relu(random_batch(field, width, 5))
     after = field._linear(pieces, layer)
     rng = np.random.default_rng(2)

@@ -588,6 +588,7 @@ class CertifySettings:
         gsplat_version: Of gsplat's rules; None: 1.4.0.
         sampling, num_samples, near_plane: Of the rays of a NeRF; None: the method's own.
         occupancy_grid: File of a grid that is declared as part of a NeRF.
+        device: Where a NeRF is bounded, "cpu" or "cuda"; None: "cpu".
         workers: Processes that bound the rays of a NeRF.
         arithmetic: "float32" or "real"; None: the strongest that the scene has.
         network_arithmetic: The same of the network.
@@ -613,6 +614,7 @@ class CertifySettings:
     occupancy_grid: Path | None = None
     workers: int = 1
     given_set: Mapping[str, Any] | None = None
+    device: str | None = None
 
 
 def open_certification(settings: CertifySettings) -> Certification:
@@ -634,6 +636,7 @@ def open_certification(settings: CertifySettings) -> Certification:
         near_plane=settings.near_plane,
         occupancy_grid=settings.occupancy_grid,
         given_set=settings.given_set,
+        device=settings.device,
     )
     path = load_camera_path(files.camera_path_filename)
     scene = files.scene.open()

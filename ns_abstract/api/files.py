@@ -35,6 +35,7 @@ class Settings:
         outputs: "rgb", and what is bounded beside it: "depth", "accumulation".
         occupancy_grid: File of a grid that is declared as part of a NeRF.
         sampling, num_samples, near_plane: Of the rays of a NeRF; None: the method's own.
+        device: Where a NeRF is bounded, "cpu" or "cuda"; None: "cpu".
     """
 
     load_config: Path
@@ -53,13 +54,15 @@ class Settings:
     workers: int = 1
     given_set: Mapping[str, Any] | None = None
     outputs: tuple[str, ...] = ("rgb",)
+    device: str | None = None
 
     @property
     def scene(self) -> SceneSource:
         """The scene and the program that draws it."""
         options = ProgramOptions(
-            self.renderer, self.sampling, self.num_samples, self.near_plane, self.occupancy_grid, self.gsplat_version
-        )
+            self.renderer, self.sampling, self.num_samples, self.near_plane, self.occupancy_grid, self.gsplat_version,
+            self.device,
+        )  # fmt: skip
         return SceneSource(self.load_config, options)
 
 

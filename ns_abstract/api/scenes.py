@@ -108,6 +108,7 @@ def load_scene(
     near_plane: float | None = None,
     occupancy_grid: str | os.PathLike[str] | None = None,
     gsplat_version: str | None = None,
+    device: str | None = None,
 ) -> Scene:
     """Read a scene; nothing in the files is executed.
 
@@ -120,14 +121,14 @@ def load_scene(
         near_plane: NeRF: start of the rays in normalised units; 0.
         occupancy_grid: NeRF: a grid outside of which the field is declared empty.
         gsplat_version: Splats: whose rules are bounded, "1.4.0" (default), "1.5.3" or "1.6.0".
+        device: NeRF: where the field is bounded, "cpu" (default) or "cuda" (a GPU's float64).
 
     Raises:
         InputError: A file or an option cannot be used.
     """
     grid = None if occupancy_grid is None else Path(occupancy_grid)
-    scene = SceneSource(
-        Path(path), ProgramOptions(renderer, sampling, num_samples, near_plane, grid, gsplat_version)
-    ).open()
+    options = ProgramOptions(renderer, sampling, num_samples, near_plane, grid, gsplat_version, device)
+    scene = SceneSource(Path(path), options).open()
     # options that do not go with the scene are told at once
     scene.method()
     return scene

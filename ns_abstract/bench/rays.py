@@ -24,7 +24,7 @@ class RaySample(NerfFrame):
     """Some rays of a frame, as a picture of one row."""
 
     def __init__(self, method: NerfMethod, poses: PoseSet, count: int, seed: int) -> None:
-        super().__init__(method.scene, method.sampling, poses)
+        super().__init__(method.scene, method.sampling, poses, method.device)
         chosen = np.sort(np.random.default_rng(seed).permutation(self.tile_count)[:count])
         #: [n, 2] rows and columns.
         self.chosen = np.stack([chosen // self.across, chosen % self.across], axis=1)
@@ -36,7 +36,7 @@ class RaySample(NerfFrame):
 
 
 def measure(job: PathJob, name: str, frame: int, scale: float, **options: Any) -> dict[str, object]:
-    """One row: CPU seconds by ray to a ratio, and attacks by random poses, corners and gradient ascent.
+    """One row: seconds by ray to a ratio, and attacks by random poses, corners and gradient ascent.
 
     Args:
         job, name, frame, scale: The scene, and the set of poses (`pose_set`).
@@ -53,10 +53,10 @@ def measure(job: PathJob, name: str, frame: int, scale: float, **options: Any) -
     threads = torch.get_num_threads()
     # threads that wait for one another would count
     torch.set_num_threads(1)
-    start = time.process_time()
+    begun, start = time.perf_counter(), time.process_time()
     refinement = Refinement(sample, frame, job.goal(options["ratio"], options["seconds"]), seed=options["seed"])
     result = refinement.run()
-    spent = time.process_time() - start
+    spent, passed = time.process_time() - start, time.perf_counter() - begun
     torch.set_num_threads(threads)
     _, probe, twin = nerf_renderer(job.method.scene, poses, job.method.sampling)
     chosen = torch.from_numpy(sample.chosen)
@@ -71,11 +71,13 @@ def measure(job: PathJob, name: str, frame: int, scale: float, **options: Any) -
     return {
         "scene": job.method.name,
         "field": job.method.scene.fine.text,
+        "device": job.method.device,
         "size": f"{poses.camera.width}x{poses.camera.height}",
         "set": name,
         "scale": scale,
         "rays": sample.tile_count,
         "CPU s / ray": spent / sample.tile_count,
+        "s / ray": passed / sample.tile_count,
         "MPG": last.mpg,
         "witness MPG": last.mpg_witness,
         "ratio": last.mpg / last.mpg_witness if last.mpg_witness else float("nan"),

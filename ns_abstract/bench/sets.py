@@ -46,12 +46,13 @@ def open_jobs(
     arithmetic: str | None = None,
     occupancy_grid: Path | None = None,
     gsplat_version: str | None = None,
+    device: str | None = None,
 ) -> list[PathJob]:
     """The runs, or the demo scene where none is named.
 
     Without ``arithmetic`` it is the strongest that the method has, without ``gsplat_version`` splats have their usual
-    rules. Without ``camera_path`` each run's own ``camera_path.json``, in the folder that holds the method's folder, is
-    used.
+    rules; NeRFs are bounded on ``device``. Without ``camera_path`` each run's own ``camera_path.json``, in the folder
+    that holds the method's folder, is used.
 
     Raises:
         InputError: A file cannot be used.
@@ -67,7 +68,7 @@ def open_jobs(
         path = camera_path if camera_path is not None else config.resolve().parents[2] / "camera_path.json"
         settings = Settings(
             config, path, downscale_factor=downscale_factor, arithmetic=arithmetic, occupancy_grid=occupancy_grid,
-            gsplat_version=gsplat_version,
+            gsplat_version=gsplat_version, device=device,
         )  # fmt: skip
         jobs.append(open_job(settings, Perturbation()))
     return jobs

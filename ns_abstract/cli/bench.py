@@ -139,6 +139,8 @@ class Rays(Scenes):
     """Poses of the attacks, beside gradient ascent."""
     occupancy_grid: Path | None = None
     """Declare the fields empty outside of this grid's occupied voxels."""
+    device: Literal["cpu", "cuda"] | None = None
+    """cuda: bound the field on a GPU. Default: cpu."""
     scale: float = 1.0
     """Multiplies the ranges of translations and rotations."""
     seed: int = 0
@@ -448,8 +450,9 @@ def bench(
 
     grid = options.occupancy_grid if isinstance(options, Rays | Tightness) else None
     jobs = open_jobs(
-        options.load_config, options.camera_path_filename, options.downscale_factor, None, grid, options.gsplat_version
-    )
+        options.load_config, options.camera_path_filename, options.downscale_factor, None, grid, options.gsplat_version,
+        options.device if isinstance(options, Rays) else None,
+    )  # fmt: skip
     rows: list[dict[str, Any]] = []
     tables: dict[int, list[dict[str, Any]]] = {}
     results = {}

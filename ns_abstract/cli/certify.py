@@ -63,6 +63,8 @@ class Certify(GivenSet):
     occupancy_grid: Path | None = None
     """NeRF: declare the field empty outside of this grid's occupied voxels (.npz, see ns-abstract-export occupancy).
     That makes it another scene, for which the certificate holds."""
+    device: Literal["cpu", "cuda"] | None = None
+    """NeRF. cuda: bound the field on a GPU, in float64. Default: cpu."""
     network_arithmetic: Literal["float32", "real"] = "float32"
     """float32: every float32 evaluation of the network (the default). real: the exact function of its weights alone."""
     picture: Literal["float", "8-bit"] = "float"

@@ -62,6 +62,8 @@ class Render(GivenSet):
     occupancy_grid: Path | None = None
     """NeRF: declare the field empty outside of this grid's occupied voxels (.npz, see ns-abstract-export occupancy).
     That makes it another scene, for which the bounds hold."""
+    device: Literal["cpu", "cuda"] | None = None
+    """NeRF. cuda: bound the field on a GPU, in float64. Default: cpu."""
     outputs: tuple[Literal["rgb", "depth", "accumulation"], ...] = ("rgb",)
     """What is bounded. rgb is always; depth: gsplat's expected depth, normalised units (splats). accumulation: the part
     of the light that the scene takes."""

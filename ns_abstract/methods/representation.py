@@ -23,6 +23,7 @@ class ProgramOptions:
         near_plane: Start of the rays, normalised units (NeRF).
         occupancy_grid: File of a grid that is declared as part of the scene (NeRF).
         gsplat_version: Whose rules draw splats, of `VERSIONS`; None: 1.4.0.
+        device: Where the field is bounded, "cpu" or "cuda" (NeRF); None: "cpu".
     """
 
     renderer: str | None = None
@@ -31,6 +32,7 @@ class ProgramOptions:
     near_plane: float | None = None
     occupancy_grid: Path | None = None
     gsplat_version: str | None = None
+    device: str | None = None
 
     def refuse(self, names: tuple[str, ...], problem: str) -> None:
         """Refuse options of other representations.

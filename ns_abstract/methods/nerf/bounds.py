@@ -26,15 +26,17 @@ from ns_abstract.geometry.poses import PoseSet
 from ns_abstract.methods.nerf.hsv import Range, shifted_bounds
 from ns_abstract.methods.nerf.render import Sampling, camera_rays
 from ns_abstract.methods.nerf.samples import composite, edge_bounds
-from ns_abstract.methods.nerf.scene import NerfScene
-from ns_abstract.methods.nerf.zonotope import Affine, FieldBounds, Pieces
+from ns_abstract.methods.nerf.scene import FieldWeights, NerfScene
+from ns_abstract.methods.nerf.zonotope import ERROR_TERMS, Affine, FieldBounds, Pieces
 
 #: (degree, grid) of the polynomials by number of parameters.
 _DEGREES = {0: (1, 2), 1: (28, 112), 2: (6, 20), 3: (4, 10)}
 #: Degree of the Taylor models of poses.
 _TAYLOR = 6
-#: Cells bounded at once.
+#: Cells bounded at once by compiled kernels, whose numbers stay in a core's cache.
 _BATCH = 128
+#: Elsewhere: values of a layer's neurons on the grid, and how many arrays as large there may be at a time, about.
+_VALUES, _ARRAYS = 1 << 25, 12
 #: Samples of a ray that are bounded before the light that is left is looked at.
 _BLOCK = 8
 #: Halvings below cells of the starting width, by number of parameters (one level may concern any axis).
@@ -75,6 +77,18 @@ def basis_of(dimensions: int) -> ChebyshevBasis:
     """The polynomials that are used for ``dimensions`` parameters."""
     degree, grid = _DEGREES.get(dimensions, (1, 2))
     return ChebyshevBasis(dimensions, degree, grid)
+
+
+def cells_at_once(field: FieldWeights, basis: ChebyshevBasis) -> int:
+    """Cells of a batch where kernels are not compiled."""
+    return max(1, _VALUES // (len(basis.evaluation) * field.width))
+
+
+def device_bytes(field: FieldWeights, basis: ChebyshevBasis) -> int:
+    """Memory that such a batch may take, about."""
+    # error terms before and after a layer, and their product with slopes
+    columns = 3 * ERROR_TERMS * cells_at_once(field, basis) * field.width
+    return 8 * (_ARRAYS * _VALUES + columns) + (1 << 29)
 
 
 @dataclass(frozen=True)
@@ -276,19 +290,29 @@ class NerfBounds:
         sampling: Uniform, or hierarchical: bounded wherever the fine field may be sampled (design.md, F10, F14).
         dimensions: Number of parameters.
         device: Where the network is bounded.
+        compiled: Whether by kernels compiled for a processor; None: where ``device`` is one.
     """
 
     def __init__(
-        self, scene: NerfScene, sampling: Sampling, dimensions: int, device: torch.device | str = "cpu"
+        self,
+        scene: NerfScene,
+        sampling: Sampling,
+        dimensions: int,
+        device: torch.device | str = "cpu",
+        compiled: bool | None = None,
     ) -> None:
         self.sampling, self.device = sampling, torch.device(device)
         self.swept = sampling.kind == "hierarchical"
         self.basis = basis_of(dimensions + self.swept)
-        self.field = FieldBounds(scene.fine, self.basis, device=device)
+        self.field = FieldBounds(scene.fine, self.basis, device=device, compiled=compiled)
+        #: Cells bounded at once.
+        self.batch = _BATCH if self.field.compiled else cells_at_once(scene.fine, self.basis)
         edges = sampling.edges
         self.occupancy = scene.occupancy
         #: Of the coarse pass, by pose alone.
-        self.coarse = FieldBounds(scene.coarse, basis_of(dimensions), device=device) if self.swept else None
+        self.coarse = None
+        if self.swept:
+            self.coarse = FieldBounds(scene.coarse, basis_of(dimensions), device=device, compiled=compiled)
         self.distances = 0.5 * (edges[1:] + edges[:-1])
         self.lengths = edges[1:] - edges[:-1]
         self.taylor = min(_TAYLOR, max(1, self.basis.degree))
@@ -358,9 +382,9 @@ class NerfBounds:
         monomials = torch.from_numpy(np.prod(basis.nodes[:, None, :] ** pencil.exponents, axis=-1)).to(self.device)
         bernstein = torch.from_numpy(basis.bernstein(parts)).to(self.device)
         rays, places = (a.ravel() for a in np.mgrid[:n, :samples])
-        for first in range(0, rays.size, _BATCH):
+        for first in range(0, rays.size, self.batch):
             checkpoint()
-            ray, place = rays[first : first + _BATCH], places[first : first + _BATCH]
+            ray, place = rays[first : first + self.batch], places[first : first + self.batch]
             lines, radius = pencil.points(ray, self.distances[place], 0.0 * self.distances[place])
             nodes = monomials @ torch.from_numpy(lines).to(self.device)
             encoded = coarse.encode(nodes, torch.from_numpy(radius).to(self.device), coarse.position)
@@ -538,8 +562,8 @@ class _Work:
                 continue
             items = join_items(waiting.pop(level))
             again = []
-            for start in range(0, len(items), _BATCH):
-                batch = items.take(slice(start, start + _BATCH))
+            for start in range(0, len(items), self.owner.batch):
+                batch = items.take(slice(start, start + self.owner.batch))
                 halve, lost, seen = self._bound_batch(level, batch, _COARSE)
                 again.append(batch.take(halve))
                 first = self.start[batch.ray, batch.sample] == level
@@ -588,8 +612,9 @@ class _Work:
                 which = level == deeper
                 cell = self._cell_of(deeper)[part[which]]
                 found = np.unique(np.stack([ray[which], sample[which], cell]), axis=1)
-                for start in range(0, found.shape[1], _BATCH):
-                    self._bound_batch(int(deeper), _Items(*found[:, start : start + _BATCH]), math.inf)
+                for start in range(0, found.shape[1], self.owner.batch):
+                    items = _Items(*found[:, start : start + self.owner.batch])
+                    self._bound_batch(int(deeper), items, math.inf)
             rays = np.unique(ray)
 
     def _cell_of(self, level: int) -> np.ndarray:

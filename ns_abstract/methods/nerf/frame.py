@@ -38,6 +38,8 @@ _LOOK_SHARES = np.linspace(0.0, 1.0, 9)
 _SHIFT_PARTS, _SHIFT_MOTION = 12, 6.0
 #: Weights that a worker multiplies between two looks at the clock, in units of rays times weights.
 _WORK = 1_250_000
+#: Rays that fill the batches of a GPU.
+_RAYS_ON_DEVICE = 256
 #: Seconds between looks at results of other processes, and those that they get to end when the time is over.
 _PATIENCE, _GRACE = 0.2, 3.0
 
@@ -128,7 +130,8 @@ class NerfFrame:
         self.bounds = NerfBounds(*self._recipe)
         weights = sum(array.size for array in scene.fine.arrays())
         self.workers = workers
-        self.tiles_at_once = workers * int(np.clip(_WORK // weights, 1, 32))
+        rays = _RAYS_ON_DEVICE if device != "cpu" else int(np.clip(_WORK // weights, 1, 32))
+        self.tiles_at_once = workers * rays
         self._witness: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None
 
     #: Few kernels, which are compiled together.

@@ -12,6 +12,8 @@ import numpy as np
 from ns_abstract.geometry.box import ParameterBox
 from ns_abstract.geometry.poses import PoseSet
 from ns_abstract.io.errors import InputError
+from ns_abstract.methods.nerf.bounds import basis_of, device_bytes
+from ns_abstract.methods.nerf.device import check_device, processes_that_fit
 from ns_abstract.methods.nerf.frame import NerfFrame
 from ns_abstract.methods.nerf.occupancy import VOXEL_BYTES, OccupancyGrid
 from ns_abstract.methods.nerf.render import Sampling
@@ -37,11 +39,12 @@ class NerfMethod:
         sampling: "uniform" (None: the same), or "hierarchical": Nerfstudio's own picture, by bins (design.md, F10).
         num_samples: N of uniform samples; None: 64.
         near_plane: Start of the rays, normalised units; None: 0, as in Nerfstudio's evaluation.
-        workers: Processes that bound rays.
+        workers: Processes that bound rays; on a GPU, as many of them as have room there.
         occupancy: Declared as part of the scene: density is 0 outside of its occupied voxels.
+        device: Where the field is bounded and drawn: "cpu" (None: the same) or "cuda".
 
     Raises:
-        InputError: An option does not go with a NeRF.
+        InputError: An option does not go with a NeRF, or the device is not there.
     """
 
     def __init__(
@@ -54,6 +57,7 @@ class NerfMethod:
         near_plane: float | None = None,
         occupancy: OccupancyGrid | None = None,
         workers: int = 1,
+        device: str | None = None,
     ) -> None:
         if renderer not in (None, "paper"):
             raise InputError(f"{renderer} draws splats, this run is a NeRF", field="--renderer", fix="leave it out")
@@ -82,6 +86,7 @@ class NerfMethod:
             raise InputError(f"found {near}", field="--near-plane", fix=f"give 0 or more, below {scene.far:g}")
         self.scene = scene if occupancy is None else replace(scene, occupancy=occupancy)
         self.workers = workers
+        self.device = check_device(device)
         self.paper = renderer == "paper"
         background = np.zeros(3) if self.paper else scene.background
         red, green, blue = (float(v) for v in background)
@@ -138,7 +143,14 @@ class NerfMethod:
         """
         if layers:
             raise InputError("depth and accumulation of a NeRF are not bounded", field="--outputs", fix="leave it out")
-        return NerfFrame(self.scene, self.sampling, poses, workers=self.workers)
+        return NerfFrame(self.scene, self.sampling, poses, self.device, self._processes(poses.geometry.box.dimensions))
+
+    def _processes(self, dimensions: int) -> int:
+        """Processes that bound rays of a set with so many parameters."""
+        if self.device == "cpu":
+            return self.workers
+        swept = self.sampling.kind == "hierarchical"
+        return processes_that_fit(device_bytes(self.scene.fine, basis_of(dimensions + swept)), self.workers)
 
     def easier(self, poses: PoseSet) -> Iterator[tuple[str, NerfFrame]]:
         """None are known."""
@@ -208,6 +220,7 @@ class NerfMethod:
             "name": scene.name,
             "source": str(scene.source),
             "field": scene.fine.text,
+            "device": self.device,
             "samples": s.samples,
             "near": s.near,
             "far": s.far,

@@ -26,8 +26,9 @@ def _method(scene: NerfScene, options: ProgramOptions, arithmetic: str | None, w
     options.refuse(("gsplat_version",), "is for splats, this run is a NeRF")
     grid = None if options.occupancy_grid is None else load_grid(options.occupancy_grid)
     return NerfMethod(
-        scene, options.renderer, arithmetic, options.sampling, options.num_samples, options.near_plane, grid, workers
-    )
+        scene, options.renderer, arithmetic, options.sampling, options.num_samples, options.near_plane, grid, workers,
+        options.device,
+    )  # fmt: skip
 
 
 NERF = Representation(lambda source: isinstance(source, RunConfig) and holds_nerf(source), _load, _method, rays=True)

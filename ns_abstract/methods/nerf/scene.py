@@ -122,6 +122,11 @@ class FieldWeights:
         )
 
     @property
+    def width(self) -> int:
+        """Most neurons of a layer."""
+        return max(layer.weight.shape[0] for layer in (*self.base, *self.head))
+
+    @property
     def text(self) -> str:
         """The architecture in a few words."""
         skips = [str(i) for i, layer in enumerate(self.base) if layer.skip]

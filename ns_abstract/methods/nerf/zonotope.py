@@ -39,6 +39,8 @@ _ELLIPSES = (1.05, 1.15, 1.3, 1.6, 2.0, 2.6, 3.5, 5.0, 8.0, 14.0, 30.0, 80.0, 30
 #: Last layers of the base whose columns are multiplied in float32, as those of the head: the later a radius begins, the
 #: less it grows.
 _NARROW_LAYERS = 4
+#: Error terms of a piece beyond which it is given up.
+ERROR_TERMS = 400
 #: Roundings of a column's product in float32 beside one by live input: the column, its slope, their product, and the
 #: sums of a step; 2 to spare.
 _NARROW_STEPS = 8
@@ -159,13 +161,19 @@ class FieldBounds:
         basis: Polynomials of the pose.
         limit: Error terms by piece beyond which it is given up.
         device: Where the work is done.
+        compiled: Whether by kernels compiled for a processor; None: where ``device`` is one.
     """
 
     def __init__(
-        self, weights: FieldWeights, basis: ChebyshevBasis, limit: int = 400, device: torch.device | str = "cpu"
+        self,
+        weights: FieldWeights,
+        basis: ChebyshevBasis,
+        limit: int = ERROR_TERMS,
+        device: torch.device | str = "cpu",
+        compiled: bool | None = None,
     ) -> None:
         self.weights, self.basis, self.limit, self.device = weights, basis, limit, torch.device(device)
-        self._compiled = self.device.type == "cpu"
+        self.compiled = self.device.type == "cpu" if compiled is None else compiled
         wide = len(weights.base) - _NARROW_LAYERS
         self.position, self.direction = weights.position_waves, weights.direction_waves
         self._base = [
@@ -180,7 +188,7 @@ class FieldBounds:
         self._evaluation = torch.from_numpy(basis.evaluation).to(device)
         self._fit = torch.from_numpy(np.ascontiguousarray(basis.fit)).to(device)
         self._chord = torch.from_numpy(basis.chord).to(device)
-        self._grid = grid_of(basis) if self._compiled and basis.dimensions == 1 and basis.grid % 2 == 0 else None
+        self._grid = grid_of(basis) if self.compiled and basis.dimensions == 1 and basis.grid % 2 == 0 else None
         degrees = torch.from_numpy(basis.indices).to(device, torch.float64)
         ellipses = torch.tensor(_ELLIPSES, dtype=torch.float64, device=device)
         # [ellipses, d, m]: bound of |Im T_k| on the ellipse of one variable, rounded up
@@ -193,8 +201,8 @@ class FieldBounds:
         weight = torch.from_numpy(layer.weight).to(self.device, torch.float64).T.contiguous()
         bias = torch.from_numpy(layer.bias).to(self.device, torch.float64)
         # only the compiled product gains by float32
-        narrow &= self._compiled
-        lines = functional.pad(weight, (0, -weight.shape[1] % (LINE // 4))) if self._compiled else weight
+        narrow &= self.compiled
+        lines = functional.pad(weight, (0, -weight.shape[1] % (LINE // 4))) if self.compiled else weight
         return _Linear(weight, weight.abs(), bias, lines, lines.float() if narrow else None)
 
     # --- encodings -----------------------------------------------------------------------------
@@ -258,7 +266,7 @@ class FieldBounds:
         """Polynomials, columns, owners and sums of columns times the weight's rows behind the first ``count``."""
         weight = layer.weight[count:]
         (batch, m, _), n = pieces.poly.shape, weight.shape[1]
-        if not self._compiled:
+        if not self.compiled:
             columns = (pieces.columns * pieces.slope[pieces.owner]) @ weight
             columns = torch.cat([columns, weight[pieces.new_neuron] * pieces.new_size[:, None]])
             owner = torch.cat([pieces.owner, pieces.new_owner])
@@ -347,8 +355,9 @@ class FieldBounds:
         low, high = centre - half, centre + half
         e, r = rho[which, neuron], box[which, neuron]
         now_active = low >= e + r
-        slope[which[now_active], neuron[now_active]] = 1.0
-        kink = ~now_active & ~(high <= -(e + r))
+        slope[which, neuron] = now_active.to(torch.float64)
+        # one look at the device for all of them
+        kink = torch.nonzero(~now_active & ~(high <= -(e + r)))[:, 0]
         which, neuron, p, values, low, high, e, r, slack = (
             a[kink] for a in (which, neuron, p, values, low, high, e, r, slack)
         )

@@ -257,6 +257,11 @@ def _row_count(means: Any, file: Path) -> int:
     return shape[0]
 
 
+#: Least squared length of a quaternion. Each of its four squares may be flushed, which changes their sum by 2^-24 of it
+#: at most.
+LEAST_QUATERNION = 2.0**-100
+
+
 def _drawable(arrays: _Arrays, file: Path, fields: dict[str, str]) -> tuple[_Arrays, dict[str, Any]]:
     """Check scales and quaternions; leave out the rows that gsplat can never draw.
 
@@ -272,12 +277,13 @@ def _drawable(arrays: _Arrays, file: Path, fields: dict[str, str]) -> tuple[_Arr
     _require_rows(normal, file, fields["scales"], "exp of the logarithm is not a normal float32")
     squared = np.square(arrays.quats.astype(np.float64)).sum(axis=1)
     zero = squared == 0
-    # Outside this range rsqrt(|q|^2) in the kernel is 0, infinite or depends on the device.
+    # Squares that a device flushes to 0 are then part of the kernel's own rounding (design.md, G6); beyond the largest
+    # float32, rsqrt(|q|^2) is 0.
     _require_rows(
-        zero | ((squared >= low) & (squared <= high)),
+        zero | ((squared >= LEAST_QUATERNION) & (squared <= high)),
         file,
         fields["quats"],
-        "squared length of the quaternion is not a normal float32",
+        "squared length of the quaternion is below 2^-100 or above the largest float32",
     )
     if zero.all():
         problem = "every quaternion is zero, so nothing is drawn"

@@ -216,7 +216,7 @@ def _load(source: RunConfig | Path) -> SplatScene:
 
 
 def _method(scene: SplatScene, options: ProgramOptions, arithmetic: str | None, workers: int) -> SplatMethod:
-    nerf = ("sampling", "num_samples", "near_plane", "occupancy_grid")
+    nerf = ("sampling", "num_samples", "near_plane", "occupancy_grid", "device")
     options.refuse(nerf, "is for runs of vanilla-nerf, this run is a splat")
     if options.renderer == "paper":
         options.refuse(("gsplat_version",), "the paper's renderer is not gsplat")
