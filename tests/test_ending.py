@@ -497,6 +497,7 @@ def test_a_signal_before_and_after_the_work_is_no_traceback(code: str, said: str
         ),
         ImportError("failed to map segment from shared object: Cannot allocate memory"),
         RuntimeError("std::bad_alloc"),
+        RuntimeError("CUDA out of memory. Tried to allocate 2.00 GiB."),
     ],
 )
 @pytest.mark.parametrize("relief", ["give fewer --workers", "raise --downscale-factor"])

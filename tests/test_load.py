@@ -746,6 +746,7 @@ BAD_CHECKPOINTS: dict[str, tuple[Spoil, tuple[str, ...]]] = {
     "scale too small": (_value("scales", 0, -87.4), ("scales", "row 0")),
     "all quaternions zero": (_with(quats=torch.zeros(GAUSSIANS, 4)), ("quats", "zero")),
     "tiny quaternion": (_with(quats=torch.full((GAUSSIANS, 4), 1e-25)), ("quats", "row 0")),
+    "quaternion of flushed squares": (_with(quats=torch.full((GAUSSIANS, 4), 0.499 * 2.0**-50)), ("quats", "2^-100")),
     "huge quaternion": (_with(quats=torch.full((GAUSSIANS, 4), 1e25)), ("quats", "row 0")),
 }
 

@@ -54,6 +54,16 @@ FIELDS = (
         _ZONOTOPE, "FieldBounds._relu", "spread[which, neuron] += error", "pass", _UNITS + "[1-True]",
     ),
     Fault(
+        "layers: where torch works alone, sums of error terms are too small",
+        _ZONOTOPE, "FieldBounds._product", "column_sums(columns, owner, batch)",
+        "0.2 * column_sums(columns, owner, batch)", _LAYERS + "[False-False]",
+    ),
+    Fault(
+        "layers: where torch works alone, what a range shows to be on is off",
+        _ZONOTOPE, "FieldBounds._relu_torch", "slope[which, neuron] = now_active.to(torch.float64)", "pass",
+        _UNITS + "[1-False]",
+    ),
+    Fault(
         "layers: all rows of a block are its first four",
         _LAYER, "multiply", "four_rows(f, (r0 - begin) * k, places, k, w, c, stride, nothing)",
         "four_rows(f, 0, places, k, w, c, stride, nothing)", _PRODUCTS,

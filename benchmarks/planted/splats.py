@@ -17,8 +17,17 @@ _FORM_COLORS = "methods/splat/form_colors.py"
 _LINE_COLORS = "methods/splat/line_colors.py"
 _COLORS = "methods/splat/colors.py"
 _CONSTANTS = "methods/splat/constants.py"
+_LOAD = "methods/splat/load.py"
 
 SPLATS = (
+    Fault(
+        "quaternions whose squares a GPU flushes are taken",
+        _LOAD,
+        "",
+        "LEAST_QUATERNION = 2.0**-100",
+        "LEAST_QUATERNION = 2.0**-126",
+        "test_load.py::test_bad_checkpoint[quaternion of flushed squares]",
+    ),
     Fault(
         "near plane is not uncertain",
         _RECORDS,

@@ -25,7 +25,9 @@ _SIGNALS = (signal.SIGINT, signal.SIGTERM)
 _PATIENCE = 3.0
 #: Bytes of address space below which torch and the compiler cannot start.
 _LEAST_ADDRESS_SPACE = 4 << 30
-_SHORTAGE = ("can't allocate memory", "cannot allocate memory", "bad_alloc", "failed to allocate memory")
+_SHORTAGE = (
+    "can't allocate memory", "cannot allocate memory", "bad_alloc", "failed to allocate memory", "out of memory",
+)  # fmt: skip
 #: Most characters of a complaint about options, which may repeat long options.
 _COMPLAINT = 600
 
