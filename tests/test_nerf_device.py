@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 from nerfs import UNIFORM, pixels_of, poses, tiny_scene
+from test_nerf_certify import COSTLY, cells, outside
 from test_nerf_frame import FIELDS, SETS, attack
 
 from ns_abstract.arithmetic.rounding import UNIT64
@@ -65,6 +66,17 @@ def test_bins_of_the_coarse_pass(device: str) -> None:
     for values in pose_set.box.sample(40, np.random.default_rng(0)):
         colors = frame.renderer.pixels(pose_set.camera, pose_set.pose(values), pixels)
         assert ((found.lower <= colors) & (colors <= found.upper)).all()
+
+
+@pytest.mark.parametrize("device", DEVICES)
+def test_cells_of_certificates(device: str) -> None:
+    scene, pose_set = tiny_scene(3), poses(SETS["orbit"])
+    frame = NerfFrame(scene, UNIFORM, pose_set, device)
+    frame.bounds = NerfBounds(scene, UNIFORM, 1, device, compiled=False)
+    for box in cells(frame.box):
+        found = frame.sets(box, lambda: COSTLY)
+        assert (found.upper - found.lower).mean() < 0.5, "nothing was bounded"
+        assert outside(frame, box, found) == 0
 
 
 def test_a_planted_fault_is_found(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -22,8 +22,8 @@ from ns_abstract.geometry.poses import COLOR_SHIFTS, PoseSet
 from ns_abstract.methods.nerf.bounds import Division, NerfBounds, Pencil, RayBounds, Shifts
 from ns_abstract.methods.nerf.planes import fit_planes
 
-#: Rays that are bounded together.
-GROUP = 8
+#: Rays that are bounded together by compiled kernels, and by torch alone, which wants many cells at a time.
+_GROUP, _GROUP_ON_DEVICE = 8, 64
 #: What an open sample may move a pixel by, by level.
 TOLERANCES = (0.02, 0.005, 0.0012, 3e-4)
 #: Times that, where samples may lie anywhere in their bins: bounds are loose there anyhow.
@@ -93,7 +93,8 @@ class Strips:
         self.pixels, self.run = pixels, run
         self.poses = self.geometry.box
         self.shifting = tuple(name for name in pose_set.box.names if name in COLOR_SHIFTS)
-        self.groups = [slice(k, min(k + GROUP, len(pixels))) for k in range(0, len(pixels), GROUP)]
+        group = _GROUP if bounds.field.compiled else _GROUP_ON_DEVICE
+        self.groups = [slice(k, min(k + group, len(pixels))) for k in range(0, len(pixels), group)]
         self._known: OrderedDict[tuple, _Kept] = OrderedDict()
         self._bytes = 0
         self._layout: Layout | None = None
@@ -265,7 +266,8 @@ class Strips:
                 weights = None if weigh is None else weigh()
                 if weights is None:
                     break
-            cost = np.add.reduceat((weights * _widths(linear)).sum(axis=1), np.arange(0, len(self.pixels), GROUP))
+            starts = [group.start for group in self.groups]
+            cost = np.add.reduceat((weights * _widths(linear)).sum(axis=1), starts)
             # what no level can make good is not begun
             if not _ENOUGH < cost.sum() < TOLERANCES[level - 1] / TOLERANCES[levels - 1]:
                 break
