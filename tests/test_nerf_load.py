@@ -170,9 +170,15 @@ def test_damaged_runs_are_one_line(inputs, tmp_path: Path, monkeypatch, capsys) 
     one_line(*call(monkeypatch, capsys, flags(inputs, tmp_path / "out")), str(checkpoint))
 
 
-def test_samples_are_an_option_of_nerfs_alone(blobs, tmp_path: Path, monkeypatch, capsys) -> None:
-    options = blobs.options(tmp_path / "out", num_samples=8)
-    one_line(*call(monkeypatch, capsys, options), "--num-samples")
+@pytest.mark.parametrize(("option", "value"), [("num_samples", 8), ("device", "cpu")])
+def test_options_of_nerfs_alone(blobs, tmp_path: Path, monkeypatch, capsys, option: str, value: object) -> None:
+    options = blobs.options(tmp_path / "out", **{option: value})
+    one_line(*call(monkeypatch, capsys, options), "--" + option.replace("_", "-"))
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="there is a CUDA device")
+def test_a_device_that_is_not_there_is_one_line(inputs, tmp_path: Path, monkeypatch, capsys) -> None:
+    one_line(*call(monkeypatch, capsys, flags(inputs, tmp_path / "out", "--device", "cuda")), "--device")
 
 
 def test_the_papers_renderer_is_black_behind(inputs: dict[str, Path]) -> None:
