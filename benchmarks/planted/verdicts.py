@@ -250,6 +250,7 @@ VERDICTS = (
         "batch.bytes > min(ROWS_AT_ONCE, self.memory // 16)",
         "batch.bytes > 1 << 62",
         "test_network_bounds.py::test_rows_that_end_by_plan_keep_within_memory",
+        True,
     ),
     Fault(
         "network: sums of a softmax that are cut off are exact",
