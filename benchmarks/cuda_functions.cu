@@ -166,10 +166,20 @@ struct Patterns {
     }
 };
 
+// Numbers as a row of the table has them.
+std::string listed(const float *values, int count) {
+    std::string found;
+    for (int k = 0; k < count; ++k) {
+        char text[32];
+        snprintf(text, sizeof(text), "%.9g", exact_double(values[k]));
+        found += (k ? ", " : "") + std::string(text);
+    }
+    return found;
+}
+
 template <class F> std::string one_argument(const F &f, uint64_t index) {
-    char text[64];
-    snprintf(text, sizeof(text), "%.9g", exact_double(as_float(f.patterns(index))));
-    return text;
+    const float x = as_float(f.patterns(index));
+    return listed(&x, 1);
 }
 
 // --- One function each -----------------------------------------------------------------------------------------------
@@ -225,8 +235,22 @@ struct Logarithm {
     }
 };
 
-struct Root {
+struct SquareRoot {
     static constexpr const char *NAME = "sqrtf(x)";
+    static HD float tested(float x) { return tested_sqrt(x); }
+    static HD double exact(double x) { return ::sqrt(x); }
+    static HD double charge(const Charges &c) { return c.sqrt; }
+};
+
+struct ReciprocalRoot {
+    static constexpr const char *NAME = "rsqrtf(x)";
+    static HD float tested(float x) { return tested_rsqrt(x); }
+    static HD double exact(double x) { return 1.0 / ::sqrt(x); }
+    static HD double charge(const Charges &c) { return c.rsqrt; }
+};
+
+template <class F> struct Rooted {
+    static constexpr const char *NAME = F::NAME;
     static constexpr int RANGES = 2;
     static const Range *ranges() {
         static const Range all[] = {{"x normal", "2^-24"}, {"x subnormal", "2^-24"}};
@@ -239,26 +263,9 @@ struct Root {
         const float x = as_float(patterns(index));
         const double wide = exact_double(x);
         if (!is_finite(x) || wide <= 0) return;
-        const double exact = ::sqrt(wide), error = fabs(exact_double(tested_sqrt(x)) - exact);
+        const double exact = F::exact(wide), error = fabs(exact_double(F::tested(x)) - exact);
         const bool small = is_subnormal(x);
-        emit(small ? 1 : 0, error, exact * UNIT, ulp(exact), small ? NOT_CHARGED : c.sqrt);
-    }
-};
-
-struct ReciprocalRoot {
-    static constexpr const char *NAME = "rsqrtf(x)";
-    static constexpr int RANGES = 2;
-    static const Range *ranges() { return Root::ranges(); }
-    Patterns patterns;
-    Charges c;
-    std::string at(uint64_t index) const { return one_argument(*this, index); }
-    template <class E> HD void operator()(uint64_t index, E emit) const {
-        const float x = as_float(patterns(index));
-        const double wide = exact_double(x);
-        if (!is_finite(x) || wide <= 0) return;
-        const double exact = 1.0 / ::sqrt(wide), error = fabs(exact_double(tested_rsqrt(x)) - exact);
-        const bool small = is_subnormal(x);
-        emit(small ? 1 : 0, error, exact * UNIT, ulp(exact), small ? NOT_CHARGED : c.rsqrt);
+        emit(small ? 1 : 0, error, exact * UNIT, ulp(exact), small ? NOT_CHARGED : F::charge(c));
     }
 };
 
@@ -379,11 +386,9 @@ struct Sums {
         a = as_float(first), b = as_float(second), other = as_float(third);
     }
     std::string at(uint64_t index) const {
-        float a, b, other;
-        draw(index, a, b, other);
-        char text[128];
-        snprintf(text, sizeof(text), "%.9g, %.9g, %.9g", exact_double(a), exact_double(b), exact_double(other));
-        return text;
+        float drawn[3];
+        draw(index, drawn[0], drawn[1], drawn[2]);
+        return listed(drawn, 3);
     }
     template <class E> HD void compare(int range, double odd, float got, E emit) const {
         const bool tiny = fabs(odd) < TINY;
@@ -436,9 +441,7 @@ struct Rotation {
     std::string at(uint64_t index) const {
         float q[4];
         draw(index, q);
-        char text[128];
-        snprintf(text, sizeof(text), "(%.9g, %.9g, %.9g, %.9g)", q[0], q[1], q[2], q[3]);
-        return text;
+        return "(" + listed(q, 4) + ")";
     }
     template <class E> HD void operator()(uint64_t index, E emit) const {
         float q[4], r[9];
@@ -477,9 +480,7 @@ struct Direction {
     std::string at(uint64_t index) const {
         float d[3];
         draw(index, d);
-        char text[96];
-        snprintf(text, sizeof(text), "(%.9g, %.9g, %.9g)", d[0], d[1], d[2]);
-        return text;
+        return "(" + listed(d, 3) + ")";
     }
     template <class E> HD void operator()(uint64_t index, E emit) const {
         float d[3];
@@ -747,8 +748,8 @@ int main(int count, char **arguments) {
     const uint64_t inputs = patterns.inputs < 1ull << 32 ? patterns.inputs : 1ull << 32;
     measure(Exponential{patterns, c}, inputs);
     measure(Logarithm{patterns, c}, inputs);
-    measure(Root{patterns, c}, inputs);
-    measure(ReciprocalRoot{patterns, c}, inputs);
+    measure(Rooted<SquareRoot>{patterns, c}, inputs);
+    measure(Rooted<ReciprocalRoot>{patterns, c}, inputs);
     measure(Reciprocal{patterns, c}, inputs);
     measure(Quotient{c}, sample ? sample : 1ull << 35);
     measure(Sums{c}, sample ? sample : 10000000000ull);

@@ -361,10 +361,11 @@ class Cells:
         used = share.flatten(1).amax(dim=1)
         found = torch.cat([torch.cat(rows, dim=1).double(), used[:, None]], dim=1).cpu().numpy()
         tally.renders += len(poses)
-        tally.outside += int(found[:, :-1][:, 0::3].sum())
-        tally.comparisons += int(found[:, :-1][:, 1::3].sum())
-        excess = found[:, :-1][:, 2::3]
-        if int(found[:, :-1][:, 0::3].sum()) and (tally.worst is None or excess.max() > tally.excess):
+        # by render and part: how many are outside, how many were compared, the largest excess
+        outside, compared, excess = np.moveaxis(found[:, :-1].reshape(len(found), -1, 3), 2, 0)
+        tally.outside += int(outside.sum())
+        tally.comparisons += int(compared.sum())
+        if outside.any() and (tally.worst is None or excess.max() > tally.excess):
             render, part = np.unravel_index(int(excess.argmax()), excess.shape)
             tally.worst = self._place(number, poses[render], [values[render] for values, *_ in parts], parts, int(part))
         tally.excess = max(tally.excess, float(excess.max()))

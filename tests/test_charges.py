@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
-import importlib.util
-import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
+from benchmark_scripts import script
 
 from ns_abstract.arithmetic.rounding import FLOAT32, REAL, Arithmetic, Charges, charges
 from ns_abstract.geometry.camera_path import Camera
@@ -19,13 +17,7 @@ from ns_abstract.methods.splat.constants import GSPLAT_1_4_0
 from ns_abstract.methods.splat.scene import SplatScene
 from ns_abstract.perturbation.specification import Perturbation
 
-LEDGER = Path(__file__).resolve().parents[1] / "benchmarks" / "ledger.py"
-if not LEDGER.exists():
-    pytest.skip("the benchmarks are not beside the tests", allow_module_level=True)
-_spec = importlib.util.spec_from_file_location("ledger", LEDGER)
-assert _spec is not None and _spec.loader is not None
-ledger = sys.modules["ledger"] = importlib.util.module_from_spec(_spec)
-_spec.loader.exec_module(ledger)
+ledger = script("ledger")
 
 MEASURED = [name for name in Charges._fields if name not in ledger.UNMEASURED]
 #: Values that matter where twice as much is too little to be seen.

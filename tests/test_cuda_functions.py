@@ -2,36 +2,26 @@
 
 from __future__ import annotations
 
-import importlib.util
 import json
 import shutil
-import sys
 from pathlib import Path
 from types import ModuleType
 from typing import Any
 
 import numpy as np
 import pytest
+from benchmark_scripts import BENCHMARKS, script
 
 from ns_abstract.arithmetic.rounding import FLOAT32, UNIT32, charges
 from ns_abstract.io.errors import InputError
 from ns_abstract.methods.splat.load import scene_from_parameters
-
-SCRIPT = Path(__file__).resolve().parents[1] / "benchmarks" / "cuda_functions.py"
-if not SCRIPT.exists():
-    pytest.skip("the benchmarks are not beside the tests", allow_module_level=True)
 
 compiled = pytest.mark.skipif(shutil.which("g++") is None, reason="g++ is not installed: the host's build needs it")
 
 
 @pytest.fixture(scope="module")
 def program() -> ModuleType:
-    spec = importlib.util.spec_from_file_location("cuda_functions", SCRIPT)
-    assert spec is not None and spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    sys.modules["cuda_functions"] = module
-    spec.loader.exec_module(module)
-    return module
+    return script("cuda_functions")
 
 
 @pytest.fixture(scope="module")
@@ -105,7 +95,7 @@ def test_planted_charges_are_exceeded(program: ModuleType, binary: Path, tmp_pat
 @compiled
 def test_one_wrong_result_is_found(program: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """One input in some hundred thousand: no number in one build, off by eight ulps in the other."""
-    text = SCRIPT.with_suffix(".cu").read_text(encoding="utf-8")
+    text = (BENCHMARKS / "cuda_functions.cu").read_text(encoding="utf-8")
     right = "{ return static_cast<float>(std::exp(static_cast<double>(x))); }"
     for wrong in ("NAN", "std::exp(x) * (1.f + 0x1p-20f)"):
         changed = tmp_path / "changed.cu"

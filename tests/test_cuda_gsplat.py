@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import json
 import math
-import sys
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -13,6 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from benchmark_scripts import script
 from conftest import blob_scene
 
 from ns_abstract.arithmetic.rounding import FLOAT32
@@ -26,21 +26,13 @@ from ns_abstract.methods.splat.reference import Reference
 from ns_abstract.methods.splat.scene import SplatScene
 from ns_abstract.perturbation.specification import parse_perturbation
 
-BENCHMARKS = Path(__file__).resolve().parents[1] / "benchmarks"
-if not BENCHMARKS.is_dir():
-    pytest.skip("the benchmarks are not beside the tests", allow_module_level=True)
 SIZE = 12
 SHIFT = 0.02
 
 
 @pytest.fixture(scope="module")
 def cuda() -> Any:
-    sys.path.insert(0, str(BENCHMARKS))
-    try:
-        import cuda_gsplat
-    finally:
-        sys.path.remove(str(BENCHMARKS))
-    return cuda_gsplat
+    return script("cuda_gsplat")
 
 
 class ByReference:

@@ -2,31 +2,24 @@
 
 from __future__ import annotations
 
-import importlib.util
 import re
-import sys
 from pathlib import Path
 from types import ModuleType
 
 import numpy as np
 import pytest
+from benchmark_scripts import script
 from PIL import Image
 
 ROOT = Path(__file__).resolve().parents[1]
-SCRIPT, PAGE = ROOT / "benchmarks" / "gallery.py", ROOT / "docs" / "gallery.md"
-if not (SCRIPT.exists() and PAGE.exists()):
+PAGE = ROOT / "docs" / "gallery.md"
+if not PAGE.exists():
     pytest.skip("the documentation is not beside the tests", allow_module_level=True)
 
 
 @pytest.fixture(scope="module")
 def gallery() -> ModuleType:
-    spec = importlib.util.spec_from_file_location("gallery", SCRIPT)
-    assert spec is not None and spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    # dataclasses look their module up
-    sys.modules["gallery"] = module
-    spec.loader.exec_module(module)
-    return module
+    return script("gallery")
 
 
 def test_the_page_shows_the_commands_that_are_run(gallery: ModuleType) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -10,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from benchmark_scripts import BENCHMARKS, script
 from torch import nn
 
 import ns_abstract as nsa
@@ -24,24 +24,14 @@ from ns_abstract.verify.model import NetworkModel
 from ns_abstract.verify.network import load_network
 from ns_abstract.verify.preprocess import Preprocess
 
-BENCHMARKS = Path(__file__).resolve().parents[1] / "benchmarks"
 NETWORKS = BENCHMARKS / "networks"
-if not NETWORKS.is_dir():
-    pytest.skip("the benchmarks are not beside the tests", allow_module_level=True)
 
 
 @pytest.fixture(scope="module")
 def scripts() -> Any:
-    """The modules of the benchmarks, which import each other by their plain names."""
-    sys.path.insert(0, str(BENCHMARKS))
-    try:
-        import certify_views
-        import objects
-        import train_views
-        import views
-    finally:
-        sys.path.remove(str(BENCHMARKS))
-    return SimpleNamespace(objects=objects, train=train_views, views=views, certify=certify_views)
+    return SimpleNamespace(
+        objects=script("objects"), train=script("train_views"), views=script("views"), certify=script("certify_views")
+    )
 
 
 def judge(name: str) -> NetworkModel:

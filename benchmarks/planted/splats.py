@@ -24,8 +24,8 @@ SPLATS = (
         "quaternions whose squares a GPU flushes are taken",
         _LOAD,
         "",
-        "LEAST_QUATERNION = 2.0**-100",
-        "LEAST_QUATERNION = 2.0**-126",
+        "_LEAST_QUATERNION = 2.0**-100",
+        "_LEAST_QUATERNION = 2.0**-126",
         "test_load.py::test_bad_checkpoint[quaternion of flushed squares]",
     ),
     Fault(

@@ -130,7 +130,7 @@ class NerfFrame:
         self.bounds = NerfBounds(*self._recipe)
         weights = sum(array.size for array in scene.fine.arrays())
         self.workers = workers
-        rays = _RAYS_ON_DEVICE if device != "cpu" else int(np.clip(_WORK // weights, 1, 32))
+        rays = int(np.clip(_WORK // weights, 1, 32)) if self.bounds.field.compiled else _RAYS_ON_DEVICE
         self.tiles_at_once = workers * rays
         self._witness: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None
 

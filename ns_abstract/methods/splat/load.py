@@ -37,6 +37,10 @@ _MODEL_DEFAULTS: dict[str, Any] = {
 }
 _PARAMETERS = ("means", "scales", "quats", "features_dc", "features_rest", "opacities")
 
+#: Least squared length of a quaternion. Each of its four squares may be flushed, which changes their sum by 2^-24 of it
+#: at most.
+_LEAST_QUATERNION = 2.0**-100
+
 _PLY_HEADER_LIMIT = 64 * 2**10
 _PLY_SIZES = {
     **dict.fromkeys(("char", "uchar", "int8", "uint8"), 1),
@@ -257,11 +261,6 @@ def _row_count(means: Any, file: Path) -> int:
     return shape[0]
 
 
-#: Least squared length of a quaternion. Each of its four squares may be flushed, which changes their sum by 2^-24 of it
-#: at most.
-LEAST_QUATERNION = 2.0**-100
-
-
 def _drawable(arrays: _Arrays, file: Path, fields: dict[str, str]) -> tuple[_Arrays, dict[str, Any]]:
     """Check scales and quaternions; leave out the rows that gsplat can never draw.
 
@@ -280,7 +279,7 @@ def _drawable(arrays: _Arrays, file: Path, fields: dict[str, str]) -> tuple[_Arr
     # Squares that a device flushes to 0 are then part of the kernel's own rounding (design.md, G6); beyond the largest
     # float32, rsqrt(|q|^2) is 0.
     _require_rows(
-        zero | ((squared >= LEAST_QUATERNION) & (squared <= high)),
+        zero | ((squared >= _LEAST_QUATERNION) & (squared <= high)),
         file,
         fields["quats"],
         "squared length of the quaternion is below 2^-100 or above the largest float32",
