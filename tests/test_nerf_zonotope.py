@@ -280,7 +280,7 @@ def test_products_leave_out_what_is_off(kind: type, inputs: int, live: int, outp
     )  # fmt: skip
     begin, new_begin = (np.concatenate([[0], np.cumsum(c)]) for c in (counts, new_counts))
     terms = Terms(columns, begin, slope, new_begin, neuron, sizes)
-    lines = np.full((inputs, outputs + -outputs % (LINE // 4)), np.nan)
+    lines = np.full((inputs, outputs + -outputs % (LINE // 2)), np.nan)
     lines[:, :outputs] = wide
     linear(poly, np.where(off, 0.0, 1.0), terms, lines, lines.astype(kind), out)
     np.testing.assert_allclose(out.poly, np.where(off[:, None], 0.0, poly) @ wide, atol=1e-12)

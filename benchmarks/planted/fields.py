@@ -65,16 +65,17 @@ FIELDS = (
     ),
     Fault(
         "layers: all rows of a block are its first four",
-        _LAYER, "multiply", "four_rows(f, (r0 - begin) * k, places, k, w, c, stride, nothing)",
-        "four_rows(f, 0, places, k, w, c, stride, nothing)", _PRODUCTS,
+        _LAYER, "multiply", "four_rows(f, rows_from(first, count - 1, inputs), places, k, w, c, stride, line, nothing)",
+        "four_rows(f, rows_from(0, count - 1, inputs), places, k, w, c, stride, line, nothing)", _PRODUCTS,
     ),
     Fault(
         "layers: the end of a product's row is its last line's beginning",
-        _LAYER, "multiply", "rest[r - r0, j - c]", "rest[r - r0, 0]", _PRODUCTS,
+        _LAYER, "multiply", "rest[r - first, j - c]", "rest[r - first, 0]", _PRODUCTS,
     ),
     Fault(
         "layers: a product takes the first rows of the weight, not those of what is live",
-        "arithmetic/simd/products.py", "four_rows", "at + stride * lines[i]", "at + stride * i", _PRODUCTS,
+        "arithmetic/simd/products.py", "four_rows", "load_line(elements, at + stride * k)",
+        "load_line(elements, at + stride * i)", _PRODUCTS,
     ),
     Fault(
         "layers: open neurons are left out as those that are off",
@@ -114,8 +115,8 @@ FIELDS = (
     ),
     Fault(
         "compiled units: values on the grid are without the highest degrees",
-        _RELU, "_multiply", "four_rows(factors, ROWS * count * block, lines, count, elements, c, LANES, nothing)",
-        "four_rows(factors, ROWS * count * block, lines, count - 4, elements, c, LANES, nothing)", _UNITS + "[1-True]",
+        _RELU, "_multiply", "four_rows(factors, rows, places, terms, elements, c, LANES, line, nothing)",
+        "four_rows(factors, rows, places, terms - 4, elements, c, LANES, line, nothing)", _UNITS + "[1-True]",
     ),
     Fault(
         "fields: what is left of a dim cell is its polynomial's alone",

@@ -12,55 +12,40 @@ import numpy as np
 from numba import njit
 
 from ns_abstract.arithmetic.simd.intrinsics import pointer
-from ns_abstract.arithmetic.simd.lanes import LINE, load_line, store
-from ns_abstract.arithmetic.simd.products import ROWS, four_rows
+from ns_abstract.arithmetic.simd.lanes import LINE, load_line
+from ns_abstract.arithmetic.simd.products import ROWS, four_rows, rows_from, store_rows
 
 #: Rows of a product that pass a line of the weight while it stays in a core's first cache; a multiple of `ROWS`.
 BLOCK = 32
 
 
 @njit(cache=True, error_model="numpy")
-def multiply(x, live, scale, weight, factors, rest, out):
-    """``out[r] = sum_i x[r, live[i]] scale[i] weight[live[i]]``.
+def multiply(x, live, weight, rest, out):
+    """``out[r] = sum_i x[r, live[i]] weight[live[i]]``.
 
     Args:
         x: [R, inputs].
-        live, scale: [k] inputs, and what they are multiplied by first.
-        weight: [inputs, n and more, to whole lines].
-        factors: [BLOCK inputs] scratch.
-        rest: [ROWS, a line] scratch.
+        live: [k] inputs.
+        weight: [inputs, n and more, to whole pairs of lines].
+        rest: [ROWS, two lines] scratch.
         out: [R, n].
     """
-    (count, n), stride, lanes, k = out.shape, weight.shape[1], LINE // weight.itemsize, live.shape[0]
-    w, f, o, s, places = pointer(weight), pointer(factors), pointer(out), pointer(rest), pointer(live)
+    (count, n), (inputs, stride) = out.shape, weight.shape
+    line, k = LINE // weight.itemsize, live.shape[0]
+    w, f, o, s, places = pointer(weight), pointer(x), pointer(out), pointer(rest), pointer(live)
     rest[:] = 0.0
-    nothing = load_line(s, 0)
+    nothing, pair = load_line(s, 0), 2 * line
     for begin in range(0, count, BLOCK):
-        past = min(begin + BLOCK, count)
-        for r0 in range(begin, past, ROWS):
-            # the last row fills up the last step
-            r1, r2, r3 = min(r0 + 1, count - 1), min(r0 + 2, count - 1), min(r0 + 3, count - 1)
-            at = (r0 - begin) * k
-            for i in range(k):
-                j, g = live[i], scale[i]
-                f[at], f[at + 1], f[at + 2], f[at + 3] = x[r0, j] * g, x[r1, j] * g, x[r2, j] * g, x[r3, j] * g
-                at += ROWS
-        for c in range(0, n, lanes):
-            for r0 in range(begin, past, ROWS):
-                t0, t1, t2, t3 = four_rows(f, (r0 - begin) * k, places, k, w, c, stride, nothing)
-                if c + lanes <= n:
-                    store(o, r0 * n + c, t0)
-                    store(o, min(r0 + 1, count - 1) * n + c, t1)
-                    store(o, min(r0 + 2, count - 1) * n + c, t2)
-                    store(o, min(r0 + 3, count - 1) * n + c, t3)
+        for c in range(0, n, pair):
+            for first in range(begin, min(begin + BLOCK, count), ROWS):
+                sums = four_rows(f, rows_from(first, count - 1, inputs), places, k, w, c, stride, line, nothing)
+                if c + pair <= n:
+                    store_rows(o, rows_from(first, count - 1, n), c, line, sums)
                     continue
-                store(s, 0, t0)
-                store(s, lanes, t1)
-                store(s, 2 * lanes, t2)
-                store(s, 3 * lanes, t3)
-                for r in range(r0, min(r0 + ROWS, count)):
+                store_rows(s, rows_from(0, ROWS - 1, pair), 0, line, sums)
+                for r in range(first, min(first + ROWS, count)):
                     for j in range(c, n):
-                        out[r, j] = rest[r - r0, j - c]
+                        out[r, j] = rest[r - first, j - c]
 
 
 class Terms(NamedTuple):
@@ -104,26 +89,31 @@ def linear(poly, size, terms, wide, weight, out):
         poly: [B, m, inputs].
         size: [B, inputs] 0 where a neuron is off: what the other arrays hold there is not looked at.
         terms: `Terms`.
-        wide, weight: [inputs, n and more, to whole lines] for polynomials, float64, and for columns, of their type.
+        wide, weight: [inputs, n and more, to whole pairs of lines] for polynomials, float64, and for columns, of their type.
         out: `Product`, filled.
     """
     inputs, n = wide.shape[0], out.poly.shape[2]
-    live, gain, ones = np.empty(inputs, np.int64), np.empty(inputs, weight.dtype), np.ones(inputs, np.float64)
-    factors, factors_wide = np.empty(BLOCK * inputs, weight.dtype), np.empty(BLOCK * inputs, np.float64)
-    rest = np.empty((ROWS, LINE // weight.itemsize), weight.dtype)
-    rest_wide = np.empty((ROWS, LINE // wide.itemsize), np.float64)
+    live, gain = np.empty(inputs, np.int64), np.empty(inputs, weight.dtype)
+    scaled = np.empty((BLOCK, inputs), weight.dtype)
+    rest = np.empty((ROWS, 2 * LINE // weight.itemsize), weight.dtype)
+    rest_wide = np.empty((ROWS, 2 * LINE // wide.itemsize), np.float64)
     place = 0
     for b in range(poly.shape[0]):
         count = 0
         for j in range(inputs):
             if size[b, j] != 0.0:
-                live[count], gain[count] = j, terms.slope[b, j]
+                live[count] = j
                 count += 1
-        multiply(poly[b], live[:count], ones, wide, factors_wide, rest_wide, out.poly[b])
+            gain[j] = terms.slope[b, j]
+        multiply(poly[b], live[:count], wide, rest_wide, out.poly[b])
         first = place
-        columns = terms.columns[terms.begin[b] : terms.begin[b + 1]]
-        place += columns.shape[0]
-        multiply(columns, live[:count], gain, weight, factors, rest, out.columns[first:place])
+        for begin in range(terms.begin[b], terms.begin[b + 1], BLOCK):
+            past = min(begin + BLOCK, terms.begin[b + 1])
+            for c in range(begin, past):
+                for j in range(inputs):
+                    scaled[c - begin, j] = terms.columns[c, j] * gain[j]
+            multiply(scaled[: past - begin], live[:count], weight, rest, out.columns[place : place + past - begin])
+            place += past - begin
         for c in range(terms.new_begin[b], terms.new_begin[b + 1]):
             for j in range(n):
                 out.columns[place, j] = terms.new_size[c] * wide[terms.new_neuron[c], j]

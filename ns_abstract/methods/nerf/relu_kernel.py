@@ -13,8 +13,8 @@ from numba import njit
 from ns_abstract.arithmetic.chebyshev import ChebyshevBasis
 from ns_abstract.arithmetic.rounding import CHEBYSHEV_ROUNDING, FIELD_UP, UNIT64
 from ns_abstract.arithmetic.simd.intrinsics import pointer
-from ns_abstract.arithmetic.simd.lanes import LINE, load_line, store
-from ns_abstract.arithmetic.simd.products import ROWS, four_rows
+from ns_abstract.arithmetic.simd.lanes import LINE, load_line
+from ns_abstract.arithmetic.simd.products import ROWS, four_rows, rows_from, store_rows
 
 #: Neurons side by side.
 LANES = 32
@@ -27,7 +27,7 @@ class Grid(NamedTuple):
 
     Attributes:
         points: (g + 1) / 2.
-        even, odd: Values [points, .] of the basis' even and odd degrees, as `_packed` has them.
+        even, odd: Values [points, .] of the basis' even and odd degrees, with rows of zeros to whole `ROWS`.
         fit_even, fit_odd: The fit [., points] of even and odd degrees, likewise.
         order: 0, 1, 2, ..., for as many as these matrices have columns.
         chord: [m].
@@ -44,45 +44,39 @@ class Grid(NamedTuple):
     norming: float
 
 
-def _packed(matrix: np.ndarray) -> np.ndarray:
-    """[., columns, ROWS] of a ``matrix``: so many rows side by side, with rows of zeros behind the last."""
-    rows, columns = matrix.shape
-    whole = np.zeros((rows + -rows % ROWS, columns))
-    whole[:rows] = matrix
-    return np.ascontiguousarray(whole.reshape(-1, ROWS, columns).transpose(0, 2, 1))
+def _whole(matrix: np.ndarray) -> np.ndarray:
+    """``matrix`` [., columns] with rows of zeros behind its last to whole `ROWS`."""
+    return np.pad(matrix, ((0, -len(matrix) % ROWS), (0, 0)))
 
 
 def grid_of(basis: ChebyshevBasis) -> Grid:
     """The grid of a ``basis`` of one variable, whose ``grid`` is even."""
     points = basis.grid // 2 + 1
     values, fit = basis.evaluation[:points], basis.fit[:, :points]
-    even, odd, fit_even, fit_odd = map(_packed, (values[:, 0::2], values[:, 1::2], fit[0::2], fit[1::2]))
+    even, odd, fit_even, fit_odd = map(_whole, (values[:, 0::2], values[:, 1::2], fit[0::2], fit[1::2]))
     return Grid(points, even, odd, fit_even, fit_odd, np.arange(max(points, basis.size)), basis.chord, basis.norming)
 
 
 @njit(cache=True, error_model="numpy")
 def _multiply(matrix, order, lanes, out):
-    """``out = matrix @ lanes``, [R, LANES] of a `_packed` [R, K] and [K, LANES]; ``order``: see `Grid`."""
-    blocks, count, _ = matrix.shape
+    """``out = matrix @ lanes``, [R, LANES] of [R, K] and [K, LANES]; R: whole `ROWS`; ``order``: see `Grid`."""
+    count, terms = matrix.shape
     factors, elements, results = pointer(matrix), pointer(lanes), pointer(out)
-    lines, step = pointer(order), LINE // lanes.itemsize
+    places, line = pointer(order), LINE // lanes.itemsize
     out[0] = 0.0
     nothing = load_line(results, 0)
-    for block in range(blocks):
-        for c in range(0, LANES, step):
-            t0, t1, t2, t3 = four_rows(factors, ROWS * count * block, lines, count, elements, c, LANES, nothing)
-            at = ROWS * LANES * block + c
-            store(results, at, t0)
-            store(results, at + LANES, t1)
-            store(results, at + 2 * LANES, t2)
-            store(results, at + 3 * LANES, t3)
+    for first in range(0, count, ROWS):
+        rows = rows_from(first, count - 1, terms)
+        for c in range(0, LANES, 2 * line):
+            sums = four_rows(factors, rows, places, terms, elements, c, LANES, line, nothing)
+            store_rows(results, rows_from(first, count - 1, LANES), c, line, sums)
 
 
 @njit(cache=True, error_model="numpy")
 def _scratch(grid):
     """Zeros for coefficients of even and odd degrees, and room for their sums, [., LANES]."""
-    degrees = np.zeros((ROWS * grid.fit_even.shape[0], LANES)), np.zeros((ROWS * grid.fit_odd.shape[0], LANES))
-    return (*degrees, np.empty((ROWS * grid.even.shape[0], LANES)), np.empty((ROWS * grid.odd.shape[0], LANES)))
+    degrees = np.zeros((grid.fit_even.shape[0], LANES)), np.zeros((grid.fit_odd.shape[0], LANES))
+    return (*degrees, np.empty((grid.even.shape[0], LANES)), np.empty((grid.odd.shape[0], LANES)))
 
 
 @njit(cache=True, error_model="numpy")

@@ -136,7 +136,7 @@ class Affine:
 class _Linear:
     """A linear layer: transposed ``weight`` [in, out], its ``absolute`` value and ``bias`` [out], all float64.
 
-    For compiled products: ``lines``, the weight with zeros behind its rows to whole lines, and ``narrow``, the same in
+    For compiled products: ``lines``, the weight with zeros behind its rows to whole pairs of lines, and ``narrow``, the same in
     float32, which it is exactly, where columns are multiplied in that.
     """
 
@@ -202,7 +202,7 @@ class FieldBounds:
         bias = torch.from_numpy(layer.bias).to(self.device, torch.float64)
         # only the compiled product gains by float32
         narrow &= self.compiled
-        lines = functional.pad(weight, (0, -weight.shape[1] % (LINE // 4))) if self.compiled else weight
+        lines = functional.pad(weight, (0, -weight.shape[1] % (LINE // 2))) if self.compiled else weight
         return _Linear(weight, weight.abs(), bias, lines, lines.float() if narrow else None)
 
     # --- encodings -----------------------------------------------------------------------------
