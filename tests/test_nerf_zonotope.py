@@ -13,7 +13,7 @@ from nerfs import raw_outputs, tiny_weights
 from ns_abstract.arithmetic.simd.lanes import LINE
 from ns_abstract.methods.nerf import zonotope
 from ns_abstract.methods.nerf.bounds import basis_of, greatest, opacity
-from ns_abstract.methods.nerf.layer_kernel import BLOCK, Product, Terms, linear
+from ns_abstract.methods.nerf.layer_kernel import BLOCK, Before, Behind, Weights, linear
 from ns_abstract.methods.nerf.scene import Encoding, FieldWeights, Layer
 from ns_abstract.methods.nerf.zonotope import Affine, FieldBounds
 
@@ -274,16 +274,21 @@ def test_products_leave_out_what_is_off(kind: type, inputs: int, live: int, outp
     sizes = rng.uniform(size=len(neuron))
     wide = rng.normal(size=(inputs, outputs)).astype(np.float32).astype(np.float64)
     total = len(owner) + len(neuron)
-    out = Product(
+    out = Behind(
         np.full((batch, m, outputs), np.nan), np.full((total, outputs), np.nan, kind), np.full(total, -1),
-        np.full((batch, outputs), np.nan),
+        *np.full((2, batch, outputs), np.nan),
     )  # fmt: skip
-    begin, new_begin = (np.concatenate([[0], np.cumsum(c)]) for c in (counts, new_counts))
-    terms = Terms(columns, begin, slope, new_begin, neuron, sizes)
+    rest = np.where(off, np.nan, rng.uniform(size=(batch, inputs)))
+    before = Before(poly, np.where(off, 0.0, 1.0), rest, rest, slope, columns, owner, new_owner, neuron, sizes)
     lines = np.full((inputs, outputs + -outputs % (LINE // 2)), np.nan)
     lines[:, :outputs] = wide
-    linear(poly, np.where(off, 0.0, 1.0), terms, lines, lines.astype(kind), out)
-    np.testing.assert_allclose(out.poly, np.where(off[:, None], 0.0, poly) @ wide, atol=1e-12)
+    bias = rng.normal(size=outputs)
+    weights = Weights(lines, lines.astype(kind), np.abs(wide), bias, 0.0, 0.0, 0.0)
+    linear(before, weights, poly[:0, :, :outputs], rest[:0], out)
+    result = np.where(off[:, None], 0.0, poly) @ wide
+    result[:, 0] += bias
+    np.testing.assert_allclose(out.poly, result, atol=1e-12)
+    np.testing.assert_allclose(out.box, np.where(off, 0.0, rest) @ np.abs(wide), atol=1e-12)
     for b in range(batch):
         old = np.where(off[b], 0.0, columns[owner == b] * slope[b]).astype(np.float64) @ wide
         new = sizes[new_owner == b, None] * wide[neuron[new_owner == b]]
@@ -362,22 +367,22 @@ def faulty_remainder(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def faulty_columns(monkeypatch: pytest.MonkeyPatch) -> None:
-    product = FieldBounds._product
+    linear = FieldBounds._linear
 
-    def narrowed(self: FieldBounds, pieces: zonotope.Pieces, *arguments: object) -> tuple[torch.Tensor, ...]:
-        return product(self, replace(pieces, slope=0.1 * pieces.slope), *arguments)  # type: ignore[arg-type]
+    def narrowed(self: FieldBounds, pieces: zonotope.Pieces, *arguments: object) -> Affine:
+        return linear(self, replace(pieces, slope=0.1 * pieces.slope), *arguments)  # type: ignore[arg-type]
 
-    monkeypatch.setattr(FieldBounds, "_product", narrowed)
+    monkeypatch.setattr(FieldBounds, "_linear", narrowed)
 
 
 def faulty_sums(monkeypatch: pytest.MonkeyPatch) -> None:
-    product = FieldBounds._product
+    linear = FieldBounds._linear
 
-    def narrowed(self: FieldBounds, *arguments: object) -> tuple[torch.Tensor, ...]:
-        *found, spread = product(self, *arguments)  # type: ignore[arg-type]
-        return *found, 0.1 * spread
+    def narrowed(self: FieldBounds, *arguments: object) -> Affine:
+        found = linear(self, *arguments)  # type: ignore[arg-type]
+        return replace(found, spread=0.1 * found.spread)
 
-    monkeypatch.setattr(FieldBounds, "_product", narrowed)
+    monkeypatch.setattr(FieldBounds, "_linear", narrowed)
 
 
 @pytest.mark.parametrize(

@@ -11,12 +11,16 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
+from ns_abstract.arithmetic.rounding import FIELD_UP, UNIT64
 from ns_abstract.arithmetic.simd.intrinsics import pointer
 from ns_abstract.arithmetic.simd.lanes import LINE, load_line
 from ns_abstract.arithmetic.simd.products import ROWS, four_rows, rows_from, store_rows
 
 #: Rows of a product that pass a line of the weight while it stays in a core's first cache; a multiple of `ROWS`.
 BLOCK = 32
+#: Roundings of a column's product in float32 beside one by live input: the column, its slope, their product, and the
+#: sums of a step; 2 to spare.
+NARROW_STEPS = 8
 
 
 @njit(cache=True, error_model="numpy")
@@ -48,79 +52,150 @@ def multiply(x, live, weight, rest, out):
                         out[r, j] = rest[r - first, j - c]
 
 
-class Terms(NamedTuple):
-    """Error terms of B pieces before a layer.
+class Weights(NamedTuple):
+    """A layer.
 
     Attributes:
-        columns: [C, inputs] in the order of their pieces, of the type that they are multiplied in.
-        begin: [B + 1] where the columns of each piece begin.
-        slope: [B, inputs] what columns are multiplied by first.
-        new_begin, new_neuron, new_size: [B + 1], [N], [N] those that move one neuron only, likewise.
+        wide, columns: [inputs, n and more, to whole pairs of lines] for polynomials, float64, and for columns, of their
+            type.
+        absolute: [inputs, n] float64.
+        bias: [n].
+        rounding: Relative error of a sum over the layer.
+        narrow: Relative error of one rounding of columns, where it is not in ``rounding``, or 0.
+        underflow: Absolute error of columns before and behind the layer.
     """
 
+    wide: np.ndarray
     columns: np.ndarray
-    begin: np.ndarray
+    absolute: np.ndarray
+    bias: np.ndarray
+    rounding: float
+    narrow: float
+    underflow: float
+
+
+class Before(NamedTuple):
+    """B pieces before a layer; see `zonotope.Pieces`. What stands where ``size`` is 0 is not looked at.
+
+    Attributes:
+        poly: [B, m, inputs].
+        size, spread, box, slope: [B, inputs].
+        columns, owner: [C, inputs] of the type that they are multiplied in, and [C] their pieces, ascending.
+        new_owner, new_neuron, new_size: [N] error terms that move one neuron only, likewise.
+    """
+
+    poly: np.ndarray
+    size: np.ndarray
+    spread: np.ndarray
+    box: np.ndarray
     slope: np.ndarray
-    new_begin: np.ndarray
+    columns: np.ndarray
+    owner: np.ndarray
+    new_owner: np.ndarray
     new_neuron: np.ndarray
     new_size: np.ndarray
 
 
-class Product(NamedTuple):
+class Behind(NamedTuple):
     """B pieces behind a layer.
 
     Attributes:
         poly: [B, m, n].
-        columns, owner: [C + N, n] of the columns' type and [C + N] their pieces, in order.
+        columns, owner: [C + N, n] of the columns' type and [C + N] their pieces, ascending.
         sums: [B, n] float64 sums of the absolute columns.
+        box: [B, n].
     """
 
     poly: np.ndarray
     columns: np.ndarray
     owner: np.ndarray
     sums: np.ndarray
+    box: np.ndarray
 
 
 @njit(cache=True, error_model="numpy")
-def linear(poly, size, terms, wide, weight, out):
-    """A linear layer without its bias, piece by piece (design.md, F4).
+def _columns(b, z, first, new, live, weights, scratch, out, place):
+    """Columns of the piece ``b`` behind a layer, from ``place`` on, and their sums.
 
     Args:
-        poly: [B, m, inputs].
-        size: [B, inputs] 0 where a neuron is off: what the other arrays hold there is not looked at.
-        terms: `Terms`.
-        wide, weight: [inputs, n and more, to whole pairs of lines] for polynomials, float64, and for columns, of their type.
-        out: `Product`, filled.
+        first, new: Where its columns, and those of one neuron, begin in ``z``.
+        scratch: [BLOCK, inputs], [inputs] and [ROWS, two lines] of the columns' type.
+
+    Returns:
+        Where those of the next piece begin, in ``z`` and behind the layer.
     """
-    inputs, n = wide.shape[0], out.poly.shape[2]
-    live, gain = np.empty(inputs, np.int64), np.empty(inputs, weight.dtype)
-    scaled = np.empty((BLOCK, inputs), weight.dtype)
-    rest = np.empty((ROWS, 2 * LINE // weight.itemsize), weight.dtype)
-    rest_wide = np.empty((ROWS, 2 * LINE // wide.itemsize), np.float64)
-    place = 0
-    for b in range(poly.shape[0]):
+    scaled, slope, rest = scratch
+    inputs, n = scaled.shape[1], out.sums.shape[1]
+    begin = place
+    for j in range(inputs):
+        slope[j] = z.slope[b, j]
+    while first < z.owner.shape[0] and z.owner[first] == b:
+        count = 0
+        while count < BLOCK and first < z.owner.shape[0] and z.owner[first] == b:
+            for j in range(inputs):
+                scaled[count, j] = z.columns[first, j] * slope[j]
+            count += 1
+            first += 1
+        multiply(scaled[:count], live, weights.columns, rest, out.columns[place : place + count])
+        place += count
+    while new < z.new_owner.shape[0] and z.new_owner[new] == b:
+        for j in range(n):
+            out.columns[place, j] = z.new_size[new] * weights.wide[z.new_neuron[new], j]
+        place += 1
+        new += 1
+    sums = out.sums[b]
+    sums[:] = 0.0
+    for c in range(begin, place):
+        for j in range(n):
+            sums[j] += abs(out.columns[c, j])
+    out.owner[begin:place] = b
+    return first, new, place
+
+
+@njit(cache=True, error_model="numpy")
+def _box(b, z, live, weights, box):
+    """The ``box`` [n] of the piece ``b`` behind a layer, but for its bias: that before it, and rounding (F4)."""
+    box[:] = weights.underflow
+    narrow = (live.shape[0] + NARROW_STEPS) * weights.narrow
+    for j in live:
+        radius = (z.size[b, j] + z.box[b, j]) * weights.rounding + z.box[b, j]
+        radius += narrow * z.spread[b, j] + weights.underflow
+        for k in range(box.shape[0]):
+            box[k] += radius * weights.absolute[j, k]
+
+
+@njit(cache=True, error_model="numpy")
+def linear(z, weights, onto, onto_box, out):
+    """A linear layer, piece by piece (design.md, F4).
+
+    Args:
+        z: `Before`.
+        weights: `Weights`.
+        onto, onto_box: [B, m, n] and [B, n] what other inputs contribute, to which the rest is added, or nothing ([0,
+            ...]).
+        out: `Behind`, filled.
+    """
+    inputs, n = weights.absolute.shape
+    found, kind = np.empty(inputs, np.int64), weights.columns.dtype
+    rest_wide = np.empty((ROWS, 2 * LINE // weights.wide.itemsize), np.float64)
+    scratch = (
+        np.empty((BLOCK, inputs), kind), np.empty(inputs, kind),
+        np.empty((ROWS, 2 * LINE // weights.columns.itemsize), kind),
+    )  # fmt: skip
+    first, new, place = 0, 0, 0
+    for b in range(z.poly.shape[0]):
         count = 0
         for j in range(inputs):
-            if size[b, j] != 0.0:
-                live[count] = j
+            if z.size[b, j] != 0.0:
+                found[count] = j
                 count += 1
-            gain[j] = terms.slope[b, j]
-        multiply(poly[b], live[:count], wide, rest_wide, out.poly[b])
-        first = place
-        for begin in range(terms.begin[b], terms.begin[b + 1], BLOCK):
-            past = min(begin + BLOCK, terms.begin[b + 1])
-            for c in range(begin, past):
-                for j in range(inputs):
-                    scaled[c - begin, j] = terms.columns[c, j] * gain[j]
-            multiply(scaled[: past - begin], live[:count], weight, rest, out.columns[place : place + past - begin])
-            place += past - begin
-        for c in range(terms.new_begin[b], terms.new_begin[b + 1]):
-            for j in range(n):
-                out.columns[place, j] = terms.new_size[c] * wide[terms.new_neuron[c], j]
-            place += 1
-        sums = out.sums[b]
-        sums[:] = 0.0
-        for c in range(first, place):
-            for j in range(n):
-                sums[j] += abs(out.columns[c, j])
-        out.owner[first:place] = b
+        live, poly, box = found[:count], out.poly[b], out.box[b]
+        multiply(z.poly[b], live, weights.wide, rest_wide, poly)
+        first, new, place = _columns(b, z, first, new, live, weights, scratch, out, place)
+        _box(b, z, live, weights, box)
+        if onto.shape[0]:
+            poly += onto[b]
+            box += onto_box[b]
+        for j in range(n):
+            poly[0, j] += weights.bias[j]
+            box[j] = (box[j] + 4.0 * UNIT64 * (abs(weights.bias[j]) + abs(poly[0, j]))) * FIELD_UP

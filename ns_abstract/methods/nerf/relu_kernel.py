@@ -5,6 +5,7 @@ The grid is symmetric and ``T_k(-p) = (-1)^k T_k(p)``, so even and odd degrees a
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -42,6 +43,44 @@ class Grid(NamedTuple):
     order: np.ndarray
     chord: np.ndarray
     norming: float
+
+
+class Before(NamedTuple):
+    """B pieces before an activation; see `zonotope.Affine`.
+
+    Attributes:
+        poly: [B, m, n] coefficients; replaced where the sign is open, and where a piece fails. What is off keeps its
+            own: its size is 0.
+        sums: [B, n] sums of absolute columns.
+        box: [B, n]; replaced.
+        failed, count: [B].
+    """
+
+    poly: np.ndarray
+    sums: np.ndarray
+    box: np.ndarray
+    failed: np.ndarray
+    count: np.ndarray
+
+
+class Behind(NamedTuple):
+    """B pieces behind an activation; see `zonotope.Pieces`.
+
+    Attributes:
+        slope: [B, n] what columns are multiplied by.
+        size, spread: [B, n] sums of absolute coefficients and columns, and of columns alone.
+        failed, count: [B].
+        piece, neuron, error: [B n] piece, neuron and size of the new error terms, piece by piece, as many as there are.
+    """
+
+    slope: np.ndarray
+    size: np.ndarray
+    spread: np.ndarray
+    failed: np.ndarray
+    count: np.ndarray
+    piece: np.ndarray
+    neuron: np.ndarray
+    error: np.ndarray
 
 
 def _whole(matrix: np.ndarray) -> np.ndarray:
@@ -119,7 +158,7 @@ def _absolute(even, odd, out):
 def _certain(poly, rho, box, failed, slope, size, which, neuron):
     """Decide the signs that the sums of coefficients decide; returns the number of the others (``which``, ``neuron``).
 
-    See `relu` for the arguments; ``size`` is that of an active neuron where nothing is decided.
+    See `_open` for the arguments; ``size`` is that of an active neuron where nothing is decided.
     """
     pieces, m, n = poly.shape
     spread = np.empty(n)
@@ -250,17 +289,10 @@ def _errors(values, fitted, above, below, least, most):
 
 
 @njit(cache=True, error_model="numpy")
-def relu(poly, rho, box, failed, grid, slope, size, which, neuron, error):
-    """max(0, z) in place (design.md, F5); returns the number of new error terms.
+def _open(poly, rho, box, failed, grid, slope, size, which, neuron, error):
+    """Slopes and sizes, and polynomials and boxes in place; returns the number of new error terms.
 
-    Args:
-        poly: [B, m, n] coefficients; replaced where the sign is open. What is off keeps its own: its size is 0.
-        rho: [B, n] sums of absolute columns.
-        box: [B, n]; replaced.
-        failed: [B].
-        grid: `Grid`.
-        slope, size: [B, n], filled: what columns are multiplied by; sum of absolute coefficients and columns.
-        which, neuron, error: [B n], filled with piece, neuron and size of the new error terms, piece by piece.
+    See `relu`; ``rho``: [B, n] sums of absolute columns, ``which``, ``neuron`` and ``error``: new error terms.
     """
     found = _certain(poly, rho, box, failed, slope, size, which, neuron)
     lows, highs = np.empty(found), np.empty(found)
@@ -305,4 +337,33 @@ def relu(poly, rho, box, failed, grid, slope, size, which, neuron, error):
             size[b, j] = (total + kept * e + new) * FIELD_UP
             box[b, j] *= FIELD_UP
             error[first + c] = new
+    return found
+
+
+@njit(cache=True, error_model="numpy")
+def relu(z, grid, limit, out):
+    """max(0, z) in place (design.md, F5); returns the number of new error terms.
+
+    Args:
+        z: `Before`.
+        grid: `Grid`.
+        limit: Error terms of a piece beyond which it fails.
+        out: `Behind`, filled.
+    """
+    pieces, n = z.sums.shape
+    rho = z.sums * FIELD_UP
+    found = _open(z.poly, rho, z.box, z.failed, grid, out.slope, out.size, out.piece, out.neuron, out.error)
+    out.spread[:] = rho * out.slope
+    out.count[:] = z.count
+    for i in range(found):
+        out.spread[out.piece[i], out.neuron[i]] += out.error[i]
+        out.count[out.piece[i]] += 1
+    for b in range(pieces):
+        failed = z.failed[b] or out.count[b] > limit
+        for j in range(n):
+            out.spread[b, j] *= FIELD_UP
+            failed |= not math.isfinite(out.size[b, j])
+        out.failed[b] = failed
+        if failed:
+            z.poly[b], z.box[b], out.size[b], out.spread[b] = 0.0, 0.0, 0.0, 0.0
     return found

@@ -30,7 +30,8 @@ from ns_abstract.arithmetic.rounding import (
     gamma,
 )
 from ns_abstract.arithmetic.simd.lanes import LINE
-from ns_abstract.methods.nerf.layer_kernel import Product, Terms, linear
+from ns_abstract.methods.nerf import layer_kernel, relu_kernel
+from ns_abstract.methods.nerf.layer_kernel import Weights, linear
 from ns_abstract.methods.nerf.relu_kernel import LEAST_SLOPE, Grid, grid_of, relu
 from ns_abstract.methods.nerf.scene import Encoding, FieldWeights, Layer, Waves
 
@@ -41,9 +42,8 @@ _ELLIPSES = (1.05, 1.15, 1.3, 1.6, 2.0, 2.6, 3.5, 5.0, 8.0, 14.0, 30.0, 80.0, 30
 _NARROW_LAYERS = 4
 #: Error terms of a piece beyond which it is given up.
 ERROR_TERMS = 400
-#: Roundings of a column's product in float32 beside one by live input: the column, its slope, their product, and the
-#: sums of a step; 2 to spare.
-_NARROW_STEPS = 8
+#: What one rounding of a column in float32 is charged with, and what is of second order.
+_NARROW = (1.0 + 2.0**-10) * UNIT32
 
 
 def _rounding(inputs: int) -> float:
@@ -136,8 +136,8 @@ class Affine:
 class _Linear:
     """A linear layer: transposed ``weight`` [in, out], its ``absolute`` value and ``bias`` [out], all float64.
 
-    For compiled products: ``lines``, the weight with zeros behind its rows to whole pairs of lines, and ``narrow``, the same in
-    float32, which it is exactly, where columns are multiplied in that.
+    For compiled products: ``lines``, the weight with zeros behind its rows to whole pairs of lines, and ``narrow``, the
+    same in float32, which it is exactly, where columns are multiplied in that.
     """
 
     weight: Tensor
@@ -248,97 +248,107 @@ class FieldBounds:
     def _linear(self, pieces: Pieces, layer: _Linear, first: tuple[Tensor, Tensor] | None = None) -> Affine:
         """A linear layer on ``pieces``, after ``first`` (polynomials, remainders) in the order of its inputs (F4)."""
         count = 0 if first is None else first[0].shape[-1]
+        given = None if first is None else self._given(*first, layer, count)
+        if self.compiled:
+            return self._linear_compiled(pieces, layer, count, given)
         rounding = _rounding(layer.weight.shape[0])
         radius = (pieces.size + pieces.box).mul_(rounding).add_(pieces.box)
-        if layer.narrow is not None:
-            steps = (pieces.size != 0.0).sum(dim=1, keepdim=True, dtype=torch.float64) + _NARROW_STEPS
-            radius.addcmul_(steps * (1.0 + 2.0**-10) * UNIT32, pieces.spread).add_(UNDERFLOW_COLUMNS)
-        box = radius @ layer.absolute[count:] + (0.0 if layer.narrow is None else UNDERFLOW_COLUMNS)
-        poly, columns, owner, spread = self._product(pieces, layer, count)
-        if first is not None:
-            poly.flatten(0, 1).addmm_(first[0].flatten(0, 1), layer.weight[:count])
-            box += (first[1] + rounding * (first[0].abs().sum(dim=1) + first[1])) @ layer.absolute[:count]
+        box = radius @ layer.absolute[count:]
+        weight = layer.weight[count:]
+        columns = (pieces.columns * pieces.slope[pieces.owner]) @ weight
+        columns = torch.cat([columns, weight[pieces.new_neuron] * pieces.new_size[:, None]])
+        owner = torch.cat([pieces.owner, pieces.new_owner])
+        poly = pieces.poly @ weight
+        if given is not None:
+            poly += given[0]
+            box += given[1]
+        self._shift(poly, box, layer)
+        spread = column_sums(columns, owner, poly.shape[0])
+        return Affine(poly, columns, owner, spread, box, pieces.failed, pieces.count)
+
+    def _given(self, poly: Tensor, remainder: Tensor, layer: _Linear, count: int) -> tuple[Tensor, Tensor]:
+        """Polynomials and box of a layer's sums over its first ``count`` inputs, polynomials and remainders."""
+        rounding = _rounding(layer.weight.shape[0])
+        box = (remainder + rounding * (poly.abs().sum(dim=1) + remainder)) @ layer.absolute[:count]
+        return poly @ layer.weight[:count], box
+
+    def _shift(self, poly: Tensor, box: Tensor, layer: _Linear) -> None:
+        """Add the bias, in place."""
         poly[:, 0] += layer.bias
         box += 4.0 * UNIT64 * (layer.bias.abs() + poly[:, 0].abs())
-        return Affine(poly, columns, owner, spread, box * FIELD_UP, pieces.failed, pieces.count)
+        box *= FIELD_UP
 
-    def _product(self, pieces: Pieces, layer: _Linear, count: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Polynomials, columns, owners and sums of columns times the weight's rows behind the first ``count``."""
-        weight = layer.weight[count:]
-        (batch, m, _), n = pieces.poly.shape, weight.shape[1]
-        if not self.compiled:
-            columns = (pieces.columns * pieces.slope[pieces.owner]) @ weight
-            columns = torch.cat([columns, weight[pieces.new_neuron] * pieces.new_size[:, None]])
-            owner = torch.cat([pieces.owner, pieces.new_owner])
-            return pieces.poly @ weight, columns, owner, column_sums(columns, owner, batch)
-        wide = layer.lines[count:]
-        kind = wide if layer.narrow is None else layer.narrow[count:]
-        total = pieces.columns.shape[0] + pieces.new_owner.shape[0]
-        poly, spread = torch.empty(batch, m, n, dtype=torch.float64), torch.empty(batch, n, dtype=torch.float64)
-        columns, owner = torch.empty(total, n, dtype=kind.dtype), torch.empty(total, dtype=torch.int64)
-        places = torch.arange(batch + 1)
+    def _linear_compiled(
+        self, pieces: Pieces, layer: _Linear, count: int, given: tuple[Tensor, Tensor] | None
+    ) -> Affine:
+        """See `_linear`; ``given``: what its first ``count`` inputs contribute."""
+        narrow = layer.narrow is not None
+        kind = layer.lines if layer.narrow is None else layer.narrow
+        weights = Weights(
+            layer.lines[count:].numpy(), kind[count:].numpy(), layer.absolute[count:].numpy(), layer.bias.numpy(),
+            _rounding(layer.weight.shape[0]), _NARROW if narrow else 0.0, UNDERFLOW_COLUMNS if narrow else 0.0,
+        )  # fmt: skip
+        (batch, m, _), n = pieces.poly.shape, layer.weight.shape[1]
+        total = pieces.owner.shape[0] + pieces.new_owner.shape[0]
         before = (
-            pieces.columns.to(kind.dtype), torch.searchsorted(pieces.owner, places), pieces.slope,
-            torch.searchsorted(pieces.new_owner, places), pieces.new_neuron, pieces.new_size,
+            pieces.poly, pieces.size, pieces.spread, pieces.box, pieces.slope, pieces.columns.to(kind.dtype),
+            pieces.owner, pieces.new_owner, pieces.new_neuron, pieces.new_size,
         )  # fmt: skip
+        poly, sums = torch.empty(batch, m, n, dtype=torch.float64), torch.empty(batch, n, dtype=torch.float64)
+        columns, owner = torch.empty(total, n, dtype=kind.dtype), torch.empty(total, dtype=torch.int64)
+        box = torch.empty(batch, n, dtype=torch.float64)
+        onto = (poly[:0], box[:0]) if given is None else given
         linear(
-            pieces.poly.numpy(), pieces.size.numpy(), Terms(*(a.numpy() for a in before)), wide.numpy(),
-            kind.numpy(), Product(*(a.numpy() for a in (poly, columns, owner, spread))),
+            layer_kernel.Before(*(a.numpy() for a in before)), weights, *(a.numpy() for a in onto),
+            layer_kernel.Behind(*(a.numpy() for a in (poly, columns, owner, sums, box))),
         )  # fmt: skip
-        return poly, columns, owner, spread
+        return Affine(poly, columns, owner, sums, box, pieces.failed, pieces.count)
 
     def _first(self, poly: Tensor, remainder: Tensor, layer: _Linear) -> Affine:
         """A linear layer on polynomials and remainders alone."""
-        out = poly @ layer.weight
-        rounding = _rounding(layer.weight.shape[0])
-        box = (remainder + rounding * (poly.abs().sum(dim=1) + remainder)) @ layer.absolute
-        out[:, 0] += layer.bias
-        box += 4.0 * UNIT64 * (layer.bias.abs() + out[:, 0].abs())
+        out, box = self._given(poly, remainder, layer, layer.weight.shape[0])
+        self._shift(out, box, layer)
         pieces = poly.shape[0]
         return Affine(
             out,
             torch.zeros(0, out.shape[2], dtype=torch.float64, device=self.device),
             torch.zeros(0, dtype=torch.int64, device=self.device),
             torch.zeros_like(box),
-            box * FIELD_UP,
+            box,
             torch.zeros(pieces, dtype=torch.bool, device=self.device),
             torch.zeros(pieces, dtype=torch.int64, device=self.device),
         )
 
     def _relu(self, z: Affine) -> Pieces:
-        """max(0, z) (design.md, F5)."""
-        rho = z.spread * FIELD_UP
-        found = self._relu_torch(z, rho) if self._grid is None else self._relu_compiled(z, rho, self._grid)
-        poly, box, size, slope, which, neuron, error = found
-        columns, owner = z.columns, z.owner
-        spread = rho * slope
-        spread[which, neuron] += error
-        spread *= FIELD_UP
-        count = z.count.index_add(0, which, torch.ones_like(which))
-        failed = z.failed | (count > self.limit) | ~torch.isfinite(size).all(dim=1)
-        if bool((failed & ~z.failed).any()):
-            stays = ~failed[owner]
-            columns, owner = columns[stays], owner[stays]
-            stays = ~failed[which]
-            which, neuron, error = which[stays], neuron[stays], error[stays]
-            poly[failed], box[failed], size[failed], spread[failed] = 0.0, 0.0, 0.0, 0.0
-        return Pieces(poly, columns, owner, slope, which, neuron, error, spread, box, size, failed, count)
+        """max(0, z) (design.md, F5); ``z`` is used up."""
+        found = self._relu_torch(z) if self._grid is None else self._relu_compiled(z, self._grid)
+        if bool((found.failed & ~z.failed).any()):
+            old, new = ~found.failed[found.owner], ~found.failed[found.new_owner]
+            found = replace(
+                found, columns=found.columns[old], owner=found.owner[old], new_owner=found.new_owner[new],
+                new_neuron=found.new_neuron[new], new_size=found.new_size[new],
+            )  # fmt: skip
+        return found
 
-    def _relu_compiled(self, z: Affine, rho: Tensor, grid: Grid) -> tuple[Tensor, ...]:
-        """See `_relu_torch`; ``z`` is used up."""
+    def _relu_compiled(self, z: Affine, grid: Grid) -> Pieces:
+        """See `_relu`; error terms of pieces that fail are left in."""
         pieces, _, n = z.poly.shape
-        slope, size = torch.empty(2, pieces, n, dtype=torch.float64)
-        places = torch.empty(2, pieces * n, dtype=torch.int64)
+        slope, size, spread = torch.empty(3, pieces, n, dtype=torch.float64)
+        failed, count = torch.empty_like(z.failed), torch.empty_like(z.count)
+        piece, neuron = torch.empty(2, pieces * n, dtype=torch.int64)
         error = torch.empty(pieces * n, dtype=torch.float64)
         poly = z.poly.contiguous()
-        found = relu(
-            poly.numpy(), rho.numpy(), z.box.numpy(), z.failed.numpy(), grid, slope.numpy(), size.numpy(),
-            places[0].numpy(), places[1].numpy(), error.numpy(),
+        new = relu(
+            relu_kernel.Before(*(a.numpy() for a in (poly, z.spread, z.box, z.failed, z.count))), grid, self.limit,
+            relu_kernel.Behind(*(a.numpy() for a in (slope, size, spread, failed, count, piece, neuron, error))),
         )  # fmt: skip
-        return poly, z.box, size, slope, places[0, :found], places[1, :found], error[:found]
+        return Pieces(
+            poly, z.columns, z.owner, slope, piece[:new], neuron[:new], error[:new], spread, z.box, size, failed, count
+        )
 
-    def _relu_torch(self, z: Affine, rho: Tensor) -> tuple[Tensor, ...]:
-        """New polynomials, box and sizes, slopes of the columns, and piece, neuron and size of new error terms."""
+    def _relu_torch(self, z: Affine) -> Pieces:
+        """See `_relu`; error terms of pieces that fail are left in."""
+        rho = z.spread * FIELD_UP
         poly, box = z.poly, z.box
         spread = poly[:, 1:].abs().sum(dim=1) * FIELD_UP
         radius = spread + rho + box
@@ -382,7 +392,15 @@ class FieldBounds:
         slope[which, neuron] = kept
         size = (middle.abs() + spread + rho) * slope
         size[which, neuron] = q.abs().sum(dim=1) + kept * e + error
-        return poly, box * FIELD_UP, size * FIELD_UP, slope, which, neuron, error
+        size *= FIELD_UP
+        box *= FIELD_UP
+        spread = rho * slope
+        spread[which, neuron] += error
+        spread *= FIELD_UP
+        count = z.count.index_add(0, which, torch.ones_like(which))
+        failed = z.failed | (count > self.limit) | ~torch.isfinite(size).all(dim=1)
+        poly[failed], box[failed], size[failed], spread[failed] = 0.0, 0.0, 0.0, 0.0
+        return Pieces(poly, z.columns, z.owner, slope, which, neuron, error, spread, box, size, failed, count)
 
     def _fitted(self, p: Tensor, values: Tensor) -> tuple[Tensor, Tensor]:
         """Polynomials q [k, m] and errors [k]: ``|max(0, p) - q| <= error`` over the cell (design.md, F5)."""
