@@ -56,6 +56,7 @@ class Weights(NamedTuple):
     """A layer.
 
     Attributes:
+        seen, seen_absolute: [k, n and more, to whole pairs of lines] and [k, n]: of an encoded vector, or of none.
         wide, columns: [inputs, n and more, to whole pairs of lines] for polynomials, float64, and for columns, of their
             type.
         absolute: [inputs, n] float64.
@@ -65,6 +66,8 @@ class Weights(NamedTuple):
         underflow: Absolute error of columns before and behind the layer.
     """
 
+    seen: np.ndarray
+    seen_absolute: np.ndarray
     wide: np.ndarray
     columns: np.ndarray
     absolute: np.ndarray
@@ -80,6 +83,7 @@ class Before(NamedTuple):
     Attributes:
         poly: [B, m, inputs].
         size, spread, box, slope: [B, inputs].
+        failed, count: [B].
         columns, owner: [C, inputs] of the type that they are multiplied in, and [C] their pieces, ascending.
         new_owner, new_neuron, new_size: [N] error terms that move one neuron only, likewise.
     """
@@ -89,6 +93,8 @@ class Before(NamedTuple):
     spread: np.ndarray
     box: np.ndarray
     slope: np.ndarray
+    failed: np.ndarray
+    count: np.ndarray
     columns: np.ndarray
     owner: np.ndarray
     new_owner: np.ndarray
@@ -101,7 +107,8 @@ class Behind(NamedTuple):
 
     Attributes:
         poly: [B, m, n].
-        columns, owner: [C + N, n] of the columns' type and [C + N] their pieces, ascending.
+        columns, owner: [C + N, n] of the columns' type and [C + N] their pieces, ascending; those of pieces that failed
+            are left out.
         sums: [B, n] float64 sums of the absolute columns.
         box: [B, n].
     """
@@ -125,55 +132,78 @@ def _columns(b, z, first, new, live, weights, scratch, out, place):
         Where those of the next piece begin, in ``z`` and behind the layer.
     """
     scaled, slope, rest = scratch
-    inputs, n = scaled.shape[1], out.sums.shape[1]
-    begin = place
+    # arrays of a record are counted each time they are taken out of it
+    owner, columns, new_owner, before, wide = z.owner, z.columns, z.new_owner, z.slope[b], weights.wide
+    result, sums = out.columns, out.sums[b]
+    inputs, n, begin = scaled.shape[1], out.sums.shape[1], place
+    if z.failed[b]:
+        while first < owner.shape[0] and owner[first] == b:
+            first += 1
+        while new < new_owner.shape[0] and new_owner[new] == b:
+            new += 1
     for j in range(inputs):
-        slope[j] = z.slope[b, j]
-    while first < z.owner.shape[0] and z.owner[first] == b:
+        slope[j] = before[j]
+    while first < owner.shape[0] and owner[first] == b:
         count = 0
-        while count < BLOCK and first < z.owner.shape[0] and z.owner[first] == b:
+        while count < BLOCK and first < owner.shape[0] and owner[first] == b:
+            row, column = scaled[count], columns[first]
             for j in range(inputs):
-                scaled[count, j] = z.columns[first, j] * slope[j]
+                row[j] = column[j] * slope[j]
             count += 1
             first += 1
-        multiply(scaled[:count], live, weights.columns, rest, out.columns[place : place + count])
+        multiply(scaled[:count], live, weights.columns, rest, result[place : place + count])
         place += count
-    while new < z.new_owner.shape[0] and z.new_owner[new] == b:
+    while new < new_owner.shape[0] and new_owner[new] == b:
+        size, line, row = z.new_size[new], wide[z.new_neuron[new]], result[place]
         for j in range(n):
-            out.columns[place, j] = z.new_size[new] * weights.wide[z.new_neuron[new], j]
+            row[j] = size * line[j]
         place += 1
         new += 1
-    sums = out.sums[b]
     sums[:] = 0.0
     for c in range(begin, place):
+        row = result[c]
         for j in range(n):
-            sums[j] += abs(out.columns[c, j])
+            sums[j] += abs(row[j])
     out.owner[begin:place] = b
     return first, new, place
 
 
 @njit(cache=True, error_model="numpy")
-def _box(b, z, live, weights, box):
+def _box(b, z, encoded, remainder, live, weights, box):
     """The ``box`` [n] of the piece ``b`` behind a layer, but for its bias: that before it, and rounding (F4)."""
-    box[:] = weights.underflow
+    size, before, spread, n = z.size[b], z.box[b], z.spread[b], box.shape[0]
+    rounding, underflow, absolute, given = weights.rounding, weights.underflow, weights.absolute, weights.seen_absolute
     narrow = (live.shape[0] + NARROW_STEPS) * weights.narrow
+    box[:] = underflow
     for j in live:
-        radius = (z.size[b, j] + z.box[b, j]) * weights.rounding + z.box[b, j]
-        radius += narrow * z.spread[b, j] + weights.underflow
-        for k in range(box.shape[0]):
-            box[k] += radius * weights.absolute[j, k]
+        radius = (size[j] + before[j]) * rounding + before[j]
+        radius += narrow * spread[j] + underflow
+        row = absolute[j]
+        for k in range(n):
+            box[k] += radius * row[k]
+    if not given.shape[0]:
+        return
+    poly, rest = encoded[b], remainder[b]
+    whole = rest.copy()
+    for k in range(poly.shape[0]):
+        line = poly[k]
+        for j in range(whole.shape[0]):
+            whole[j] += abs(line[j])
+    for j in range(whole.shape[0]):
+        radius, row = rest[j] + rounding * whole[j], given[j]
+        for k in range(n):
+            box[k] += radius * row[k]
 
 
 @njit(cache=True, error_model="numpy")
-def linear(z, weights, onto, onto_box, out):
-    """A linear layer, piece by piece (design.md, F4).
+def linear(z, encoded, remainder, weights, out):
+    """A linear layer, piece by piece (design.md, F4); returns the number of columns behind it.
 
     Args:
         z: `Before`.
+        encoded, remainder: [B, m, k] and [B, k] polynomials and remainders of an encoded vector, if the layer sees it.
         weights: `Weights`.
-        onto, onto_box: [B, m, n] and [B, n] what other inputs contribute, to which the rest is added, or nothing ([0,
-            ...]).
-        out: `Behind`, filled.
+        out: `Behind`, filled; its columns and owners may have room for more.
     """
     inputs, n = weights.absolute.shape
     found, kind = np.empty(inputs, np.int64), weights.columns.dtype
@@ -182,20 +212,26 @@ def linear(z, weights, onto, onto_box, out):
         np.empty((BLOCK, inputs), kind), np.empty(inputs, kind),
         np.empty((ROWS, 2 * LINE // weights.columns.itemsize), kind),
     )  # fmt: skip
+    every, given, bias = np.arange(weights.seen.shape[0]), np.empty((z.poly.shape[1], n)), weights.bias
     first, new, place = 0, 0, 0
     for b in range(z.poly.shape[0]):
-        count = 0
+        count, size = 0, z.size[b]
         for j in range(inputs):
-            if z.size[b, j] != 0.0:
+            if size[j] != 0.0:
                 found[count] = j
                 count += 1
         live, poly, box = found[:count], out.poly[b], out.box[b]
         multiply(z.poly[b], live, weights.wide, rest_wide, poly)
         first, new, place = _columns(b, z, first, new, live, weights, scratch, out, place)
-        _box(b, z, live, weights, box)
-        if onto.shape[0]:
-            poly += onto[b]
-            box += onto_box[b]
+        _box(b, z, encoded, remainder, live, weights, box)
+        if every.shape[0]:
+            multiply(encoded[b], every, weights.seen, rest_wide, given)
+            for k in range(poly.shape[0]):
+                line, more = poly[k], given[k]
+                for j in range(n):
+                    line[j] += more[j]
+        constant = poly[0]
         for j in range(n):
-            poly[0, j] += weights.bias[j]
-            box[j] = (box[j] + 4.0 * UNIT64 * (abs(weights.bias[j]) + abs(poly[0, j]))) * FIELD_UP
+            constant[j] += bias[j]
+            box[j] = (box[j] + 4.0 * UNIT64 * (abs(bias[j]) + abs(constant[j]))) * FIELD_UP
+    return place

@@ -14,7 +14,7 @@ from numba import njit
 from ns_abstract.arithmetic.chebyshev import ChebyshevBasis
 from ns_abstract.arithmetic.rounding import CHEBYSHEV_ROUNDING, FIELD_UP, UNIT64
 from ns_abstract.arithmetic.simd.intrinsics import pointer
-from ns_abstract.arithmetic.simd.lanes import LINE, load_line
+from ns_abstract.arithmetic.simd.lanes import LINE, load_line, maximum, minimum, store
 from ns_abstract.arithmetic.simd.products import ROWS, four_rows, rows_from, store_rows
 
 #: Neurons side by side.
@@ -123,12 +123,13 @@ def _on_grid(even, odd, grid, sum_even, sum_odd, values):
     """``values`` [g, LANES] of polynomials with coefficients ``even`` and ``odd``."""
     _multiply(grid.even, grid.order, even, sum_even)
     _multiply(grid.odd, grid.order, odd, sum_odd)
-    last = values.shape[0] - 1
+    evens, odds, out, last = pointer(sum_even), pointer(sum_odd), pointer(values), values.shape[0] - 1
     for i in range(grid.points):
-        for c in range(LANES):
+        for c in range(0, LANES, LINE // values.itemsize):
             # the middle of the grid is its own mirror; odd polynomials vanish there
-            values[last - i, c] = sum_even[i, c] - sum_odd[i, c]
-            values[i, c] = sum_even[i, c] + sum_odd[i, c]
+            e, o = load_line(evens, LANES * i + c), load_line(odds, LANES * i + c)
+            store(out, LANES * (last - i) + c, e - o)
+            store(out, LANES * i + c, e + o)
 
 
 @njit(cache=True, error_model="numpy")
@@ -145,13 +146,14 @@ def _gather(poly, which, neuron, even, odd):
 @njit(cache=True, error_model="numpy")
 def _absolute(even, odd, out):
     """``out`` [LANES] sums of absolute coefficients."""
-    out[:] = 0.0
-    for k in range(even.shape[0]):
-        for c in range(LANES):
-            out[c] += abs(even[k, c])
-    for k in range(odd.shape[0]):
-        for c in range(LANES):
-            out[c] += abs(odd[k, c])
+    evens, odds, sums = pointer(even), pointer(odd), pointer(out)
+    for c in range(0, LANES, LINE // out.itemsize):
+        total = abs(load_line(evens, c))
+        for k in range(1, even.shape[0]):
+            total = total + abs(load_line(evens, LANES * k + c))
+        for k in range(odd.shape[0]):
+            total = total + abs(load_line(odds, LANES * k + c))
+        store(sums, c, total)
 
 
 @njit(cache=True, error_model="numpy")
@@ -190,19 +192,17 @@ def _certain(poly, rho, box, failed, slope, size, which, neuron):
 @njit(cache=True, error_model="numpy")
 def _ranges(values, absolute, norming, low, high):
     """``low`` and ``high`` [LANES] of polynomials from their values on the grid (design.md, F2)."""
-    low[:] = np.inf
-    high[:] = -np.inf
-    for i in range(values.shape[0]):
-        for c in range(LANES):
-            v = values[i, c]
-            low[c] = v if v < low[c] else low[c]
-            high[c] = v if v > high[c] else high[c]
-    for c in range(LANES):
-        # what is not a number is passed over above, but not in the sum of absolute coefficients
-        centre = 0.5 * (low[c] + high[c])
-        width = 0.5 * (high[c] - low[c]) * norming + CHEBYSHEV_ROUNDING * absolute[c]
-        low[c] = centre - width
-        high[c] = centre + width
+    elements, sums, lows, highs = pointer(values), pointer(absolute), pointer(low), pointer(high)
+    for c in range(0, LANES, LINE // values.itemsize):
+        least = most = load_line(elements, c)
+        for i in range(1, values.shape[0]):
+            v = load_line(elements, LANES * i + c)
+            least, most = minimum(least, v), maximum(most, v)
+        # what is not a number may be passed over above, but not in the sum of absolute coefficients
+        centre = 0.5 * (least + most)
+        width = 0.5 * (most - least) * norming + CHEBYSHEV_ROUNDING * load_line(sums, c)
+        store(lows, c, centre - width)
+        store(highs, c, centre + width)
 
 
 @njit(cache=True, error_model="numpy")
@@ -238,18 +238,17 @@ def _decide(poly, rho, box, grid, slope, size, which, neuron, found, low, high):
 @njit(cache=True, error_model="numpy")
 def _series(values, grid, sum_even, sum_odd, even, odd):
     """Coefficients ``even`` and ``odd`` of the fit to the positive parts of ``values`` [g, LANES]."""
-    last = values.shape[0] - 1
-    for i in range(grid.points - 1):
-        for c in range(LANES):
-            left = values[i, c] if values[i, c] > 0.0 else 0.0
-            right = values[last - i, c] if values[last - i, c] > 0.0 else 0.0
-            sum_even[i, c] = left + right
-            sum_odd[i, c] = left - right
-    # the middle of the grid stands for itself
-    for c in range(LANES):
-        middle = values[grid.points - 1, c]
-        sum_even[grid.points - 1, c] = middle if middle > 0.0 else 0.0
-        sum_odd[grid.points - 1, c] = 0.0
+    elements, evens, odds, last = pointer(values), pointer(sum_even), pointer(sum_odd), values.shape[0] - 1
+    middle = grid.points - 1
+    for c in range(0, LANES, LINE // values.itemsize):
+        for i in range(middle):
+            left = maximum(0.0, load_line(elements, LANES * i + c))
+            right = maximum(0.0, load_line(elements, LANES * (last - i) + c))
+            store(evens, LANES * i + c, left + right)
+            store(odds, LANES * i + c, left - right)
+        # the middle of the grid stands for itself
+        store(evens, LANES * middle + c, maximum(0.0, load_line(elements, LANES * middle + c)))
+    sum_odd[middle] = 0.0
     _multiply(grid.fit_even, grid.order, sum_even, even)
     _multiply(grid.fit_odd, grid.order, sum_odd, odd)
 
@@ -257,35 +256,40 @@ def _series(values, grid, sum_even, sum_odd, even, odd):
 @njit(cache=True, error_model="numpy")
 def _chords(even, odd, even_q, odd_q, chord, above, below):
     """Distances [LANES] of ``p - q`` and ``q`` from their chords on the grid."""
-    above[:] = 0.0
-    below[:] = 0.0
-    for k in range(chord.shape[0]):
-        p, q = (odd[k // 2], odd_q[k // 2]) if k % 2 else (even[k // 2], even_q[k // 2])
-        for c in range(LANES):
-            below[c] += abs(q[c]) * chord[k]
-            above[c] += abs(p[c] - q[c]) * chord[k]
+    evens, odds, evens_q, odds_q = pointer(even), pointer(odd), pointer(even_q), pointer(odd_q)
+    over, under = pointer(above), pointer(below)
+    for c in range(0, LANES, LINE // even.itemsize):
+        # a constant is its own chord
+        q = load_line(odds_q, c)
+        u, v = abs(q) * chord[1], abs(load_line(odds, c) - q) * chord[1]
+        for k in range(2, chord.shape[0]):
+            at = LANES * (k // 2) + c
+            q = load_line(odds_q, at) if k % 2 else load_line(evens_q, at)
+            p = load_line(odds, at) if k % 2 else load_line(evens, at)
+            u, v = u + abs(q) * chord[k], v + abs(p - q) * chord[k]
+        store(under, c, u)
+        store(over, c, v)
 
 
 @njit(cache=True, error_model="numpy")
 def _errors(values, fitted, above, below, least, most):
     """Ends ``least`` and ``most`` [LANES] of ``max(0, p) - q`` from values of p and q on the grid (design.md, F5)."""
-    least[:] = np.inf
-    most[:] = -np.inf
-    for i in range(values.shape[0]):
-        for c in range(LANES):
-            v = values[i, c] if values[i, c] > 0.0 else 0.0
-            v -= fitted[i, c]
-            most[c] = v if v > most[c] else most[c]
-    for i in range(values.shape[0] - 1):
-        for c in range(LANES):
-            left = values[i, c] - fitted[i, c]
-            right = values[i + 1, c] - fitted[i + 1, c]
-            first = (left if left < right else right) - above[c]
-            second = (-fitted[i, c] if fitted[i, c] > fitted[i + 1, c] else -fitted[i + 1, c]) - below[c]
-            first = first if first > second else second
-            least[c] = first if first < least[c] else least[c]
-    for c in range(LANES):
-        most[c] += above[c] if above[c] > below[c] else below[c]
+    elements, fits, over, under = pointer(values), pointer(fitted), pointer(above), pointer(below)
+    lows, highs = pointer(least), pointer(most)
+    for c in range(0, LANES, LINE // values.itemsize):
+        a, b = load_line(over, c), load_line(under, c)
+        p, q = load_line(elements, c), load_line(fits, c)
+        high, left = maximum(0.0, p) - q, p - q
+        low = high
+        for i in range(1, values.shape[0]):
+            p, r = load_line(elements, LANES * i + c), load_line(fits, LANES * i + c)
+            right = p - r
+            high = maximum(high, maximum(0.0, p) - r)
+            between = maximum(minimum(left, right) - a, -maximum(q, r) - b)
+            low = between if i == 1 else minimum(low, between)
+            left, q = right, r
+        store(lows, c, low)
+        store(highs, c, high + maximum(a, b))
 
 
 @njit(cache=True, error_model="numpy")
@@ -300,7 +304,8 @@ def _open(poly, rho, box, failed, grid, slope, size, which, neuron, error):
     even, odd, sum_even, sum_odd = _scratch(grid)
     even_q, odd_q = np.zeros_like(even), np.zeros_like(odd)
     values, fitted = np.empty((2 * grid.points - 1, LANES)), np.empty((2 * grid.points - 1, LANES))
-    absolute, absolute_q, above, below, least, most = np.empty((6, LANES))
+    absolute, absolute_q, above = np.empty(LANES), np.empty(LANES), np.empty(LANES)
+    below, least, most = np.empty(LANES), np.empty(LANES), np.empty(LANES)
     for first in range(0, found, LANES):
         past = min(first + LANES, found)
         _gather(poly, which[first:past], neuron[first:past], even, odd)

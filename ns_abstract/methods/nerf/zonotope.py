@@ -13,7 +13,9 @@ charged to the box.
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 import torch
@@ -31,6 +33,7 @@ from ns_abstract.arithmetic.rounding import (
 )
 from ns_abstract.arithmetic.simd.lanes import LINE
 from ns_abstract.methods.nerf import layer_kernel, relu_kernel
+from ns_abstract.methods.nerf.field_kernel import Layers, hidden_layers, stacked
 from ns_abstract.methods.nerf.layer_kernel import Weights, linear
 from ns_abstract.methods.nerf.relu_kernel import LEAST_SLOPE, Grid, grid_of, relu
 from ns_abstract.methods.nerf.scene import Encoding, FieldWeights, Layer, Waves
@@ -130,6 +133,15 @@ class Affine:
         parts = (self.poly, self.spread, self.box, self.failed, self.count)
         poly, spread, box, failed, count = (part[which] for part in parts)
         return Affine(poly, self.columns[:0], self.owner[:0], spread, box, failed, count)
+
+
+def _before(pieces: Pieces, kind: torch.dtype) -> layer_kernel.Before:
+    """``pieces`` for compiled layers, with columns of the type ``kind``."""
+    arrays = (
+        pieces.poly, pieces.size, pieces.spread, pieces.box, pieces.slope, pieces.failed, pieces.count,
+        pieces.columns.to(kind), pieces.owner, pieces.new_owner, pieces.new_neuron, pieces.new_size,
+    )  # fmt: skip
+    return layer_kernel.Before(*(array.numpy() for array in arrays))
 
 
 @dataclass(frozen=True)
@@ -247,10 +259,9 @@ class FieldBounds:
 
     def _linear(self, pieces: Pieces, layer: _Linear, first: tuple[Tensor, Tensor] | None = None) -> Affine:
         """A linear layer on ``pieces``, after ``first`` (polynomials, remainders) in the order of its inputs (F4)."""
-        count = 0 if first is None else first[0].shape[-1]
-        given = None if first is None else self._given(*first, layer, count)
         if self.compiled:
-            return self._linear_compiled(pieces, layer, count, given)
+            return self._linear_compiled(pieces, layer, first)
+        count = 0 if first is None else first[0].shape[-1]
         rounding = _rounding(layer.weight.shape[0])
         radius = (pieces.size + pieces.box).mul_(rounding).add_(pieces.box)
         box = radius @ layer.absolute[count:]
@@ -259,7 +270,8 @@ class FieldBounds:
         columns = torch.cat([columns, weight[pieces.new_neuron] * pieces.new_size[:, None]])
         owner = torch.cat([pieces.owner, pieces.new_owner])
         poly = pieces.poly @ weight
-        if given is not None:
+        if first is not None:
+            given = self._given(*first, layer, count)
             poly += given[0]
             box += given[1]
         self._shift(poly, box, layer)
@@ -278,31 +290,51 @@ class FieldBounds:
         box += 4.0 * UNIT64 * (layer.bias.abs() + poly[:, 0].abs())
         box *= FIELD_UP
 
-    def _linear_compiled(
-        self, pieces: Pieces, layer: _Linear, count: int, given: tuple[Tensor, Tensor] | None
-    ) -> Affine:
-        """See `_linear`; ``given``: what its first ``count`` inputs contribute."""
+    def _weights(self, layer: _Linear, seen: int) -> Weights:
+        """``layer``, which sees an encoded vector first, for compiled products."""
         narrow = layer.narrow is not None
         kind = layer.lines if layer.narrow is None else layer.narrow
-        weights = Weights(
-            layer.lines[count:].numpy(), kind[count:].numpy(), layer.absolute[count:].numpy(), layer.bias.numpy(),
-            _rounding(layer.weight.shape[0]), _NARROW if narrow else 0.0, UNDERFLOW_COLUMNS if narrow else 0.0,
+        lines, absolute = layer.lines.numpy(), layer.absolute.numpy()
+        return Weights(
+            lines[:seen], absolute[:seen], lines[seen:], kind.numpy()[seen:], absolute[seen:], layer.bias.numpy(),
+            _rounding(len(absolute)), _NARROW if narrow else 0.0, UNDERFLOW_COLUMNS if narrow else 0.0,
         )  # fmt: skip
+
+    def _linear_compiled(self, pieces: Pieces, layer: _Linear, first: tuple[Tensor, Tensor] | None) -> Affine:
+        """See `_linear`."""
+        encoded, remainder = (pieces.poly[..., :0], pieces.box[:, :0]) if first is None else first
+        weights = self._weights(layer, encoded.shape[-1])
         (batch, m, _), n = pieces.poly.shape, layer.weight.shape[1]
         total = pieces.owner.shape[0] + pieces.new_owner.shape[0]
-        before = (
-            pieces.poly, pieces.size, pieces.spread, pieces.box, pieces.slope, pieces.columns.to(kind.dtype),
-            pieces.owner, pieces.new_owner, pieces.new_neuron, pieces.new_size,
-        )  # fmt: skip
         poly, sums = torch.empty(batch, m, n, dtype=torch.float64), torch.empty(batch, n, dtype=torch.float64)
-        columns, owner = torch.empty(total, n, dtype=kind.dtype), torch.empty(total, dtype=torch.int64)
-        box = torch.empty(batch, n, dtype=torch.float64)
-        onto = (poly[:0], box[:0]) if given is None else given
-        linear(
-            layer_kernel.Before(*(a.numpy() for a in before)), weights, *(a.numpy() for a in onto),
+        columns = torch.empty(total, n, dtype=torch.float64 if layer.narrow is None else torch.float32)
+        owner, box = torch.empty(total, dtype=torch.int64), torch.empty(batch, n, dtype=torch.float64)
+        found = linear(
+            _before(pieces, columns.dtype), encoded.contiguous().numpy(), remainder.contiguous().numpy(), weights,
             layer_kernel.Behind(*(a.numpy() for a in (poly, columns, owner, sums, box))),
         )  # fmt: skip
-        return Affine(poly, columns, owner, sums, box, pieces.failed, pieces.count)
+        return Affine(poly, columns[:found], owner[:found], sums, box, pieces.failed, pieces.count)
+
+    def _hidden(self, pieces: Pieces, layers: Layers, first: tuple[Tensor, Tensor], grid: Grid) -> Pieces:
+        """``layers`` and their activations, compiled; ``first``: what they see as `_linear` does."""
+        encoded, remainder = (a.contiguous() for a in first)
+        (batch, m, _), n = pieces.poly.shape, int(layers.shapes[-1, 2])
+        kind = torch.from_numpy(layers.columns).dtype
+        rooms = batch * self.limit, batch * n
+        size, spread, box, slope = torch.empty(4, batch, n, dtype=torch.float64)
+        out = Pieces(
+            torch.empty(batch, m, n, dtype=torch.float64), torch.empty(rooms[0], n, dtype=kind),
+            torch.empty(rooms[0], dtype=torch.int64), slope, torch.empty(rooms[1], dtype=torch.int64),
+            torch.empty(rooms[1], dtype=torch.int64), torch.empty(rooms[1], dtype=torch.float64), spread, box, size,
+            torch.empty(batch, dtype=torch.bool), torch.empty(batch, dtype=torch.int64),
+        )  # fmt: skip
+        columns, terms = hidden_layers(
+            _before(pieces, kind), encoded.numpy(), remainder.numpy(), layers, grid, self.limit, _before(out, kind)
+        )
+        return replace(
+            out, columns=out.columns[:columns], owner=out.owner[:columns], new_owner=out.new_owner[:terms],
+            new_neuron=out.new_neuron[:terms], new_size=out.new_size[:terms],
+        )  # fmt: skip
 
     def _first(self, poly: Tensor, remainder: Tensor, layer: _Linear) -> Affine:
         """A linear layer on polynomials and remainders alone."""
@@ -433,10 +465,41 @@ class FieldBounds:
 
     def base(self, poly: Tensor, remainder: Tensor) -> Pieces:
         """The base network on an encoded position (`encode`)."""
-        pieces = self._relu(self._first(poly, remainder, self._base[0]))
+        first = poly, remainder
+        if self._grid is not None:
+            pieces = self._nothing(poly)
+            for layers in self._base_stacks:
+                pieces = self._hidden(pieces, layers, first, self._grid)
+            return pieces
+        pieces = self._relu(self._first(*first, self._base[0]))
         for layer, tensors in zip(self.weights.base[1:], self._base[1:], strict=True):
-            pieces = self._relu(self._linear(pieces, tensors, (poly, remainder) if layer.skip else None))
+            pieces = self._relu(self._linear(pieces, tensors, first if layer.skip else None))
         return pieces
+
+    @cached_property
+    def _base_stacks(self) -> list[Layers]:
+        """Layers of the base, those together whose columns are of one type."""
+        layers = [
+            self._weights(tensors, self.position.columns.size if i == 0 or layer.skip else 0)
+            for i, (layer, tensors) in enumerate(zip(self.weights.base, self._base, strict=True))
+        ]
+        return [stacked(list(group)) for _, group in itertools.groupby(layers, key=lambda layer: layer.columns.dtype)]
+
+    @cached_property
+    def _head_stack(self) -> Layers:
+        return stacked(
+            [self._weights(layer, 0 if i else self.direction.columns.size) for i, layer in enumerate(self._head)]
+        )
+
+    def _nothing(self, poly: Tensor) -> Pieces:
+        """As many pieces as ``poly`` [B, m, k] has, of no neuron."""
+        pieces, m, _ = poly.shape
+        none, index = torch.zeros(pieces, 0, dtype=torch.float64), torch.zeros(0, dtype=torch.int64)
+        failed, count = torch.zeros(pieces, dtype=torch.bool), torch.zeros(pieces, dtype=torch.int64)
+        return Pieces(
+            torch.zeros(pieces, m, 0, dtype=torch.float64), none[:0], index, none, index, index,
+            torch.zeros(0, dtype=torch.float64), none, none, none, failed, count,
+        )  # fmt: skip
 
     def density(self, pieces: Pieces) -> Affine:
         """The density before its softplus, one output."""
@@ -444,7 +507,11 @@ class FieldBounds:
 
     def color(self, pieces: Pieces, poly: Tensor, remainder: Tensor) -> Affine:
         """The colour before its sigmoid, three outputs, from an encoded direction."""
-        pieces = self._relu(self._linear(pieces, self._head[0], (poly, remainder)))
-        for tensors in self._head[1:]:
-            pieces = self._relu(self._linear(pieces, tensors))
+        first = poly, remainder
+        if self._grid is not None:
+            pieces = self._hidden(pieces, self._head_stack, first, self._grid)
+        else:
+            pieces = self._relu(self._linear(pieces, self._head[0], first))
+            for layer in self._head[1:]:
+                pieces = self._relu(self._linear(pieces, layer))
         return self._linear(pieces, self._color)

@@ -1,0 +1,209 @@
+"""Layer after layer on a few pieces at a time, which stay in a core's cache meanwhile (design.md, F4, F5)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+
+from ns_abstract.arithmetic.simd.lanes import LINE
+from ns_abstract.methods.nerf import relu_kernel
+from ns_abstract.methods.nerf.layer_kernel import Before, Behind, Weights, linear
+from ns_abstract.methods.nerf.relu_kernel import relu
+
+#: Pieces that go through all layers together.
+CHUNK = 8
+
+
+class Layers(NamedTuple):
+    """Layers one behind the other, so that kernels are compiled once for any number of them; made by `stacked`.
+
+    Attributes:
+        shapes: [L, 3] rows that belong to an encoded vector, to neurons, and outputs.
+        begins: [L, 3] where a layer begins in ``wide`` and ``columns``, in ``absolute``, and in ``bias``.
+        wide, columns, absolute, bias: Those of `layer_kernel.Weights`, rows of an encoded vector first.
+        rounding: [L].
+        narrow, underflow: Of all layers.
+    """
+
+    shapes: np.ndarray
+    begins: np.ndarray
+    wide: np.ndarray
+    columns: np.ndarray
+    absolute: np.ndarray
+    bias: np.ndarray
+    rounding: np.ndarray
+    narrow: float
+    underflow: float
+
+
+def stacked(layers: Sequence[Weights]) -> Layers:
+    """``layers``, whose columns are of one type, one behind the other."""
+    shapes = np.array([(len(w.seen), len(w.wide), len(w.bias)) for w in layers], np.int64)
+    wide = [part.ravel() for w in layers for part in (w.seen, w.wide)]
+    # nobody multiplies columns by rows of an encoded vector
+    columns = [part.astype(w.columns.dtype).ravel() for w in layers for part in (w.seen, w.columns)]
+    absolute = [part.ravel() for w in layers for part in (w.seen_absolute, w.absolute)]
+    sizes = [(w.seen.size + w.wide.size, w.seen_absolute.size + w.absolute.size, len(w.bias)) for w in layers]
+    begins = np.concatenate([np.zeros((1, 3), np.int64), np.cumsum(np.array(sizes, np.int64), axis=0)[:-1]])
+    return Layers(
+        shapes, begins, _joined(wide), _joined(columns), _joined(absolute), _joined([w.bias for w in layers]),
+        np.array([w.rounding for w in layers]), layers[0].narrow, layers[0].underflow,
+    )  # fmt: skip
+
+
+def _joined(parts: list[np.ndarray]) -> np.ndarray:
+    """``parts`` one behind the other, from the beginning of a line on."""
+    size, kind = sum(part.size for part in parts), parts[0].dtype
+    room = np.empty(size + LINE // kind.itemsize, kind)
+    first = -room.ctypes.data % LINE // kind.itemsize
+    return np.concatenate(parts, out=room[first : first + size])
+
+
+class Room(NamedTuple):
+    """Where CHUNK pieces are kept behind a layer and its activation, each array for the widest layer, flat.
+
+    Attributes:
+        poly, sums, box, slope, size, spread: float64.
+        failed, count: [CHUNK].
+        piece, neuron, error: Of new error terms.
+        columns, owner: Of the columns' type, and their pieces.
+    """
+
+    poly: np.ndarray
+    sums: np.ndarray
+    box: np.ndarray
+    slope: np.ndarray
+    size: np.ndarray
+    spread: np.ndarray
+    failed: np.ndarray
+    count: np.ndarray
+    piece: np.ndarray
+    neuron: np.ndarray
+    error: np.ndarray
+    columns: np.ndarray
+    owner: np.ndarray
+
+
+@njit(cache=True, error_model="numpy")
+def _room(m, n, columns, kind):
+    """A `Room` for layers of at most n neurons, m coefficients and so many ``columns``."""
+    k = CHUNK * n
+    return Room(
+        np.empty(m * k), np.empty(k), np.empty(k), np.empty(k), np.empty(k), np.empty(k), np.empty(CHUNK, np.bool_),
+        np.empty(CHUNK, np.int64), np.empty(k, np.int64), np.empty(k, np.int64), np.empty(k),
+        np.empty(columns * n, kind), np.empty(columns, np.int64),
+    )  # fmt: skip
+
+
+@njit(cache=True, error_model="numpy")
+def _layer(layers, i):
+    """The layer i as `layer_kernel.Weights`."""
+    seen, inputs, n = layers.shapes[i]
+    first, second, third = layers.begins[i]
+    rows, stride = seen + inputs, n + -n % (LINE // 2)
+    wide = layers.wide[first : first + rows * stride].reshape((rows, stride))
+    columns = layers.columns[first : first + rows * stride].reshape((rows, stride))
+    absolute = layers.absolute[second : second + rows * n].reshape((rows, n))
+    return Weights(
+        wide[:seen], absolute[:seen], wide[seen:], columns[seen:], absolute[seen:], layers.bias[third : third + n],
+        layers.rounding[i], layers.narrow, layers.underflow,
+    )  # fmt: skip
+
+
+@njit(cache=True, error_model="numpy")
+def _step(z, encoded, remainder, weights, grid, limit, room):
+    """One layer and its activation on the pieces ``z``; returns what is kept of them in ``room``."""
+    (pieces, m, _), n = z.poly.shape, weights.bias.shape[0]
+    k, rows = pieces * n, room.owner.shape[0]
+    poly, columns = room.poly[: m * k].reshape((pieces, m, n)), room.columns[: rows * n].reshape((rows, n))
+    sums, box = room.sums[:k].reshape((pieces, n)), room.box[:k].reshape((pieces, n))
+    slope, size = room.slope[:k].reshape((pieces, n)), room.size[:k].reshape((pieces, n))
+    spread, failed, count = room.spread[:k].reshape((pieces, n)), room.failed[:pieces], room.count[:pieces]
+    total = linear(z, encoded, remainder, weights, Behind(poly, columns, room.owner, sums, box))
+    new = relu(
+        relu_kernel.Before(poly, sums, box, z.failed, z.count), grid, limit,
+        relu_kernel.Behind(slope, size, spread, failed, count, room.piece, room.neuron, room.error),
+    )  # fmt: skip
+    return Before(
+        poly, size, spread, box, slope, failed, count, columns[:total], room.owner[:total], room.piece[:new],
+        room.neuron[:new], room.error[:new],
+    )  # fmt: skip
+
+
+@njit(cache=True, error_model="numpy")
+def _copy(source, target):
+    """All of ``source`` into ``target``, which is as large: an assignment looks at every index."""
+    flat, result = source.reshape(-1), target.reshape(-1)
+    for i in range(flat.shape[0]):
+        result[i] = flat[i]
+
+
+@njit(cache=True, error_model="numpy")
+def _piecewise(z, first, new, begin, past):
+    """Pieces ``begin`` to ``past`` of ``z``, whose columns, and those of one neuron, begin at ``first`` and ``new``.
+
+    Returns:
+        The pieces, with owners from 0 on, and where the next one's columns begin.
+    """
+    last, latest = first, new
+    while last < z.owner.shape[0] and z.owner[last] < past:
+        last += 1
+    while latest < z.new_owner.shape[0] and z.new_owner[latest] < past:
+        latest += 1
+    return (
+        Before(
+            z.poly[begin:past], z.size[begin:past], z.spread[begin:past], z.box[begin:past], z.slope[begin:past],
+            z.failed[begin:past], z.count[begin:past], z.columns[first:last], z.owner[first:last] - begin,
+            z.new_owner[new:latest] - begin, z.new_neuron[new:latest], z.new_size[new:latest],
+        ),
+        last,
+        latest,
+    )  # fmt: skip
+
+
+@njit(cache=True, error_model="numpy")
+def hidden_layers(z, encoded, remainder, layers, grid, limit, out):
+    """Layers and their activations, the pieces in the order in which they are given.
+
+    Args:
+        z: `layer_kernel.Before` of B pieces.
+        encoded, remainder: [B, m, k] and [B, k] of the vector that layers see (`layer_kernel.linear`).
+        layers: `Layers`.
+        grid, limit: See `relu_kernel.relu`.
+        out: `layer_kernel.Before` of the last layer, filled; [B limit, n] columns and [B n] new error terms have room.
+
+    Returns:
+        Numbers of columns and of new error terms.
+    """
+    pieces, m = z.poly.shape[:2]
+    widest = layers.shapes[:, 2].max()
+    rows, kind = CHUNK * limit, z.columns.dtype
+    here, there = _room(m, widest, rows, kind), _room(m, widest, rows, kind)
+    first, new, columns, terms = 0, 0, 0, 0
+    for begin in range(0, pieces, CHUNK):
+        past = min(begin + CHUNK, pieces)
+        found, first, new = _piecewise(z, first, new, begin, past)
+        for i in range(layers.shapes.shape[0]):
+            found = _step(found, encoded[begin:past], remainder[begin:past], _layer(layers, i), grid, limit, here)
+            here, there = there, here
+        _copy(found.poly, out.poly[begin:past])
+        _copy(found.size, out.size[begin:past])
+        _copy(found.spread, out.spread[begin:past])
+        _copy(found.box, out.box[begin:past])
+        _copy(found.slope, out.slope[begin:past])
+        _copy(found.failed, out.failed[begin:past])
+        _copy(found.count, out.count[begin:past])
+        for c in range(found.owner.shape[0]):
+            if not found.failed[found.owner[c]]:
+                _copy(found.columns[c], out.columns[columns])
+                out.owner[columns] = found.owner[c] + begin
+                columns += 1
+        for c in range(found.new_owner.shape[0]):
+            if not found.failed[found.new_owner[c]]:
+                out.new_owner[terms], out.new_neuron[terms] = found.new_owner[c] + begin, found.new_neuron[c]
+                out.new_size[terms] = found.new_size[c]
+                terms += 1
+    return columns, terms
