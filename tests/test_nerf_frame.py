@@ -302,7 +302,7 @@ def test_processes_find_what_this_process_finds_and_survive_a_kill() -> None:
     box = pose_set.box.split(0, 2)[0]
     tiles = np.arange(12)
     shared, alone = NerfFrame(scene, UNIFORM, pose_set, workers=2), NerfFrame(scene, UNIFORM, pose_set)
-    assert shared.tiles_at_once == 2 * alone.tiles_at_once
+    assert shared.tiles_at_once == 8 * alone.tiles_at_once
     engine = frame_module._processes(2)
     try:
         together = shared.bound(box, tiles)

@@ -13,6 +13,7 @@ from nerfs import raw_outputs, tiny_weights
 from ns_abstract.arithmetic.simd.lanes import LINE
 from ns_abstract.methods.nerf import zonotope
 from ns_abstract.methods.nerf.bounds import basis_of, greatest, opacity
+from ns_abstract.methods.nerf.field_kernel import CHUNK
 from ns_abstract.methods.nerf.layer_kernel import BLOCK, Before, Behind, Weights, linear
 from ns_abstract.methods.nerf.scene import Encoding, FieldWeights, Layer
 from ns_abstract.methods.nerf.zonotope import Affine, FieldBounds
@@ -55,8 +56,8 @@ def worst(
     zero = torch.zeros(count, 3, dtype=torch.float64)
     encoded = field.encode(on_curve(curve, basis.nodes), zero, field.position)
     seen = field.encode(on_curve(direction, basis.nodes), zero, field.direction)
-    pieces = field.base(*encoded)
-    found = [field.density(pieces), field.color(pieces, *seen)]
+    pieces, density = field.base(*encoded)
+    found = [density, field.color(pieces, *seen)]
     rng = np.random.default_rng(seed + 2)
     points = np.concatenate([rng.uniform(-1, 1, (samples, dimensions)), rng.choice([-1.0, 1.0], (8, dimensions))])
     values = torch.from_numpy(basis.values(points))
@@ -279,16 +280,22 @@ def test_products_leave_out_what_is_off(kind: type, inputs: int, live: int, outp
         *np.full((2, batch, outputs), np.nan),
     )  # fmt: skip
     rest = np.where(off, np.nan, rng.uniform(size=(batch, inputs)))
-    before = Before(poly, np.where(off, 0.0, 1.0), rest, rest, slope, columns, owner, new_owner, neuron, sizes)
-    lines = np.full((inputs, outputs + -outputs % (LINE // 2)), np.nan)
-    lines[:, :outputs] = wide
-    bias = rng.normal(size=outputs)
-    weights = Weights(lines, lines.astype(kind), np.abs(wide), bias, 0.0, 0.0, 0.0)
-    linear(before, weights, poly[:0, :, :outputs], rest[:0], out)
-    result = np.where(off[:, None], 0.0, poly) @ wide
+    failed, none = np.zeros(batch, bool), np.zeros(batch, np.int64)
+    before = Before(
+        poly, np.where(off, 0.0, 1.0), rest, rest, slope, failed, none, columns, owner, new_owner, neuron, sizes
+    )
+    # columns and rows of an encoded vector come first
+    lines = np.full((2 + inputs, outputs + -outputs % (LINE // 2)), np.nan)
+    given = rng.normal(size=(2, outputs))
+    lines[:, :outputs] = np.concatenate([given, wide])
+    encoded, remainder, bias = rng.normal(size=(batch, m, 2)), rng.uniform(size=(batch, 2)), rng.normal(size=outputs)
+    weights = Weights(lines[:2], np.abs(given), lines[2:], lines[2:].astype(kind), np.abs(wide), bias, 0.0, 0.0, 0.0)
+    assert linear(before, encoded, remainder, weights, out) == total
+    result = np.where(off[:, None], 0.0, poly) @ wide + encoded @ given
     result[:, 0] += bias
     np.testing.assert_allclose(out.poly, result, atol=1e-12)
-    np.testing.assert_allclose(out.box, np.where(off, 0.0, rest) @ np.abs(wide), atol=1e-12)
+    box = np.where(off, 0.0, rest) @ np.abs(wide) + remainder @ np.abs(given)
+    np.testing.assert_allclose(out.box, box, atol=1e-12)
     for b in range(batch):
         old = np.where(off[b], 0.0, columns[owner == b] * slope[b]).astype(np.float64) @ wide
         new = sizes[new_owner == b, None] * wide[neuron[new_owner == b]]
@@ -309,17 +316,20 @@ def test_pieces_with_too_many_terms_are_given_up() -> None:
     field = FieldBounds(weights, basis, limit=3)
     curve = curves(8, 0.3, 1, 0)
     nodes = on_curve(curve, basis.nodes)
-    pieces = field.base(*field.encode(nodes, torch.zeros(8, 3, dtype=torch.float64), field.position))
+    pieces, _ = field.base(*field.encode(nodes, torch.zeros(8, 3, dtype=torch.float64), field.position))
     assert pieces.failed.any()
     assert not pieces.failed[pieces.owner].any() and not pieces.failed[pieces.new_owner].any()
 
 
-def test_numbers_that_are_none_fail() -> None:
+@pytest.mark.parametrize("compiled", [True, False])
+def test_numbers_that_are_none_fail(compiled: bool) -> None:
     weights, basis = tiny_weights(0), basis_of(1)
     field = FieldBounds(weights, basis)
+    if not compiled:
+        field._grid = None
     nodes = on_curve(curves(4, 0.01, 1, 0), basis.nodes).clone()
     nodes[2] = float("nan")
-    pieces = field.base(*field.encode(nodes, torch.zeros(4, 3, dtype=torch.float64), field.position))
+    pieces, _ = field.base(*field.encode(nodes, torch.zeros(4, 3, dtype=torch.float64), field.position))
     assert pieces.failed.tolist() == [False, False, True, False]
 
 
@@ -333,7 +343,7 @@ def test_compiled_and_torch_agree(monkeypatch: pytest.MonkeyPatch) -> None:
         assert field._grid is not None
         if not compiled:
             field._grid = None
-        found.append(field.base(*field.encode(nodes, zero, field.position)))
+        found.append(field.base(*field.encode(nodes, zero, field.position))[0])
     assert found[0].new_size.numel() > 0
     for name in ("owner", "new_owner", "new_neuron", "failed", "count"):
         assert torch.equal(getattr(found[0], name), getattr(found[1], name)), name
@@ -341,6 +351,44 @@ def test_compiled_and_torch_agree(monkeypatch: pytest.MonkeyPatch) -> None:
         pieces.poly = pieces.poly * (pieces.size != 0.0)[:, None]
     for name in ("poly", "columns", "slope", "new_size", "spread", "box", "size"):
         torch.testing.assert_close(getattr(found[0], name), getattr(found[1], name), rtol=1e-9, atol=1e-11)
+
+
+@pytest.mark.parametrize("layers", [3, 6])
+def test_chunks_are_as_good_as_layer_after_layer(layers: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Pieces of several chunks, the last one smaller, in fields whose early layers have float64 columns or not."""
+    weights, basis = tiny_weights(2, rough=5.0), basis_of(1)
+    if layers > len(weights.base):
+        # copies of a hidden layer in between
+        middle = next(layer for layer in weights.base[1:] if not layer.skip)
+        added = (middle,) * (layers - len(weights.base))
+        weights = replace(weights, base=(weights.base[0], *added, *weights.base[1:]))
+    field = FieldBounds(weights, basis)
+    assert field._grid is not None
+    count = 2 * CHUNK + 3
+    zero = torch.zeros(count, 3, dtype=torch.float64)
+    encoded = field.encode(on_curve(curves(count, 6e-3, 1, 0), basis.nodes), zero, field.position)
+    seen = field.encode(on_curve(curves(count, 6e-3, 1, 1), basis.nodes), zero, field.direction)
+    pieces, density = field.base(*encoded)
+    # colours are of some pieces, whose columns begin anywhere
+    some = torch.tensor([1, 2, *range(CHUNK - 1, count)])
+    color = field.color(pieces.select(some), *(part[some] for part in seen))
+    after = field._relu(field._first(*encoded, field._base[0]))
+    for layer, tensors in zip(weights.base[1:], field._base[1:], strict=True):
+        after = field._relu(field._linear(after, tensors, encoded if layer.skip else None))
+    assert torch.equal(pieces.failed, after.failed) and not after.failed.any()
+    for name in ("owner", "new_owner", "new_neuron", "count"):
+        assert torch.equal(getattr(pieces, name), getattr(after, name)), name
+    for name in ("columns", "slope", "new_size", "spread", "box", "size"):
+        torch.testing.assert_close(getattr(pieces, name), getattr(after, name), rtol=1e-9, atol=1e-11)
+    head = after.select(some)
+    for i, tensors in enumerate(field._head):
+        head = field._relu(field._linear(head, tensors, None if i else tuple(part[some] for part in seen)))
+    for found, expected in (
+        (density, field._linear(after, field._density)),
+        (color, field._linear(head, field._color)),
+    ):
+        for name in ("poly", "spread", "box"):
+            torch.testing.assert_close(getattr(found, name), getattr(expected, name), rtol=1e-9, atol=1e-11)
 
 
 # ---------------------------------------------------------------- planted faults
@@ -392,8 +440,8 @@ def faulty_sums(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_planted_faults_are_found(monkeypatch: pytest.MonkeyPatch, fault, half: float) -> None:
     weights = [tiny_weights(seed, rough=20.0) for seed in range(3)]
     assert max(worst(w, half, seed=s)[0] for s, w in enumerate(weights)) <= 0.0
-    if fault is faulty_fit:
-        # the general rule, which the compiled one agrees with
+    if fault is not faulty_remainder:
+        # the general rules, which the compiled ones agree with
         monkeypatch.setattr(zonotope, "grid_of", lambda basis: None)
     fault(monkeypatch)
     assert max(worst(w, half, seed=s)[0] for s, w in enumerate(weights)) > 0.0

@@ -28,16 +28,32 @@ FIELDS = (
     Fault(
         "fields: a layer forgets the box before it",
         _ZONOTOPE, "FieldBounds._linear", "radius @ layer.absolute[count:]", "0.0 * (radius @ layer.absolute[count:])",
-        _LAYERS,
+        _LAYERS + "[False-False]",
     ),
     Fault(
         "fields: a layer forgets its bias",
-        _ZONOTOPE, "FieldBounds._linear", "poly[:, 0] += layer.bias", "pass", _LAYERS,
+        _ZONOTOPE, "FieldBounds._shift", "poly[:, 0] += layer.bias", "pass", _LAYERS + "[False-False]",
+    ),
+    Fault(
+        "layers: the compiled one forgets the box before it",
+        _LAYER, "_box", "(size[j] + before[j]) * rounding + before[j]", "(size[j] + before[j]) * rounding",
+        _LAYERS + "[True-True]",
+    ),
+    Fault(
+        "layers: the compiled one forgets its bias",
+        _LAYER, "linear", "constant[j] += bias[j]", "pass", _LAYERS + "[True-True]",
+    ),
+    Fault(
+        "layers: the compiled one forgets what it sees of an encoded vector",
+        _LAYER, "linear", "line[j] += more[j]", "pass", _PRODUCTS,
+    ),
+    Fault(
+        "layers: the compiled one forgets the remainder of an encoded vector",
+        _LAYER, "_box", "rest[j] + rounding * whole[j]", "rounding * whole[j]", _PRODUCTS,
     ),
     Fault(
         "fields: error terms of one neuron lose their size",
-        _LAYER, "linear", "terms.new_size[c] * wide[terms.new_neuron[c], j]",
-        "0.1 * terms.new_size[c] * wide[terms.new_neuron[c], j]", _LAYERS,
+        _LAYER, "_columns", "size * line[j]", "0.1 * size * line[j]", _LAYERS + "[True-True]",
     ),
     Fault(
         "layers: gradual underflow of columns in float32 is not charged",
@@ -45,18 +61,20 @@ FIELDS = (
     ),
     Fault(
         "layers: columns in float32 are not charged",
-        _ZONOTOPE, "FieldBounds._linear",
-        "radius.addcmul_(steps * (1.0 + 2.0**-10) * UNIT32, pieces.spread).add_(UNDERFLOW_COLUMNS)",
-        "radius.add_(UNDERFLOW_COLUMNS)", _NARROW + "[1.0]",
+        _LAYER, "_box", "narrow * spread[j] + underflow", "underflow", _NARROW + "[1.0]",
     ),
     Fault(
         "layers: the sum of error terms forgets those that are new",
-        _ZONOTOPE, "FieldBounds._relu", "spread[which, neuron] += error", "pass", _UNITS + "[1-True]",
+        _ZONOTOPE, "FieldBounds._relu_torch", "spread[which, neuron] += error", "pass", _UNITS + "[1-False]",
+    ),
+    Fault(
+        "compiled units: the sum of error terms forgets those that are new",
+        _RELU, "relu", "out.spread[out.piece[i], out.neuron[i]] += out.error[i]", "pass", _UNITS + "[1-True]",
     ),
     Fault(
         "layers: where torch works alone, sums of error terms are too small",
-        _ZONOTOPE, "FieldBounds._product", "column_sums(columns, owner, batch)",
-        "0.2 * column_sums(columns, owner, batch)", _LAYERS + "[False-False]",
+        _ZONOTOPE, "FieldBounds._linear", "column_sums(columns, owner, poly.shape[0])",
+        "0.2 * column_sums(columns, owner, poly.shape[0])", _LAYERS + "[False-False]",
     ),
     Fault(
         "layers: where torch works alone, what a range shows to be on is off",
@@ -79,7 +97,7 @@ FIELDS = (
     ),
     Fault(
         "layers: open neurons are left out as those that are off",
-        _LAYER, "linear", "size[b, j] != 0.0", "size[b, j] != 0.0 and terms.slope[b, j] == 1.0", _LAYERS,
+        _LAYER, "linear", "size[j] != 0.0", "size[j] != 0.0 and z.slope[b, j] == 1.0", _LAYERS + "[True-True]",
     ),
     Fault(
         "fields: an open unit counts as active",
@@ -110,8 +128,23 @@ FIELDS = (
     ),
     Fault(
         "fields: what is no number does not fail",
-        _ZONOTOPE, "FieldBounds._relu", "z.failed | (count > self.limit) | ~torch.isfinite(size).all(dim=1)",
-        "z.failed | (count > self.limit)", "test_nerf_zonotope.py::test_numbers_that_are_none_fail", True,
+        _ZONOTOPE, "FieldBounds._relu_torch", "z.failed | (count > self.limit) | ~torch.isfinite(size).all(dim=1)",
+        "z.failed | (count > self.limit)", "test_nerf_zonotope.py::test_numbers_that_are_none_fail[False]", True,
+    ),
+    Fault(
+        "compiled units: what is no number does not fail",
+        _RELU, "relu", "failed |= not math.isfinite(out.size[b, j])", "pass",
+        "test_nerf_zonotope.py::test_numbers_that_are_none_fail[True]", True,
+    ),
+    Fault(
+        "fields: the second chunk of pieces begins with the first one's columns",
+        "methods/nerf/field_kernel.py", "_piecewise", "z.columns[first:last]", "z.columns[: last - first]",
+        "test_nerf_zonotope.py::test_chunks_are_as_good_as_layer_after_layer", True,
+    ),
+    Fault(
+        "fields: columns of failed pieces are kept",
+        "methods/nerf/field_kernel.py", "through_layers", "not found.failed[found.owner[c]]", "True",
+        "test_nerf_zonotope.py::test_pieces_with_too_many_terms_are_given_up", True,
     ),
     Fault(
         "compiled units: values on the grid are without the highest degrees",
@@ -131,16 +164,16 @@ FIELDS = (
     ),
     Fault(
         "compiled units: the line's error is a quarter of what it is",
-        _RELU, "relu", "line_error = (0.5 * line * -bottom + 4.0 * slack) * FIELD_UP",
+        _RELU, "_open", "line_error = (0.5 * line * -bottom + 4.0 * slack) * FIELD_UP",
         "line_error = (0.25 * line * -bottom + 4.0 * slack) * FIELD_UP", _UNITS + "[1-True]",
     ),
     Fault(
         "compiled units: the fit is not shifted to its middle",
-        _RELU, "relu", "0.5 * (most[c] + least[c])", "0.0", _UNITS + "[1-True]",
+        _RELU, "_open", "0.5 * (most[c] + least[c])", "0.0", _UNITS + "[1-True]",
     ),
     Fault(
         "compiled units: columns are halved without their error",
-        _RELU, "relu",
+        _RELU, "_open",
         "(new + 0.5 * e + 2.0 * slack) * FIELD_UP", "(new + 2.0 * slack) * FIELD_UP",
         _UNITS + "[1-True]",
     ),

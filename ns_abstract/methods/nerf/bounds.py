@@ -388,7 +388,7 @@ class NerfBounds:
             lines, radius = pencil.points(ray, self.distances[place], 0.0 * self.distances[place])
             nodes = monomials @ torch.from_numpy(lines).to(self.device)
             encoded = coarse.encode(nodes, torch.from_numpy(radius).to(self.device), coarse.position)
-            z = coarse.density(coarse.base(*encoded))
+            _, z = coarse.base(*encoded)
             ends = _parts(z, bernstein)
             length = torch.from_numpy(self.lengths[place]).to(self.device)[:, None]
             alpha = [opacity(ends[up][..., 0], length, up=bool(up)).cpu().numpy() for up in (0, 1)]
@@ -720,8 +720,7 @@ class _Work:
         there = monomials[torch.from_numpy(items.cell).to(device)]
         nodes = there @ torch.from_numpy(lines).to(device)
         encoded = field.encode(nodes, torch.from_numpy(radius).to(device), field.position)
-        pieces = field.base(*encoded)
-        density = field.density(pieces)
+        pieces, density = field.base(*encoded)
         halve, lost = np.zeros((2, len(items)), bool)
         seen = np.flatnonzero(~self._leave_alike(level, items, density))
         if not seen.size:

@@ -38,9 +38,13 @@ class Layers(NamedTuple):
     narrow: float
     underflow: float
 
+    def none(self) -> Layers:
+        """No layer, with columns of the same type."""
+        return self._replace(shapes=self.shapes[:0], begins=self.begins[:0])
+
 
 def stacked(layers: Sequence[Weights]) -> Layers:
-    """``layers``, whose columns are of one type, one behind the other."""
+    """``layers``, one at least, whose columns are of one type, one behind the other."""
     shapes = np.array([(len(w.seen), len(w.wide), len(w.bias)) for w in layers], np.int64)
     wide = [part.ravel() for w in layers for part in (w.seen, w.wide)]
     # nobody multiplies columns by rows of an encoded vector
@@ -60,6 +64,14 @@ def _joined(parts: list[np.ndarray]) -> np.ndarray:
     room = np.empty(size + LINE // kind.itemsize, kind)
     first = -room.ctypes.data % LINE // kind.itemsize
     return np.concatenate(parts, out=room[first : first + size])
+
+
+class Outputs(NamedTuple):
+    """B pieces behind a last layer: polynomials [B, m, n], sums of absolute columns and box [B, n]."""
+
+    poly: np.ndarray
+    sums: np.ndarray
+    box: np.ndarray
 
 
 class Room(NamedTuple):
@@ -165,21 +177,24 @@ def _piecewise(z, first, new, begin, past):
 
 
 @njit(cache=True, error_model="numpy")
-def hidden_layers(z, encoded, remainder, layers, grid, limit, out):
-    """Layers and their activations, the pieces in the order in which they are given.
+def through_layers(z, encoded, remainder, layers, last, grid, limit, out, outputs):
+    """Layers with their activations and a last one without, the pieces in the order in which they are given.
 
     Args:
         z: `layer_kernel.Before` of B pieces.
         encoded, remainder: [B, m, k] and [B, k] of the vector that layers see (`layer_kernel.linear`).
-        layers: `Layers`.
+        layers, last: `Layers`; at most one is last, which sees no encoded vector.
         grid, limit: See `relu_kernel.relu`.
-        out: `layer_kernel.Before` of the last layer, filled; [B limit, n] columns and [B n] new error terms have room.
+        out: `layer_kernel.Before` behind ``layers``, filled; [B limit, n] columns and [B n] new error terms have room.
+        outputs: `Outputs` of the last layer, filled.
 
     Returns:
         Numbers of columns and of new error terms.
     """
     pieces, m = z.poly.shape[:2]
     widest = layers.shapes[:, 2].max()
+    if last.shapes.shape[0]:
+        widest = max(widest, last.shapes[0, 2])
     rows, kind = CHUNK * limit, z.columns.dtype
     here, there = _room(m, widest, rows, kind), _room(m, widest, rows, kind)
     first, new, columns, terms = 0, 0, 0, 0
@@ -189,6 +204,13 @@ def hidden_layers(z, encoded, remainder, layers, grid, limit, out):
         for i in range(layers.shapes.shape[0]):
             found = _step(found, encoded[begin:past], remainder[begin:past], _layer(layers, i), grid, limit, here)
             here, there = there, here
+        if last.shapes.shape[0]:
+            # its columns are of no use but for their sums; ``here`` is free
+            weights, n = _layer(last, 0), last.shapes[0, 2]
+            tail = here.columns[: rows * n].reshape((rows, n))
+            poly, sums, box = outputs.poly[begin:past], outputs.sums[begin:past], outputs.box[begin:past]
+            behind = Behind(poly, tail, here.owner, sums, box)
+            linear(found, encoded[begin:past], remainder[begin:past], weights, behind)
         _copy(found.poly, out.poly[begin:past])
         _copy(found.size, out.size[begin:past])
         _copy(found.spread, out.spread[begin:past])

@@ -36,8 +36,9 @@ _LOOK_RAYS, _LOOK_POSES = 256, 7
 _LOOK_SHARES = np.linspace(0.0, 1.0, 9)
 #: Parts of every range of hues and saturations; pixels that a turn of the whole circle counts for.
 _SHIFT_PARTS, _SHIFT_MOTION = 12, 6.0
-#: Weights that a worker multiplies between two looks at the clock, in units of rays times weights.
-_WORK = 1_250_000
+#: Weights of one share of work, in units of rays times weights, and shares of a worker between two looks at the goal
+#: where there are several workers: they end at about the same time.
+_WORK, _SHARES = 1_600_000, 4
 #: Rays that fill the batches of a GPU.
 _RAYS_ON_DEVICE = 256
 #: Seconds between looks at results of other processes, and those that they get to end when the time is over.
@@ -130,8 +131,9 @@ class NerfFrame:
         self.bounds = NerfBounds(*self._recipe)
         weights = sum(array.size for array in scene.fine.arrays())
         self.workers = workers
-        rays = int(np.clip(_WORK // weights, 1, 32)) if self.bounds.field.compiled else _RAYS_ON_DEVICE
-        self.tiles_at_once = workers * rays
+        compiled = self.bounds.field.compiled
+        self._share = int(np.clip(_WORK // weights, 1, 32)) if compiled else _RAYS_ON_DEVICE
+        self.tiles_at_once = workers * self._share * (_SHARES if compiled and workers > 1 else 1)
         self._witness: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None
 
     #: Few kernels, which are compiled together.
@@ -208,12 +210,12 @@ class NerfFrame:
             if within is not None:
                 known = within.alpha[np.searchsorted(within.tiles, tiles)]
             parts = []
-            try:
-                for i in range(0, tiles.size, self.tiles_at_once):
-                    mine = slice(i, i + self.tiles_at_once)
-                    parts += self._batch(box, tiles[mine], None if known is None else known[mine])
-            except AbandonedError:
-                parts.append(self._unknown(tiles.size - sum(len(part.lower) for part in parts)))
+            for i in range(0, tiles.size, self.tiles_at_once):
+                if is_over():
+                    parts.append(self._unknown(tiles.size - i))
+                    break
+                mine = slice(i, i + self.tiles_at_once)
+                parts += self._batch(box, tiles[mine], None if known is None else known[mine])
             lower, upper, alpha = (
                 np.concatenate([getattr(part, name) for part in parts]) for name in ("lower", "upper", "alpha")
             )
@@ -234,12 +236,12 @@ class NerfFrame:
         return RayBounds(np.zeros((count, 3)), np.ones((count, 3)), alpha, 0, self.bounds.displacement)
 
     def _batch(self, box: ParameterBox, tiles: np.ndarray, known: np.ndarray | None) -> list[RayBounds]:
-        """Bounds of rays that are worked on together, in one share for every worker."""
+        """Bounds of rays that are worked on together, in shares for all workers."""
         tolerance, shifts = self._tolerance(box), self._shifts(box)
         low, high = self._reached(box, tiles, bool(shifts))
         low, high = low - tolerance, high + tolerance
         poses = box.without(COLOR_SHIFTS)
-        size = -(-tiles.size // self.workers)
+        size = min(self._share, -(-tiles.size // self.workers))
         shares = []
         for start in range(0, tiles.size, size):
             part = slice(start, start + size)
@@ -249,18 +251,33 @@ class NerfFrame:
                     None if known is None else known[part], (low[part], high[part]), shifts,
                 )
             )  # fmt: skip
-        found = self._run(shares)
-        self.bounds.displacement = typical_displacement(found)
-        return found
+        found = self._tried(shares)
+        done = [part for part in found if part is not None]
+        if done:
+            self.bounds.displacement = typical_displacement(done)
+        return [
+            self._unknown(len(share[2])) if part is None else part for share, part in zip(shares, found, strict=True)
+        ]
 
     def _run(self, calls: Sequence[Sequence[Any]]) -> list[RayBounds]:
         """`NerfBounds.rays` with the arguments of each call, side by side where there are several.
 
         Raises:
-            AbandonedError: There is no time for it.
+            AbandonedError: There is no time for all of them.
         """
+        found = [part for part in self._tried(calls) if part is not None]
+        if len(found) < len(calls):
+            raise AbandonedError
+        return found
+
+    def _tried(self, calls: Sequence[Sequence[Any]]) -> list[RayBounds | None]:
+        """See `_run`; None: there was no time for a call."""
         if len(calls) == 1 or self.workers == 1:
-            return [self.bounds.rays(*call) for call in calls]
+            parts: list[RayBounds | None] = []
+            with suppress(AbandonedError):
+                for call in calls:
+                    parts.append(self.bounds.rays(*call))
+            return parts + [None] * (len(calls) - len(parts))
         engine = _processes(self.workers)
         for number, call in enumerate(calls):
             engine.submit(number, _bound_share, self._token, self._recipe, self.bounds.displacement, call)
@@ -275,14 +292,13 @@ class NerfFrame:
                     patience = time.monotonic() + _GRACE
                     engine.abandon()
                 if patience is not None and (not engine.unfinished or time.monotonic() > patience):
-                    raise AbandonedError
-        except BaseException:
+                    break
+        finally:
             # what is still at work would answer those who ask next
             if engine.unfinished:
                 _processes.cache_clear()
                 engine.close()
-            raise
-        return [done[number] for number in range(len(calls))]
+        return [done.get(number) for number in range(len(calls))]
 
     @cached_property
     def _strips(self) -> Strips:

@@ -33,7 +33,7 @@ from ns_abstract.arithmetic.rounding import (
 )
 from ns_abstract.arithmetic.simd.lanes import LINE
 from ns_abstract.methods.nerf import layer_kernel, relu_kernel
-from ns_abstract.methods.nerf.field_kernel import Layers, hidden_layers, stacked
+from ns_abstract.methods.nerf.field_kernel import Layers, Outputs, stacked, through_layers
 from ns_abstract.methods.nerf.layer_kernel import Weights, linear
 from ns_abstract.methods.nerf.relu_kernel import LEAST_SLOPE, Grid, grid_of, relu
 from ns_abstract.methods.nerf.scene import Encoding, FieldWeights, Layer, Waves
@@ -315,8 +315,13 @@ class FieldBounds:
         )  # fmt: skip
         return Affine(poly, columns[:found], owner[:found], sums, box, pieces.failed, pieces.count)
 
-    def _hidden(self, pieces: Pieces, layers: Layers, first: tuple[Tensor, Tensor], grid: Grid) -> Pieces:
-        """``layers`` and their activations, compiled; ``first``: what they see as `_linear` does."""
+    def _through(
+        self, pieces: Pieces, layers: Layers, last: Layers, first: tuple[Tensor, Tensor], grid: Grid
+    ) -> tuple[Pieces, Affine]:
+        """``layers`` with their activations and the ``last`` one, compiled.
+
+        ``first``: polynomials and remainders that they see first. The last one's columns are left out.
+        """
         encoded, remainder = (a.contiguous() for a in first)
         (batch, m, _), n = pieces.poly.shape, int(layers.shapes[-1, 2])
         kind = torch.from_numpy(layers.columns).dtype
@@ -328,13 +333,18 @@ class FieldBounds:
             torch.empty(rooms[1], dtype=torch.int64), torch.empty(rooms[1], dtype=torch.float64), spread, box, size,
             torch.empty(batch, dtype=torch.bool), torch.empty(batch, dtype=torch.int64),
         )  # fmt: skip
-        columns, terms = hidden_layers(
-            _before(pieces, kind), encoded.numpy(), remainder.numpy(), layers, grid, self.limit, _before(out, kind)
-        )
-        return replace(
+        count = int(last.shapes[:, 2].sum())
+        poly = torch.empty(batch, m, count, dtype=torch.float64)
+        sums, radius = torch.empty(2, batch, count, dtype=torch.float64)
+        columns, terms = through_layers(
+            _before(pieces, kind), encoded.numpy(), remainder.numpy(), layers, last, grid, self.limit,
+            _before(out, kind), Outputs(poly.numpy(), sums.numpy(), radius.numpy()),
+        )  # fmt: skip
+        out = replace(
             out, columns=out.columns[:columns], owner=out.owner[:columns], new_owner=out.new_owner[:terms],
             new_neuron=out.new_neuron[:terms], new_size=out.new_size[:terms],
         )  # fmt: skip
+        return out, Affine(poly, out.columns[:0, :0], out.owner[:0], sums, radius, out.failed, out.count)
 
     def _first(self, poly: Tensor, remainder: Tensor, layer: _Linear) -> Affine:
         """A linear layer on polynomials and remainders alone."""
@@ -463,33 +473,40 @@ class FieldBounds:
 
     # --- networks ------------------------------------------------------------------------------
 
-    def base(self, poly: Tensor, remainder: Tensor) -> Pieces:
-        """The base network on an encoded position (`encode`)."""
+    def base(self, poly: Tensor, remainder: Tensor) -> tuple[Pieces, Affine]:
+        """The base network on an encoded position (`encode`), and the density before its softplus, one output.
+
+        The density's columns are left out.
+        """
         first = poly, remainder
         if self._grid is not None:
             pieces = self._nothing(poly)
-            for layers in self._base_stacks:
-                pieces = self._hidden(pieces, layers, first, self._grid)
-            return pieces
+            *before, (layers, last) = self._base_stacks
+            for early, none in before:
+                pieces, _ = self._through(pieces, early, none, first, self._grid)
+            return self._through(pieces, layers, last, first, self._grid)
         pieces = self._relu(self._first(*first, self._base[0]))
         for layer, tensors in zip(self.weights.base[1:], self._base[1:], strict=True):
             pieces = self._relu(self._linear(pieces, tensors, first if layer.skip else None))
-        return pieces
+        density = self._linear(pieces, self._density)
+        return pieces, density.without_columns(torch.arange(len(poly), device=self.device))
 
     @cached_property
-    def _base_stacks(self) -> list[Layers]:
-        """Layers of the base, those together whose columns are of one type."""
+    def _base_stacks(self) -> list[tuple[Layers, Layers]]:
+        """Layers of the base, those together whose columns are of one type, and the one behind them, if any."""
         layers = [
             self._weights(tensors, self.position.columns.size if i == 0 or layer.skip else 0)
             for i, (layer, tensors) in enumerate(zip(self.weights.base, self._base, strict=True))
         ]
-        return [stacked(list(group)) for _, group in itertools.groupby(layers, key=lambda layer: layer.columns.dtype)]
+        parts = [stacked(list(group)) for _, group in itertools.groupby(layers, key=lambda layer: layer.columns.dtype)]
+        last = stacked([self._weights(self._density, 0)])
+        return [(part, part.none()) for part in parts[:-1]] + [(parts[-1], last)]
 
     @cached_property
-    def _head_stack(self) -> Layers:
-        return stacked(
-            [self._weights(layer, 0 if i else self.direction.columns.size) for i, layer in enumerate(self._head)]
-        )
+    def _head_stacks(self) -> tuple[Layers, Layers]:
+        """Layers of the head, and the colour's."""
+        layers = [self._weights(layer, 0 if i else self.direction.columns.size) for i, layer in enumerate(self._head)]
+        return stacked(layers), stacked([self._weights(self._color, 0)])
 
     def _nothing(self, poly: Tensor) -> Pieces:
         """As many pieces as ``poly`` [B, m, k] has, of no neuron."""
@@ -501,17 +518,12 @@ class FieldBounds:
             torch.zeros(0, dtype=torch.float64), none, none, none, failed, count,
         )  # fmt: skip
 
-    def density(self, pieces: Pieces) -> Affine:
-        """The density before its softplus, one output."""
-        return self._linear(pieces, self._density)
-
     def color(self, pieces: Pieces, poly: Tensor, remainder: Tensor) -> Affine:
-        """The colour before its sigmoid, three outputs, from an encoded direction."""
+        """The colour before its sigmoid, three outputs, from an encoded direction; its columns are left out."""
         first = poly, remainder
         if self._grid is not None:
-            pieces = self._hidden(pieces, self._head_stack, first, self._grid)
-        else:
-            pieces = self._relu(self._linear(pieces, self._head[0], first))
-            for layer in self._head[1:]:
-                pieces = self._relu(self._linear(pieces, layer))
-        return self._linear(pieces, self._color)
+            return self._through(pieces, *self._head_stacks, first, self._grid)[1]
+        pieces = self._relu(self._linear(pieces, self._head[0], first))
+        for layer in self._head[1:]:
+            pieces = self._relu(self._linear(pieces, layer))
+        return self._linear(pieces, self._color).without_columns(torch.arange(len(poly), device=self.device))
