@@ -11,7 +11,7 @@ import torch
 from nerfs import raw_outputs, tiny_weights
 
 from ns_abstract.arithmetic.simd.lanes import LINE
-from ns_abstract.methods.nerf import zonotope
+from ns_abstract.methods.nerf import relu_kernel, zonotope
 from ns_abstract.methods.nerf.bounds import basis_of, greatest, opacity
 from ns_abstract.methods.nerf.field_kernel import CHUNK
 from ns_abstract.methods.nerf.layer_kernel import BLOCK, Before, Behind, Weights, linear
@@ -156,6 +156,21 @@ def moved(columns: torch.Tensor, owner: torch.Tensor, signs: torch.Tensor, piece
     return torch.zeros(pieces, columns.shape[1], dtype=torch.float64).index_add_(0, owner, columns * signs[:, None])
 
 
+def compiled_relu(field: FieldBounds, z: Affine) -> zonotope.Pieces:
+    """`FieldBounds._relu` by the compiled kernel."""
+    assert field._grid is not None
+    pieces, _, n = z.poly.shape
+    slope, size, spread = torch.empty(3, pieces, n, dtype=torch.float64)
+    failed, count = torch.empty_like(z.failed), torch.empty_like(z.count)
+    piece, neuron = torch.empty(2, pieces * n, dtype=torch.int64)
+    error = torch.empty(pieces * n, dtype=torch.float64)
+    before = relu_kernel.Before(*(a.numpy() for a in (z.poly, z.spread, z.box, z.failed, z.count)))
+    behind = relu_kernel.Behind(*(a.numpy() for a in (slope, size, spread, failed, count, piece, neuron, error)))
+    found = relu_kernel.relu(before, field._grid, field.limit, behind)
+    new = piece[:found], neuron[:found], error[:found]
+    return zonotope.Pieces(z.poly, z.columns, z.owner, slope, *new, spread, z.box, size, failed, count)
+
+
 #: What the comparison's own arithmetic may be off by, far below what is charged for anything but rounding.
 ROUNDING = 1e-12
 
@@ -165,9 +180,6 @@ def test_every_unit_is_enclosed(dimensions: int, compiled: bool) -> None:
     """max(0, z) of one unit after the other, at the ends of its error terms and box."""
     weights, basis, kinds = tiny_weights(0), basis_of(dimensions), set()
     field = FieldBounds(weights, basis)
-    if not compiled:
-        field._grid = None
-    assert (field._grid is not None) == compiled
     rng = np.random.default_rng(1)
     points = np.concatenate([rng.uniform(-1, 1, (300, dimensions)), rng.choice([-1.0, 1.0], (8, dimensions))])
     values = torch.from_numpy(basis.values(points))
@@ -176,7 +188,7 @@ def test_every_unit_is_enclosed(dimensions: int, compiled: bool) -> None:
         given = torch.matmul(values, z.poly)
         rho, box = z.spread, z.box.clone()
         before = z.columns.clone()
-        found = field._relu(z)
+        found = compiled_relu(field, z) if compiled else field._relu(z)
         slope = found.slope
         new = torch.zeros(16, 16, dtype=torch.float64)
         new[found.new_owner, found.new_neuron] = found.new_size

@@ -65,7 +65,7 @@ FIELDS = (
     ),
     Fault(
         "layers: the sum of error terms forgets those that are new",
-        _ZONOTOPE, "FieldBounds._relu_torch", "spread[which, neuron] += error", "pass", _UNITS + "[1-False]",
+        _ZONOTOPE, "FieldBounds._relu", "spread[which, neuron] += error", "pass", _UNITS + "[1-False]",
     ),
     Fault(
         "compiled units: the sum of error terms forgets those that are new",
@@ -78,7 +78,7 @@ FIELDS = (
     ),
     Fault(
         "layers: where torch works alone, what a range shows to be on is off",
-        _ZONOTOPE, "FieldBounds._relu_torch", "slope[which, neuron] = now_active.to(torch.float64)", "pass",
+        _ZONOTOPE, "FieldBounds._relu", "slope[which, neuron] = now_active.to(torch.float64)", "pass",
         _UNITS + "[1-False]",
     ),
     Fault(
@@ -101,20 +101,20 @@ FIELDS = (
     ),
     Fault(
         "fields: an open unit counts as active",
-        _ZONOTOPE, "FieldBounds._relu_torch", "low >= e + r", "high >= e + r", _UNITS + "[1-False]",
+        _ZONOTOPE, "FieldBounds._relu", "low >= e + r", "high >= e + r", _UNITS + "[1-False]",
     ),
     Fault(
         "fields: a unit that may be active counts as dead",
-        _ZONOTOPE, "FieldBounds._relu_torch", "high <= -(e + r)", "low <= -(e + r)", _UNITS + "[1-False]",
+        _ZONOTOPE, "FieldBounds._relu", "high <= -(e + r)", "low <= -(e + r)", _UNITS + "[1-False]",
     ),
     Fault(
         "fields: the radius of a unit forgets its columns",
-        _ZONOTOPE, "FieldBounds._relu_torch", "spread + rho + box", "0.2 * spread + 0.0 * rho + box",
+        _ZONOTOPE, "FieldBounds._relu", "spread + rho + box", "0.2 * spread + 0.0 * rho + box",
         _UNITS + "[1-False]",
     ),
     Fault(
         "fields: the line's error is a quarter of what it is",
-        _ZONOTOPE, "FieldBounds._relu_torch", "(0.5 * line * -bottom + 4.0 * slack) * FIELD_UP",
+        _ZONOTOPE, "FieldBounds._relu", "(0.5 * line * -bottom + 4.0 * slack) * FIELD_UP",
         "(0.25 * line * -bottom + 4.0 * slack) * FIELD_UP", _UNITS + "[1-False]",
     ),
     Fault(
@@ -128,7 +128,7 @@ FIELDS = (
     ),
     Fault(
         "fields: what is no number does not fail",
-        _ZONOTOPE, "FieldBounds._relu_torch", "z.failed | (count > self.limit) | ~torch.isfinite(size).all(dim=1)",
+        _ZONOTOPE, "FieldBounds._relu", "z.failed | (count > self.limit) | ~torch.isfinite(size).all(dim=1)",
         "z.failed | (count > self.limit)", "test_nerf_zonotope.py::test_numbers_that_are_none_fail[False]", True,
     ),
     Fault(

@@ -17,7 +17,7 @@ ROWS = 4
 
 @njit(cache=True, error_model="numpy")
 def four_rows(factors, rows, places, count, elements, at, stride, line, begin):
-    """``begin + sum_i factors[rows[r] + places[i]] elements[at + stride places[i] : ...]``, i < ``count``, r = 0, ..., 3.
+    """``begin + sum_i factors[rows[r] + places[i]] elements[at + stride places[i] : ...]``, r = 0, ..., 3.
 
     Args:
         factors, places, elements: `intrinsics.pointer`; factors and elements of one type.

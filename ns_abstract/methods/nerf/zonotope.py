@@ -32,10 +32,10 @@ from ns_abstract.arithmetic.rounding import (
     gamma,
 )
 from ns_abstract.arithmetic.simd.lanes import LINE
-from ns_abstract.methods.nerf import layer_kernel, relu_kernel
+from ns_abstract.methods.nerf import layer_kernel
 from ns_abstract.methods.nerf.field_kernel import Layers, Outputs, stacked, through_layers
 from ns_abstract.methods.nerf.layer_kernel import Weights, linear
-from ns_abstract.methods.nerf.relu_kernel import LEAST_SLOPE, Grid, grid_of, relu
+from ns_abstract.methods.nerf.relu_kernel import LEAST_SLOPE, Grid, grid_of
 from ns_abstract.methods.nerf.scene import Encoding, FieldWeights, Layer, Waves
 
 #: Radii of Bernstein ellipses that are tried for the remainder of an encoding.
@@ -363,33 +363,6 @@ class FieldBounds:
 
     def _relu(self, z: Affine) -> Pieces:
         """max(0, z) (design.md, F5); ``z`` is used up."""
-        found = self._relu_torch(z) if self._grid is None else self._relu_compiled(z, self._grid)
-        if bool((found.failed & ~z.failed).any()):
-            old, new = ~found.failed[found.owner], ~found.failed[found.new_owner]
-            found = replace(
-                found, columns=found.columns[old], owner=found.owner[old], new_owner=found.new_owner[new],
-                new_neuron=found.new_neuron[new], new_size=found.new_size[new],
-            )  # fmt: skip
-        return found
-
-    def _relu_compiled(self, z: Affine, grid: Grid) -> Pieces:
-        """See `_relu`; error terms of pieces that fail are left in."""
-        pieces, _, n = z.poly.shape
-        slope, size, spread = torch.empty(3, pieces, n, dtype=torch.float64)
-        failed, count = torch.empty_like(z.failed), torch.empty_like(z.count)
-        piece, neuron = torch.empty(2, pieces * n, dtype=torch.int64)
-        error = torch.empty(pieces * n, dtype=torch.float64)
-        poly = z.poly.contiguous()
-        new = relu(
-            relu_kernel.Before(*(a.numpy() for a in (poly, z.spread, z.box, z.failed, z.count))), grid, self.limit,
-            relu_kernel.Behind(*(a.numpy() for a in (slope, size, spread, failed, count, piece, neuron, error))),
-        )  # fmt: skip
-        return Pieces(
-            poly, z.columns, z.owner, slope, piece[:new], neuron[:new], error[:new], spread, z.box, size, failed, count
-        )
-
-    def _relu_torch(self, z: Affine) -> Pieces:
-        """See `_relu`; error terms of pieces that fail are left in."""
         rho = z.spread * FIELD_UP
         poly, box = z.poly, z.box
         spread = poly[:, 1:].abs().sum(dim=1) * FIELD_UP
@@ -441,8 +414,14 @@ class FieldBounds:
         spread *= FIELD_UP
         count = z.count.index_add(0, which, torch.ones_like(which))
         failed = z.failed | (count > self.limit) | ~torch.isfinite(size).all(dim=1)
-        poly[failed], box[failed], size[failed], spread[failed] = 0.0, 0.0, 0.0, 0.0
-        return Pieces(poly, z.columns, z.owner, slope, which, neuron, error, spread, box, size, failed, count)
+        columns, owner = z.columns, z.owner
+        if bool((failed & ~z.failed).any()):
+            stays = ~failed[owner]
+            columns, owner = columns[stays], owner[stays]
+            stays = ~failed[which]
+            which, neuron, error = which[stays], neuron[stays], error[stays]
+            poly[failed], box[failed], size[failed], spread[failed] = 0.0, 0.0, 0.0, 0.0
+        return Pieces(poly, columns, owner, slope, which, neuron, error, spread, box, size, failed, count)
 
     def _fitted(self, p: Tensor, values: Tensor) -> tuple[Tensor, Tensor]:
         """Polynomials q [k, m] and errors [k]: ``|max(0, p) - q| <= error`` over the cell (design.md, F5)."""
