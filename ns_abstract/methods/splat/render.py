@@ -134,17 +134,19 @@ def _region(mean_x, mean_y, a, b, c, alpha, camera, rules):
 
 
 @njit(cache=True, error_model="numpy", inline="always")
-def _set_color(scene, i, direction, basis, color):
-    """Write the colour of Gaussian i, seen along ``direction`` [3] (not of unit length), to ``color`` [>= 3]."""
-    sh, shift = borrowed(scene.sh), borrowed(scene.color_shift)
-    if scene.degree == 0:
+def _set_color(sh, shift, degree, most, i, direction, basis, color):
+    """Write the colour of Gaussian i, seen along ``direction`` [3] (not of unit length), to ``color`` [>= 3].
+
+    ``sh``, ``shift``, ``degree`` and ``most`` are of `_Scene`; a record's arrays would all be counted at every call.
+    """
+    if degree == 0:
         for channel in range(3):
             color[channel] = sh[i, 0, channel]
     else:
-        sh_color(sh[i], direction, scene.degree, basis, color)
+        sh_color(sh[i], direction, degree, basis, color)
     if shift.shape[0] > 0:
         for channel in range(3):
-            color[channel] = min(scene.color_max, max(0.0, color[channel] + shift[i, channel]))
+            color[channel] = min(most, max(0.0, color[channel] + shift[i, channel]))
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
@@ -163,6 +165,7 @@ def _project_worker(counter_, scene, rotation, position, eye, camera, rules, out
     """
     counter = pointer(counter_)
     means, axes, opacity = borrowed(scene.means), borrowed(scene.axes), borrowed(scene.opacity)
+    sh, shift, degree, most = borrowed(scene.sh), borrowed(scene.color_shift), scene.degree, scene.color_max
     records, box, tiles = borrowed(out.record), borrowed(out.box), borrowed(out.tiles)
     depth, visible = borrowed(out.depth), borrowed(out.visible)
     fx, fy, cx, cy = camera.fx, camera.fy, camera.cx, camera.cy
@@ -178,8 +181,8 @@ def _project_worker(counter_, scene, rotation, position, eye, camera, rules, out
     r0 = rotation[0, 0], rotation[0, 1], rotation[0, 2]
     r1 = rotation[1, 0], rotation[1, 1], rotation[1, 2]
     r2 = rotation[2, 0], rotation[2, 1], rotation[2, 2]
-    basis = np.empty(16)
-    direction = np.empty(3)
+    basis_, direction_ = np.empty(16), np.empty(3)
+    basis, direction = borrowed(basis_), borrowed(direction_)
     while True:
         start = taken(counter) * CHUNK
         if start >= means.shape[0]:
@@ -225,9 +228,11 @@ def _project_worker(counter_, scene, rotation, position, eye, camera, rules, out
             record[_OPACITY] = alpha
             for k in range(3):
                 direction[k] = means[i, k] - eye[k]
-            _set_color(scene, i, direction, basis, record[_RED:])
+            _set_color(sh, shift, degree, most, i, direction, basis, record[_RED:])
             depth[i] = z
             visible[i] = 1
+    # the owners of what is borrowed live to here
+    return basis_.size + direction_.size
 
 
 # rows of a block's state: transmittance, colours, whether the pixel still takes light
