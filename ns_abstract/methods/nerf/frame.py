@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from ns_abstract.arithmetic.outward import outward
-from ns_abstract.execution.ending import AbandonedError, is_over
+from ns_abstract.execution.ending import AbandonedError, checkpoint, is_over
 from ns_abstract.execution.engines import Processes
 from ns_abstract.geometry.box import ParameterBox
 from ns_abstract.geometry.poses import COLOR_SHIFTS, PoseSet
@@ -210,12 +210,13 @@ class NerfFrame:
             if within is not None:
                 known = within.alpha[np.searchsorted(within.tiles, tiles)]
             parts = []
-            for i in range(0, tiles.size, self.tiles_at_once):
-                if is_over():
-                    parts.append(self._unknown(tiles.size - i))
-                    break
-                mine = slice(i, i + self.tiles_at_once)
-                parts += self._batch(box, tiles[mine], None if known is None else known[mine])
+            try:
+                for i in range(0, tiles.size, self.tiles_at_once):
+                    checkpoint()
+                    mine = slice(i, i + self.tiles_at_once)
+                    parts += self._batch(box, tiles[mine], None if known is None else known[mine])
+            except AbandonedError:
+                parts.append(self._unknown(tiles.size - sum(len(part.lower) for part in parts)))
             lower, upper, alpha = (
                 np.concatenate([getattr(part, name) for part in parts]) for name in ("lower", "upper", "alpha")
             )
