@@ -171,6 +171,15 @@ def compiled_relu(field: FieldBounds, z: Affine) -> zonotope.Pieces:
     return zonotope.Pieces(z.poly, z.columns, z.owner, slope, *new, spread, z.box, size, failed, count)
 
 
+#: An encoded vector of no number, for layers that see none.
+NOTHING = torch.zeros(16, 1, 0, dtype=torch.float64), torch.zeros(16, 0, dtype=torch.float64)
+
+
+def hidden_layer(field: FieldBounds) -> zonotope._Linear:
+    """A layer of ``field`` all of whose inputs are neurons."""
+    return replace(field._base[1], seen=0)
+
+
 #: What the comparison's own arithmetic may be off by, far below what is charged for anything but rounding.
 ROUNDING = 1e-12
 
@@ -209,7 +218,7 @@ def test_linear_layers_are_enclosed(compiled: bool, narrow: bool) -> None:
     """Error terms keep their values through a layer: those that move one neuron, too."""
     weights, basis = tiny_weights(0), basis_of(1)
     field = FieldBounds(weights, basis)
-    layer = field._base[1]
+    layer = hidden_layer(field)
     width, count = layer.weight.shape
     layer = replace(layer, bias=layer.bias + torch.linspace(-1.0, 1.0, count, dtype=torch.float64))
     assert layer.narrow is not None
@@ -218,7 +227,7 @@ def test_linear_layers_are_enclosed(compiled: bool, narrow: bool) -> None:
     if not compiled:
         field.compiled, field._grid = False, None
     pieces = field._relu(random_batch(field, width, 5))
-    after = field._linear(pieces, layer)
+    after = field._linear(pieces, layer, NOTHING)
     rng = np.random.default_rng(2)
     values = torch.from_numpy(basis.values(rng.uniform(-1, 1, (50, 1))))
     units = torch.zeros(len(pieces.new_size), width, dtype=torch.float64)
@@ -246,13 +255,14 @@ def test_linear_layers_are_enclosed(compiled: bool, narrow: bool) -> None:
 def test_columns_in_float32_are_charged(scale: float) -> None:
     """What float32 products of columns are off by lies in the box, which is hardly wider; gradual underflow, too."""
     field = FieldBounds(tiny_weights(0), basis_of(1))
-    layer = field._base[1]
+    layer = hidden_layer(field)
     pieces = field._relu(random_batch(field, layer.weight.shape[0], 5))
     pieces = replace(
         pieces, columns=scale * pieces.columns, new_size=scale * pieces.new_size, spread=scale * pieces.spread,
         box=0.0 * pieces.box, size=scale * pieces.size, poly=0.0 * pieces.poly,
     )  # fmt: skip
-    after, wide = field._linear(pieces, layer), field._linear(pieces, replace(layer, narrow=None))
+    after = field._linear(pieces, layer, NOTHING)
+    wide = field._linear(pieces, replace(layer, narrow=None), NOTHING)
     bias = 4.0 * zonotope.UNIT64 * (layer.bias.abs() + after.poly[:, 0].abs())
     away = zonotope.column_sums(after.columns.double() - wide.columns, after.owner, 16)
     assert (away > 0.0).any() and (away <= after.box - bias).all()
@@ -262,11 +272,11 @@ def test_columns_in_float32_are_charged(scale: float) -> None:
 
 def test_columns_beyond_float32_fail() -> None:
     field = FieldBounds(tiny_weights(0), basis_of(1))
-    layer = field._base[1]
+    layer = hidden_layer(field)
     pieces = field._relu(random_batch(field, layer.weight.shape[0], 5))
     columns = pieces.columns.clone()
     columns[pieces.owner == 7] *= 1e39
-    after = field._relu(field._linear(replace(pieces, columns=columns), layer))
+    after = field._relu(field._linear(replace(pieces, columns=columns), layer, NOTHING))
     assert after.failed[7] and after.failed.sum() == 1
 
 
@@ -366,7 +376,7 @@ def test_compiled_and_torch_agree(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.parametrize("layers", [3, 6])
-def test_chunks_are_as_good_as_layer_after_layer(layers: int, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_chunks_are_as_good_as_layer_after_layer(layers: int) -> None:
     """Pieces of several chunks, the last one smaller, in fields whose early layers have float64 columns or not."""
     weights, basis = tiny_weights(2, rough=5.0), basis_of(1)
     if layers > len(weights.base):
@@ -384,20 +394,20 @@ def test_chunks_are_as_good_as_layer_after_layer(layers: int, monkeypatch: pytes
     # colours are of some pieces, whose columns begin anywhere
     some = torch.tensor([1, 2, *range(CHUNK - 1, count)])
     color = field.color(pieces.select(some), *(part[some] for part in seen))
-    after = field._relu(field._first(*encoded, field._base[0]))
-    for layer, tensors in zip(weights.base[1:], field._base[1:], strict=True):
-        after = field._relu(field._linear(after, tensors, encoded if layer.skip else None))
+    after = field._nothing(encoded[0])
+    for layer in field._base:
+        after = field._relu(field._linear(after, layer, encoded))
     assert torch.equal(pieces.failed, after.failed) and not after.failed.any()
     for name in ("owner", "new_owner", "new_neuron", "count"):
         assert torch.equal(getattr(pieces, name), getattr(after, name)), name
     for name in ("columns", "slope", "new_size", "spread", "box", "size"):
         torch.testing.assert_close(getattr(pieces, name), getattr(after, name), rtol=1e-9, atol=1e-11)
-    head = after.select(some)
-    for i, tensors in enumerate(field._head):
-        head = field._relu(field._linear(head, tensors, None if i else tuple(part[some] for part in seen)))
+    head, of_some = after.select(some), (seen[0][some], seen[1][some])
+    for layer in field._head:
+        head = field._relu(field._linear(head, layer, of_some))
     for found, expected in (
-        (density, field._linear(after, field._density)),
-        (color, field._linear(head, field._color)),
+        (density, field._linear(after, field._density, encoded)),
+        (color, field._linear(head, field._color, of_some)),
     ):
         for name in ("poly", "spread", "box"):
             torch.testing.assert_close(getattr(found, name), getattr(expected, name), rtol=1e-9, atol=1e-11)

@@ -27,12 +27,12 @@ FIELDS = (
     ),
     Fault(
         "fields: a layer forgets the box before it",
-        _ZONOTOPE, "FieldBounds._linear", "radius @ layer.absolute[count:]", "0.0 * (radius @ layer.absolute[count:])",
+        _ZONOTOPE, "FieldBounds._linear", "radius @ layer.absolute[seen:]", "0.0 * (radius @ layer.absolute[seen:])",
         _LAYERS + "[False-False]",
     ),
     Fault(
         "fields: a layer forgets its bias",
-        _ZONOTOPE, "FieldBounds._shift", "poly[:, 0] += layer.bias", "pass", _LAYERS + "[False-False]",
+        _ZONOTOPE, "FieldBounds._linear", "poly[:, 0] += layer.bias", "pass", _LAYERS + "[False-False]",
     ),
     Fault(
         "layers: the compiled one forgets the box before it",

@@ -75,39 +75,30 @@ class Outputs(NamedTuple):
 
 
 class Room(NamedTuple):
-    """Where CHUNK pieces are kept behind a layer and its activation, each array for the widest layer, flat.
+    """Where CHUNK pieces are kept behind a ``layer`` and its ``activation``, each array flat, for the widest layer."""
 
-    Attributes:
-        poly, sums, box, slope, size, spread: float64.
-        failed, count: [CHUNK].
-        piece, neuron, error: Of new error terms.
-        columns, owner: Of the columns' type, and their pieces.
-    """
-
-    poly: np.ndarray
-    sums: np.ndarray
-    box: np.ndarray
-    slope: np.ndarray
-    size: np.ndarray
-    spread: np.ndarray
-    failed: np.ndarray
-    count: np.ndarray
-    piece: np.ndarray
-    neuron: np.ndarray
-    error: np.ndarray
-    columns: np.ndarray
-    owner: np.ndarray
+    layer: Behind
+    activation: relu_kernel.Behind
 
 
 @njit(cache=True, error_model="numpy")
 def _room(m, n, columns, kind):
     """A `Room` for layers of at most n neurons, m coefficients and so many ``columns``."""
     k = CHUNK * n
-    return Room(
-        np.empty(m * k), np.empty(k), np.empty(k), np.empty(k), np.empty(k), np.empty(k), np.empty(CHUNK, np.bool_),
-        np.empty(CHUNK, np.int64), np.empty(k, np.int64), np.empty(k, np.int64), np.empty(k),
-        np.empty(columns * n, kind), np.empty(columns, np.int64),
+    layer = Behind(
+        np.empty(m * k), np.empty(columns * n, kind), np.empty(columns, np.int64), np.empty(k), np.empty(k)
     )  # fmt: skip
+    activation = relu_kernel.Behind(
+        np.empty(k), np.empty(k), np.empty(k), np.empty(CHUNK, np.bool_), np.empty(CHUNK, np.int64),
+        np.empty(k, np.int64), np.empty(k, np.int64), np.empty(k),
+    )  # fmt: skip
+    return Room(layer, activation)
+
+
+@njit(cache=True, error_model="numpy")
+def _table(flat, rows, n):
+    """The first ``rows`` of n numbers each."""
+    return flat[: rows * n].reshape((rows, n))
 
 
 @njit(cache=True, error_model="numpy")
@@ -129,19 +120,21 @@ def _layer(layers, i):
 def _step(z, encoded, remainder, weights, grid, limit, room):
     """One layer and its activation on the pieces ``z``; returns what is kept of them in ``room``."""
     (pieces, m, _), n = z.poly.shape, weights.bias.shape[0]
-    k, rows = pieces * n, room.owner.shape[0]
-    poly, columns = room.poly[: m * k].reshape((pieces, m, n)), room.columns[: rows * n].reshape((rows, n))
-    sums, box = room.sums[:k].reshape((pieces, n)), room.box[:k].reshape((pieces, n))
-    slope, size = room.slope[:k].reshape((pieces, n)), room.size[:k].reshape((pieces, n))
-    spread, failed, count = room.spread[:k].reshape((pieces, n)), room.failed[:pieces], room.count[:pieces]
-    total = linear(z, encoded, remainder, weights, Behind(poly, columns, room.owner, sums, box))
-    new = relu(
-        relu_kernel.Before(poly, sums, box, z.failed, z.count), grid, limit,
-        relu_kernel.Behind(slope, size, spread, failed, count, room.piece, room.neuron, room.error),
+    poly, columns, owner, sums, box = room.layer
+    slope, size, spread, failed, count, piece, neuron, error = room.activation
+    layer = Behind(
+        poly[: pieces * m * n].reshape((pieces, m, n)), _table(columns, owner.shape[0], n), owner,
+        _table(sums, pieces, n), _table(box, pieces, n),
     )  # fmt: skip
+    total = linear(z, encoded, remainder, weights, layer)
+    activation = relu_kernel.Behind(
+        _table(slope, pieces, n), _table(size, pieces, n), _table(spread, pieces, n), failed[:pieces], count[:pieces],
+        piece, neuron, error,
+    )  # fmt: skip
+    new = relu(relu_kernel.Before(layer.poly, layer.sums, layer.box, z.failed, z.count), grid, limit, activation)
     return Before(
-        poly, size, spread, box, slope, failed, count, columns[:total], room.owner[:total], room.piece[:new],
-        room.neuron[:new], room.error[:new],
+        layer.poly, activation.size, activation.spread, layer.box, activation.slope, activation.failed,
+        activation.count, layer.columns[:total], owner[:total], piece[:new], neuron[:new], error[:new],
     )  # fmt: skip
 
 
@@ -207,9 +200,9 @@ def through_layers(z, encoded, remainder, layers, last, grid, limit, out, output
         if last.shapes.shape[0]:
             # its columns are of no use but for their sums; ``here`` is free
             weights, n = _layer(last, 0), last.shapes[0, 2]
-            tail = here.columns[: rows * n].reshape((rows, n))
+            columns_there, owner = _table(here.layer.columns, rows, n), here.layer.owner
             poly, sums, box = outputs.poly[begin:past], outputs.sums[begin:past], outputs.box[begin:past]
-            behind = Behind(poly, tail, here.owner, sums, box)
+            behind = Behind(poly, columns_there, owner, sums, box)
             linear(found, encoded[begin:past], remainder[begin:past], weights, behind)
         _copy(found.poly, out.poly[begin:past])
         _copy(found.size, out.size[begin:past])

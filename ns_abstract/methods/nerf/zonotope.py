@@ -49,6 +49,10 @@ ERROR_TERMS = 400
 _NARROW = (1.0 + 2.0**-10) * UNIT32
 
 
+#: Polynomials [B, m, k] and remainders [B, k] of an encoded vector.
+Encoded = tuple[Tensor, Tensor]
+
+
 def _rounding(inputs: int) -> float:
     """Relative error of a layer of ``inputs``: of this module's sums, and of a concrete float64 evaluation."""
     return 2.0 * gamma(inputs + 4)
@@ -148,10 +152,12 @@ def _before(pieces: Pieces, kind: torch.dtype) -> layer_kernel.Before:
 class _Linear:
     """A linear layer: transposed ``weight`` [in, out], its ``absolute`` value and ``bias`` [out], all float64.
 
+    The first ``seen`` inputs are an encoded vector's, those behind them neurons.
     For compiled products: ``lines``, the weight with zeros behind its rows to whole pairs of lines, and ``narrow``, the
     same in float32, which it is exactly, where columns are multiplied in that.
     """
 
+    seen: int
     weight: Tensor
     absolute: Tensor
     bias: Tensor
@@ -189,11 +195,13 @@ class FieldBounds:
         wide = len(weights.base) - _NARROW_LAYERS
         self.position, self.direction = weights.position_waves, weights.direction_waves
         self._base = [
-            self._put(_seeing(layer, weights.position, self.position) if i == 0 or layer.skip else layer, i >= wide)
+            self._put(layer, i >= wide, (weights.position, self.position) if i == 0 or layer.skip else None)
             for i, layer in enumerate(weights.base)
         ]
-        self._head = [self._put(_seeing(weights.head[0], weights.direction, self.direction), True)]
-        self._head += [self._put(layer, True) for layer in weights.head[1:]]
+        self._head = [
+            self._put(layer, True, None if i else (weights.direction, self.direction))
+            for i, layer in enumerate(weights.head)
+        ]
         self._density, self._color = self._put(weights.density, True), self._put(weights.color, True)
         kept, rest = (torch.from_numpy(a).to(device) for a in basis.interpolation)
         self._kept, self._rest = kept, rest
@@ -209,13 +217,16 @@ class FieldBounds:
         )
         self._decay = 4.0 * ellipses**-basis.degree / (ellipses - 1.0) * (1.0 + 2.0**-30)
 
-    def _put(self, layer: Layer, narrow: bool) -> _Linear:
+    def _put(self, layer: Layer, narrow: bool, sees: tuple[Encoding, Waves] | None = None) -> _Linear:
+        if sees is not None:
+            layer = _seeing(layer, *sees)
+        seen = 0 if sees is None else sees[1].columns.size
         weight = torch.from_numpy(layer.weight).to(self.device, torch.float64).T.contiguous()
         bias = torch.from_numpy(layer.bias).to(self.device, torch.float64)
         # only the compiled product gains by float32
         narrow &= self.compiled
         lines = functional.pad(weight, (0, -weight.shape[1] % (LINE // 2))) if self.compiled else weight
-        return _Linear(weight, weight.abs(), bias, lines, lines.float() if narrow else None)
+        return _Linear(seen, weight, weight.abs(), bias, lines, lines.float() if narrow else None)
 
     # --- encodings -----------------------------------------------------------------------------
 
@@ -257,42 +268,30 @@ class FieldBounds:
 
     # --- layers --------------------------------------------------------------------------------
 
-    def _linear(self, pieces: Pieces, layer: _Linear, first: tuple[Tensor, Tensor] | None = None) -> Affine:
-        """A linear layer on ``pieces``, after ``first`` (polynomials, remainders) in the order of its inputs (F4)."""
+    def _linear(self, pieces: Pieces, layer: _Linear, first: Encoded) -> Affine:
+        """A linear layer on ``pieces``, and on the encoded vector ``first`` if the layer sees it (F4)."""
         if self.compiled:
             return self._linear_compiled(pieces, layer, first)
-        count = 0 if first is None else first[0].shape[-1]
-        rounding = _rounding(layer.weight.shape[0])
+        seen, rounding = layer.seen, _rounding(layer.weight.shape[0])
         radius = (pieces.size + pieces.box).mul_(rounding).add_(pieces.box)
-        box = radius @ layer.absolute[count:]
-        weight = layer.weight[count:]
+        box = radius @ layer.absolute[seen:]
+        weight = layer.weight[seen:]
         columns = (pieces.columns * pieces.slope[pieces.owner]) @ weight
         columns = torch.cat([columns, weight[pieces.new_neuron] * pieces.new_size[:, None]])
         owner = torch.cat([pieces.owner, pieces.new_owner])
         poly = pieces.poly @ weight
-        if first is not None:
-            given = self._given(*first, layer, count)
-            poly += given[0]
-            box += given[1]
-        self._shift(poly, box, layer)
-        spread = column_sums(columns, owner, poly.shape[0])
-        return Affine(poly, columns, owner, spread, box, pieces.failed, pieces.count)
-
-    def _given(self, poly: Tensor, remainder: Tensor, layer: _Linear, count: int) -> tuple[Tensor, Tensor]:
-        """Polynomials and box of a layer's sums over its first ``count`` inputs, polynomials and remainders."""
-        rounding = _rounding(layer.weight.shape[0])
-        box = (remainder + rounding * (poly.abs().sum(dim=1) + remainder)) @ layer.absolute[:count]
-        return poly @ layer.weight[:count], box
-
-    def _shift(self, poly: Tensor, box: Tensor, layer: _Linear) -> None:
-        """Add the bias, in place."""
+        if seen:
+            encoded, remainder = first
+            poly += encoded @ layer.weight[:seen]
+            box += (remainder + rounding * (encoded.abs().sum(dim=1) + remainder)) @ layer.absolute[:seen]
         poly[:, 0] += layer.bias
         box += 4.0 * UNIT64 * (layer.bias.abs() + poly[:, 0].abs())
-        box *= FIELD_UP
+        spread = column_sums(columns, owner, poly.shape[0])
+        return Affine(poly, columns, owner, spread, box * FIELD_UP, pieces.failed, pieces.count)
 
-    def _weights(self, layer: _Linear, seen: int) -> Weights:
-        """``layer``, which sees an encoded vector first, for compiled products."""
-        narrow = layer.narrow is not None
+    def _weights(self, layer: _Linear) -> Weights:
+        """``layer`` for compiled products."""
+        seen, narrow = layer.seen, layer.narrow is not None
         kind = layer.lines if layer.narrow is None else layer.narrow
         lines, absolute = layer.lines.numpy(), layer.absolute.numpy()
         return Weights(
@@ -300,27 +299,26 @@ class FieldBounds:
             _rounding(len(absolute)), _NARROW if narrow else 0.0, UNDERFLOW_COLUMNS if narrow else 0.0,
         )  # fmt: skip
 
-    def _linear_compiled(self, pieces: Pieces, layer: _Linear, first: tuple[Tensor, Tensor] | None) -> Affine:
+    def _linear_compiled(self, pieces: Pieces, layer: _Linear, first: Encoded) -> Affine:
         """See `_linear`."""
-        encoded, remainder = (pieces.poly[..., :0], pieces.box[:, :0]) if first is None else first
-        weights = self._weights(layer, encoded.shape[-1])
+        encoded, remainder = (a.contiguous() for a in first)
         (batch, m, _), n = pieces.poly.shape, layer.weight.shape[1]
         total = pieces.owner.shape[0] + pieces.new_owner.shape[0]
         poly, sums = torch.empty(batch, m, n, dtype=torch.float64), torch.empty(batch, n, dtype=torch.float64)
         columns = torch.empty(total, n, dtype=torch.float64 if layer.narrow is None else torch.float32)
         owner, box = torch.empty(total, dtype=torch.int64), torch.empty(batch, n, dtype=torch.float64)
         found = linear(
-            _before(pieces, columns.dtype), encoded.contiguous().numpy(), remainder.contiguous().numpy(), weights,
+            _before(pieces, columns.dtype), encoded.numpy(), remainder.numpy(), self._weights(layer),
             layer_kernel.Behind(*(a.numpy() for a in (poly, columns, owner, sums, box))),
         )  # fmt: skip
         return Affine(poly, columns[:found], owner[:found], sums, box, pieces.failed, pieces.count)
 
     def _through(
-        self, pieces: Pieces, layers: Layers, last: Layers, first: tuple[Tensor, Tensor], grid: Grid
+        self, pieces: Pieces, layers: Layers, last: Layers, first: Encoded, grid: Grid
     ) -> tuple[Pieces, Affine]:
-        """``layers`` with their activations and the ``last`` one, compiled.
+        """``layers`` with their activations and the ``last`` one, compiled; see `_linear`.
 
-        ``first``: polynomials and remainders that they see first. The last one's columns are left out.
+        The last one's columns are left out.
         """
         encoded, remainder = (a.contiguous() for a in first)
         (batch, m, _), n = pieces.poly.shape, int(layers.shapes[-1, 2])
@@ -345,21 +343,6 @@ class FieldBounds:
             new_neuron=out.new_neuron[:terms], new_size=out.new_size[:terms],
         )  # fmt: skip
         return out, Affine(poly, out.columns[:0, :0], out.owner[:0], sums, radius, out.failed, out.count)
-
-    def _first(self, poly: Tensor, remainder: Tensor, layer: _Linear) -> Affine:
-        """A linear layer on polynomials and remainders alone."""
-        out, box = self._given(poly, remainder, layer, layer.weight.shape[0])
-        self._shift(out, box, layer)
-        pieces = poly.shape[0]
-        return Affine(
-            out,
-            torch.zeros(0, out.shape[2], dtype=torch.float64, device=self.device),
-            torch.zeros(0, dtype=torch.int64, device=self.device),
-            torch.zeros_like(box),
-            box,
-            torch.zeros(pieces, dtype=torch.bool, device=self.device),
-            torch.zeros(pieces, dtype=torch.int64, device=self.device),
-        )
 
     def _relu(self, z: Affine) -> Pieces:
         """max(0, z) (design.md, F5); ``z`` is used up."""
@@ -457,44 +440,38 @@ class FieldBounds:
 
         The density's columns are left out.
         """
-        first = poly, remainder
+        first, pieces = (poly, remainder), self._nothing(poly)
         if self._grid is not None:
-            pieces = self._nothing(poly)
             *before, (layers, last) = self._base_stacks
             for early, none in before:
                 pieces, _ = self._through(pieces, early, none, first, self._grid)
             return self._through(pieces, layers, last, first, self._grid)
-        pieces = self._relu(self._first(*first, self._base[0]))
-        for layer, tensors in zip(self.weights.base[1:], self._base[1:], strict=True):
-            pieces = self._relu(self._linear(pieces, tensors, first if layer.skip else None))
-        density = self._linear(pieces, self._density)
+        for layer in self._base:
+            pieces = self._relu(self._linear(pieces, layer, first))
+        density = self._linear(pieces, self._density, first)
         return pieces, density.without_columns(torch.arange(len(poly), device=self.device))
 
     @cached_property
     def _base_stacks(self) -> list[tuple[Layers, Layers]]:
         """Layers of the base, those together whose columns are of one type, and the one behind them, if any."""
-        layers = [
-            self._weights(tensors, self.position.columns.size if i == 0 or layer.skip else 0)
-            for i, (layer, tensors) in enumerate(zip(self.weights.base, self._base, strict=True))
-        ]
+        layers = [self._weights(layer) for layer in self._base]
         parts = [stacked(list(group)) for _, group in itertools.groupby(layers, key=lambda layer: layer.columns.dtype)]
-        last = stacked([self._weights(self._density, 0)])
+        last = stacked([self._weights(self._density)])
         return [(part, part.none()) for part in parts[:-1]] + [(parts[-1], last)]
 
     @cached_property
     def _head_stacks(self) -> tuple[Layers, Layers]:
         """Layers of the head, and the colour's."""
-        layers = [self._weights(layer, 0 if i else self.direction.columns.size) for i, layer in enumerate(self._head)]
-        return stacked(layers), stacked([self._weights(self._color, 0)])
+        return stacked([self._weights(layer) for layer in self._head]), stacked([self._weights(self._color)])
 
     def _nothing(self, poly: Tensor) -> Pieces:
         """As many pieces as ``poly`` [B, m, k] has, of no neuron."""
-        pieces, m, _ = poly.shape
-        none, index = torch.zeros(pieces, 0, dtype=torch.float64), torch.zeros(0, dtype=torch.int64)
-        failed, count = torch.zeros(pieces, dtype=torch.bool), torch.zeros(pieces, dtype=torch.int64)
+        none = poly[:, 0, :0]
+        index = torch.zeros(0, dtype=torch.int64, device=self.device)
+        failed = torch.zeros(len(poly), dtype=torch.bool, device=self.device)
         return Pieces(
-            torch.zeros(pieces, m, 0, dtype=torch.float64), none[:0], index, none, index, index,
-            torch.zeros(0, dtype=torch.float64), none, none, none, failed, count,
+            poly[..., :0].contiguous(), none[:0], index, none, index, index, poly.new_zeros(0), none, none, none,
+            failed, failed.to(torch.int64),
         )  # fmt: skip
 
     def color(self, pieces: Pieces, poly: Tensor, remainder: Tensor) -> Affine:
@@ -502,7 +479,6 @@ class FieldBounds:
         first = poly, remainder
         if self._grid is not None:
             return self._through(pieces, *self._head_stacks, first, self._grid)[1]
-        pieces = self._relu(self._linear(pieces, self._head[0], first))
-        for layer in self._head[1:]:
-            pieces = self._relu(self._linear(pieces, layer))
-        return self._linear(pieces, self._color).without_columns(torch.arange(len(poly), device=self.device))
+        for layer in self._head:
+            pieces = self._relu(self._linear(pieces, layer, first))
+        return self._linear(pieces, self._color, first).without_columns(torch.arange(len(poly), device=self.device))
