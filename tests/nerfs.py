@@ -20,14 +20,16 @@ from ns_abstract.perturbation.specification import parse_perturbation
 UNIFORM = Sampling("uniform", 0.0, 4.0, 24, 0, (0.2, 0.6, 1.0))
 
 
-def tiny_weights(seed: int = 0, *, density: float = 8.0, rough: float = 1.0, color: float = 4.0) -> FieldWeights:
-    """A random field of 3 x 16 with a skip, empty in three quarters of the space about the origin.
+def tiny_weights(
+    seed: int = 0, *, density: float = 8.0, rough: float = 1.0, color: float = 4.0, layers: int = 3
+) -> FieldWeights:
+    """A random field of ``layers`` x 16 with a skip, empty in three quarters of the space about the origin.
 
     ``density`` is the standard deviation of the density before its softplus, ``rough`` scales the waves of the
     encoding and ``color`` the last layer of the colours.
     """
     torch.manual_seed(seed)
-    found = NerfNetwork(3, 16, 1, 2, 8).weights()
+    found = NerfNetwork(layers, 16, 1, 2, 8).weights()
 
     def scaled(layer: Layer, by: float, columns: slice = slice(None)) -> Layer:
         weight = layer.weight.copy()

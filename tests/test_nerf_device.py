@@ -107,7 +107,7 @@ def test_batches_fit_the_fields() -> None:
     """Wider layers and finer grids have smaller batches."""
     narrow, wide = tiny_scene(0).fine, NerfNetwork(3, 256, 1, 2, 128).weights()
     for dimensions in (1, 2, 3):
-        basis = basis_of(dimensions)
+        basis = basis_of(dimensions, wide)
         assert cells_at_once(narrow, basis) > cells_at_once(wide, basis) >= 1
         values = 8 * len(basis.evaluation) * cells_at_once(wide, basis) * wide.width
         assert values < device_bytes(wide, basis) < 2**33

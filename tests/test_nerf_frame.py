@@ -15,7 +15,9 @@ from ns_abstract.geometry.poses import PoseSet
 from ns_abstract.methods.nerf import bounds as bounds_module
 from ns_abstract.methods.nerf import frame as frame_module
 from ns_abstract.methods.nerf.bounds import Division, NerfBounds, RayBounds
+from ns_abstract.methods.nerf.field import Field
 from ns_abstract.methods.nerf.frame import NerfFrame
+from ns_abstract.methods.nerf.render import NerfRenderer
 from ns_abstract.methods.nerf.scene import NerfScene
 from ns_abstract.refine.engine import Goal, Refinement, groups
 from ns_abstract.refine.result import FrameResult, joined
@@ -113,11 +115,27 @@ def test_the_whole_set_costs_nothing_and_rays_come_in_batches() -> None:
     whole = frame.bound(pose_set.box, np.arange(12))
     assert (whole.lower == 0.0).all() and (whole.upper == 1.0).all()
     sizes = []
-    bound = frame.bound
+    bound = frame.bound_parts
     frame.tiles_at_once = 5
-    frame.bound = lambda box, tiles, *rest: sizes.append(len(tiles)) or bound(box, tiles, *rest)  # type: ignore[method-assign]
+    frame.bound_parts = lambda boxes, tiles, *rest: sizes.append(len(tiles)) or bound(boxes, tiles, *rest)  # type: ignore[method-assign]
     Refinement(frame, 0, Goal(ratio=1.0, seconds=60.0, cells=9)).run()
     assert sizes[0] == 12 and max(sizes[1:]) <= 5
+
+
+@pytest.mark.parametrize("density", [8.0, 1e4])
+def test_colours_of_samples_that_add_nothing_are_not_needed(density: float, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The same pictures, bit for bit, as where slopes are asked for and every colour is."""
+    scene, pose_set = tiny_scene(2, density=density), poses(SETS["point"])
+    renderer, points = NerfRenderer(scene, UNIFORM), []
+    color = Field.color
+    monkeypatch.setattr(
+        Field, "color", lambda field, base, *rest: points.append(base[..., 0].numel()) or color(field, base, *rest)
+    )
+    pose = torch.from_numpy(pose_set.pose(pose_set.box.middle))
+    whole = renderer.picture(pose_set.camera, pose.clone().requires_grad_()).detach().reshape(-1, 3)
+    picture = renderer.pixels(pose_set.camera, pose.numpy(), pixels_of(pose_set.camera))
+    assert (picture == whole.numpy()).all()
+    assert (points[1] < 0.9 * points[0]) == (density > 1e3)
 
 
 def unreached(result: FrameResult) -> int:

@@ -25,6 +25,7 @@ FIELDS = {
     "saturated colours": {"color": 1e4},
     "high frequencies": {"rough": 60.0},
     "all of it": {"density": 1e4, "color": 300.0, "rough": 30.0},
+    "many layers": {"layers": 6},
 }
 
 
@@ -49,7 +50,7 @@ def worst(
     weights: FieldWeights, half: float, dimensions: int = 1, count: int = 24, seed: int = 0, samples: int = 400
 ) -> tuple[float, int, float]:
     """Largest excess of concrete outputs beyond the bounds, comparisons, and mean width over true width."""
-    basis = basis_of(dimensions)
+    basis = basis_of(dimensions, weights)
     field = FieldBounds(weights, basis)
     curve = curves(count, half, dimensions, seed)
     direction = curves(count, half, dimensions, seed + 1)
@@ -187,7 +188,8 @@ ROUNDING = 1e-12
 @pytest.mark.parametrize(("dimensions", "compiled"), [(1, True), (1, False), (2, False)])
 def test_every_unit_is_enclosed(dimensions: int, compiled: bool) -> None:
     """max(0, z) of one unit after the other, at the ends of its error terms and box."""
-    weights, basis, kinds = tiny_weights(0), basis_of(dimensions), set()
+    weights, kinds = tiny_weights(0), set()
+    basis = basis_of(dimensions, weights)
     field = FieldBounds(weights, basis)
     rng = np.random.default_rng(1)
     points = np.concatenate([rng.uniform(-1, 1, (300, dimensions)), rng.choice([-1.0, 1.0], (8, dimensions))])
@@ -216,7 +218,8 @@ def test_every_unit_is_enclosed(dimensions: int, compiled: bool) -> None:
 @pytest.mark.parametrize(("compiled", "narrow"), [(True, True), (True, False), (False, False)])
 def test_linear_layers_are_enclosed(compiled: bool, narrow: bool) -> None:
     """Error terms keep their values through a layer: those that move one neuron, too."""
-    weights, basis = tiny_weights(0), basis_of(1)
+    weights = tiny_weights(0)
+    basis = basis_of(1, weights)
     field = FieldBounds(weights, basis)
     layer = hidden_layer(field)
     width, count = layer.weight.shape
@@ -254,7 +257,7 @@ def test_linear_layers_are_enclosed(compiled: bool, narrow: bool) -> None:
 @pytest.mark.parametrize("scale", [1.0, 1e-25, 1e-39])
 def test_columns_in_float32_are_charged(scale: float) -> None:
     """What float32 products of columns are off by lies in the box, which is hardly wider; gradual underflow, too."""
-    field = FieldBounds(tiny_weights(0), basis_of(1))
+    field = FieldBounds(tiny_weights(0), basis_of(1, tiny_weights(0)))
     layer = hidden_layer(field)
     pieces = field._relu(random_batch(field, layer.weight.shape[0], 5))
     pieces = replace(
@@ -271,7 +274,7 @@ def test_columns_in_float32_are_charged(scale: float) -> None:
 
 
 def test_columns_beyond_float32_fail() -> None:
-    field = FieldBounds(tiny_weights(0), basis_of(1))
+    field = FieldBounds(tiny_weights(0), basis_of(1, tiny_weights(0)))
     layer = hidden_layer(field)
     pieces = field._relu(random_batch(field, layer.weight.shape[0], 5))
     columns = pieces.columns.clone()
@@ -334,7 +337,8 @@ def test_tightness() -> None:
 
 
 def test_pieces_with_too_many_terms_are_given_up() -> None:
-    weights, basis = tiny_weights(0, rough=60.0), basis_of(1)
+    weights = tiny_weights(0, rough=60.0)
+    basis = basis_of(1, weights)
     field = FieldBounds(weights, basis, limit=3)
     curve = curves(8, 0.3, 1, 0)
     nodes = on_curve(curve, basis.nodes)
@@ -345,7 +349,8 @@ def test_pieces_with_too_many_terms_are_given_up() -> None:
 
 @pytest.mark.parametrize("compiled", [True, False])
 def test_numbers_that_are_none_fail(compiled: bool) -> None:
-    weights, basis = tiny_weights(0), basis_of(1)
+    weights = tiny_weights(0)
+    basis = basis_of(1, weights)
     field = FieldBounds(weights, basis)
     if not compiled:
         field._grid = None
@@ -357,7 +362,8 @@ def test_numbers_that_are_none_fail(compiled: bool) -> None:
 
 def test_compiled_and_torch_agree(monkeypatch: pytest.MonkeyPatch) -> None:
     """The compiled ReLU of one parameter follows the general one up to rounding."""
-    weights, basis = tiny_weights(2, rough=5.0), basis_of(1)
+    weights = tiny_weights(2, rough=5.0)
+    basis = basis_of(1, weights)
     nodes, zero = on_curve(curves(16, 6e-3, 1, 0), basis.nodes), torch.zeros(16, 3, dtype=torch.float64)
     found = []
     for compiled in (True, False):
@@ -378,7 +384,8 @@ def test_compiled_and_torch_agree(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.parametrize("layers", [3, 6])
 def test_chunks_are_as_good_as_layer_after_layer(layers: int) -> None:
     """Pieces of several chunks, the last one smaller, in fields whose early layers have float64 columns or not."""
-    weights, basis = tiny_weights(2, rough=5.0), basis_of(1)
+    weights = tiny_weights(2, rough=5.0)
+    basis = basis_of(1, weights)
     if layers > len(weights.base):
         # copies of a hidden layer in between
         middle = next(layer for layer in weights.base[1:] if not layer.skip)
@@ -474,7 +481,7 @@ def test_planted_faults_are_found(monkeypatch: pytest.MonkeyPatch, fault, half: 
 
 def test_greatest_values_on_whole_cells() -> None:
     """Never below what a piece reaches, and reached where coefficients do not alternate."""
-    basis, rng = basis_of(1), np.random.default_rng(3)
+    basis, rng = basis_of(1, tiny_weights(0)), np.random.default_rng(3)
     poly = rng.normal(size=(40, basis.size, 2)) * 10.0 ** rng.uniform(-3, 3, (40, 1, 2))
     poly[:8] = np.abs(poly[:8])
     poly[8:12, 0] *= 1e12

@@ -39,7 +39,7 @@ REGION = 1.0 + 2.0**-30
 #: Taylor models: radii are sums of fewer than 2^10 terms, of two roundings each.
 TAYLOR_UP = 1.0 + 2.0**11 * UNIT64
 #: Polynomials in Chebyshev's basis: more than the rounding of the matrices' entries (arguments and cosines: 40 units of
-#: degree at most 32) and of products with them (at most 2^11 terms).
+#: degree at most 40) and of products with them (at most 2^11 terms).
 CHEBYSHEV_ROUNDING = 2.0**-41
 #: Fields of NeRFs: sums over a layer, in any order; at most 2^12 terms.
 FIELD_UP = 1.0 + 2.0**-40

@@ -31,6 +31,9 @@ from ns_abstract.methods.nerf.zonotope import ERROR_TERMS, Affine, FieldBounds, 
 
 #: (degree, grid) of the polynomials by number of parameters.
 _DEGREES = {0: (1, 2), 1: (28, 112), 2: (6, 20), 3: (4, 10)}
+#: The same of one parameter for a field whose base has at most so many layers: it bears cells as wide as its waves are
+#: followed, while deeper ones bend more.
+_SHALLOW, _SHALLOW_DEGREE = 4, (35, 126)
 #: Degree of the Taylor models of poses.
 _TAYLOR = 6
 #: Cells bounded at once by compiled kernels, whose numbers stay in a core's cache.
@@ -73,9 +76,11 @@ _UNSEEN = 1e-5
 Shifts = tuple[Range, Range]
 
 
-def basis_of(dimensions: int) -> ChebyshevBasis:
-    """The polynomials that are used for ``dimensions`` parameters."""
+def basis_of(dimensions: int, field: FieldWeights) -> ChebyshevBasis:
+    """The polynomials that are used for ``dimensions`` parameters of a ``field``."""
     degree, grid = _DEGREES.get(dimensions, (1, 2))
+    if dimensions == 1 and len(field.base) <= _SHALLOW:
+        degree, grid = _SHALLOW_DEGREE
     return ChebyshevBasis(dimensions, degree, grid)
 
 
@@ -303,7 +308,7 @@ class NerfBounds:
     ) -> None:
         self.sampling, self.device = sampling, torch.device(device)
         self.swept = sampling.kind == "hierarchical"
-        self.basis = basis_of(dimensions + self.swept)
+        self.basis = basis_of(dimensions + self.swept, scene.fine)
         self.field = FieldBounds(scene.fine, self.basis, device=device, compiled=compiled)
         #: Cells bounded at once.
         self.batch = _BATCH if self.field.compiled else cells_at_once(scene.fine, self.basis)
@@ -312,7 +317,9 @@ class NerfBounds:
         #: Of the coarse pass, by pose alone.
         self.coarse = None
         if self.swept:
-            self.coarse = FieldBounds(scene.coarse, basis_of(dimensions), device=device, compiled=compiled)
+            self.coarse = FieldBounds(
+                scene.coarse, basis_of(dimensions, scene.coarse), device=device, compiled=compiled
+            )
         self.distances = 0.5 * (edges[1:] + edges[:-1])
         self.lengths = edges[1:] - edges[:-1]
         self.taylor = min(_TAYLOR, max(1, self.basis.degree))

@@ -170,6 +170,30 @@ def _piecewise(z, first, new, begin, past):
 
 
 @njit(cache=True, error_model="numpy")
+def _keep(found, begin, out, columns, terms):
+    """Columns and new error terms of ``found``, whose pieces are ``begin`` and later ones in ``out``, where they end.
+
+    Returns:
+        Where the next ones begin.
+    """
+    # arrays of a record are counted each time they are taken out of it
+    source, owner, failed, target, owners = found.columns, found.owner, found.failed, out.columns, out.owner
+    for c in range(owner.shape[0]):
+        if not failed[owner[c]]:
+            for j in range(source.shape[1]):
+                target[columns, j] = source[c, j]
+            owners[columns] = owner[c] + begin
+            columns += 1
+    new_owner, neuron, size = found.new_owner, found.new_neuron, found.new_size
+    new_owners, neurons, sizes = out.new_owner, out.new_neuron, out.new_size
+    for c in range(new_owner.shape[0]):
+        if not failed[new_owner[c]]:
+            new_owners[terms], neurons[terms], sizes[terms] = new_owner[c] + begin, neuron[c], size[c]
+            terms += 1
+    return columns, terms
+
+
+@njit(cache=True, error_model="numpy")
 def through_layers(z, encoded, remainder, layers, last, grid, limit, out, outputs):
     """Layers with their activations and a last one without, the pieces in the order in which they are given.
 
@@ -211,14 +235,5 @@ def through_layers(z, encoded, remainder, layers, last, grid, limit, out, output
         _copy(found.slope, out.slope[begin:past])
         _copy(found.failed, out.failed[begin:past])
         _copy(found.count, out.count[begin:past])
-        for c in range(found.owner.shape[0]):
-            if not found.failed[found.owner[c]]:
-                _copy(found.columns[c], out.columns[columns])
-                out.owner[columns] = found.owner[c] + begin
-                columns += 1
-        for c in range(found.new_owner.shape[0]):
-            if not found.failed[found.new_owner[c]]:
-                out.new_owner[terms], out.new_neuron[terms] = found.new_owner[c] + begin, found.new_neuron[c]
-                out.new_size[terms] = found.new_size[c]
-                terms += 1
+        columns, terms = _keep(found, begin, out, columns, terms)
     return columns, terms

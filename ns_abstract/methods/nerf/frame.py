@@ -41,6 +41,8 @@ _SHIFT_PARTS, _SHIFT_MOTION = 12, 6.0
 _WORK, _SHARES = 1_600_000, 4
 #: Rays that fill the batches of a GPU.
 _RAYS_ON_DEVICE = 256
+#: Relative change of the width of cells, from some rays to the next, below which it is known.
+_STEADY = 0.03
 #: Seconds between looks at results of other processes, and those that they get to end when the time is over.
 _PATIENCE, _GRACE = 0.2, 3.0
 
@@ -56,6 +58,10 @@ class RayContext:
 
     tiles: np.ndarray
     alpha: np.ndarray
+
+    def of(self, tiles: np.ndarray) -> np.ndarray:
+        """[t, samples] bounds of ``tiles`` [t], which are among its own."""
+        return self.alpha[np.searchsorted(self.tiles, tiles)]
 
     @property
     def nbytes(self) -> int:
@@ -135,6 +141,8 @@ class NerfFrame:
         self._share = int(np.clip(_WORK // weights, 1, 32)) if compiled else _RAYS_ON_DEVICE
         self.tiles_at_once = workers * self._share * (_SHARES if compiled and workers > 1 else 1)
         self._witness: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None
+        #: whether boxes need not wait for what others tell of the width of cells
+        self._steady = False
 
     #: Few kernels, which are compiled together.
     stages: tuple[str, ...] = ()
@@ -200,34 +208,33 @@ class NerfFrame:
 
         Rays that there is no time for any more (`ns_abstract.execution.ending`) are bounded by [0, 1].
         """
+        return self.bound_parts([box], tiles, within, keep_linear)[0]
+
+    def bound_parts(
+        self, boxes: Sequence[ParameterBox], tiles: np.ndarray, within: RayContext | None = None,
+        keep_linear: bool = False, pixels: np.ndarray | None = None,
+    ) -> list[RayBox]:  # fmt: skip
+        """`bound` over each of ``boxes``, side by side; see `ns_abstract.refine.protocol.PartsFrame`."""
         tiles = np.asarray(tiles)
-        d = box.dimensions
-        whole = d > 0 and box == self.box
-        if whole:
-            lower, upper, context = np.zeros((tiles.size, 3)), np.ones((tiles.size, 3)), None
-        else:
-            known = None
-            if within is not None:
-                known = within.alpha[np.searchsorted(within.tiles, tiles)]
-            parts = []
-            try:
-                for i in range(0, tiles.size, self.tiles_at_once):
-                    checkpoint()
-                    mine = slice(i, i + self.tiles_at_once)
-                    parts += self._batch(box, tiles[mine], None if known is None else known[mine])
-            except AbandonedError:
-                parts.append(self._unknown(tiles.size - sum(len(part.lower) for part in parts)))
+        if self.box.dimensions > 0 and self.box in boxes:
+            nothing = self._unknown(tiles.size)
+            return [self._box(nothing.lower, nothing.upper, None, keep_linear) for _ in boxes]
+        order = np.argsort(tiles)
+        found = []
+        for parts in self._parts(boxes, tiles, None if within is None else within.of(tiles)):
             lower, upper, alpha = (
                 np.concatenate([getattr(part, name) for part in parts]) for name in ("lower", "upper", "alpha")
             )
-            order = np.argsort(tiles)
-            context = RayContext(tiles[order], alpha[order])
-        low, high = outward(lower, upper)
-        shape = (tiles.size, 1, 1, 3)
-        low, high = low.reshape(shape), high.reshape(shape)
+            found.append(self._box(lower, upper, RayContext(tiles[order], alpha[order]), keep_linear))
+        return found
+
+    def _box(self, lower: np.ndarray, upper: np.ndarray, context: RayContext | None, keep_linear: bool) -> RayBox:
+        """What is told of bounds [t, 3]."""
+        d = self.box.dimensions
+        low, high = (side.reshape(-1, 1, 1, 3) for side in outward(lower, upper))
         linear = None
         if keep_linear:
-            flat = np.zeros((*shape, d), np.float32)
+            flat = np.zeros((*low.shape, d), np.float32)
             linear = flat, low, flat, high
         return RayBox(low, high, np.zeros(d), context, linear)
 
@@ -236,29 +243,57 @@ class NerfFrame:
         alpha = np.ones((count, self.bounds.distances.size), np.float32)
         return RayBounds(np.zeros((count, 3)), np.ones((count, 3)), alpha, 0, self.bounds.displacement)
 
-    def _batch(self, box: ParameterBox, tiles: np.ndarray, known: np.ndarray | None) -> list[RayBounds]:
-        """Bounds of rays that are worked on together, in shares for all workers."""
-        tolerance, shifts = self._tolerance(box), self._shifts(box)
-        low, high = self._reached(box, tiles, bool(shifts))
-        low, high = low - tolerance, high + tolerance
-        poses = box.without(COLOR_SHIFTS)
+    def _parts(
+        self, boxes: Sequence[ParameterBox], tiles: np.ndarray, known: np.ndarray | None
+    ) -> list[list[RayBounds]]:
+        """Bounds of rays over each of ``boxes``, in some pieces; [0, 1] where there is no time for more."""
+        found: list[list[RayBounds]] = [[] for _ in boxes]
+        done = 0
+        with suppress(AbandonedError):
+            for first in range(0, tiles.size, self.tiles_at_once):
+                checkpoint()
+                mine = slice(first, first + self.tiles_at_once)
+                batch: list[list[RayBounds]] = []
+                while len(batch) < len(boxes):
+                    some = boxes[len(batch) :] if self._steady else boxes[len(batch) : len(batch) + 1]
+                    batch += self._batch(some, tiles[mine], None if known is None else known[mine])
+                for parts, more in zip(found, batch, strict=True):
+                    parts += more
+                done = first + tiles[mine].size
+        if done < tiles.size:
+            for parts in found:
+                parts.append(self._unknown(tiles.size - done))
+        return found
+
+    def _batch(
+        self, boxes: Sequence[ParameterBox], tiles: np.ndarray, known: np.ndarray | None
+    ) -> list[list[RayBounds]]:
+        """Bounds over each of ``boxes`` of rays that are worked on together, in shares for all workers."""
         size = min(self._share, -(-tiles.size // self.workers))
         shares = []
-        for start in range(0, tiles.size, size):
-            part = slice(start, start + size)
-            shares.append(
-                (
-                    self._geometry, poses, self._pixels(tiles[part]), tolerance,
-                    None if known is None else known[part], (low[part], high[part]), shifts,
-                )
-            )  # fmt: skip
-        found = self._tried(shares)
-        done = [part for part in found if part is not None]
+        for box in boxes:
+            tolerance, shifts = self._tolerance(box), self._shifts(box)
+            low, high = self._reached(box, tiles, bool(shifts))
+            low, high = low - tolerance, high + tolerance
+            poses = box.without(COLOR_SHIFTS)
+            for start in range(0, tiles.size, size):
+                part = slice(start, start + size)
+                shares.append(
+                    (
+                        self._geometry, poses, self._pixels(tiles[part]), tolerance,
+                        None if known is None else known[part], (low[part], high[part]), shifts,
+                    )
+                )  # fmt: skip
+        tried = self._tried(shares)
+        done = [part for part in tried if part is not None]
         if done:
-            self.bounds.displacement = typical_displacement(done)
-        return [
-            self._unknown(len(share[2])) if part is None else part for share, part in zip(shares, found, strict=True)
+            before, self.bounds.displacement = self.bounds.displacement, typical_displacement(done)
+            self._steady = abs(self.bounds.displacement / before - 1.0) < _STEADY
+        parts = [
+            self._unknown(len(share[2])) if part is None else part for share, part in zip(shares, tried, strict=True)
         ]
+        each = len(parts) // len(boxes)
+        return [parts[i : i + each] for i in range(0, len(parts), each)]
 
     def _run(self, calls: Sequence[Sequence[Any]]) -> list[RayBounds]:
         """`NerfBounds.rays` with the arguments of each call, side by side where there are several.

@@ -134,7 +134,7 @@ def _columns(b, z, first, new, live, weights, scratch, out, place):
     scaled, slope, rest = scratch
     # arrays of a record are counted each time they are taken out of it
     owner, columns, new_owner, before, wide = z.owner, z.columns, z.new_owner, z.slope[b], weights.wide
-    result, sums = out.columns, out.sums[b]
+    new_neuron, new_size, result, sums = z.new_neuron, z.new_size, out.columns, out.sums[b]
     inputs, n, begin = scaled.shape[1], out.sums.shape[1], place
     if z.failed[b]:
         while first < owner.shape[0] and owner[first] == b:
@@ -146,24 +146,22 @@ def _columns(b, z, first, new, live, weights, scratch, out, place):
     while first < owner.shape[0] and owner[first] == b:
         count = 0
         while count < BLOCK and first < owner.shape[0] and owner[first] == b:
-            row, column = scaled[count], columns[first]
             for j in range(inputs):
-                row[j] = column[j] * slope[j]
+                scaled[count, j] = columns[first, j] * slope[j]
             count += 1
             first += 1
         multiply(scaled[:count], live, weights.columns, rest, result[place : place + count])
         place += count
     while new < new_owner.shape[0] and new_owner[new] == b:
-        size, line, row = z.new_size[new], wide[z.new_neuron[new]], result[place]
+        size, neuron = new_size[new], new_neuron[new]
         for j in range(n):
-            row[j] = size * line[j]
+            result[place, j] = size * wide[neuron, j]
         place += 1
         new += 1
     sums[:] = 0.0
     for c in range(begin, place):
-        row = result[c]
         for j in range(n):
-            sums[j] += abs(row[j])
+            sums[j] += abs(result[c, j])
     out.owner[begin:place] = b
     return first, new, place
 
@@ -178,21 +176,19 @@ def _box(b, z, encoded, remainder, live, weights, box):
     for j in live:
         radius = (size[j] + before[j]) * rounding + before[j]
         radius += narrow * spread[j] + underflow
-        row = absolute[j]
         for k in range(n):
-            box[k] += radius * row[k]
+            box[k] += radius * absolute[j, k]
     if not given.shape[0]:
         return
     poly, rest = encoded[b], remainder[b]
     whole = rest.copy()
     for k in range(poly.shape[0]):
-        line = poly[k]
         for j in range(whole.shape[0]):
-            whole[j] += abs(line[j])
+            whole[j] += abs(poly[k, j])
     for j in range(whole.shape[0]):
-        radius, row = rest[j] + rounding * whole[j], given[j]
+        radius = rest[j] + rounding * whole[j]
         for k in range(n):
-            box[k] += radius * row[k]
+            box[k] += radius * given[j, k]
 
 
 @njit(cache=True, error_model="numpy")
@@ -227,11 +223,9 @@ def linear(z, encoded, remainder, weights, out):
         if every.shape[0]:
             multiply(encoded[b], every, weights.seen, rest_wide, given)
             for k in range(poly.shape[0]):
-                line, more = poly[k], given[k]
                 for j in range(n):
-                    line[j] += more[j]
-        constant = poly[0]
+                    poly[k, j] += given[k, j]
         for j in range(n):
-            constant[j] += bias[j]
-            box[j] = (box[j] + 4.0 * UNIT64 * (abs(bias[j]) + abs(constant[j]))) * FIELD_UP
+            poly[0, j] += bias[j]
+            box[j] = (box[j] + 4.0 * UNIT64 * (abs(bias[j]) + abs(poly[0, j]))) * FIELD_UP
     return place

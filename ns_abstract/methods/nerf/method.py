@@ -149,8 +149,8 @@ class NerfMethod:
         """Processes that bound rays of a set with so many parameters."""
         if self.device == "cpu":
             return self.workers
-        swept = self.sampling.kind == "hierarchical"
-        return processes_that_fit(device_bytes(self.scene.fine, basis_of(dimensions + swept)), self.workers)
+        field, swept = self.scene.fine, self.sampling.kind == "hierarchical"
+        return processes_that_fit(device_bytes(field, basis_of(dimensions + swept, field)), self.workers)
 
     def easier(self, poses: PoseSet) -> Iterator[tuple[str, NerfFrame]]:
         """None are known."""

@@ -28,8 +28,8 @@ class Grid(NamedTuple):
 
     Attributes:
         points: (g + 1) / 2.
-        even, odd: Values [points, .] of the basis' even and odd degrees, with rows of zeros to whole `ROWS`.
-        fit_even, fit_odd: The fit [., points] of even and odd degrees, likewise.
+        even, odd: Values [points, .] of the basis' even and odd degrees.
+        fit_even, fit_odd: The fit [., points] of even and odd degrees.
         order: 0, 1, 2, ..., for as many as these matrices have columns.
         chord: [m].
         norming: See `ChebyshevBasis.norming`.
@@ -83,22 +83,17 @@ class Behind(NamedTuple):
     error: np.ndarray
 
 
-def _whole(matrix: np.ndarray) -> np.ndarray:
-    """``matrix`` [., columns] with rows of zeros behind its last to whole `ROWS`."""
-    return np.pad(matrix, ((0, -len(matrix) % ROWS), (0, 0)))
-
-
 def grid_of(basis: ChebyshevBasis) -> Grid:
     """The grid of a ``basis`` of one variable, whose ``grid`` is even."""
     points = basis.grid // 2 + 1
     values, fit = basis.evaluation[:points], basis.fit[:, :points]
-    even, odd, fit_even, fit_odd = map(_whole, (values[:, 0::2], values[:, 1::2], fit[0::2], fit[1::2]))
-    return Grid(points, even, odd, fit_even, fit_odd, np.arange(max(points, basis.size)), basis.chord, basis.norming)
+    parts = [np.ascontiguousarray(part) for part in (values[:, 0::2], values[:, 1::2], fit[0::2], fit[1::2])]
+    return Grid(points, *parts, np.arange(max(points, basis.size)), basis.chord, basis.norming)
 
 
 @njit(cache=True, error_model="numpy")
 def _multiply(matrix, order, lanes, out):
-    """``out = matrix @ lanes``, [R, LANES] of [R, K] and [K, LANES]; R: whole `ROWS`; ``order``: see `Grid`."""
+    """``out = matrix @ lanes``, [R, LANES] of [R, K] and [K, LANES]; ``order``: see `Grid`."""
     count, terms = matrix.shape
     factors, elements, results = pointer(matrix), pointer(lanes), pointer(out)
     places, line = pointer(order), LINE // lanes.itemsize
@@ -112,33 +107,53 @@ def _multiply(matrix, order, lanes, out):
 
 
 @njit(cache=True, error_model="numpy")
-def _scratch(grid):
-    """Zeros for coefficients of even and odd degrees, and room for their sums, [., LANES]."""
-    degrees = np.zeros((grid.fit_even.shape[0], LANES)), np.zeros((grid.fit_odd.shape[0], LANES))
-    return (*degrees, np.empty((grid.even.shape[0], LANES)), np.empty((grid.odd.shape[0], LANES)))
+def _degrees(grid):
+    """Room for coefficients of even and odd degrees, [., LANES]."""
+    return np.empty((grid.fit_even.shape[0], LANES)), np.empty((grid.fit_odd.shape[0], LANES))
 
 
 @njit(cache=True, error_model="numpy")
-def _on_grid(even, odd, grid, sum_even, sum_odd, values):
+def _both(evens, odds):
+    """Sums and differences of what `four_rows` returns, twice."""
+    a0, a1, a2, a3, a4, a5, a6, a7 = evens
+    b0, b1, b2, b3, b4, b5, b6, b7 = odds
+    return (
+        (a0 + b0, a1 + b1, a2 + b2, a3 + b3, a4 + b4, a5 + b5, a6 + b6, a7 + b7),
+        (a0 - b0, a1 - b1, a2 - b2, a3 - b3, a4 - b4, a5 - b5, a6 - b6, a7 - b7),
+    )
+
+
+@njit(cache=True, error_model="numpy")
+def _on_grid(even, odd, grid, values):
     """``values`` [g, LANES] of polynomials with coefficients ``even`` and ``odd``."""
-    _multiply(grid.even, grid.order, even, sum_even)
-    _multiply(grid.odd, grid.order, odd, sum_odd)
-    evens, odds, out, last = pointer(sum_even), pointer(sum_odd), pointer(values), values.shape[0] - 1
-    for i in range(grid.points):
-        for c in range(0, LANES, LINE // values.itemsize):
+    factors, other = pointer(grid.even), pointer(grid.odd)
+    terms, others, middle = grid.even.shape[1], grid.odd.shape[1], grid.points - 1
+    elements, more, out, places = pointer(even), pointer(odd), pointer(values), pointer(grid.order)
+    line, last = LINE // values.itemsize, LANES * (values.shape[0] - 1)
+    values[0] = 0.0
+    nothing = load_line(out, 0)
+    for first in range(0, grid.points, ROWS):
+        rows, others_rows = rows_from(first, middle, terms), rows_from(first, middle, others)
+        p0, p1, p2, p3 = rows_from(first, middle, LANES)
+        for c in range(0, LANES, 2 * line):
+            evens = four_rows(factors, rows, places, terms, elements, c, LANES, line, nothing)
+            odds = four_rows(other, others_rows, places, others, more, c, LANES, line, nothing)
+            front, back = _both(evens, odds)
             # the middle of the grid is its own mirror; odd polynomials vanish there
-            e, o = load_line(evens, LANES * i + c), load_line(odds, LANES * i + c)
-            store(out, LANES * (last - i) + c, e - o)
-            store(out, LANES * i + c, e + o)
+            store_rows(out, (last - p0, last - p1, last - p2, last - p3), c, line, back)
+            store_rows(out, (p0, p1, p2, p3), c, line, front)
 
 
 @njit(cache=True, error_model="numpy")
 def _gather(poly, which, neuron, even, odd):
     """Coefficients of up to LANES neurons into ``even`` and ``odd``; lanes that are left are 0."""
-    for k in range(poly.shape[1]):
+    (_, m, n), flat, places = poly.shape, poly.reshape(-1), np.empty(LANES, np.int64)
+    for c in range(which.shape[0]):
+        places[c] = which[c] * m * n + neuron[c]
+    for k in range(m):
         rows = odd if k % 2 else even
         for c in range(which.shape[0]):
-            rows[k // 2, c] = poly[which[c], k, neuron[c]]
+            rows[k // 2, c] = flat[places[c] + k * n]
         for c in range(which.shape[0], LANES):
             rows[k // 2, c] = 0.0
 
@@ -211,7 +226,7 @@ def _decide(poly, rho, box, grid, slope, size, which, neuron, found, low, high):
 
     What is not a number stays open, and fails in `relu`.
     """
-    even, odd, sum_even, sum_odd = _scratch(grid)
+    even, odd = _degrees(grid)
     values = np.empty((2 * grid.points - 1, LANES))
     absolute, least, most = np.empty(LANES), np.empty(LANES), np.empty(LANES)
     left = 0
@@ -219,7 +234,7 @@ def _decide(poly, rho, box, grid, slope, size, which, neuron, found, low, high):
         past = min(first + LANES, found)
         _gather(poly, which[first:past], neuron[first:past], even, odd)
         _absolute(even, odd, absolute)
-        _on_grid(even, odd, grid, sum_even, sum_odd, values)
+        _on_grid(even, odd, grid, values)
         _ranges(values, absolute, grid.norming, least, most)
         for c in range(past - first):
             b, j = which[first + c], neuron[first + c]
@@ -301,19 +316,20 @@ def _open(poly, rho, box, failed, grid, slope, size, which, neuron, error):
     found = _certain(poly, rho, box, failed, slope, size, which, neuron)
     lows, highs = np.empty(found), np.empty(found)
     found = _decide(poly, rho, box, grid, slope, size, which, neuron, found, lows, highs)
-    even, odd, sum_even, sum_odd = _scratch(grid)
-    even_q, odd_q = np.zeros_like(even), np.zeros_like(odd)
-    values, fitted = np.empty((2 * grid.points - 1, LANES)), np.empty((2 * grid.points - 1, LANES))
+    m, points = poly.shape[1], grid.points
+    (even, odd), (even_q, odd_q) = _degrees(grid), _degrees(grid)
+    sum_even, sum_odd = np.empty((points, LANES)), np.empty((points, LANES))
+    values, fitted = np.empty((2 * points - 1, LANES)), np.empty((2 * points - 1, LANES))
     absolute, absolute_q, above = np.empty(LANES), np.empty(LANES), np.empty(LANES)
     below, least, most = np.empty(LANES), np.empty(LANES), np.empty(LANES)
     for first in range(0, found, LANES):
         past = min(first + LANES, found)
         _gather(poly, which[first:past], neuron[first:past], even, odd)
         _absolute(even, odd, absolute)
-        _on_grid(even, odd, grid, sum_even, sum_odd, values)
+        _on_grid(even, odd, grid, values)
         _series(values, grid, sum_even, sum_odd, even_q, odd_q)
         _absolute(even_q, odd_q, absolute_q)
-        _on_grid(even_q, odd_q, grid, sum_even, sum_odd, fitted)
+        _on_grid(even_q, odd_q, grid, fitted)
         _chords(even, odd, even_q, odd_q, grid.chord, above, below)
         _errors(values, fitted, above, below, least, most)
         for c in range(past - first):
@@ -329,14 +345,17 @@ def _open(poly, rho, box, failed, grid, slope, size, which, neuron, error):
             if by_line:
                 kept, shift, new = line, 0.5 * line * -bottom, line_error
                 box[b, j] = r * line
-            for k in range(poly.shape[1]):
-                if by_line:
-                    q = line * (odd[k // 2, c] if k % 2 else even[k // 2, c])
-                else:
-                    q = odd_q[k // 2, c] if k % 2 else even_q[k // 2, c]
-                q += shift if k == 0 else 0.0
+            evens, odds, factor = (even, odd, line) if by_line else (even_q, odd_q, 1.0)
+            for k in range(0, m, 2):
+                q = factor * evens[k // 2, c]
+                if k == 0:
+                    q += shift
                 poly[b, k, j] = q
                 total += abs(q)
+                if k + 1 < m:
+                    q = factor * odds[k // 2, c]
+                    poly[b, k + 1, j] = q
+                    total += abs(q)
             new += 8.0 * UNIT64 * (total + e)
             slope[b, j] = kept
             size[b, j] = (total + kept * e + new) * FIELD_UP
@@ -355,20 +374,25 @@ def relu(z, grid, limit, out):
         limit: Error terms of a piece beyond which it fails.
         out: `Behind`, filled.
     """
-    pieces, n = z.sums.shape
-    rho = z.sums * FIELD_UP
-    found = _open(z.poly, rho, z.box, z.failed, grid, out.slope, out.size, out.piece, out.neuron, out.error)
-    out.spread[:] = rho * out.slope
-    out.count[:] = z.count
-    for i in range(found):
-        out.spread[out.piece[i], out.neuron[i]] += out.error[i]
-        out.count[out.piece[i]] += 1
+    # arrays of a record are counted each time they are taken out of it
+    poly, sums, box, old_failed, old_count = z
+    slope, size, spread, failed, count, piece, neuron, error = out
+    pieces, n = sums.shape
+    rho = sums * FIELD_UP
+    found = _open(poly, rho, box, old_failed, grid, slope, size, piece, neuron, error)
     for b in range(pieces):
-        failed = z.failed[b] or out.count[b] > limit
+        count[b] = old_count[b]
         for j in range(n):
-            out.spread[b, j] *= FIELD_UP
-            failed |= not math.isfinite(out.size[b, j])
-        out.failed[b] = failed
-        if failed:
-            z.poly[b], z.box[b], out.size[b], out.spread[b] = 0.0, 0.0, 0.0, 0.0
+            spread[b, j] = rho[b, j] * slope[b, j]
+    for i in range(found):
+        spread[piece[i], neuron[i]] += error[i]
+        count[piece[i]] += 1
+    for b in range(pieces):
+        fails = old_failed[b] or count[b] > limit
+        for j in range(n):
+            spread[b, j] *= FIELD_UP
+            fails |= not math.isfinite(size[b, j])
+        failed[b] = fails
+        if fails:
+            poly[b], box[b], size[b], spread[b] = 0.0, 0.0, 0.0, 0.0
     return found

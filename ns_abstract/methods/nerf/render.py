@@ -103,6 +103,10 @@ class NerfRenderer:
             bins = self._refined(bins, _weights(density, self._lengths(bins)))
         density, base, inside = self._densities(self.fine, origin, world, bins)
         weights = _weights(density, self._lengths(bins))
+        if not weights.requires_grad:
+            # most samples of empty space add exactly nothing, whatever their colour
+            seen = weights > 0.0
+            base, inside = base[seen[inside]], seen
         color = self.fine.color(base, world[:, None].expand(-1, weights.shape[1], -1)[inside])
         if shift is not None:
             color = shifted(color, *shift)
