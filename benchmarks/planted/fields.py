@@ -41,11 +41,11 @@ FIELDS = (
     ),
     Fault(
         "layers: the compiled one forgets its bias",
-        _LAYER, "linear", "constant[j] += bias[j]", "pass", _LAYERS + "[True-True]",
+        _LAYER, "linear", "poly[0, j] += bias[j]", "pass", _LAYERS + "[True-True]",
     ),
     Fault(
         "layers: the compiled one forgets what it sees of an encoded vector",
-        _LAYER, "linear", "line[j] += more[j]", "pass", _PRODUCTS,
+        _LAYER, "linear", "poly[k, j] += given[k, j]", "pass", _PRODUCTS,
     ),
     Fault(
         "layers: the compiled one forgets the remainder of an encoded vector",
@@ -53,7 +53,7 @@ FIELDS = (
     ),
     Fault(
         "fields: error terms of one neuron lose their size",
-        _LAYER, "_columns", "size * line[j]", "0.1 * size * line[j]", _LAYERS + "[True-True]",
+        _LAYER, "_columns", "size * wide[neuron, j]", "0.1 * size * wide[neuron, j]", _LAYERS + "[True-True]",
     ),
     Fault(
         "layers: gradual underflow of columns in float32 is not charged",
@@ -82,9 +82,10 @@ FIELDS = (
         _UNITS + "[1-False]",
     ),
     Fault(
-        "layers: all rows of a block are its first four",
-        _LAYER, "multiply", "four_rows(f, rows_from(first, count - 1, inputs), places, k, w, c, stride, line, nothing)",
-        "four_rows(f, rows_from(0, count - 1, inputs), places, k, w, c, stride, line, nothing)", _PRODUCTS,
+        "layers: all rows of a block are its first six",
+        _LAYER, "multiply",
+        "sums_of_rows(f, rows_from(first, count - 1, inputs), places, k, w, c, stride, line, nothing)",
+        "sums_of_rows(f, rows_from(0, count - 1, inputs), places, k, w, c, stride, line, nothing)", _PRODUCTS,
     ),
     Fault(
         "layers: the end of a product's row is its last line's beginning",
@@ -92,7 +93,7 @@ FIELDS = (
     ),
     Fault(
         "layers: a product takes the first rows of the weight, not those of what is live",
-        "arithmetic/simd/products.py", "four_rows", "load_line(elements, at + stride * k)",
+        "arithmetic/simd/products.py", "sums_of_rows", "load_line(elements, at + stride * k)",
         "load_line(elements, at + stride * i)", _PRODUCTS,
     ),
     Fault(
@@ -133,7 +134,7 @@ FIELDS = (
     ),
     Fault(
         "compiled units: what is no number does not fail",
-        _RELU, "relu", "failed |= not math.isfinite(out.size[b, j])", "pass",
+        _RELU, "relu", "fails |= not math.isfinite(size[b, j])", "pass",
         "test_nerf_zonotope.py::test_numbers_that_are_none_fail[True]", True,
     ),
     Fault(
@@ -143,13 +144,13 @@ FIELDS = (
     ),
     Fault(
         "fields: columns of failed pieces are kept",
-        "methods/nerf/field_kernel.py", "through_layers", "not found.failed[found.owner[c]]", "True",
+        "methods/nerf/field_kernel.py", "_keep", "not failed[owner[c]]", "True",
         "test_nerf_zonotope.py::test_pieces_with_too_many_terms_are_given_up", True,
     ),
     Fault(
         "compiled units: values on the grid are without the highest degrees",
-        _RELU, "_multiply", "four_rows(factors, rows, places, terms, elements, c, LANES, line, nothing)",
-        "four_rows(factors, rows, places, terms - 4, elements, c, LANES, line, nothing)", _UNITS + "[1-True]",
+        _RELU, "_on_grid", "sums_of_rows(factors, rows, places, terms, elements, c, LANES, line, nothing)",
+        "sums_of_rows(factors, rows, places, terms - 4, elements, c, LANES, line, nothing)", _UNITS + "[1-True]",
     ),
     Fault(
         "fields: what is left of a dim cell is its polynomial's alone",

@@ -14,7 +14,7 @@ from ns_abstract.methods.nerf.layer_kernel import Before, Behind, Weights, linea
 from ns_abstract.methods.nerf.relu_kernel import relu
 
 #: Pieces that go through all layers together.
-CHUNK = 8
+CHUNK = 16
 
 
 class Layers(NamedTuple):

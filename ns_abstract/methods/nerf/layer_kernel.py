@@ -14,10 +14,10 @@ from numba import njit
 from ns_abstract.arithmetic.rounding import FIELD_UP, UNIT64
 from ns_abstract.arithmetic.simd.intrinsics import pointer
 from ns_abstract.arithmetic.simd.lanes import LINE, load_line
-from ns_abstract.arithmetic.simd.products import ROWS, four_rows, rows_from, store_rows
+from ns_abstract.arithmetic.simd.products import ROWS, rows_from, store_rows, sums_of_rows
 
 #: Rows of a product that pass a line of the weight while it stays in a core's first cache; a multiple of `ROWS`.
-BLOCK = 32
+BLOCK = 36
 #: Roundings of a column's product in float32 beside one by live input: the column, its slope, their product, and the
 #: sums of a step; 2 to spare.
 NARROW_STEPS = 8
@@ -42,7 +42,7 @@ def multiply(x, live, weight, rest, out):
     for begin in range(0, count, BLOCK):
         for c in range(0, n, pair):
             for first in range(begin, min(begin + BLOCK, count), ROWS):
-                sums = four_rows(f, rows_from(first, count - 1, inputs), places, k, w, c, stride, line, nothing)
+                sums = sums_of_rows(f, rows_from(first, count - 1, inputs), places, k, w, c, stride, line, nothing)
                 if c + pair <= n:
                     store_rows(o, rows_from(first, count - 1, n), c, line, sums)
                     continue

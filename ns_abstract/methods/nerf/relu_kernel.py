@@ -15,7 +15,7 @@ from ns_abstract.arithmetic.chebyshev import ChebyshevBasis
 from ns_abstract.arithmetic.rounding import CHEBYSHEV_ROUNDING, FIELD_UP, UNIT64
 from ns_abstract.arithmetic.simd.intrinsics import pointer
 from ns_abstract.arithmetic.simd.lanes import LINE, load_line, maximum, minimum, store
-from ns_abstract.arithmetic.simd.products import ROWS, four_rows, rows_from, store_rows
+from ns_abstract.arithmetic.simd.products import ROWS, rows_from, store_rows, sums_of_rows
 
 #: Neurons side by side.
 LANES = 32
@@ -102,7 +102,7 @@ def _multiply(matrix, order, lanes, out):
     for first in range(0, count, ROWS):
         rows = rows_from(first, count - 1, terms)
         for c in range(0, LANES, 2 * line):
-            sums = four_rows(factors, rows, places, terms, elements, c, LANES, line, nothing)
+            sums = sums_of_rows(factors, rows, places, terms, elements, c, LANES, line, nothing)
             store_rows(results, rows_from(first, count - 1, LANES), c, line, sums)
 
 
@@ -113,13 +113,17 @@ def _degrees(grid):
 
 
 @njit(cache=True, error_model="numpy")
-def _both(evens, odds):
-    """Sums and differences of what `four_rows` returns, twice."""
-    a0, a1, a2, a3, a4, a5, a6, a7 = evens
-    b0, b1, b2, b3, b4, b5, b6, b7 = odds
-    return (
-        (a0 + b0, a1 + b1, a2 + b2, a3 + b3, a4 + b4, a5 + b5, a6 + b6, a7 + b7),
-        (a0 - b0, a1 - b1, a2 - b2, a3 - b3, a4 - b4, a5 - b5, a6 - b6, a7 - b7),
+def _both(even, odd):
+    """Sums and differences of one line of rows."""
+    a0, a1, a2, a3, a4, a5 = even
+    b0, b1, b2, b3, b4, b5 = odd
+    return (a0 + b0, a1 + b1, a2 + b2, a3 + b3, a4 + b4, a5 + b5), (
+        a0 - b0,
+        a1 - b1,
+        a2 - b2,
+        a3 - b3,
+        a4 - b4,
+        a5 - b5,
     )
 
 
@@ -134,14 +138,15 @@ def _on_grid(even, odd, grid, values):
     nothing = load_line(out, 0)
     for first in range(0, grid.points, ROWS):
         rows, others_rows = rows_from(first, middle, terms), rows_from(first, middle, others)
-        p0, p1, p2, p3 = rows_from(first, middle, LANES)
+        p0, p1, p2, p3, p4, p5 = rows_from(first, middle, LANES)
+        front, back = (p0, p1, p2, p3, p4, p5), (last - p0, last - p1, last - p2, last - p3, last - p4, last - p5)
         for c in range(0, LANES, 2 * line):
-            evens = four_rows(factors, rows, places, terms, elements, c, LANES, line, nothing)
-            odds = four_rows(other, others_rows, places, others, more, c, LANES, line, nothing)
-            front, back = _both(evens, odds)
+            evens = sums_of_rows(factors, rows, places, terms, elements, c, LANES, line, nothing)
+            odds = sums_of_rows(other, others_rows, places, others, more, c, LANES, line, nothing)
+            (sums, less), (sums_next, less_next) = _both(evens[0], odds[0]), _both(evens[1], odds[1])
             # the middle of the grid is its own mirror; odd polynomials vanish there
-            store_rows(out, (last - p0, last - p1, last - p2, last - p3), c, line, back)
-            store_rows(out, (p0, p1, p2, p3), c, line, front)
+            store_rows(out, back, c, line, (less, less_next))
+            store_rows(out, front, c, line, (sums, sums_next))
 
 
 @njit(cache=True, error_model="numpy")
