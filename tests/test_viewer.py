@@ -358,6 +358,8 @@ def test_an_empty_selection_is_told(background: Callable[..., Background]) -> No
 def test_bounds_of_a_nerf_ray_by_ray(background: Callable[..., Background]) -> None:
     scene = NerfSource(tiny_scene(3))
     asked = View(nerf_camera(6, 5), perturbation_of({"x": 0.002}))
+    # compiled kernels are kept, and time is for rays
+    scene.frame(asked.camera, asked.perturbation).warm_up()
     one = background(scene=scene)
     seen: list[Snapshot] = []
 

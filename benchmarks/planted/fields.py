@@ -69,7 +69,7 @@ FIELDS = (
     ),
     Fault(
         "compiled units: the sum of error terms forgets those that are new",
-        _RELU, "relu", "out.spread[out.piece[i], out.neuron[i]] += out.error[i]", "pass", _UNITS + "[1-True]",
+        _RELU, "relu", "spread[piece[i], neuron[i]] += error[i]", "pass", _UNITS + "[1-True]",
     ),
     Fault(
         "layers: where torch works alone, sums of error terms are too small",

@@ -87,8 +87,9 @@ def grid_of(basis: ChebyshevBasis) -> Grid:
     """The grid of a ``basis`` of one variable, whose ``grid`` is even."""
     points = basis.grid // 2 + 1
     values, fit = basis.evaluation[:points], basis.fit[:, :points]
-    parts = [np.ascontiguousarray(part) for part in (values[:, 0::2], values[:, 1::2], fit[0::2], fit[1::2])]
-    return Grid(points, *parts, np.arange(max(points, basis.size)), basis.chord, basis.norming)
+    parts = values[:, 0::2], values[:, 1::2], fit[0::2], fit[1::2]
+    even, odd, fit_even, fit_odd = map(np.ascontiguousarray, parts)
+    return Grid(points, even, odd, fit_even, fit_odd, np.arange(max(points, basis.size)), basis.chord, basis.norming)
 
 
 @njit(cache=True, error_model="numpy")
