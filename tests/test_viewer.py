@@ -84,7 +84,6 @@ def source(odd: str = "") -> SplatSource:
 def background(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[..., Background]]:
     """Makes a background that shows a source and is closed in the end."""
     monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(Path(__file__).parent), os.environ.get("PYTHONPATH", "")]))
-    monkeypatch.setenv("NUMBA_NUM_THREADS", "1")
     made: list[Background] = []
 
     def make(odd: str = "", scene: Source | None = None, **options: Any) -> Background:
