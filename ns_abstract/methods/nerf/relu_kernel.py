@@ -118,14 +118,9 @@ def _both(even, odd):
     """Sums and differences of one line of rows."""
     a0, a1, a2, a3, a4, a5 = even
     b0, b1, b2, b3, b4, b5 = odd
-    return (a0 + b0, a1 + b1, a2 + b2, a3 + b3, a4 + b4, a5 + b5), (
-        a0 - b0,
-        a1 - b1,
-        a2 - b2,
-        a3 - b3,
-        a4 - b4,
-        a5 - b5,
-    )
+    sums = a0 + b0, a1 + b1, a2 + b2, a3 + b3, a4 + b4, a5 + b5
+    differences = a0 - b0, a1 - b1, a2 - b2, a3 - b3, a4 - b4, a5 - b5
+    return sums, differences
 
 
 @njit(cache=True, error_model="numpy")
@@ -139,8 +134,8 @@ def _on_grid(even, odd, grid, values):
     nothing = load_line(out, 0)
     for first in range(0, grid.points, ROWS):
         rows, others_rows = rows_from(first, middle, terms), rows_from(first, middle, others)
-        p0, p1, p2, p3, p4, p5 = rows_from(first, middle, LANES)
-        front, back = (p0, p1, p2, p3, p4, p5), (last - p0, last - p1, last - p2, last - p3, last - p4, last - p5)
+        front = p0, p1, p2, p3, p4, p5 = rows_from(first, middle, LANES)
+        back = last - p0, last - p1, last - p2, last - p3, last - p4, last - p5
         for c in range(0, LANES, 2 * line):
             evens = sums_of_rows(factors, rows, places, terms, elements, c, LANES, line, nothing)
             odds = sums_of_rows(other, others_rows, places, others, more, c, LANES, line, nothing)
