@@ -385,13 +385,8 @@ def test_compiled_and_torch_agree(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.parametrize("layers", [3, 6])
 def test_chunks_are_as_good_as_layer_after_layer(layers: int) -> None:
     """Pieces of several chunks, the last one smaller, in fields whose early layers have float64 columns or not."""
-    weights = tiny_weights(2, rough=5.0)
+    weights = tiny_weights(2, rough=5.0, layers=layers)
     basis = basis_of(1, weights)
-    if layers > len(weights.base):
-        # copies of a hidden layer in between
-        middle = next(layer for layer in weights.base[1:] if not layer.skip)
-        added = (middle,) * (layers - len(weights.base))
-        weights = replace(weights, base=(weights.base[0], *added, *weights.base[1:]))
     field = FieldBounds(weights, basis)
     assert field._grid is not None
     count = 2 * CHUNK + 3

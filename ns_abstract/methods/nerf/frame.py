@@ -248,21 +248,20 @@ class NerfFrame:
     ) -> list[list[RayBounds]]:
         """Bounds of rays over each of ``boxes``, in some pieces; [0, 1] where there is no time for more."""
         found: list[list[RayBounds]] = [[] for _ in boxes]
-        done = 0
         with suppress(AbandonedError):
             for first in range(0, tiles.size, self.tiles_at_once):
                 checkpoint()
-                mine = slice(first, first + self.tiles_at_once)
-                batch: list[list[RayBounds]] = []
-                while len(batch) < len(boxes):
-                    some = boxes[len(batch) :] if self._steady else boxes[len(batch) : len(batch) + 1]
-                    batch += self._batch(some, tiles[mine], None if known is None else known[mine])
-                for parts, more in zip(found, batch, strict=True):
-                    parts += more
-                done = first + tiles[mine].size
-        if done < tiles.size:
-            for parts in found:
-                parts.append(self._unknown(tiles.size - done))
+                mine, begun = slice(first, first + self.tiles_at_once), 0
+                while begun < len(boxes):
+                    past = len(boxes) if self._steady else begun + 1
+                    batch = self._batch(boxes[begun:past], tiles[mine], None if known is None else known[mine])
+                    for parts, more in zip(found[begun:past], batch, strict=True):
+                        parts += more
+                    begun = past
+        for parts in found:
+            missing = tiles.size - sum(len(part.lower) for part in parts)
+            if missing:
+                parts.append(self._unknown(missing))
         return found
 
     def _batch(

@@ -190,7 +190,7 @@ class FieldBounds:
         device: torch.device | str = "cpu",
         compiled: bool | None = None,
     ) -> None:
-        self.weights, self.basis, self.limit, self.device = weights, basis, limit, torch.device(device)
+        self.basis, self.limit, self.device = basis, limit, torch.device(device)
         self.compiled = self.device.type == "cpu" if compiled is None else compiled
         wide = len(weights.base) - _NARROW_LAYERS
         self.position, self.direction = weights.position_waves, weights.direction_waves
