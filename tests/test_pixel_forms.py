@@ -19,11 +19,14 @@ from ns_abstract.methods.splat.alphas import (
     _exponent_of_several,
     _fitted_exponential,
     _Limits,
+    _set_curvature,
 )
 from ns_abstract.methods.splat.blend import blend_several
 from ns_abstract.methods.splat.block import (
     ALPHA_HIGH,
     ALPHA_LOW,
+    BEND,
+    BEND_SPREAD,
     FORM,
     LISTED,
     Fragments,
@@ -157,16 +160,72 @@ def test_what_moves_along_or_across_its_offset(across):
 
 
 @njit(error_model="numpy")
+def _curved(exponent_, limits, charged, rows_, scratch, m):
+    exponent, rows = pointer(exponent_), pointer(rows_)
+    zero = 0.0 * load8(exponent, 0)
+    alpha = _fitted_exponential(
+        _Exponent(
+            load8(exponent, 0), load8(exponent, 8), load8(exponent, 16), zero, load8(exponent, 24),
+            load8(exponent, 32), load8(exponent, 40),
+        ),
+        limits, charged,
+    )  # fmt: skip
+    _set_curvature(alpha, rows, scratch, m)
+
+
+@pytest.mark.parametrize("d", [1, 2, 3, 6])
+def test_the_range_of_alpha_s_curvature(d):
+    """What products of parameters add to alpha stays within its range, which is that of squares alone exactly (B10)."""
+    generator = np.random.default_rng(d)
+    m, bends = d + 1, d * (d + 1) // 2
+    pairs = list(itertools.combinations_with_replacement(range(d), 2))
+    for mixed in (0.0, 1.0):
+        rows = np.zeros((FORM + m + 1 + bends + 2 * m, 8))
+        rows[FORM + 1 : FORM + m] = generator.uniform(-0.2, 0.2, (d, 8)) * mixed
+        for number, (i, k) in enumerate(pairs):
+            rows[FORM + m + 1 + number] = generator.uniform(-0.3, 0.3, 8) * (1.0 if i == k else mixed)
+        slopes, sizes = np.abs(rows[FORM + 1 : FORM + m]).sum(axis=0), np.abs(rows[FORM + m + 1 :]).sum(axis=0)
+        exponent = np.stack([1.0 - slopes, 1.0 + slopes + sizes, np.ones(8), slopes, sizes, 0.0 * sizes])
+        limits = _Limits(1.0, 1.0, 0.0, 60.0, 1e-12, 1e-12, 0.9999999, 1.0)
+        flat = rows.ravel()
+        _curved(exponent.ravel(), limits, charges(REAL), flat, 8 * (FORM + m + 1 + bends), m)
+        found = flat.reshape(-1, 8)
+        middle, spread = found[BEND], found[BEND_SPREAD]
+        bend = found[FORM + m + 1 : FORM + m + 1 + bends]
+        assert np.abs(bend).max() > 0.01
+        least, most = np.zeros(8), np.zeros(8)
+        corners = itertools.product([-1.0, 0.0, 1.0], repeat=d)
+        for p in [*corners, *generator.uniform(-1.0, 1.0, (50, d))]:
+            value = sum(bend[number] * p[i] * p[k] for number, (i, k) in enumerate(pairs))
+            least, most = np.minimum(least, value), np.maximum(most, value)
+        assert np.all(middle - spread <= least + 1e-15) and np.all(most <= middle + spread + 1e-15)
+        if mixed == 0.0 or d == 1:
+            assert np.allclose(middle - spread, least, atol=1e-15) and np.allclose(middle + spread, most, atol=1e-15)
+
+
+@njit(error_model="numpy")
 def _blended(values_, lists_, colors_, background_, shape, forms, count, t_, out_):
     values, lists, colors, background = pointer(values_), pointer(lists_), pointer(colors_), pointer(background_)
     nothing = pointer(out_)
     bends = shape.dimensions * (shape.dimensions + 1) // 2
-    fragments = Fragments(values, fragment_width(shape), bends, lists, lists, 64, values)
+    fragments = Fragments(values, fragment_width(shape), bends, lists, values, lists, 64, values)
     palette = Palette(colors, forms, background, background)
     radius, ends = blend_several(0, count, fragments, palette, values, pointer(t_), shape.monomials)
     store(nothing, 0, radius)
     store(nothing, 4, ends.low)
     store(nothing, 8, ends.high)
+
+
+def _bend_range(bends, d):
+    """Middle and half-width of the range of a quadratic part: `|p q|` is at most half of `p p + q q`."""
+    own, shared = np.zeros(d), np.zeros(d)
+    for bend, (i, k) in zip(bends, itertools.combinations_with_replacement(range(d), 2), strict=True):
+        if i == k:
+            own[i] = bend
+        else:
+            shared[[i, k]] += 0.5 * abs(bend)
+    low, high = np.minimum(0.0, own - shared).sum(), np.maximum(0.0, own + shared).sum()
+    return 0.5 * (low + high), 0.5 * (high - low)
 
 
 def _polynomial(coefficients, p, d):
@@ -198,6 +257,7 @@ def test_blends_of_exact_alphas(d, moving):
             spread = np.abs(linear).sum() + np.abs(bend).sum()
             values[e, FORM : FORM + d + 1] = [middle, *linear]
             values[e, FORM + d + 2 : FORM + d + 2 + bend.size] = bend
+            values[e, BEND], values[e, BEND_SPREAD] = _bend_range(bend, d)
             values[e, ALPHA_LOW], values[e, ALPHA_HIGH] = max(0.0, middle - spread), min(1.0, middle + spread)
             alphas.append([middle, *linear, *bend])
             colors[e, 0, :3] = generator.random(3)
@@ -242,6 +302,7 @@ def _two_layers(front, behind, radius=0.0, bounds=None):
         spread = np.abs(alpha[1:]).sum()
         values[e, FORM : FORM + m], values[e, FORM + m + 1 : FORM + m + 4] = alpha[:3], alpha[3:]
         values[e, FORM + m] = radius
+        values[e, BEND], values[e, BEND_SPREAD] = _bend_range(alpha[3:], d)
         ends = (alpha[0] - spread, alpha[0] + spread) if bounds is None else bounds
         values[e, ALPHA_LOW], values[e, ALPHA_HIGH] = ends
         colors[e, :, 0] = 1.0 - e

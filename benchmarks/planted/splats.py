@@ -399,9 +399,9 @@ SPLATS = (
     Fault(
         "several parameters: alpha's mixed products count once",
         _ALPHAS,
-        "_alphas_of_several",
-        "2.0 * square",
-        "square",
+        "_set_curvature",
+        "2.0 * (slope * load8(rows, 8 * (FORM + k)))",
+        "slope * load8(rows, 8 * (FORM + k))",
         "test_bounds.py::test_curvature_of_several_parameters[two-classic]",
     ),
     Fault(
@@ -470,10 +470,18 @@ SPLATS = (
     ),
     Fault(
         "several parameters: alpha's curvature has no mixed products",
+        _ALPHAS,
+        "_set_curvature",
+        "shared = shared + half",
+        "shared = shared + 0.0",
+        "test_pixel_forms.py::test_the_range_of_alpha_s_curvature",
+    ),
+    Fault(
+        "several parameters: what is behind bends by no mixed products",
         _BLEND,
-        "_bend_range",
-        "shared += half",
-        "pass",
+        "_curve_range",
+        "shared = shared + half",
+        "shared = shared + 0.0",
         "test_pixel_forms.py::test_curvatures_of_two_layers[0.1]",
     ),
     Fault(

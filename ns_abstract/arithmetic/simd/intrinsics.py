@@ -37,16 +37,22 @@ def borrowed(typingctx, array):  # pyright: ignore[reportRedeclaration]
 
 @intrinsic
 def prefetch(typingctx, array, row, byte):  # pyright: ignore[reportRedeclaration]
-    """Ask for the cache line of ``array[row]`` (first axis) that lies ``byte`` bytes in; changes nothing."""
-    if not isinstance(array, types.Array):
-        raise TypeError(f"prefetch() takes an array, not {array}")
+    """Ask for the cache line of ``array[row]`` (first axis) that lies ``byte`` bytes in; changes nothing.
+
+    ``array`` may be a `pointer`.
+    """
+    if not isinstance(array, types.Array | types.CPointer):
+        raise TypeError(f"prefetch() takes an array or a pointer, not {array}")
 
     def codegen(context, builder, signature, args):
-        source = arrayobj.make_array(signature.args[0])(context, builder, args[0])
-        stride = cgutils.unpack_tuple(builder, source.strides)[0]
+        if isinstance(array, types.Array):
+            source = arrayobj.make_array(signature.args[0])(context, builder, args[0])
+            start, stride = source.data, cgutils.unpack_tuple(builder, source.strides)[0]
+        else:
+            start, stride = args[0], args[1].type(context.get_abi_sizeof(context.get_data_type(array.dtype)))
         offset = builder.add(builder.mul(stride, args[1]), args[2])
         raw = ir.IntType(8).as_pointer()
-        address = builder.gep(builder.bitcast(source.data, raw), [offset], source_etype=ir.IntType(8))
+        address = builder.gep(builder.bitcast(start, raw), [offset], source_etype=ir.IntType(8))
         int32 = ir.IntType(32)
         function = builder.module.declare_intrinsic(
             "llvm.prefetch", [raw], ir.FunctionType(ir.VoidType(), [raw, int32, int32, int32])

@@ -15,7 +15,7 @@ from ns_abstract.arithmetic.elementary import EXP_RELATIVE_ERROR, exp_kernel, fm
 from ns_abstract.arithmetic.rounding import FRAGMENT_ROUNDING, UP
 from ns_abstract.arithmetic.simd.intrinsics import signed
 from ns_abstract.arithmetic.simd.lanes import bits, load8, maximum, minimum, store, store_columns, where
-from ns_abstract.methods.splat.block import ALPHA_HIGH, ALPHA_LOW, FORM, parabola, set_unknown
+from ns_abstract.methods.splat.block import ALPHA_HIGH, ALPHA_LOW, BEND, BEND_SPREAD, FORM, parabola, set_unknown
 from ns_abstract.methods.splat.records import EXPONENT_LIMIT, FORMS, KAPPA, OPACITY_HIGH, OPACITY_LOW, UNBOUNDED
 
 #: Half-width of the exponent's range up to which exp(-t) is fitted by a polynomial.
@@ -301,6 +301,37 @@ def _exponent_of_several(record, f, ax, ay, rows, scratch, m, antialiased):
 
 
 @njit(cache=True, error_model="numpy", forceinline=True)
+def _set_curvature(alpha, rows, scratch, m):
+    """Turn the exponent's curvature in ``rows`` [., 8] into that of ``alpha``, and write its range (design.md, B10).
+
+    The rows hold the exponent's slopes, too; ``scratch`` is the first that is free.
+    """
+    low = 0.0 * alpha.low
+    high = low
+    for k in range(1, m):
+        store(rows, scratch + 8 * k, low)
+    at = 8 * (FORM + m + 1)
+    for j in range(1, m):
+        slope = alpha.curve * load8(rows, 8 * (FORM + j))
+        own = fma(alpha.weight, load8(rows, at), slope * load8(rows, 8 * (FORM + j)))
+        store(rows, at, own)
+        at += 8
+        shared = load8(rows, scratch + 8 * j)
+        for k in range(j + 1, m):
+            bend = fma(alpha.weight, load8(rows, at), 2.0 * (slope * load8(rows, 8 * (FORM + k))))
+            store(rows, at, bend)
+            at += 8
+            # |p_j p_k| is at most half the sum of their squares
+            half = 0.5 * abs(bend)
+            shared = shared + half
+            store(rows, scratch + 8 * k, load8(rows, scratch + 8 * k) + half)
+        low = low + minimum(0.0, own - shared)
+        high = high + maximum(0.0, own + shared)
+    store(rows, 8 * BEND, 0.5 * (low + high))
+    store(rows, 8 * BEND_SPREAD, 0.5 * (high - low))
+
+
+@njit(cache=True, error_model="numpy", forceinline=True)
 def _alphas_of_several(record, begin, n, given, block, limits, charges, antialiased, m):
     """`alphas` for several parameters, or none: curvature of forms of order 1 (design.md, B10)."""
     batch, rows, values, width = block.batch, block.batch.rows, block.fragments.values, block.fragments.width
@@ -315,15 +346,7 @@ def _alphas_of_several(record, begin, n, given, block, limits, charges, antialia
         if reached == 0:
             continue
         found |= reached << q
-        at = 8 * (FORM + m + 1)
-        for j in range(1, m):
-            slope = alpha.curve * load8(rows, 8 * (FORM + j))
-            for k in range(j, m):
-                square = slope * load8(rows, 8 * (FORM + k))
-                if j < k:
-                    square = 2.0 * square
-                store(rows, at, fma(alpha.weight, load8(rows, at), square))
-                at += 8
+        _set_curvature(alpha, rows, 8 * width, m)
         _store_fragments(rows, alpha, values, given + q * width, width, m)
     return found
 

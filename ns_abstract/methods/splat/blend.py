@@ -11,11 +11,13 @@ from numba import njit
 
 from ns_abstract.arithmetic.elementary import fma
 from ns_abstract.arithmetic.rounding import FRAGMENT_ROUNDING, UNIT64, UP
-from ns_abstract.arithmetic.simd.intrinsics import advanced, lowest_bit, signed
-from ns_abstract.arithmetic.simd.lanes import bits, load4, load8, maximum, minimum, store, where
+from ns_abstract.arithmetic.simd.intrinsics import advanced, lowest_bit, prefetch, signed
+from ns_abstract.arithmetic.simd.lanes import LINE, bits, load4, load8, maximum, minimum, store, where
 from ns_abstract.methods.splat.block import (
     ALPHA_HIGH,
     ALPHA_LOW,
+    BEND,
+    BEND_SPREAD,
     FORM,
     LIGHT,
     LISTED,
@@ -28,6 +30,8 @@ from ns_abstract.methods.splat.block import (
 )
 from ns_abstract.methods.splat.lists import BLOCK, PIXELS
 
+#: Fragments ahead that are asked for.
+_AHEAD = 2
 #: Reordering that moves no channel of a pixel by more is not examined beyond the swap bound.
 _REORDERING_MATTERS = 1e-4
 
@@ -179,9 +183,9 @@ def _worth_reordering(begin, end, ends, form_low, form_high, fragments, forms, m
     falls = 0.0 * ends.low
     rises = falls
     for entry in range(begin, end):
-        at, _, move = listed_fragment(fragments, entry, forms)
+        _, _, move = listed_fragment(fragments, entry, forms)
         if move != 0:
-            light = fragments.values[at + LIGHT]
+            light = fragments.light[2 * entry + LIGHT]
             falls = fma(light, load4(moves, move), falls)
             rises = fma(light, load4(moves, move + 4), rises)
     gain = maximum(minimum(falls, ends.low + falls - form_low), minimum(rises, form_high - (ends.high - rises)))
@@ -267,28 +271,11 @@ def blend_quadratic(begin, end, fragments, palette, moves, t):
 
 
 @njit(cache=True, error_model="numpy", forceinline=True)
-def _bend_range(bends, u, m):
-    """Range of a quadratic part, at most 0 to at least 0, from its ``bends`` (design.md, B10); ``u`` [m] is scratch."""
-    for k in range(1, m):
-        u[k] = 0.0
-    low, high, pair = 0.0, 0.0, 0
-    for j in range(1, m):
-        own, shared = bends[pair], u[j]
-        pair += 1
-        for k in range(j + 1, m):
-            # |p_j p_k| is at most half the sum of their squares
-            half = 0.5 * abs(bends[pair])
-            shared += half
-            u[k] += half
-            pair += 1
-        low += min(0.0, own - shared)
-        high += max(0.0, own + shared)
-    return low, high
-
-
-@njit(cache=True, error_model="numpy", forceinline=True)
 def _curve_range(t, u, m):
-    """`_bend_range` of the polynomials ``t`` [m + bends, 4], channel by channel; ``u`` [m, 4] is scratch."""
+    """Range of the quadratic parts of the polynomials ``t`` [m + bends, 4], at most 0 to at least 0 (design.md, B10).
+
+    ``u`` [m, 4] is scratch.
+    """
     low = 0.0 * load4(t, 0)
     high = low
     for k in range(1, m):
@@ -298,6 +285,7 @@ def _curve_range(t, u, m):
         own, shared = load4(t, 4 * pair), load4(u, 4 * j)
         pair += 1
         for k in range(j + 1, m):
+            # |p_j p_k| is at most half the sum of their squares
             half = 0.5 * abs(load4(t, 4 * pair))
             shared = shared + half
             store(u, 4 * k, load4(u, 4 * k) + half)
@@ -319,8 +307,7 @@ def _step_of_several(r, at, key, fragments, palette, t, u, m):
     form = advanced(values, at + FORM)
     bends = advanced(form, m + 1)
     # alpha's curvature is about - bent to about + bent, that of what is behind likewise
-    low, high = _bend_range(bends, u, m)
-    about, bent, bend_size = 0.5 * (low + high), 0.5 * (high - low), high - low
+    about, bent = values[at + BEND], values[at + BEND_SPREAD]
     sunk, risen = _curve_range(t, u, m)
     middle_curve, wound, curved = 0.5 * (sunk + risen), 0.5 * (risen - sunk), maximum(risen, -sunk)
     a0 = form[0]
@@ -354,7 +341,7 @@ def _step_of_several(r, at, key, fragments, palette, t, u, m):
     size = abs(value) + change_size + curved
     dropped = fma(steep, wound, bent * (change_size + wound)) * UP
     added = fma(values[at + ALPHA_HIGH], load4(colors, key + 4 * forms), dropped)
-    rounding = fma(1.0 + steep + bend_size, size + 2.0 * curved, abs(middle))
+    rounding = fma(1.0 + steep + 2.0 * bent, size + 2.0 * curved, abs(middle))
     added = fma(form[m], size * UP, fma(FRAGMENT_ROUNDING, rounding, added))
     return fma(1.0 - values[at + ALPHA_LOW], r, added)
 
@@ -382,6 +369,9 @@ def blend_several(begin, end, fragments, palette, moves, t, m):
         store(t, 4 * k, r)
     ends = _Ends(p0, p0, p0, p0)
     for entry in range(end - 1, begin - 1, -1):
+        ahead, _, _ = listed_fragment(fragments, max(entry - _AHEAD, begin), forms)
+        for byte in range(0, 8 * fragments.width, LINE):
+            prefetch(values, ahead, byte)
         at, key, move = listed_fragment(fragments, entry, forms)
         r = _step_of_several(r, at, key, fragments, palette, t, u, m)
         ends = _blend_interval(ends, values, at, colors, key + color_ends(forms))

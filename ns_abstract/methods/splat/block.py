@@ -31,9 +31,11 @@ BATCH = 8
 # at fragments of uncertain order may leave; 0, 1, 2, ...
 TLO, THI, LAST, RHO, LOST, OPEN, HIDDEN, NUMBERS = range(0, 8 * PIXELS, PIXELS)
 ROWS = 8
-#: Columns of a fragment: bounds of alpha, transmittance behind it at its least and before it at its most, alpha's
-#: coefficients and then its radius; where curvature is kept (B10), coefficients of products of two parameters follow.
-ALPHA_LOW, ALPHA_HIGH, LEFT, LIGHT, FORM = range(5)
+#: Columns of a fragment: bounds of alpha, middle and half-width of the range of its curvature, alpha's coefficients and
+#: then its radius; where curvature is kept (B10), coefficients of products of two parameters follow.
+ALPHA_LOW, ALPHA_HIGH, BEND, BEND_SPREAD, FORM = range(5)
+#: What a list tells of the light at a fragment: behind it at its least, before it at its most.
+LEFT, LIGHT = range(2)
 #: Columns of an entry of a pixel's list: the fragment's number, its list position, its row of moves; one is spare.
 LISTED = 4
 #: Columns of a row of moves: by how much reordering may lower and raise the pixel, found from sums and from maxima.
@@ -63,6 +65,7 @@ class Fragments(NamedTuple):
         width: Numbers of a fragment.
         bends: Coefficients of products of two parameters that are kept beside forms of order 1.
         lists: [PIXELS, capacity, LISTED] each pixel's fragments, nearest first.
+        light: [PIXELS, capacity, 2] the light at each: see `LEFT`.
         lengths: [PIXELS] of the lists.
         capacity: Fragments that each list has room for.
         per_pixel: [ROWS, PIXELS] what is known of each pixel.
@@ -72,6 +75,7 @@ class Fragments(NamedTuple):
     width: int
     bends: int
     lists: np.ndarray
+    light: np.ndarray
     lengths: np.ndarray
     capacity: int
     per_pixel: np.ndarray
@@ -194,6 +198,7 @@ class Buffers(NamedTuple):
     shifted: np.ndarray
     values: np.ndarray
     lists: np.ndarray
+    light: np.ndarray
     drawn: np.ndarray
     places: np.ndarray
     moves: np.ndarray
@@ -246,6 +251,7 @@ def new_buffers(shape, forms, pair_limit, background):
         shifted=np.zeros(_POSITIONS * color_size(forms)),
         values=_aligned(_CAPACITY * PIXELS * width),
         lists=np.empty((PIXELS, _CAPACITY, LISTED), np.uint32),
+        light=np.empty((PIXELS, _CAPACITY, 2)),
         drawn=np.empty(2 * _CAPACITY, np.int64),
         places=np.empty((2 * _CAPACITY, PIXELS), np.uint32),
         moves=np.empty((32 * _CAPACITY, MOVES)),
@@ -261,10 +267,13 @@ def resized(old, positions, capacity, shape, forms):
         places, depths = np.empty((7, positions), np.int64), np.empty((2, positions))
         palette = np.zeros(positions * color_size(forms))
         shifted = np.zeros(positions * color_size(forms))
-    values, lists, drawn, of_slots, moves = old.values, old.lists, old.drawn, old.places, old.moves
+    values, lists, light, drawn, of_slots, moves = (
+        old.values, old.lists, old.light, old.drawn, old.places, old.moves,
+    )  # fmt: skip
     if capacity > lists.shape[1]:
         values = _aligned(capacity * PIXELS * fragment_width(shape))
         lists = np.empty((PIXELS, capacity, LISTED), np.uint32)
+        light = np.empty((PIXELS, capacity, 2))
         drawn = np.empty(2 * capacity, np.int64)
         of_slots = np.empty((2 * capacity, PIXELS), np.uint32)
         moves = np.empty((32 * capacity, MOVES))
@@ -286,6 +295,7 @@ def resized(old, positions, capacity, shape, forms):
         shifted=shifted,
         values=values,
         lists=lists,
+        light=light,
         drawn=drawn,
         places=of_slots,
         moves=moves,
@@ -302,6 +312,7 @@ def block_of(buffers, shape, forms):
         fragment_width(shape),
         bends_of(shape),
         pointer(buffers.lists),
+        pointer(buffers.light),
         pointer(buffers.lengths),
         buffers.lists.shape[1],
         pointer(buffers.per_pixel),
@@ -366,6 +377,8 @@ def set_unknown(fragments, at, high, m):
     values = fragments.values
     for k in range(FORM + m + 1, FORM + m + 1 + fragments.bends):
         values[at + k] = 0.0
+    values[at + BEND] = 0.0
+    values[at + BEND_SPREAD] = 0.0
     values[at + ALPHA_LOW] = 0.0
     values[at + ALPHA_HIGH] = high
     values[at + FORM] = 0.5 * high

@@ -337,17 +337,16 @@ def _still_live(found, pixels, live):
 @njit(cache=True, error_model="numpy", forceinline=True)
 def _append(number, q, k, t_low, t_high, fragments):
     """Append fragment ``number`` to pixel q's list, with the light that it leaves; returns its place there."""
-    at = number * fragments.width
-    per_pixel, lists = fragments.per_pixel, fragments.lists
-    fragments.values[at + LEFT] = t_low
-    fragments.values[at + LIGHT] = per_pixel[THI + q]
+    per_pixel, lists, light = fragments.per_pixel, fragments.lists, fragments.light
+    count = fragments.lengths[q]
+    entry = q * fragments.capacity + count
+    light[2 * entry + LEFT] = t_low
+    light[2 * entry + LIGHT] = per_pixel[THI + q]
     per_pixel[TLO + q] = t_low
     per_pixel[THI + q] = t_high
-    count = fragments.lengths[q]
-    entry = LISTED * (q * fragments.capacity + count)
-    lists[entry] = number
-    lists[entry + 1] = k
-    lists[entry + 2] = 0
+    lists[LISTED * entry] = number
+    lists[LISTED * entry + 1] = k
+    lists[LISTED * entry + 2] = 0
     fragments.lengths[q] = count + 1
     return count
 
@@ -669,13 +668,13 @@ def apply_stops(slots, block, inputs):
             end = start + int(fragments.lengths[q])
             while behind + 1 < end and int(lists[LISTED * (behind + 1) + 1]) <= entries.last[k]:
                 behind += 1
-            t_low = values[int(lists[LISTED * behind]) * width + LEFT]
+            t_low = fragments.light[2 * behind + LEFT]
             if t_low > stop_high:
                 continue
             before = e
             while before > start and int(lists[LISTED * (before - 1) + 1]) >= entries.first[k]:
                 before -= 1
-            light = values[int(lists[LISTED * before]) * width + LIGHT]
+            light = fragments.light[2 * before + LIGHT]
             at = int(lists[LISTED * e]) * width
             t_high = light * (1.0 - values[at + ALPHA_LOW]) * (1.0 + step)
             # the most light that a stop at this fragment may leave
