@@ -55,6 +55,7 @@ def main() -> None:
     parser.add_argument("--minutes", type=float, default=20.0, help="of the certificate")
     parser.add_argument("--workers", type=int, default=2)
     parser.add_argument("--comparisons", type=int, default=200_000)
+    parser.add_argument("--device", choices=["cpu", "cuda"], default="cpu", help="where the field is bounded")
     options = parser.parse_args()
     torch.manual_seed(0)
     options.output_dir.mkdir(parents=True, exist_ok=True)
@@ -63,7 +64,9 @@ def main() -> None:
     orbit = value["perturbation"]["orbit"]
     (options.output_dir / "path.json").write_text(json.dumps(value))
     camera = load_camera_path(options.output_dir / "path.json").cameras[0]
-    scene = nsa.load_scene(options.run, num_samples=options.num_samples, near_plane=options.near_plane)
+    scene = nsa.load_scene(
+        options.run, num_samples=options.num_samples, near_plane=options.near_plane, device=options.device
+    )
     begin = time.perf_counter()
     whole = nsa.PoseSet(camera, orbit={**orbit, "azimuth": [0.0, 2.0 * math.pi]}, translation={"x": 0.01, "y": 0.01})
     frame = scene.method().frame(whole.of(scene))
