@@ -146,6 +146,18 @@ def test_slanted_cells_enclose_and_are_tighter(job: PathJob) -> None:
     assert excess[0] < excess[1]
 
 
+def test_what_turns_undo_does_not_move(job: PathJob) -> None:
+    """Motion is that of the slanted parameters, also where the box holds parameters of no pose (R1)."""
+    poses = pose_set(job, "six", 0, 8.0)
+    straight, slant = (SplatFrame(*program_of(job), poses, slanted=slanted) for slanted in (False, True))
+    shifts = [poses.box.names.index(name) for name in ("x", "y")]
+    assert (slant.motion(slant.box)[shifts] < 0.5 * straight.motion(straight.box)[shifts]).all()
+    # a pose beyond the set is another one than what is rendered for it
+    corner = slant.box.corners()[0]
+    assert not np.allclose(slant.pose_set.pose(corner), slant.pose_set.pose(corner, beyond=True))
+    assert np.array_equal(poses.pose(poses.box.corners()[0]), poses.pose(poses.box.corners()[0], beyond=True))
+
+
 def test_a_shear_that_loses_poses_is_noticed(job: PathJob, monkeypatch: pytest.MonkeyPatch) -> None:
     whole = PoseSet.sheared
 

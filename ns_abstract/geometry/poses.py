@@ -248,11 +248,14 @@ class PoseSet:
         axis, angle = axis_angle(first.T @ last)
         return first, start[:, 3], axis, angle, end[:, 3] - start[:, 3]
 
-    def pose(self, values: Float64Array) -> Float64Array:
-        """Camera-to-world [3, 4] at parameter values [d] (physical units, in the order of ``box``)."""
+    def pose(self, values: Float64Array, beyond: bool = False) -> Float64Array:
+        """Camera-to-world [3, 4] at parameter values [d] (physical units, in the order of ``box``).
+
+        Those of no pose of the set give the nearest one (`sheared`), or what lies ``beyond`` the set.
+        """
         p = dict(self.fixed) | dict(zip(self.box.names, np.asarray(values, np.float64).tolist(), strict=True))
         for name, factors in self.shear.items():
-            low, high = self.perturbation.rotation[name]
+            low, high = (-np.inf, np.inf) if beyond else self.perturbation.rotation[name]
             p[name] = min(max(p[name] + sum(factor * p[other] for other, factor in factors.items()), low), high)
         rotation, position, axis, angle, displacement = self._base
         if self.target_camera is not None:
@@ -363,9 +366,9 @@ class PoseSet:
                 position = position - parameter(name) * np.eye(3)[k]
         return rotation, position
 
-    def world_to_camera(self, values: Float64Array) -> tuple[Float64Array, Float64Array]:
-        """Rotation [3, 3] (OpenCV axes) and camera position [3] at parameter values [d]."""
-        pose = self.pose(values)
+    def world_to_camera(self, values: Float64Array, beyond: bool = False) -> tuple[Float64Array, Float64Array]:
+        """Rotation [3, 3] (OpenCV axes) and camera position [3] at parameter values [d]; see `pose`."""
+        pose = self.pose(values, beyond)
         return np.ascontiguousarray(pose[:, :3].T * _FLIP[:, None]), pose[:, 3].copy()
 
 

@@ -366,7 +366,8 @@ class SplatFrame:
         return self._project(self.box.middle, means)[1][seen]
 
     def _project(self, values: np.ndarray, means: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        rotation, position = self.pose_set.world_to_camera(values)
+        # as the parameters go on: taken back into the set, a shift would come without the turn that undoes it
+        rotation, position = self.pose_set.world_to_camera(values, beyond=True)
         x, y, z = rotation @ (means - position).T
         with np.errstate(all="ignore"):
             pixels = np.stack(
