@@ -40,16 +40,21 @@ from ns_abstract.methods.splat.stage_data import FormShape
 
 
 @njit(error_model="numpy")
-def _fitted(exponent_, limits, charged, out_):
-    exponent, out = pointer(exponent_), pointer(out_)
+def _alpha(exponent_, limits, charged):
+    exponent = pointer(exponent_)
     zero = 0.0 * load8(exponent, 0)
-    alpha = _fitted_exponential(
+    return _fitted_exponential(
         _Exponent(
             load8(exponent, 0), load8(exponent, 8), load8(exponent, 16), zero, load8(exponent, 24),
             load8(exponent, 32), load8(exponent, 40),
         ),
         limits, charged,
     )  # fmt: skip
+
+
+@njit(error_model="numpy")
+def _fitted(exponent_, limits, charged, out_):
+    out, alpha = pointer(out_), _alpha(exponent_, limits, charged)
     store(out, 0, alpha.center)
     store(out, 8, alpha.radius)
     store(out, 16, alpha.weight)
@@ -161,16 +166,7 @@ def test_what_moves_along_or_across_its_offset(across):
 
 @njit(error_model="numpy")
 def _curved(exponent_, limits, charged, rows_, scratch, m):
-    exponent, rows = pointer(exponent_), pointer(rows_)
-    zero = 0.0 * load8(exponent, 0)
-    alpha = _fitted_exponential(
-        _Exponent(
-            load8(exponent, 0), load8(exponent, 8), load8(exponent, 16), zero, load8(exponent, 24),
-            load8(exponent, 32), load8(exponent, 40),
-        ),
-        limits, charged,
-    )  # fmt: skip
-    _set_curvature(alpha, rows, scratch, m)
+    _set_curvature(_alpha(exponent_, limits, charged), pointer(rows_), scratch, m)
 
 
 @pytest.mark.parametrize("d", [1, 2, 3, 6])

@@ -180,7 +180,7 @@ def _quadratic_alphas(record, begin, n, given, block, limits, charges, antialias
         high = minimum(high, s0 + top + radius + rounding)
         alpha = _fitted_exponential(_Exponent(low, high, s0, radius, slope, bend, quadratic), limits, charges)
         bent = fma(alpha.weight, quadratic, alpha.curve * (linear * linear))
-        # the columns between alpha's bounds and its form are set later
+        # one parameter's forms hold its curvature: nothing reads the columns of its range
         store_columns(
             values, given + 8 * q, 8,
             (
