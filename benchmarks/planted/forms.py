@@ -239,6 +239,14 @@ FORMS = (
         "test_slanted.py::test_feasible_loses_no_pose[six]",
     ),
     Fault(
+        "bounds of a cell that was tried are taken for a wider one of the first cover",
+        _ENGINE,
+        "Refinement._cover",
+        "part.box == first.box",
+        "part is parts[len(parts) // 2]",
+        "test_engine.py::test_bounds_of_a_cell_that_was_tried_are_not_those_of_a_wider_one[10]",
+    ),
+    Fault(
         "a part is dropped where some of its poses are none of the set's",
         _ENGINE,
         "Refinement._cut",

@@ -46,14 +46,19 @@ FIRST_MOTION, FIRST_MOTIONS = 0.5, 0.6
 #: A first cover of one parameter aims at this part of the excess that the goal, or the ratio if larger, allows.
 _AIM_SHARE, _AIM_RATIO = 0.6, 1.05
 #: Halving the first cell of one parameter leaves less than this part of its excess, or does not help; an excess from
-#: this part of the largest on may only be cut off at 0 and 1.
+#: this part of the largest on may be cut off at 0 and 1.
 _HELPS, _CUT_OFF = 0.5, 0.25
+#: A first cover of several aims at so many times the excess that the goal allows, as long as halving its cells leaves
+#: less than this part of theirs.
+_AIM_PART, _STILL_HELPS = 3.0, 0.8
 #: Part of the gap beyond the witnesses that a goal allows which a leaf may leave open at a pixel for good.
 _CLOSED_SHARE = 0.25
 #: Leaves whose box is narrower than this part of the set are not split: rounding rules there.
 _NARROWEST = 2.0**-40
 #: Most corners of the set that are rendered at the start.
 _CORNERS = 64
+#: About as many of them are rendered before the first cover of several parameters.
+_EARLY_CORNERS = 4
 #: Other scenes of the set that are rendered at the middle, and at every other witness.
 _MEMBERS, _MEMBERS_BY_WITNESS = 48, 2
 #: Part of the time that the first cover of the set may take.
@@ -345,6 +350,9 @@ class Refinement:
             slopes[axis] *= 0.5
         return parts
 
+    def _cut_all(self, parts: list[_Part], axis: int) -> list[_Part]:
+        return [half for part in parts for half in self._cut(part, axis)]
+
     def _axis(self, box: ParameterBox, slopes: np.ndarray) -> int:
         """The axis that the picture varies most along, of those that can be halved."""
         slopes = np.nan_to_num(slopes, nan=0.0, posinf=float(np.finfo(np.float64).max))
@@ -455,7 +463,7 @@ class Refinement:
             self._views.append((values, self._witness(values)))
 
     def _begin(self) -> np.ndarray:
-        """What the first cover asks for; returns the corners of the set that are left for later."""
+        """Render what the first cover asks for; returns the corners of the set that are left for later."""
         corners = self._corners()
         if self.frame.box.dimensions == 1:
             # two
@@ -466,6 +474,11 @@ class Refinement:
             if self.goal.ratio >= _AIM_RATIO:
                 # the cover alone may reach the goal; cells that are split had better tell what they hide
                 self.floor = self._allow((self.goal.ratio - 1.0) * self._mpg(self.witness_lower, self.witness_upper))
+        elif not self.frame.tilewise:
+            early = np.arange(len(corners)) % max(1, len(corners) // _EARLY_CORNERS) == 0
+            for values in corners[early]:
+                self._witness(values)
+            corners = corners[~early]
         return corners
 
     def proceed(self, goal: Goal) -> FrameResult:
@@ -538,20 +551,48 @@ class Refinement:
         frame, parts = self.frame, [self._whole]
         if not frame.tilewise and frame.box.dimensions == 1:
             return self._equal_parts(everything)
-        motion = np.nan_to_num(np.array(frame.motion(frame.box), np.float64), nan=0.0)
         history = [parts]
-        limit = np.inf if frame.tilewise else FIRST_MOTIONS
-        while motion.size and motion.max() > limit and 2 * len(parts) <= _COVER_CELLS:
-            axis = int(np.argmax(motion))
-            parts = [half for part in parts for half in self._cut(part, axis)]
-            motion[axis] *= 0.5
-            history.append(parts)
+        if not frame.tilewise and frame.box.dimensions:
+            motion = np.nan_to_num(np.array(frame.motion(frame.box), np.float64), nan=0.0)
+            while motion.max() > FIRST_MOTIONS and 2 * len(parts) <= _COVER_CELLS:
+                axis = int(np.argmax(motion))
+                parts = self._cut_all(parts, axis)
+                motion[axis] *= 0.5
+                history.append(parts)
         first = parts[len(parts) // 2]
         probe, allowed = self._probe(first, everything)
         while len(parts) > allowed and len(history) > 1:
             history.pop()
             parts = history[-1]
-        return parts, first, probe
+        if frame.tilewise or not frame.box.dimensions or first is not parts[len(parts) // 2]:
+            return parts, first, probe
+        return self._finer_parts(parts, first, probe, allowed, everything)
+
+    def _finer_parts(
+        self, parts: list[_Part], first: _Part, probe: Bounds, allowed: float, everything: np.ndarray
+    ) -> tuple[list[_Part], _Part, Bounds]:
+        """``parts`` halved again along what a cell in the middle varies most along, while its excess asks for it."""
+        aim = _AIM_PART * self.goal.excess(self._mpg(self.witness_lower, self.witness_upper))
+        before = np.inf
+        while True:
+            excess = self._beyond(first, probe)
+            helped = excess <= _STILL_HELPS * before or before >= self._cut_off
+            if excess <= aim or not helped or 2 * len(parts) > min(allowed, _COVER_CELLS):
+                return parts, first, probe
+            parts, before = self._cut_all(parts, self._axis(first.box, probe.slopes)), excess
+            first = parts[len(parts) // 2]
+            probe, allowed = self._probe(first, everything)
+
+    @property
+    def _cut_off(self) -> float:
+        """An excess that may only be that large because bounds end at 0 and 1."""
+        return _CUT_OFF * self._mpg(np.zeros_like(self.image), np.ones_like(self.image))
+
+    def _beyond(self, part: _Part, probe: Bounds) -> float:
+        """MPG of the bounds of ``part`` beyond that of the pictures at its two ends and at the middle of the set."""
+        ends = [self._witness(np.array(end)) for end in (part.box.lower, part.box.upper)]
+        low, high = np.minimum.reduce([self.image, *ends]), np.maximum.reduce([self.image, *ends])
+        return self._mpg(*_usable(probe.lower, probe.upper)) - self._mpg(low, high)
 
     def _equal_parts(self, everything: np.ndarray) -> tuple[list[_Part], _Part, Bounds]:
         """`_first_parts` of one parameter: as many as the excess of a cell in the middle asks for."""
@@ -559,18 +600,15 @@ class Refinement:
         # odd: the middle of the set, which is rendered, is that of a part
         count, before = 2 * int(min(motion / FIRST_MOTION, _COVER_CELLS) / 2.0) + 1, np.inf
         goal = replace(self.goal, ratio=max(self.goal.ratio, _AIM_RATIO))
-        unsure = _CUT_OFF * self._mpg(np.zeros_like(self.image), np.ones_like(self.image))
         while True:
             part = self._cut(self._whole, 0, count)[count // 2]
             probe, affordable = self._probe(part, everything)
-            ends = [self._witness(np.array(end)) for end in (part.box.lower, part.box.upper)]
-            low, high = np.minimum.reduce([self.image, *ends]), np.maximum.reduce([self.image, *ends])
-            excess = self._mpg(*_usable(probe.lower, probe.upper)) - self._mpg(low, high)
+            excess = self._beyond(part, probe)
             aim = _AIM_SHARE * goal.excess(self._mpg(self.witness_lower, self.witness_upper))
             # it falls with the square of the width
             wanted = math.ceil(count * math.sqrt(min(excess / aim, 1e6))) if aim > 0.0 < excess else count
             most = int(min(affordable, _COVER_CELLS))
-            helped = excess <= _HELPS * before or before >= unsure
+            helped = excess <= _HELPS * before or before >= self._cut_off
             if wanted < 2 * count or 2 * count > most or not helped:
                 return self._cut(self._whole, 0, max(1, min(wanted if helped else count, most))), part, probe
             count, before = 2 * count + 1, excess
