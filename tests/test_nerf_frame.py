@@ -75,11 +75,9 @@ def test_sets_of_poses_are_enclosed(name: str) -> None:
 
 @pytest.mark.parametrize("name", FIELDS)
 def test_stiff_fields_are_enclosed(name: str) -> None:
-    for seed in (0, 1):
-        scene = tiny_scene(seed, **FIELDS[name])
-        for spec in ({"rotation": {"yaw": 0.002}}, {"translation": {"x": 2e-4}}):
-            pose_set = poses(spec)
-            assert attack(scene, pose_set, bounded(scene, pose_set, 0.05))[1] == 0
+    for seed, spec in enumerate(({"rotation": {"yaw": 0.002}}, {"translation": {"x": 2e-4}})):
+        scene, pose_set = tiny_scene(seed, **FIELDS[name]), poses(spec)
+        assert attack(scene, pose_set, bounded(scene, pose_set, 0.05))[1] == 0
 
 
 def test_a_single_pose_is_one_colour() -> None:

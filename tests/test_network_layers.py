@@ -275,25 +275,25 @@ def test_read_like_onnxruntime(name: str, tmp_path: Path) -> None:
 @pytest.mark.parametrize("name", CASES)
 @pytest.mark.parametrize(("d", "radius", "slack"), [(1, 0.1, 0.01), (2, 0.5, 0.3), (3, 0.003, 1e-7)])
 def test_contained_under_attack(name: str, d: int, radius: float, slack: float, tmp_path: Path) -> None:
-    compared = 0
-    for seed in range(2):
-        file = written(name, tmp_path, seed)
-        network, run = load_network(file), session(file)
-        rows = rows_for(network.output_size)
-        offset = np.arange(4.0)
-        images = image_sets(SHAPE, 2, d, radius, slack, seed)
-        found = [bound_outputs(network, images, rows, offset, substitution=s) for s in ("everywhere", "end", "box")]
-        for cell in range(2):
-            least, count = attack(network, run, images, cell, rows)
-            compared += count
-            for bounds in found:
-                assert np.isfinite(bounds.lower[cell]).all()
-                assert (bounds.lower[cell] <= least + offset).all()
-        # one row's plane, at every corner and in the middle
+    # another network and other images at every number of parameters
+    seed, compared = d, 0
+    file = written(name, tmp_path, seed)
+    network, run = load_network(file), session(file)
+    rows = rows_for(network.output_size)
+    offset = np.arange(4.0)
+    images = image_sets(SHAPE, 2, d, radius, slack, seed)
+    found = [bound_outputs(network, images, rows, offset, substitution=s) for s in ("everywhere", "end", "box")]
+    for cell in range(2):
+        least, count = attack(network, run, images, cell, rows)
+        compared += count
         for bounds in found:
-            assert (bounds.b - np.abs(bounds.a).sum(-1) <= bounds.lower + 1e-9 * np.abs(bounds.lower)).all()
-        assert (found[1].lower >= found[2].lower).all()
-    assert compared > 500
+            assert np.isfinite(bounds.lower[cell]).all()
+            assert (bounds.lower[cell] <= least + offset).all()
+    # one row's plane, at every corner and in the middle
+    for bounds in found:
+        assert (bounds.b - np.abs(bounds.a).sum(-1) <= bounds.lower + 1e-9 * np.abs(bounds.lower)).all()
+    assert (found[1].lower >= found[2].lower).all()
+    assert compared > 250
 
 
 @pytest.mark.parametrize("name", CASES)
