@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import os
 import subprocess
 import sys
 from dataclasses import replace
@@ -450,6 +451,8 @@ def test_rows_that_end_by_plan_keep_within_memory(tmp_path: Path) -> None:
     words = subprocess.run(
         [sys.executable, "-c", _MEASURED, str(file), str(memory), "1e13"],
         cwd=Path(__file__).parent,
+        # what is freed goes back at once: what the allocator would keep, 10 to 110 MiB by chance, is not measured
+        env=os.environ | {"MALLOC_MMAP_THRESHOLD_": str(1 << 16)},
         capture_output=True,
         text=True,
         check=True,
@@ -457,8 +460,7 @@ def test_rows_that_end_by_plan_keep_within_memory(tmp_path: Path) -> None:
     taken, foreseen = float(words[0]), float(words[1])
     print(f"{taken / 2**20:.0f} MiB taken, {foreseen / 2**20:.0f} foreseen")
     assert words[2] == "True"
-    # what is resident holds what the allocator keeps, too: 5 % more on a busy machine
-    assert 4 << 20 < taken <= 1.1 * memory and taken <= 1.5 * foreseen
+    assert 4 << 20 < taken <= memory and taken <= 1.5 * foreseen
 
 
 def test_plans_keep_to_what_is_allowed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
