@@ -190,7 +190,7 @@ def test_bounds_hold_the_exact_range(**c: Any) -> None:
     assert result.bounded
     assert 1 <= result.cells <= c["cells"]
     # cells that were tried to find out how many are needed may be of no use
-    assert 0 <= len(frame.calls) - result.cells <= 12
+    assert 0 <= len(frame.calls) - result.cells <= {0: 1, 1: 12}.get(c["dimensions"], 5)
 
 
 def after_cover(result: FrameResult) -> TracePoint:
@@ -327,7 +327,7 @@ def test_first_cover_stays_coarse_where_smaller_cells_do_not_help(dimensions: in
 
     frame.bound = loose  # type: ignore[method-assign]
     result = refine(frame, Goal(1.05, FOREVER, 200))
-    assert after_cover(result).cells <= 8
+    assert after_cover(result).cells <= (7 if dimensions == 1 else 8)
 
 
 @pytest.mark.parametrize(("dimensions", "ratio", "first"), [(1, 1.002, 1.01), (2, 1.1, 1.15)])

@@ -57,7 +57,7 @@ _CLOSED_SHARE = 0.25
 _NARROWEST = 2.0**-40
 #: Most corners of the set that are rendered at the start.
 _CORNERS = 64
-#: About as many of them are rendered before the first cover of several parameters.
+#: About as many of them are rendered before the first cover: both of one parameter.
 _EARLY_CORNERS = 4
 #: Other scenes of the set that are rendered at the middle, and at every other witness.
 _MEMBERS, _MEMBERS_BY_WITNESS = 48, 2
@@ -346,7 +346,7 @@ class Refinement:
         parts, slopes = [cell.part], cell.slopes.copy()
         for _ in range(count.bit_length() - 1):
             axis = self._axis(cell.box, slopes)
-            parts = [half for part in parts for half in self._cut(part, axis)]
+            parts = self._cut_all(parts, axis)
             slopes[axis] *= 0.5
         return parts
 
@@ -465,21 +465,16 @@ class Refinement:
     def _begin(self) -> np.ndarray:
         """Render what the first cover asks for; returns the corners of the set that are left for later."""
         corners = self._corners()
-        if self.frame.box.dimensions == 1:
-            # two
-            for values in corners:
-                with suppress(AbandonedError):
-                    self._witness(values)
-            corners = corners[:0]
-            if self.goal.ratio >= _AIM_RATIO:
-                # the cover alone may reach the goal; cells that are split had better tell what they hide
-                self.floor = self._allow((self.goal.ratio - 1.0) * self._mpg(self.witness_lower, self.witness_upper))
-        elif not self.frame.tilewise:
-            early = np.arange(len(corners)) % max(1, len(corners) // _EARLY_CORNERS) == 0
-            for values in corners[early]:
+        if self.frame.tilewise and self.frame.box.dimensions != 1:
+            return corners
+        early = np.arange(len(corners)) % max(1, len(corners) // _EARLY_CORNERS) == 0
+        for values in corners[early]:
+            with suppress(AbandonedError):
                 self._witness(values)
-            corners = corners[~early]
-        return corners
+        if self.frame.box.dimensions == 1 and self.goal.ratio >= _AIM_RATIO:
+            # the cover alone may reach the goal; cells that are split had better tell what they hide
+            self.floor = self._allow((self.goal.ratio - 1.0) * self._mpg(self.witness_lower, self.witness_upper))
+        return corners[~early]
 
     def proceed(self, goal: Goal) -> FrameResult:
         """Go on after `run` has covered the set; time between the two does not count."""
@@ -547,26 +542,27 @@ class Refinement:
         return _Part(box, np.ones(box.dimensions, bool), np.ones(box.dimensions, bool))
 
     def _first_parts(self, everything: np.ndarray) -> tuple[list[_Part], _Part, Bounds]:
-        """Parts that cover the set, as many as motion asks for and time and memory allow; one part, and its bounds."""
+        """Parts that cover the set, as many as it takes and time and memory allow; one that was tried, its bounds."""
         frame, parts = self.frame, [self._whole]
-        if not frame.tilewise and frame.box.dimensions == 1:
+        if frame.tilewise or not frame.box.dimensions:
+            return parts, parts[0], self._probe(parts[0], everything)[0]
+        if frame.box.dimensions == 1:
             return self._equal_parts(everything)
         history = [parts]
-        if not frame.tilewise and frame.box.dimensions:
-            motion = np.nan_to_num(np.array(frame.motion(frame.box), np.float64), nan=0.0)
-            while motion.max() > FIRST_MOTIONS and 2 * len(parts) <= _COVER_CELLS:
-                axis = int(np.argmax(motion))
-                parts = self._cut_all(parts, axis)
-                motion[axis] *= 0.5
-                history.append(parts)
+        motion = np.nan_to_num(np.array(frame.motion(frame.box), np.float64), nan=0.0)
+        while motion.max() > FIRST_MOTIONS and 2 * len(parts) <= _COVER_CELLS:
+            axis = int(np.argmax(motion))
+            parts = self._cut_all(parts, axis)
+            motion[axis] *= 0.5
+            history.append(parts)
         first = parts[len(parts) // 2]
         probe, allowed = self._probe(first, everything)
+        if len(parts) <= allowed:
+            return self._finer_parts(parts, first, probe, allowed, everything)
         while len(parts) > allowed and len(history) > 1:
             history.pop()
             parts = history[-1]
-        if frame.tilewise or not frame.box.dimensions or first is not parts[len(parts) // 2]:
-            return parts, first, probe
-        return self._finer_parts(parts, first, probe, allowed, everything)
+        return parts, first, probe
 
     def _finer_parts(
         self, parts: list[_Part], first: _Part, probe: Bounds, allowed: float, everything: np.ndarray
@@ -576,17 +572,18 @@ class Refinement:
         before = np.inf
         while True:
             excess = self._beyond(first, probe)
-            helped = excess <= _STILL_HELPS * before or before >= self._cut_off
+            helped = self._helped(excess, before, _STILL_HELPS)
             if excess <= aim or not helped or 2 * len(parts) > min(allowed, _COVER_CELLS):
                 return parts, first, probe
             parts, before = self._cut_all(parts, self._axis(first.box, probe.slopes)), excess
             first = parts[len(parts) // 2]
             probe, allowed = self._probe(first, everything)
 
-    @property
-    def _cut_off(self) -> float:
-        """An excess that may only be that large because bounds end at 0 and 1."""
-        return _CUT_OFF * self._mpg(np.zeros_like(self.image), np.ones_like(self.image))
+    def _helped(self, excess: float, before: float, share: float) -> bool:
+        """Whether smaller cells left at most ``share`` of the excess ``before``, or that may have been cut off."""
+        return excess <= share * before or before >= _CUT_OFF * self._mpg(
+            np.zeros_like(self.image), np.ones_like(self.image)
+        )
 
     def _beyond(self, part: _Part, probe: Bounds) -> float:
         """MPG of the bounds of ``part`` beyond that of the pictures at its two ends and at the middle of the set."""
@@ -608,7 +605,7 @@ class Refinement:
             # it falls with the square of the width
             wanted = math.ceil(count * math.sqrt(min(excess / aim, 1e6))) if aim > 0.0 < excess else count
             most = int(min(affordable, _COVER_CELLS))
-            helped = excess <= _HELPS * before or before >= self._cut_off
+            helped = self._helped(excess, before, _HELPS)
             if wanted < 2 * count or 2 * count > most or not helped:
                 return self._cut(self._whole, 0, max(1, min(wanted if helped else count, most))), part, probe
             count, before = 2 * count + 1, excess
