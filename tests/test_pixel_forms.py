@@ -15,13 +15,14 @@ from ns_abstract.arithmetic.simd.intrinsics import pointer
 from ns_abstract.arithmetic.simd.lanes import load8, store
 from ns_abstract.methods.splat.alphas import (
     _affine_forms,
+    _cubic_exponential,
     _Exponent,
     _exponent_of_several,
     _fitted_exponential,
     _Limits,
     _set_curvature,
 )
-from ns_abstract.methods.splat.blend import blend_several
+from ns_abstract.methods.splat.blend import blend_quadratic, blend_several
 from ns_abstract.methods.splat.block import (
     ALPHA_HIGH,
     ALPHA_LOW,
@@ -111,21 +112,63 @@ def test_a_bent_exponent_is_fitted(distance, toward):
                 assert radius[lane] <= 3.0 * off + 1e-11
 
 
-@pytest.mark.parametrize("bend", [-0.3, -0.1, 0.1, 0.3])
-def test_an_exponent_that_bends_either_way_is_fitted(bend):
-    """With one parameter curvature may have either sign (B3)."""
-    slopes = np.array([0.0, 0.01, 0.05, 0.1, 0.2, 0.3, 0.4, 0.5])
-    least, most = 2.0 - slopes + min(bend, 0.0), 2.0 + slopes + max(bend, 0.0)
-    sizes, turn = np.full(8, abs(bend)), np.full(8, bend)
-    out = np.zeros(32)
-    limits = _Limits(1.0, 1.0, 0.0, 60.0, 1e-12, 1e-12, 0.999, 1.0)
-    _fitted(np.stack([least, most, np.full(8, 2.0), slopes, sizes, turn]).ravel(), limits, charges(REAL), out)
-    center, radius, weight, curve = out.reshape(4, 8)
-    for lane, slope in enumerate(slopes):
-        for p in np.linspace(-1.0, 1.0, 81):
-            linear, square = slope * p, bend * p * p
-            form = center[lane] + weight[lane] * (linear + square) + curve[lane] * linear * linear
-            assert abs(form - math.exp(-2.0 - linear - square)) <= radius[lane] + 1e-15
+@njit(error_model="numpy")
+def _cubic(exponent_, limits, charged, out_):
+    exponent, out = pointer(exponent_), pointer(out_)
+    alpha, tilt, bend = _cubic_exponential(
+        load8(exponent, 0), load8(exponent, 8), load8(exponent, 16), load8(exponent, 24), load8(exponent, 32),
+        load8(exponent, 40), limits, charged,
+    )  # fmt: skip
+    store(out, 0, alpha.low)
+    store(out, 8, alpha.high)
+    store(out, 16, alpha.center)
+    store(out, 24, tilt)
+    store(out, 32, bend)
+    store(out, 40, alpha.radius)
+
+
+@pytest.mark.parametrize("off", [0.0, 0.01])
+@pytest.mark.parametrize("bend", [-0.6, -0.2, 0.0, 0.2, 0.6, 1.2])
+def test_an_exponent_of_one_parameter_is_fitted(bend, off):
+    """exp of an exponent of order 2 that bends either way, and is ``off`` by a radius: held, hardly more (B3)."""
+    middle, slopes = 3.0, np.array([0.0, 1e-3, 0.05, 0.1, 0.3, 0.6, 0.9, 1.2])
+    grid = np.linspace(-1.0, 1.0, 201)
+    exact = middle + slopes[:, None] * grid + bend * grid * grid
+    radius = np.full(8, off)
+    ones = np.ones(8)
+    exponent = [exact.min(axis=1) - off, exact.max(axis=1) + off, middle * ones, radius, slopes, bend * ones]
+    # the least and greatest on the grid are not those in between
+    exponent[0] -= 1e-3
+    exponent[1] += 1e-3
+    out = np.zeros(48)
+    limits = _Limits(1.0, 1.0, 0.0, 60.0, 1e-12, 1e-12, 0.9999999, 1.0)
+    _cubic(np.stack(exponent).ravel(), limits, charges(REAL), out)
+    low, high, center, tilt, curve, radius = out.reshape(6, 8)
+    form = center[:, None] + tilt[:, None] * grid + curve[:, None] * grid * grid
+    found, size = np.zeros(8), np.exp(-exact.min(axis=1))
+    for shift in (-off, 0.0, off):
+        alpha = np.exp(-exact - shift)
+        # what np.exp and the lines above round
+        assert (np.abs(form - alpha) <= radius[:, None] + 1e-15).all()
+        assert (low[:, None] <= alpha).all() and (alpha <= high[:, None]).all()
+        found = np.maximum(found, np.abs(form - alpha).max(axis=1))
+    # terms of the remainder seldom meet at their largest
+    assert radius.sum() <= 1.6 * found.sum() + 0.003 * size.sum()
+
+
+def test_the_fit_of_degree_three_holds_everywhere():
+    """exp(-t) of straight exponents up to the widest that are fitted (B3)."""
+    slopes = np.linspace(0.25, 1.999, 8)
+    grid = np.linspace(-1.0, 1.0, 401)
+    zero, out = np.zeros(8), np.zeros(48)
+    exponent = np.stack([2.0 - slopes, 2.0 + slopes, np.full(8, 2.0), zero, slopes, zero])
+    limits = _Limits(1.0, 1.0, 0.0, 60.0, 1e-12, 1e-12, 2.0, 1.0)
+    _cubic(exponent.ravel(), limits, charges(REAL), out)
+    _, _, center, tilt, curve, radius = out.reshape(6, 8)
+    assert (tilt[:-1] < 0.0).all()
+    off = center[:, None] + tilt[:, None] * grid + curve[:, None] * grid * grid - np.exp(-2.0 - slopes[:, None] * grid)
+    assert (np.abs(off) <= radius[:, None] + 1e-15).all()
+    assert (radius <= 1.4 * np.abs(off).max(axis=1) + 1e-11).all()
 
 
 @njit(error_model="numpy")
@@ -210,6 +253,58 @@ def _blended(values_, lists_, colors_, background_, shape, forms, count, t_, out
     store(nothing, 0, radius)
     store(nothing, 4, ends.low)
     store(nothing, 8, ends.high)
+
+
+@njit(error_model="numpy")
+def _blended_quadratics(values_, lists_, colors_, background_, shape, forms, count, t_, out_):
+    values, lists, colors, background = pointer(values_), pointer(lists_), pointer(colors_), pointer(background_)
+    fragments = Fragments(values, fragment_width(shape), 0, lists, values, lists, 64, values)
+    palette = Palette(colors, forms, background, background)
+    radius, ends = blend_quadratic(0, count, fragments, palette, values, pointer(t_))
+    store(pointer(out_), 0, radius)
+    store(pointer(out_), 4, ends.low)
+    store(pointer(out_), 8, ends.high)
+
+
+@pytest.mark.parametrize("moving", [False, True], ids=["still", "moving"])
+@pytest.mark.parametrize("size, count, most", [(0.02, 4, 2.0), (0.3, 2, 1.6), (0.3, 24, 4.0)])
+def test_blends_of_exact_quadratic_alphas(size, count, most, moving):
+    """Alphas that are polynomials of one parameter: what products lose is charged, and hardly more (B7)."""
+    generator = np.random.default_rng(count + moving)
+    shape = FormShape(1, 2, 3)
+    forms = 3 if moving else 1
+    values, lists = np.zeros((count, int(fragment_width(shape)))), np.zeros((count, LISTED), np.uint32)
+    colors = np.zeros((count, color_size(forms) // 4, 4))
+    linear, bend = generator.uniform(-0.5, 0.5, (2, count)) * size
+    middle, spread = generator.uniform(0.4, 0.6, count), np.abs(linear) + np.abs(bend)
+    values[:, FORM : FORM + 3] = np.stack([middle, linear, bend], axis=1)
+    values[:, ALPHA_LOW], values[:, ALPHA_HIGH] = middle - spread, middle + spread
+    colors[:, 0, :3] = generator.random((count, 3))
+    if moving:
+        colors[:, 1:3, :3] = generator.uniform(-0.1, 0.1, (count, 2, 3))
+    drift, ends = np.abs(colors[:, 1:forms, :3]).sum(axis=1), color_ends(forms) // 4
+    colors[:, ends, :3], colors[:, ends + 1, :3] = colors[:, 0, :3] - drift, colors[:, 0, :3] + drift
+    lists[:, :2] = np.arange(count)[:, None]
+    background = np.array([0.2, 0.9, 0.5, 0.0])
+    t, out = np.zeros(12), np.zeros(12)
+    _blended_quadratics(values.ravel(), lists.ravel(), colors.ravel(), background, shape, forms, count, t, out)
+    form, (radius, low, high) = t.reshape(3, 4), out.reshape(3, 4)
+    found = np.zeros(3)
+    for place in np.linspace(-1.0, 1.0, 65):
+        p = Fraction(place)
+        powers = [Fraction(1), p, p * p]
+        for channel in range(3):
+            value = Fraction(background[channel])
+            for e in reversed(range(count)):
+                alpha = sum(Fraction(x) * y for x, y in zip(values[e, FORM : FORM + 3], powers, strict=True))
+                color = sum(Fraction(x) * y for x, y in zip(colors[e, :forms, channel], powers, strict=False))
+                value += alpha * (color - value)
+            off = abs(value - sum(Fraction(x) * y for x, y in zip(form[:, channel], powers, strict=True)))
+            # the radius' own rounding is added by the caller
+            assert off <= Fraction(radius[channel]) * Fraction(1 + 1e-12)
+            assert Fraction(low[channel] - 1e-15) <= value <= Fraction(high[channel] + 1e-15)
+            found[channel] = max(found[channel], float(off))
+    assert radius[:3].sum() <= most * found.sum()
 
 
 def _bend_range(bends, d):

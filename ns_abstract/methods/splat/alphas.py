@@ -54,9 +54,8 @@ class _Exponent(NamedTuple):
     Attributes:
         low, high: Bounds.
         center, radius: Of the form.
-        slope, bend: Sizes of its linear and quadratic parts.
-        turn: Twice what stands for the quadratic part in products with it; that is between 0 and ``bend``, or minus
-            ``bend`` if this is negative.
+        slope, bend: Sizes of its linear and quadratic parts; the latter is never negative.
+        turn: Twice what stands for the quadratic part in products with it.
     """
 
     low: Any
@@ -80,6 +79,37 @@ class _Alpha(NamedTuple):
     radius: Any
     weight: Any
     curve: Any
+
+
+class _Range(NamedTuple):
+    """Exponents of eight pixels as the program computes them, and their exponentials (design.md, B3).
+
+    Attributes:
+        low: The least.
+        half: Half of the range's width, at most what is fitted.
+        fits: 1 where that is all of it, else 0.
+        radius: Of the form.
+        at_low, fall: exp(-low), exp(-half).
+        slack: Relative error of the exponential.
+    """
+
+    low: Any
+    half: Any
+    fits: Any
+    radius: Any
+    at_low: Any
+    fall: Any
+    slack: Any
+
+
+class _Drawn(NamedTuple):
+    """Alphas of eight pixels after the thresholds: bounds, the form's centre and radius, 1 unless it is constant."""
+
+    low: Any
+    high: Any
+    center: Any
+    radius: Any
+    keep: Any
 
 
 class _AffineForms(NamedTuple):
@@ -178,14 +208,11 @@ def _quadratic_alphas(record, begin, n, given, block, limits, charges, antialias
             # alpha stays below the threshold
             continue
         high = minimum(high, s0 + top + radius + rounding)
-        alpha = _fitted_exponential(_Exponent(low, high, s0, radius, slope, bend, quadratic), limits, charges)
-        bent = fma(alpha.weight, quadratic, alpha.curve * (linear * linear))
+        alpha, tilt, bent = _cubic_exponential(low, high, s0, radius, linear, quadratic, limits, charges)
         # one parameter's forms hold its curvature: nothing reads the columns of its range
         store_columns(
             values, given + 8 * q, 8,
-            (
-                alpha.low, alpha.high, alpha.low, alpha.high, alpha.center, alpha.weight * linear, bent, alpha.radius,
-            ),
+            (alpha.low, alpha.high, alpha.low, alpha.high, alpha.center, tilt, bent, alpha.radius),
         )  # fmt: skip
         found |= (_ALL - bits(alpha.high < limits.alpha_min)) << q
     return found
@@ -352,49 +379,116 @@ def _alphas_of_several(record, begin, n, given, block, limits, charges, antialia
 
 
 @njit(cache=True, error_model="numpy", forceinline=True)
-def _fitted_exponential(sigma, limits, charges):
-    """The `_Alpha` opacity exp(-sigma) of an `_Exponent`, with its thresholds (design.md, B3-B4)."""
-    opacity_low, opacity_high, kappa, alpha_max = (
-        limits.opacity_low, limits.opacity_high, limits.kappa, limits.alpha_max,
-    )  # fmt: skip
-    l, b = sigma.slope, sigma.bend
-    opacity = 0.5 * (opacity_low + opacity_high)
-    opacity_spread = 0.5 * (opacity_high - opacity_low) * UP + FRAGMENT_ROUNDING * opacity
-    low = minimum(maximum(0.0, sigma.low * (1.0 - kappa)), _EXPONENT_LIMIT)
-    high = maximum(low, sigma.high * (1.0 + kappa))
-    # float evaluation moves the exponent by kappa
-    sr = sigma.radius + kappa * minimum(high, 4.0 * _EXPONENT_LIMIT)
+def _exponential_range(low, high, radius, limits, charges):
+    """The `_Range` of exponents from ``low`` to ``high`` whose form has the ``radius`` (design.md, B3)."""
+    kappa = limits.kappa
+    low = minimum(maximum(0.0, low * (1.0 - kappa)), _EXPONENT_LIMIT)
+    high = maximum(low, high * (1.0 + kappa))
     width = 0.5 * (high - low) * UP
     half = minimum(width, _FIT_LIMIT)
-    fits = where(width < _FIT_LIMIT, 1.0, 0.0)
-    e_low = exp_kernel(-low)
-    e_half = exp_kernel(-half)
     slack = charges.exponential + charges.exponential_by_argument * low + charges.exponential_by_range * half
-    slack = slack + 4.0 * EXP_RELATIVE_ERROR
-    a_high = opacity_high * e_low * (1.0 + slack)
-    a_low = fits * (opacity_low * e_low * (e_half * e_half) * (1.0 - slack))
-    # exp(-t) = k0 - k1 t + j2 t^2 +- fit over |t| <= half (design.md, B3)
-    h = 0.5 * half
-    x = h * h
-    x2 = x * x
+    return _Range(
+        low=low,
+        half=half,
+        fits=where(width < _FIT_LIMIT, 1.0, 0.0),
+        # float evaluation moves the exponent by kappa
+        radius=radius + kappa * minimum(high, 4.0 * _EXPONENT_LIMIT),
+        at_low=exp_kernel(-low),
+        fall=exp_kernel(-half),
+        slack=slack + 4.0 * EXP_RELATIVE_ERROR,
+    )
+
+
+@njit(cache=True, error_model="numpy", forceinline=True)
+def _bessel_terms(h, x):
+    """I0 - 2 I2, 2 I1 / r and 4 I2 / r^2 of modified Bessel functions at r = 2 h, x = h^2, as cut series (B3)."""
     i0 = fma(x, fma(x, fma(x, fma(x, 1.0 / 576.0, 1.0 / 36.0), 0.25), 1.0), 1.0)
     k1 = fma(x, fma(x, fma(x, fma(x, 1.0 / 2880.0, 1.0 / 144.0), 1.0 / 12.0), 0.5), 1.0)
-    j2 = fma(x, fma(x, fma(x, fma(x, 1.0 / 17280.0, 1.0 / 720.0), 1.0 / 48.0), 1.0 / 6.0), 0.5)
+    k2 = fma(x, fma(x, fma(x, fma(x, 1.0 / 17280.0, 1.0 / 720.0), 1.0 / 48.0), 1.0 / 6.0), 0.5)
+    return i0 - 2.0 * x * k2, k1, k2
+
+
+@njit(cache=True, error_model="numpy", forceinline=True)
+def _cubic_exponential(low, high, center, radius, linear, quadratic, limits, charges):
+    """Opacity exp(-sigma) for one parameter, fitted by a polynomial of degree 3 (design.md, B3).
+
+    The exponent sigma lies between ``low`` and ``high`` and within ``radius`` of
+    ``center`` + ``linear`` p + ``quadratic`` p^2. Returns the `_Drawn`, and the coefficients of p and p^2.
+    """
+    sigma = _exponential_range(low, high, radius, limits, charges)
+    # exp(-t) = k0 - k1 t + k2 t^2 - k3 t^3 +- fit over |t| <= half
+    h = 0.5 * sigma.half
+    x = h * h
+    k0, k1, k2 = _bessel_terms(h, x)
+    k3 = fma(x, fma(x, fma(x, 1.0 / 4320.0, 1.0 / 240.0), 1.0 / 24.0), 1.0 / 6.0)
+    k1 = fma(-3.0 * x, k3, k1)
+    fit = (x * x) * (1.0 / 12.0) * fma(x, fma(x, 1.0 / 48.0, 0.2), 1.0) * fma(x, 1.0 / 24.0, fma(h, 0.2, 1.0))
+    fit = fma(1.5e-4 * x, (x * x) * (x * x), fit)
+    t0 = center - (sigma.low + sigma.half)
+    # e0 + e1 u + e2 u^2 - k3 u^3 in u = linear p + quadratic p^2
+    e0 = fma(t0, fma(t0, fma(-t0, k3, k2), -k1), k0)
+    e1 = fma(t0, fma(-3.0 * t0, k3, 2.0 * k2), -k1)
+    e2 = fma(-3.0 * t0, k3, k2)
+    square, product = linear * linear, linear * quadratic
+    p3 = fma(2.0 * e2, product, -k3 * (square * linear))
+    p4 = quadratic * fma(e2, quadratic, -3.0 * k3 * square)
+    p5 = -3.0 * k3 * (product * quadratic)
+    p6 = -k3 * (quadratic * quadratic * quadratic)
+    # in Chebyshev's basis, where what is above degree 2 is left out
+    middle = fma(-5.0 / 32.0, p6, fma(-0.125, p4, e0))
+    tilt = fma(0.625, p5, fma(0.75, p3, e1 * linear))
+    bend = fma(15.0 / 16.0, p6, fma(e1, quadratic, fma(e2, square, p4)))
+    dropped = abs(fma(0.25, p3, 0.3125 * p5)) + abs(fma(0.125, p4, 0.1875 * p6))
+    dropped = dropped + 0.0625 * abs(p5) + 0.03125 * abs(p6)
+    moved = abs(linear) + abs(quadratic) + sigma.radius
+    steepest = fma(moved, fma(3.0 * k3, moved, 2.0 * abs(e2)), abs(e1))
+    size = abs(t0) + moved + 1.0
+    size = size * size * fma(2.0, size, 4.0)
+    error = fma(steepest, sigma.radius, fma(FRAGMENT_ROUNDING + 2.0 * EXP_RELATIVE_ERROR, size, dropped + fit))
+    scale = 0.5 * (limits.opacity_low + limits.opacity_high) * (sigma.at_low * sigma.fall)
+    alpha = _drawn(scale * middle, scale, error, sigma, limits, charges)
+    return alpha, where(alpha.keep == 1.0, scale * tilt, 0.0), where(alpha.keep == 1.0, scale * bend, 0.0)
+
+
+@njit(cache=True, error_model="numpy", forceinline=True)
+def _fitted_exponential(exponent, limits, charges):
+    """The `_Alpha` opacity exp(-sigma) of an `_Exponent`, with its thresholds (design.md, B3-B4)."""
+    l, b = exponent.slope, exponent.bend
+    sigma = _exponential_range(exponent.low, exponent.high, exponent.radius, limits, charges)
+    # exp(-t) = k0 - k1 t + k2 t^2 +- fit over |t| <= half
+    h = 0.5 * sigma.half
+    x = h * h
+    k0, k1, k2 = _bessel_terms(h, x)
     fit = (h * x) * (1.0 / 3.0) * fma(x, fma(x, 1.0 / 24.0, 0.25), 1.0) * fma(x, 1.0 / 15.0, fma(h, 0.25, 1.0))
-    fit = fma(1.2e-4 * x, x2 * x2, fit)
-    k0 = i0 - 2.0 * x * j2
-    t0 = sigma.center - (low + half)
-    scale = opacity * (e_low * e_half)
-    weight = fma(2.0 * j2, t0, -k1)
+    fit = fma(1.2e-4 * x, (x * x) * (x * x), fit)
+    t0 = exponent.center - (sigma.low + sigma.half)
+    scale = 0.5 * (limits.opacity_low + limits.opacity_high) * (sigma.at_low * sigma.fall)
+    weight = fma(2.0 * k2, t0, -k1)
+    sr = sigma.radius
     spread = sr + l + b
     size = fma(abs(t0), 4.0 + abs(t0), fma(spread, 1.0 + spread, 4.0))
     # the linear part times twice what the curvature is off half its turn, and the square of that
-    turn = abs(sigma.turn)
+    turn = exponent.turn
     bent = fma(l, 2.0 * b - turn, fma(0.125 * turn, turn, sr * fma(2.0, l + b, sr)))
-    error = fma(abs(weight), sr, fma(j2, bent, fma(FRAGMENT_ROUNDING + 2.0 * EXP_RELATIVE_ERROR, size, fit)))
-    radius = fma(scale, error, 1.01 * e_low * fma(opacity_high, slack, opacity_spread))
-    center = scale * fma(t0, fma(j2, t0, -k1), fma(-0.125 * j2, turn * turn, k0))
-    weight = fma(j2, sigma.turn, weight)
+    error = fma(abs(weight), sr, fma(k2, bent, fma(FRAGMENT_ROUNDING + 2.0 * EXP_RELATIVE_ERROR, size, fit)))
+    center = scale * fma(t0, fma(k2, t0, -k1), fma(-0.125 * k2, turn * turn, k0))
+    weight = fma(k2, turn, weight)
+    alpha = _drawn(center, scale, error, sigma, limits, charges)
+    return _Alpha(
+        alpha.low, alpha.high, alpha.center, alpha.radius, alpha.keep * (scale * weight), alpha.keep * (scale * k2)
+    )
+
+
+@njit(cache=True, error_model="numpy", forceinline=True)
+def _drawn(center, scale, error, sigma, limits, charges):
+    """The `_Drawn` of the exponents ``sigma``: a form about ``center``, off by ``scale`` ``error`` (design.md, B4)."""
+    opacity_low, opacity_high, alpha_max = limits.opacity_low, limits.opacity_high, limits.alpha_max
+    slack, at_low = sigma.slack, sigma.at_low
+    opacity = 0.5 * (opacity_low + opacity_high)
+    opacity_spread = 0.5 * (opacity_high - opacity_low) * UP + FRAGMENT_ROUNDING * opacity
+    a_high = opacity_high * at_low * (1.0 + slack)
+    a_low = sigma.fits * (opacity_low * at_low * (sigma.fall * sigma.fall) * (1.0 - slack))
+    radius = fma(scale, error, 1.01 * at_low * fma(opacity_high, slack, opacity_spread))
     # alpha_max
     excess = maximum(0.0, a_high - alpha_max)
     a_high = minimum(a_high, alpha_max * (1.0 + charges.threshold))
@@ -406,14 +500,14 @@ def _fitted_exponential(sigma, limits, charges):
     radius = fma(0.5, excess + jump, radius) * UP
     a_low = where(skips, 0.0, limits.sure * a_low)
     # gone where it cannot reach the threshold
-    gone = (a_high < limits.alpha_min) | (low > limits.sigma_max)
+    gone = (a_high < limits.alpha_min) | (sigma.low > limits.sigma_max)
     a_high = where(gone, 0.0, a_high)
     a_low = where(gone, 0.0, a_low)
     flat = 0.5 * (a_high - a_low)
-    keep = where(radius < flat, fits * limits.sure, 0.0)
+    keep = where(radius < flat, sigma.fits * limits.sure, 0.0)
     center = where(keep == 1.0, center, 0.5 * (a_high + a_low))
     radius = where(keep == 1.0, radius, flat * UP)
-    return _Alpha(a_low, a_high, center, radius, keep * (scale * weight), keep * (scale * j2))
+    return _Drawn(a_low, a_high, center, radius, keep)
 
 
 @njit(cache=True, error_model="numpy", forceinline=True)

@@ -245,17 +245,18 @@ def blend_quadratic(begin, end, fragments, palette, moves, t):
         else:
             v1 = -p1
             v2 = -p2
+        # p^3 = 3/4 p + T3/4 and p^4 = p^2 - 1/8 + T4/8
+        cubic = fma(a1, v2, a2 * v1)
+        quartic = a2 * v2
         # sums in the order that leaves short chains from fragment to fragment
-        p0 = fma(a0, v0, p0)
-        p1 = fma(a0, v1, fma(a1, v0, p1))
-        p2 = fma(a0, v2, fma(a2, v0, fma(a1, v1, p2)))
+        p0 = fma(a0, v0, fma(-0.125, quartic, p0))
+        p1 = fma(a0, v1, fma(a1, v0, fma(0.75, cubic, p1)))
+        p2 = fma(a0, v2, fma(a2, v0, fma(a1, v1, p2 + quartic)))
         a1 = abs(a1)
         a2 = abs(a2)
-        v1 = abs(v1)
-        v2 = abs(v2)
-        v1 = v1 + v2
-        size = abs(v0) + v1
-        added = fma(values[at + ALPHA_HIGH], load4(colors, key + 4 * forms), fma(a1, v2, a2 * v1))
+        size = abs(v0) + abs(v1) + abs(v2)
+        dropped = fma(0.25, abs(cubic), 0.125 * abs(quartic))
+        added = fma(values[at + ALPHA_HIGH], load4(colors, key + 4 * forms), dropped)
         added = fma(values[at + FORM + 3], size, fma(FRAGMENT_ROUNDING, fma(1.0 + a1 + a2, size, abs(p0)), added))
         r = fma(1.0 - values[at + ALPHA_LOW], r, added)
         ends = _blend_interval(ends, values, at, colors, key + color_ends(forms))
