@@ -32,6 +32,7 @@ from ns_abstract.methods.splat.block import (
     LISTED,
     Fragments,
     Palette,
+    bends_of,
     color_ends,
     color_size,
     fragment_width,
@@ -246,24 +247,15 @@ def test_the_range_of_alpha_s_curvature(d):
 def _blended(values_, lists_, colors_, background_, shape, forms, count, t_, out_):
     values, lists, colors, background = pointer(values_), pointer(lists_), pointer(colors_), pointer(background_)
     nothing = pointer(out_)
-    bends = shape.dimensions * (shape.dimensions + 1) // 2
-    fragments = Fragments(values, fragment_width(shape), bends, lists, values, lists, 64, values)
+    fragments = Fragments(values, fragment_width(shape), bends_of(shape), lists, values, lists, 64, values)
     palette = Palette(colors, forms, background, background)
-    radius, ends = blend_several(0, count, fragments, palette, values, pointer(t_), shape.monomials)
+    if shape.order == 2:
+        radius, ends = blend_quadratic(0, count, fragments, palette, values, pointer(t_))
+    else:
+        radius, ends = blend_several(0, count, fragments, palette, values, pointer(t_), shape.monomials)
     store(nothing, 0, radius)
     store(nothing, 4, ends.low)
     store(nothing, 8, ends.high)
-
-
-@njit(error_model="numpy")
-def _blended_quadratics(values_, lists_, colors_, background_, shape, forms, count, t_, out_):
-    values, lists, colors, background = pointer(values_), pointer(lists_), pointer(colors_), pointer(background_)
-    fragments = Fragments(values, fragment_width(shape), 0, lists, values, lists, 64, values)
-    palette = Palette(colors, forms, background, background)
-    radius, ends = blend_quadratic(0, count, fragments, palette, values, pointer(t_))
-    store(pointer(out_), 0, radius)
-    store(pointer(out_), 4, ends.low)
-    store(pointer(out_), 8, ends.high)
 
 
 @pytest.mark.parametrize("moving", [False, True], ids=["still", "moving"])
@@ -284,22 +276,22 @@ def test_blends_of_exact_quadratic_alphas(size, count, most, moving):
         colors[:, 1:3, :3] = generator.uniform(-0.1, 0.1, (count, 2, 3))
     drift, ends = np.abs(colors[:, 1:forms, :3]).sum(axis=1), color_ends(forms) // 4
     colors[:, ends, :3], colors[:, ends + 1, :3] = colors[:, 0, :3] - drift, colors[:, 0, :3] + drift
+    shades = np.zeros((count, 3, 3))
+    shades[:, :forms] = colors[:, :forms, :3]
     lists[:, :2] = np.arange(count)[:, None]
     background = np.array([0.2, 0.9, 0.5, 0.0])
     t, out = np.zeros(12), np.zeros(12)
-    _blended_quadratics(values.ravel(), lists.ravel(), colors.ravel(), background, shape, forms, count, t, out)
+    _blended(values.ravel(), lists.ravel(), colors.ravel(), background, shape, forms, count, t, out)
     form, (radius, low, high) = t.reshape(3, 4), out.reshape(3, 4)
     found = np.zeros(3)
     for place in np.linspace(-1.0, 1.0, 65):
-        p = Fraction(place)
-        powers = [Fraction(1), p, p * p]
+        p = [Fraction(place)]
         for channel in range(3):
             value = Fraction(background[channel])
             for e in reversed(range(count)):
-                alpha = sum(Fraction(x) * y for x, y in zip(values[e, FORM : FORM + 3], powers, strict=True))
-                color = sum(Fraction(x) * y for x, y in zip(colors[e, :forms, channel], powers, strict=False))
-                value += alpha * (color - value)
-            off = abs(value - sum(Fraction(x) * y for x, y in zip(form[:, channel], powers, strict=True)))
+                color = _polynomial(shades[e, :, channel], p, 1)
+                value += _polynomial(values[e, FORM : FORM + 3], p, 1) * (color - value)
+            off = abs(value - _polynomial(form[:, channel], p, 1))
             # the radius' own rounding is added by the caller
             assert off <= Fraction(radius[channel]) * Fraction(1 + 1e-12)
             assert Fraction(low[channel] - 1e-15) <= value <= Fraction(high[channel] + 1e-15)

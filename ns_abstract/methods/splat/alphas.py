@@ -54,7 +54,7 @@ class _Exponent(NamedTuple):
     Attributes:
         low, high: Bounds.
         center, radius: Of the form.
-        slope, bend: Sizes of its linear and quadratic parts; the latter is never negative.
+        slope, bend: Sizes of its linear part and of its quadratic one, which is never negative.
         turn: Twice what stands for the quadratic part in products with it.
     """
 
@@ -86,19 +86,22 @@ class _Range(NamedTuple):
 
     Attributes:
         low: The least.
-        half: Half of the range's width, at most what is fitted.
+        middle, half: Of the range that is fitted, its middle and half of its width.
         fits: 1 where that is all of it, else 0.
         radius: Of the form.
         at_low, fall: exp(-low), exp(-half).
+        scale: Alpha at ``middle``.
         slack: Relative error of the exponential.
     """
 
     low: Any
+    middle: Any
     half: Any
     fits: Any
     radius: Any
     at_low: Any
     fall: Any
+    scale: Any
     slack: Any
 
 
@@ -386,22 +389,25 @@ def _exponential_range(low, high, radius, limits, charges):
     high = maximum(low, high * (1.0 + kappa))
     width = 0.5 * (high - low) * UP
     half = minimum(width, _FIT_LIMIT)
+    at_low, fall = exp_kernel(-low), exp_kernel(-half)
     slack = charges.exponential + charges.exponential_by_argument * low + charges.exponential_by_range * half
     return _Range(
         low=low,
+        middle=low + half,
         half=half,
         fits=where(width < _FIT_LIMIT, 1.0, 0.0),
         # float evaluation moves the exponent by kappa
         radius=radius + kappa * minimum(high, 4.0 * _EXPONENT_LIMIT),
-        at_low=exp_kernel(-low),
-        fall=exp_kernel(-half),
+        at_low=at_low,
+        fall=fall,
+        scale=0.5 * (limits.opacity_low + limits.opacity_high) * (at_low * fall),
         slack=slack + 4.0 * EXP_RELATIVE_ERROR,
     )
 
 
 @njit(cache=True, error_model="numpy", forceinline=True)
-def _bessel_terms(h, x):
-    """I0 - 2 I2, 2 I1 / r and 4 I2 / r^2 of modified Bessel functions at r = 2 h, x = h^2, as cut series (B3)."""
+def _bessel_terms(x):
+    """I0 - 2 I2, 2 I1 / r and 4 I2 / r^2 of modified Bessel functions at r = 2 sqrt(x), as cut series (B3)."""
     i0 = fma(x, fma(x, fma(x, fma(x, 1.0 / 576.0, 1.0 / 36.0), 0.25), 1.0), 1.0)
     k1 = fma(x, fma(x, fma(x, fma(x, 1.0 / 2880.0, 1.0 / 144.0), 1.0 / 12.0), 0.5), 1.0)
     k2 = fma(x, fma(x, fma(x, fma(x, 1.0 / 17280.0, 1.0 / 720.0), 1.0 / 48.0), 1.0 / 6.0), 0.5)
@@ -419,12 +425,12 @@ def _cubic_exponential(low, high, center, radius, linear, quadratic, limits, cha
     # exp(-t) = k0 - k1 t + k2 t^2 - k3 t^3 +- fit over |t| <= half
     h = 0.5 * sigma.half
     x = h * h
-    k0, k1, k2 = _bessel_terms(h, x)
+    k0, k1, k2 = _bessel_terms(x)
     k3 = fma(x, fma(x, fma(x, 1.0 / 4320.0, 1.0 / 240.0), 1.0 / 24.0), 1.0 / 6.0)
     k1 = fma(-3.0 * x, k3, k1)
     fit = (x * x) * (1.0 / 12.0) * fma(x, fma(x, 1.0 / 48.0, 0.2), 1.0) * fma(x, 1.0 / 24.0, fma(h, 0.2, 1.0))
     fit = fma(1.5e-4 * x, (x * x) * (x * x), fit)
-    t0 = center - (sigma.low + sigma.half)
+    t0 = center - sigma.middle
     # e0 + e1 u + e2 u^2 - k3 u^3 in u = linear p + quadratic p^2
     e0 = fma(t0, fma(t0, fma(-t0, k3, k2), -k1), k0)
     e1 = fma(t0, fma(-3.0 * t0, k3, 2.0 * k2), -k1)
@@ -445,9 +451,9 @@ def _cubic_exponential(low, high, center, radius, linear, quadratic, limits, cha
     size = abs(t0) + moved + 1.0
     size = size * size * fma(2.0, size, 4.0)
     error = fma(steepest, sigma.radius, fma(FRAGMENT_ROUNDING + 2.0 * EXP_RELATIVE_ERROR, size, dropped + fit))
-    scale = 0.5 * (limits.opacity_low + limits.opacity_high) * (sigma.at_low * sigma.fall)
-    alpha = _drawn(scale * middle, scale, error, sigma, limits, charges)
-    return alpha, where(alpha.keep == 1.0, scale * tilt, 0.0), where(alpha.keep == 1.0, scale * bend, 0.0)
+    alpha = _drawn(middle, error, sigma, limits, charges)
+    kept = alpha.keep == 1.0
+    return alpha, where(kept, sigma.scale * tilt, 0.0), where(kept, sigma.scale * bend, 0.0)
 
 
 @njit(cache=True, error_model="numpy", forceinline=True)
@@ -458,11 +464,10 @@ def _fitted_exponential(exponent, limits, charges):
     # exp(-t) = k0 - k1 t + k2 t^2 +- fit over |t| <= half
     h = 0.5 * sigma.half
     x = h * h
-    k0, k1, k2 = _bessel_terms(h, x)
+    k0, k1, k2 = _bessel_terms(x)
     fit = (h * x) * (1.0 / 3.0) * fma(x, fma(x, 1.0 / 24.0, 0.25), 1.0) * fma(x, 1.0 / 15.0, fma(h, 0.25, 1.0))
     fit = fma(1.2e-4 * x, (x * x) * (x * x), fit)
-    t0 = exponent.center - (sigma.low + sigma.half)
-    scale = 0.5 * (limits.opacity_low + limits.opacity_high) * (sigma.at_low * sigma.fall)
+    t0 = exponent.center - sigma.middle
     weight = fma(2.0 * k2, t0, -k1)
     sr = sigma.radius
     spread = sr + l + b
@@ -471,24 +476,26 @@ def _fitted_exponential(exponent, limits, charges):
     turn = exponent.turn
     bent = fma(l, 2.0 * b - turn, fma(0.125 * turn, turn, sr * fma(2.0, l + b, sr)))
     error = fma(abs(weight), sr, fma(k2, bent, fma(FRAGMENT_ROUNDING + 2.0 * EXP_RELATIVE_ERROR, size, fit)))
-    center = scale * fma(t0, fma(k2, t0, -k1), fma(-0.125 * k2, turn * turn, k0))
+    middle = fma(t0, fma(k2, t0, -k1), fma(-0.125 * k2, turn * turn, k0))
     weight = fma(k2, turn, weight)
-    alpha = _drawn(center, scale, error, sigma, limits, charges)
+    alpha = _drawn(middle, error, sigma, limits, charges)
     return _Alpha(
-        alpha.low, alpha.high, alpha.center, alpha.radius, alpha.keep * (scale * weight), alpha.keep * (scale * k2)
-    )
+        alpha.low, alpha.high, alpha.center, alpha.radius,
+        alpha.keep * (sigma.scale * weight), alpha.keep * (sigma.scale * k2),
+    )  # fmt: skip
 
 
 @njit(cache=True, error_model="numpy", forceinline=True)
-def _drawn(center, scale, error, sigma, limits, charges):
-    """The `_Drawn` of the exponents ``sigma``: a form about ``center``, off by ``scale`` ``error`` (design.md, B4)."""
+def _drawn(middle, error, sigma, limits, charges):
+    """The `_Drawn` of the `_Range` ``sigma``; the form is about ``middle``, off by ``error``, of its scale (B4)."""
     opacity_low, opacity_high, alpha_max = limits.opacity_low, limits.opacity_high, limits.alpha_max
     slack, at_low = sigma.slack, sigma.at_low
     opacity = 0.5 * (opacity_low + opacity_high)
     opacity_spread = 0.5 * (opacity_high - opacity_low) * UP + FRAGMENT_ROUNDING * opacity
     a_high = opacity_high * at_low * (1.0 + slack)
     a_low = sigma.fits * (opacity_low * at_low * (sigma.fall * sigma.fall) * (1.0 - slack))
-    radius = fma(scale, error, 1.01 * at_low * fma(opacity_high, slack, opacity_spread))
+    center = sigma.scale * middle
+    radius = fma(sigma.scale, error, 1.01 * at_low * fma(opacity_high, slack, opacity_spread))
     # alpha_max
     excess = maximum(0.0, a_high - alpha_max)
     a_high = minimum(a_high, alpha_max * (1.0 + charges.threshold))
