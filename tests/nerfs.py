@@ -12,12 +12,16 @@ from ns_abstract.demo.nerf_fit import NerfNetwork
 from ns_abstract.geometry.camera_path import Camera
 from ns_abstract.geometry.poses import PoseSet
 from ns_abstract.geometry.views import look_at
+from ns_abstract.methods.nerf.bounds import RayBounds
 from ns_abstract.methods.nerf.field import Field, encode
 from ns_abstract.methods.nerf.render import NerfRenderer, Sampling
 from ns_abstract.methods.nerf.scene import FieldWeights, Layer, NerfScene
 from ns_abstract.perturbation.specification import parse_perturbation
+from ns_abstract.verify.attack.falsify import falsify
+from ns_abstract.verify.attack.soundness import nerf_renderer
 
 UNIFORM = Sampling("uniform", 0.0, 4.0, 24, 0, (0.2, 0.6, 1.0))
+BINS = dataclasses.replace(UNIFORM, kind="hierarchical", samples=32, importance=40)
 
 
 def tiny_weights(
@@ -92,3 +96,19 @@ def raw_outputs(weights: FieldWeights, x: torch.Tensor, direction: torch.Tensor)
     for weight, bias in field._head:
         h = functional.relu(functional.linear(h, weight, bias))
     return density, functional.linear(h, *field._color)
+
+
+def attack_first_rays(scene: NerfScene, pose_set: PoseSet, found: RayBounds) -> tuple[int, int]:
+    """Comparisons and violations of bounds of the first rays, sampled as `BINS` says.
+
+    By random poses, corners, gradient ascent and jumps.
+    """
+    camera = pose_set.camera
+    lower, upper = np.zeros((camera.height * camera.width, 3)), np.ones((camera.height * camera.width, 3))
+    lower[: len(found.lower)], upper[: len(found.lower)] = found.lower, found.upper
+    shape = (camera.height, camera.width, 3)
+    render, probe, twin = nerf_renderer(scene, pose_set, BINS)
+    result = falsify(
+        lower.reshape(shape), upper.reshape(shape), pose_set.box, render, twin, probe=probe, poses=40, seed=1
+    )
+    return result.comparisons, result.violations

@@ -14,7 +14,8 @@ from nerfs import UNIFORM, images, pixels_of, poses, tiny_scene
 from ns_abstract.geometry.poses import PoseSet
 from ns_abstract.methods.nerf import bounds as bounds_module
 from ns_abstract.methods.nerf import frame as frame_module
-from ns_abstract.methods.nerf.bounds import Division, NerfBounds, RayBounds
+from ns_abstract.methods.nerf.bounds import NerfBounds, RayBounds
+from ns_abstract.methods.nerf.division import Division
 from ns_abstract.methods.nerf.field import Field
 from ns_abstract.methods.nerf.frame import NerfFrame
 from ns_abstract.methods.nerf.render import NerfRenderer
@@ -237,7 +238,7 @@ def wrong_parts(value, bernstein):
     return low[:, :1].expand_as(low), high[:, :1].expand_as(high), error
 
 
-original_parts = bounds_module._parts
+original_parts = bounds_module.bounds_by_part
 
 
 def narrow_pencil(self, *arguments) -> None:
@@ -253,7 +254,7 @@ original_pencil = bounds_module.Pencil.__init__
     ("target", "name", "fault"),
     [
         (bounds_module._Work, "_composite", composite_without_ends),
-        (bounds_module, "_parts", wrong_parts),
+        (bounds_module, "bounds_by_part", wrong_parts),
         (bounds_module.Pencil, "__init__", narrow_pencil),
     ],
 )
@@ -270,7 +271,7 @@ def test_bounds_that_are_no_numbers_are_not_kept(monkeypatch: pytest.MonkeyPatch
         return low * float("nan"), high, error * float("nan")
 
     scene, pose_set = tiny_scene(3), poses(SETS["yaw"])
-    monkeypatch.setattr(bounds_module, "_parts", broken)
+    monkeypatch.setattr(bounds_module, "bounds_by_part", broken)
     found = bounded(scene, pose_set)
     assert np.isfinite(found.lower).all() and np.isfinite(found.upper).all()
     assert attack(scene, pose_set, found)[1] == 0

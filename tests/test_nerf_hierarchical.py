@@ -7,7 +7,7 @@ import dataclasses
 import numpy as np
 import pytest
 import torch
-from nerfs import UNIFORM, pixels_of, poses, tiny_scene
+from nerfs import BINS, attack_first_rays, pixels_of, poses, tiny_scene
 
 from ns_abstract.arithmetic.rounding import COMPOSITE_ROUNDING
 from ns_abstract.geometry.poses import PoseSet
@@ -17,12 +17,9 @@ from ns_abstract.methods.nerf.bounds import NerfBounds, RayBounds
 from ns_abstract.methods.nerf.frame import NerfFrame
 from ns_abstract.methods.nerf.method import NerfMethod
 from ns_abstract.methods.nerf.render import NerfRenderer
-from ns_abstract.methods.nerf.samples import composite, edge_bounds
+from ns_abstract.methods.nerf.samples import composite, edge_bounds, hulls
 from ns_abstract.methods.nerf.scene import NerfScene
-from ns_abstract.verify.attack.falsify import falsify
-from ns_abstract.verify.attack.soundness import nerf_renderer
 
-BINS = dataclasses.replace(UNIFORM, kind="hierarchical", samples=32, importance=40)
 SETS = {
     "point": {"rotation": {"yaw": [0.1, 0.1]}},
     "yaw": {"rotation": {"yaw": 0.001}},
@@ -30,45 +27,34 @@ SETS = {
 }
 
 
-def bounded(scene: NerfScene, pose_set: PoseSet) -> RayBounds:
-    pixels = pixels_of(pose_set.camera)[:6]
-    return NerfBounds(scene, BINS, pose_set.box.dimensions).rays(pose_set, pose_set.box, pixels, 0.05)
-
-
-def attack(scene: NerfScene, pose_set: PoseSet, found: RayBounds) -> tuple[int, int]:
-    """Comparisons and violations of random poses, corners, gradient ascent and jumps on the first rays."""
-    camera = pose_set.camera
-    lower, upper = np.zeros((camera.height * camera.width, 3)), np.ones((camera.height * camera.width, 3))
-    lower[: len(found.lower)], upper[: len(found.lower)] = found.lower, found.upper
-    shape = (camera.height, camera.width, 3)
-    render, probe, twin = nerf_renderer(scene, pose_set, BINS)
-    result = falsify(
-        lower.reshape(shape), upper.reshape(shape), pose_set.box, render, twin, probe=probe, poses=40, seed=1
-    )
-    return result.comparisons, result.violations
+def by_bins(scene: NerfScene, pose_set: PoseSet) -> RayBounds:
+    """Without samples that are followed."""
+    bounds = NerfBounds(scene, BINS, pose_set.box.dimensions)
+    asked = bounds_module._Asked(pose_set, pose_set.box, pixels_of(pose_set.camera)[:6], 0.05 / 8.0, None, None, [])
+    return bounds._apart(asked, None, False, 0.02)
 
 
 @pytest.mark.parametrize("name", SETS)
 def test_every_choice_of_samples_is_enclosed(name: str) -> None:
     for seed, changes in ((3, {}), (1, {"density": 1e3})):
         scene, pose_set = tiny_scene(seed, **changes), poses(SETS[name])
-        found = bounded(scene, pose_set)
+        found = by_bins(scene, pose_set)
         assert (found.upper - found.lower).mean() < 0.9, "nothing was bounded"
-        compared, violations = attack(scene, pose_set, found)
+        compared, violations = attack_first_rays(scene, pose_set, found)
         assert compared > 0 and violations == 0
 
 
 def test_a_smooth_field_is_tight() -> None:
     scene, pose_set = tiny_scene(3, density=1.0, color=0.5), poses(SETS["yaw"])
-    found = bounded(scene, pose_set)
+    found = by_bins(scene, pose_set)
     assert (found.upper - found.lower).mean() < 0.25
 
 
 def test_where_samples_lie_makes_opaque_fields_tight(monkeypatch: pytest.MonkeyPatch) -> None:
     scene, pose_set = tiny_scene(1, density=1e3), poses({"rotation": {"yaw": 1e-4}})
-    found = bounded(scene, pose_set)
+    found = by_bins(scene, pose_set)
     monkeypatch.setattr(bounds_module._Work, "_sampled", lambda self, low, high: (np.zeros(1), np.ones(1)))
-    wide = bounded(scene, pose_set)
+    wide = by_bins(scene, pose_set)
     assert (wide.lower <= found.lower).all() and (found.upper <= wide.upper).all()
     assert (found.upper - found.lower).mean() < 0.3 * (wide.upper - wide.lower).mean()
 
@@ -99,6 +85,14 @@ def test_edges_of_samples_are_enclosed(kind: str) -> None:
         assert (high - low).max() < 1e-9
 
 
+def in_samples(low: np.ndarray, high: np.ndarray, step: float, density: np.ndarray, color: np.ndarray):
+    """`hulls` of parts of length ``step``: densities and colours by sample."""
+    count = low.shape[1] - 1
+    found = np.empty((2, len(low), count)), np.empty((2, len(low), count, 3))
+    hulls(low, high, 0.0, step, density, color, *found)
+    return found
+
+
 @pytest.mark.parametrize("spread", [0.0, 0.003, 0.3])
 def test_sampled_parts_are_enclosed(spread: float) -> None:
     rng = np.random.default_rng(1)
@@ -111,7 +105,7 @@ def test_sampled_parts_are_enclosed(spread: float) -> None:
     density = rng.uniform(0.0, 12.0, (rows, parts)) * np.array([1.0, 1.2])[:, None, None]
     color = rng.uniform(0.0, 0.8, (rows, parts, 3)) + np.array([0.0, 0.2])[:, None, None, None]
     lower, upper = np.full((rows, 3), 0.5), np.full((rows, 3), 0.5)
-    composite(low, high, 0.0, 1.0 / parts, density[0], density[1], color[0], color[1], lower, upper)
+    composite(low, high, *in_samples(low, high, 1.0 / parts, density, color), lower, upper)
     slack = 4.0 * COMPOSITE_ROUNDING * (2 * count + 7)
     for mix in (0, 1, None, None, None):
         at = np.sort(np.clip(edges + (0 if mix is None else 2 * mix - 1) * width, low, high), axis=1)
@@ -140,7 +134,7 @@ def only_middles(self, values, end, axis=-1):
 def test_planted_faults_are_found(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(bounds_module._Work, "_anywhere", only_middles)
     scene, pose_set = tiny_scene(3, density=30.0), poses(SETS["yaw"])
-    assert attack(scene, pose_set, bounded(scene, pose_set))[1] > 0
+    assert attack_first_rays(scene, pose_set, by_bins(scene, pose_set))[1] > 0
 
 
 def test_options() -> None:
@@ -167,16 +161,17 @@ def test_segments_take_every_interval_that_may_lie_over_them() -> None:
         low[0, 0] = high[0, 0] = 0.0
         low[0, -1] = high[0, -1] = span
         density, color = 4.0 * rng.random((1, parts)) ** 2, rng.random((1, parts, 3))
+        density, color = (np.stack([values, values]) for values in (density, color))
         lower, upper = np.full((1, 3), 0.3), np.full((1, 3), 0.3)
-        composite(low, high, 0.0, span / parts, density, density, color, color, lower, upper)
+        composite(low, high, *in_samples(low, high, span / parts, density, color), lower, upper)
         for _ in range(40):
             share = rng.choice([0.0, 1.0], count + 1) if rng.random() < 0.5 else rng.random(count + 1)
             edges = np.sort(low[0] + share * (high[0] - low[0]))
             at = np.minimum((0.5 * (edges[1:] + edges[:-1]) / span * parts).astype(int), parts - 1)
             shown = np.full(3, 0.3)
             for k in range(count - 1, -1, -1):
-                opacity = -np.expm1(-(edges[k + 1] - edges[k]) * density[0, at[k]])
-                shown += opacity * (color[0, at[k]] - shown)
+                opacity = -np.expm1(-(edges[k + 1] - edges[k]) * density[0, 0, at[k]])
+                shown += opacity * (color[0, 0, at[k]] - shown)
             # what the caller charges for rounding
             room = 4.0 * COMPOSITE_ROUNDING * (count + 5)
             assert (lower[0] - room <= shown).all() and (shown <= upper[0] + room).all()

@@ -19,8 +19,9 @@ from ns_abstract.cli import render as render_command
 from ns_abstract.geometry.poses import PoseSet
 from ns_abstract.geometry.views import View, path_json
 from ns_abstract.io.errors import InputError
-from ns_abstract.methods.nerf.bounds import NerfBounds, Pencil, RayBounds
+from ns_abstract.methods.nerf.bounds import NerfBounds, RayBounds
 from ns_abstract.methods.nerf.occupancy import OccupancyGrid, load_grid
+from ns_abstract.methods.nerf.pencil import Pencil
 from ns_abstract.methods.nerf.scene import NerfScene
 from ns_abstract.methods.nerf.write import write_nerf_run
 from ns_abstract.verify.attack.falsify import falsify

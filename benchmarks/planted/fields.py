@@ -6,7 +6,8 @@ _ZONOTOPE, _BOUNDS = "methods/nerf/zonotope.py", "methods/nerf/bounds.py"
 _HSV, _OCCUPANCY, _RELU = "methods/nerf/hsv.py", "methods/nerf/occupancy.py", "methods/nerf/relu_kernel.py"
 _LAYER = "methods/nerf/layer_kernel.py"
 _PLANES, _STRIPS = "methods/nerf/planes.py", "methods/nerf/strips.py"
-_SAMPLES = "methods/nerf/samples.py"
+_SAMPLES, _PATHS = "methods/nerf/samples.py", "methods/nerf/paths.py"
+_PENCIL, _DIVISION, _OUTPUTS = "methods/nerf/pencil.py", "methods/nerf/division.py", "methods/nerf/outputs.py"
 _PARTS = "test_nerf_certify.py::test_planes_lie_beyond_every_part_exactly"
 _FIELDS = "test_nerf_zonotope.py::test_fields_are_enclosed"
 _LAYERS = "test_nerf_zonotope.py::test_linear_layers_are_enclosed"
@@ -154,13 +155,13 @@ FIELDS = (
     ),
     Fault(
         "fields: what is left of a dim cell is its polynomial's alone",
-        _BOUNDS, "greatest", "value.radius + CHEBYSHEV_ROUNDING * (middle.abs() + spread)",
+        _OUTPUTS, "greatest", "value.radius + CHEBYSHEV_ROUNDING * (middle.abs() + spread)",
         "CHEBYSHEV_ROUNDING * (middle.abs() + spread)",
         "test_nerf_zonotope.py::test_greatest_values_on_whole_cells",
     ),
     Fault(
         "fields: rounding of a dim cell's sum is not charged",
-        _BOUNDS, "greatest", "CHEBYSHEV_ROUNDING * (middle.abs() + spread)", "0.0",
+        _OUTPUTS, "greatest", "CHEBYSHEV_ROUNDING * (middle.abs() + spread)", "0.0",
         "test_nerf_zonotope.py::test_greatest_values_on_whole_cells",
     ),
     Fault(
@@ -184,26 +185,26 @@ FIELDS = (
     ),
     Fault(
         "opacity: an upper bound is rounded down",
-        _BOUNDS, "opacity", "-torch.expm1(-length * density) * (1.0 + 2.0**-46) + 2.0**-1000",
-        "-torch.expm1(-length * density) * (1.0 - 2.0**-40) + 2.0**-1000", _OPACITY,
+        _OUTPUTS, "opacity", "found * (1.0 + 2.0**-46) + 2.0**-1000",
+        "found * (1.0 - 2.0**-40) + 2.0**-1000", _OPACITY,
     ),
     Fault(
         "opacity: torch's threshold of softplus is forgotten",
-        _BOUNDS, "opacity", "z > 19.0", "z > 1e9", _OPACITY,
+        _OUTPUTS, "density", "z > 19.0", "z > 1e9", _OPACITY,
     ),
     Fault(
         "rays: the error of the pose is not charged to the direction",
-        _BOUNDS, "Pencil.points", "self.origin_radius + far[:, None] * self.direction_radius[ray]",
+        _PENCIL, "Pencil.points", "self.origin_radius + far[:, None] * self.direction_radius[ray]",
         "0.0 * self.origin_radius + 0.0 * far[:, None] * self.direction_radius[ray]",
         "test_nerf_frame.py::test_rays_of_wide_sets_lie_in_their_polynomials",
     ),
     Fault(
         "rays: ranges on a part forget half of its width",
-        _BOUNDS, "Pencil.ranges", "0.5 * (high - low)", "0.25 * (high - low)", _POINTS,
+        _PENCIL, "Pencil.ranges", "0.5 * (high - low)", "0.25 * (high - low)", _POINTS,
     ),
     Fault(
         "rays: parts of a cell change places",
-        _BOUNDS, "Division.members", "range(1, 2 * self.dimensions, 2)", "range(2 * self.dimensions - 1, 0, -2)",
+        _DIVISION, "Division.members", "range(1, 2 * self.dimensions, 2)", "range(2 * self.dimensions - 1, 0, -2)",
         "test_nerf_frame.py::test_divisions_are_nested_covers",
     ),
     Fault(
@@ -222,9 +223,7 @@ FIELDS = (
     ),
     Fault(
         "bounds of parts: the network's own error is left out",
-        _BOUNDS, "_parts",
-        "(error + CHEBYSHEV_ROUNDING * (value.poly.abs().sum(dim=1) * bernstein.abs().amax()))[:, None]",
-        "(0.0 * error)[:, None]", _STIFF, True,
+        _OUTPUTS, "bounds_by_part", "rounding + error[:, None]", "rounding", _STIFF, True,
     ),
     Fault(
         "known bounds: what is no number replaces what is known",
@@ -295,14 +294,52 @@ FIELDS = (
         "test_nerf_hierarchical.py::test_edges_of_samples_are_enclosed[known]",
     ),
     Fault(
-        "samples: the last middle is looked for where it lies at least",
-        _SAMPLES, "composite", "far = 0.5 * (edges_high[r, last] + edges_high[r, last + 1])",
-        "far = 0.5 * (edges_low[r, last] + edges_low[r, last + 1])",
+        "samples: a middle is looked for where it lies at least",
+        _SAMPLES, "hulls", "far = 0.5 * (edges_high[r, i] + edges_high[r, i + 1])",
+        "far = 0.5 * (edges_low[r, i] + edges_low[r, i + 1])",
         "test_nerf_hierarchical.py::test_sampled_parts_are_enclosed[0.003]",
     ),
     Fault(
         "samples: an interval that may lie over a segment is forgotten",
         _SAMPLES, "composite", "edges_high[r, first] > ends[k]", "edges_low[r, first] > ends[k]",
         "test_nerf_hierarchical.py::test_segments_take_every_interval_that_may_lie_over_them",
+    ),
+    Fault(
+        "followed samples: a part's own motion is not in the rest",
+        _PATHS, "Lines.around", "(low - along).min(axis=1) - room", "(low - along).min(axis=1)",
+        "test_nerf_paths.py::test_lines_hold_the_places_of_every_part[False-counts2]",
+    ),
+    Fault(
+        "followed samples: what is negligible costs nothing",
+        _PATHS, "Samples.composite", "self.price.reshape(rows, 1) * (1.0 + 2.0**-40)",
+        "0.0 * self.price.reshape(rows, 1)",
+        "test_nerf_paths.py::test_what_is_negligible_is_charged",
+    ),
+    Fault(
+        "followed samples: parts of a cell change places",
+        _PATHS, "Following._bound", "places // finer", "(np.array(inner) - 1 - places) // finer",
+        "test_nerf_paths.py::test_parts_hold_their_renders[yaw]",
+    ),
+    Fault(
+        "followed samples: the coarse pass is known better than it is",
+        _PATHS, "Paths.edges", "np.where(good, most, 1.0)", "np.where(good, least, 1.0)",
+        "test_nerf_paths.py::test_samples_are_where_and_what_they_are_said_to_be[soft-False]", True,
+    ),
+    Fault(
+        "followed samples: lengths end where intervals begin at least",
+        _PATHS, "Samples._batch", "self.high[k, :, i + 1] - self.low[k, :, i]",
+        "self.low[k, :, i + 1] - self.high[k, :, i]",
+        "test_nerf_paths.py::test_samples_are_where_and_what_they_are_said_to_be[soft-False]", True,
+    ),
+    Fault(
+        "followed samples: where density is declared 0 in part it is the field's",
+        _PATHS, "Samples._batch", "np.where(good & sure[:, None], least, 0.0)", "np.where(good, least, 0.0)",
+        "test_nerf_paths.py::test_samples_are_where_and_what_they_are_said_to_be[soft-True]", True,
+    ),
+    Fault(
+        "parts are regrouped inward",
+        _DIVISION, "regrouped", "-(-(np.arange(count) + 1) * size // count)",
+        "np.maximum((np.arange(count) + 1) * size // count, starts + 1)",
+        "test_nerf_paths.py::test_parts_are_regrouped_outward",
     ),
 )  # fmt: skip

@@ -9,8 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from functools import cached_property
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -18,19 +17,22 @@ from torch import Tensor
 
 from ns_abstract.arithmetic.chebyshev import ChebyshevBasis
 from ns_abstract.arithmetic.outward import outward
-from ns_abstract.arithmetic.rounding import CHEBYSHEV_ROUNDING, COMPOSITE_ROUNDING, UNIT64
-from ns_abstract.arithmetic.taylor import TaylorArray
+from ns_abstract.arithmetic.rounding import COMPOSITE_ROUNDING, UNIT64
 from ns_abstract.execution.ending import checkpoint
 from ns_abstract.geometry.box import ParameterBox
 from ns_abstract.geometry.poses import PoseSet
+from ns_abstract.methods.nerf.division import ENDS, Division, divided, regrouped
 from ns_abstract.methods.nerf.hsv import Range, shifted_bounds
-from ns_abstract.methods.nerf.render import Sampling, camera_rays
-from ns_abstract.methods.nerf.samples import composite, edge_bounds
+from ns_abstract.methods.nerf.outputs import bounds_by_part, brightness, greatest, opacity
+from ns_abstract.methods.nerf.paths import Following, Paths
+from ns_abstract.methods.nerf.pencil import Pencil
+from ns_abstract.methods.nerf.render import Sampling
+from ns_abstract.methods.nerf.samples import composite, hulls
 from ns_abstract.methods.nerf.scene import FieldWeights, NerfScene
 from ns_abstract.methods.nerf.zonotope import ERROR_TERMS, Affine, FieldBounds, Pieces
 
 #: (degree, grid) of the polynomials by number of parameters.
-_DEGREES = {0: (1, 2), 1: (28, 112), 2: (6, 20), 3: (4, 10)}
+_DEGREES = {0: (1, 2), 1: (28, 112), 2: (6, 20), 3: (4, 10), 4: (2, 5)}
 #: The same of one parameter for a field whose base has at most so many layers: it bears cells as wide as its waves are
 #: followed, while deeper ones bend more.
 _SHALLOW, _SHALLOW_DEGREE = 4, (35, 126)
@@ -66,6 +68,14 @@ _COARSE = 0.1
 _SHARE = 0.125
 #: Rounds of halving where the colours' bounds are too wide.
 _ROUNDS = 32
+#: Half the way of a sample over a cell to begin with; of one that is followed, whose place the coarse pass moves, too.
+_DISPLACEMENT, _FOLLOWED = 0.02, 5e-4
+#: Halvings below first cells by axis, and of the deepest cells into parts, where samples are followed.
+_FOLLOWED_DEEPER = 3
+_FOLLOWED_FINER, _FOLLOWED_FINER_MORE = {1: 2, 2: 2}, 1
+#: Rays that are left so open are bounded by bins, too, with a tolerance that is so many times as large: bounds by bins
+#: are loose anyhow.
+_LOOSE, _SWEPT = 0.5, 8.0
 #: Numbers (rays, samples, parts) that are worked on together.
 _NUMBERS = 1 << 21
 #: Light from a sample whose colour's shift is not looked at.
@@ -96,85 +106,6 @@ def device_bytes(field: FieldWeights, basis: ChebyshevBasis) -> int:
     return 8 * (_ARRAYS * _VALUES + columns) + (1 << 29)
 
 
-@dataclass(frozen=True)
-class Division:
-    """Nested equal cells of a box, and the parts that results are kept for.
-
-    A line has levels of 3, 6, 12, ... cells between those of 2, 4, 8, ...: cells are then nearer to the width that
-    the network's bounds bear.
-
-    Attributes:
-        axes: Axis that is halved from each level to the next; of a line, to that with twice as many cells.
-        dimensions: Of the box.
-        finer: Halvings of the deepest level's cells into parts, by axis.
-    """
-
-    axes: tuple[int, ...]
-    dimensions: int
-    finer: int = 0
-
-    @cached_property
-    def _levels(self) -> list[tuple[int, ...]]:
-        """Cells by axis of every level."""
-        halved = len(self.axes)
-        found = [tuple(1 << self.axes[:level].count(j) for j in range(self.dimensions)) for level in range(halved + 1)]
-        if self.dimensions == 1:
-            found += [(3 << k,) for k in range(halved - 1)]
-        return sorted(found, key=math.prod)
-
-    @property
-    def levels(self) -> int:
-        """The deepest level."""
-        return len(self._levels) - 1
-
-    def counts(self, level: int) -> tuple[int, ...]:
-        """Cells by axis of a level."""
-        return self._levels[level]
-
-    @cached_property
-    def below(self) -> tuple[int, ...]:
-        """The level that halves the cells of each level, or -1."""
-        level_of = {math.prod(counts): level for level, counts in enumerate(self._levels)}
-        return tuple(level_of.get(2 * cells, -1) for cells in level_of)
-
-    @cached_property
-    def parts(self) -> tuple[int, ...]:
-        """Parts by axis of the whole box."""
-        # cells of halves and of thirds are made of the same parts
-        finer = (3 if self.dimensions == 1 else 1) << self.finer
-        return tuple(finer * n for n in self.counts(self.levels))
-
-    def inner(self, level: int) -> tuple[int, ...]:
-        """Parts by axis of one cell of a level."""
-        return tuple(p // c for p, c in zip(self.parts, self.counts(level), strict=True))
-
-    def boxes(self, level: int) -> tuple[np.ndarray, np.ndarray]:
-        """[cells, d] lower and upper ends in [-1, 1]."""
-        counts = np.array(self.counts(level), np.int64)
-        found = list(np.ndindex(*counts.tolist()))
-        places = np.array(found, np.float64).reshape(len(found), self.dimensions)
-        return 2.0 * places / counts - 1.0, 2.0 * (places + 1.0) / counts - 1.0
-
-    def members(self, level: int) -> np.ndarray:
-        """[cells, parts of a cell] flat numbers of the parts of every cell."""
-        counts, inner = self.counts(level), self.inner(level)
-        whole = np.arange(math.prod(self.parts)).reshape([n for pair in zip(counts, inner, strict=True) for n in pair])
-        order = [*range(0, 2 * self.dimensions, 2), *range(1, 2 * self.dimensions, 2)]
-        return whole.transpose(order).reshape(math.prod(counts), math.prod(inner))
-
-    def children(self, level: int, cells: np.ndarray) -> np.ndarray:
-        """[2 n] cells of the level `below` inside ``cells`` [n]."""
-        counts, halves = self.counts(level), self.counts(self.below[level])
-        axis = int(np.argmax(np.array(halves) > counts))
-        places = np.array(np.unravel_index(cells, counts)).reshape(self.dimensions, -1)
-        found = []
-        for half in (0, 1):
-            inside = places.copy()
-            inside[axis] = 2 * inside[axis] + half
-            found.append(np.ravel_multi_index(tuple(inside), halves))
-        return np.concatenate(found)
-
-
 @dataclass
 class RayBounds:
     """What is known of n rays over a box.
@@ -194,6 +125,25 @@ class RayBounds:
     cells: int
     displacement: float
     parts: np.ndarray | None = None
+
+
+@dataclass(frozen=True)
+class _Asked:
+    """What `NerfBounds.rays` is asked for."""
+
+    pose_set: PoseSet
+    box: ParameterBox
+    pixels: np.ndarray
+    tolerance: float
+    known: np.ndarray | None
+    aim: tuple[np.ndarray, np.ndarray] | None
+    shifts: list[Shifts]
+
+    def take(self, which: np.ndarray) -> _Asked:
+        """Some of the rays."""
+        known = None if self.known is None else self.known[which]
+        aim = None if self.aim is None else (self.aim[0][which], self.aim[1][which])
+        return replace(self, pixels=self.pixels[which], known=known, aim=aim)
 
 
 @dataclass
@@ -216,83 +166,13 @@ def join_items(parts: list[_Items]) -> _Items:
     return _Items(*(np.concatenate([getattr(p, name) for p in parts]) for name in ("ray", "sample", "cell")))
 
 
-class Pencil:
-    """The rays of some pixels over one box of poses, as polynomials of the pose (design.md, F10).
-
-    Args:
-        pose_set, box: The poses.
-        pixels: [n, 2] rows and columns.
-        degree: Of the Taylor models.
-        swept: Whether samples lie anywhere in their bins; the last parameter is the place there.
-    """
-
-    def __init__(
-        self, pose_set: PoseSet, box: ParameterBox, pixels: np.ndarray, degree: int, swept: bool = False
-    ) -> None:
-        rotation, position = pose_set.taylor(box, degree)
-        in_camera = camera_rays(pose_set.camera, pixels)
-        world = (rotation[None, :, :] * TaylorArray.constant(rotation.basis, in_camera)[:, None, :]).sum(2)
-        # pixel rays and their rotation are rounded, and so is the concrete renderer's normalisation
-        world = world.widened(16.0 * UNIT64 * np.abs(in_camera).sum(axis=1)[:, None])
-        length = (world * world).sum(1)
-        direction = world * length.rsqrt()[:, None]
-        exponents = rotation.basis.exponents
-        self.exponents = np.array(exponents, np.int64).reshape(len(exponents), box.dimensions)
-        self.origin, self.origin_radius = position.coefficients, position.radius
-        self.direction = np.ascontiguousarray(direction.coefficients.transpose(1, 0, 2))  # [n, M, 3]
-        self.direction_radius = direction.radius + 16.0 * UNIT64
-        self.swept = swept
-        if swept:
-            # the place within a bin is one more parameter: (o + t d) + (h d) tau
-            place = np.repeat([0, 1], len(exponents))[:, None]
-            self.exponents = np.concatenate([np.tile(self.exponents, (2, 1)), place], axis=1)
-            self.origin = np.concatenate([self.origin, np.zeros_like(self.origin)])
-            self.along = np.concatenate([np.zeros_like(self.direction), self.direction], axis=1)
-            self.direction = np.concatenate([self.direction, np.zeros_like(self.direction)], axis=1)
-
-    def points(self, ray: np.ndarray, distance: np.ndarray, half: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Polynomials [k, M, 3] and radii [k, 3] of points at ``distance`` [k] on ``ray`` [k], ``half`` [k] swept."""
-        lines = self.origin + distance[:, None, None] * self.direction[ray]
-        far = distance
-        if self.swept:
-            lines = lines + half[:, None, None] * self.along[ray]
-            far = distance + half
-        radius = self.origin_radius + far[:, None] * self.direction_radius[ray]
-        # rounding of the polynomial's evaluation, and of the concrete renderer's point and distance
-        size = np.abs(self.origin).sum(axis=0) + far[:, None] * np.abs(self.direction[ray]).sum(axis=1)
-        return lines, radius + 64.0 * UNIT64 * size
-
-    def ranges(
-        self, lines: np.ndarray, radius: np.ndarray, low: np.ndarray, high: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Bounds [k, 3] of the ``points`` (lines, radius) on boxes from ``low`` to ``high`` [k, d] in [-1, 1]."""
-        middle, half = 0.5 * (low + high), 0.5 * (high - low)
-        there = np.prod(middle[:, None, :] ** self.exponents, axis=-1)
-        center = (there[..., None] * lines).sum(axis=1)
-        size = np.abs(lines)
-        # on [-1, 1]^d no derivative of a monomial exceeds its exponent
-        slope = (half @ self.exponents.T)[..., None]
-        spread = (slope * size).sum(axis=1) + radius + 64.0 * UNIT64 * size.sum(axis=1)
-        return center - spread, center + spread
-
-    def displacement(self, distances: np.ndarray, lengths: np.ndarray) -> np.ndarray:
-        """[n, samples, d] half of what a sample moves by over each parameter's range, about."""
-        found = np.zeros((self.direction.shape[0], distances.size, self.exponents.shape[1]))
-        for j in range(self.exponents.shape[1]):
-            moving = self.exponents[:, j] > 0
-            steps = self.origin[moving] + distances[:, None, None] * self.direction[:, None, moving]
-            found[..., j] = np.linalg.norm(np.abs(steps).sum(axis=2), axis=-1)
-        if self.swept:
-            found[..., -1] = 0.5 * lengths
-        return found
-
-
 class NerfBounds:
     """Bounds of a scene's rays.
 
     Args:
         scene: The scene.
-        sampling: Uniform, or hierarchical: bounded wherever the fine field may be sampled (design.md, F10, F14).
+        sampling: Uniform, or hierarchical: bounded where the coarse pass puts samples (design.md, F16), or wherever
+            they may be (F10, F14).
         dimensions: Number of parameters.
         device: Where the network is bounded.
         compiled: Whether by kernels compiled for a processor; None: where ``device`` is one.
@@ -314,18 +194,17 @@ class NerfBounds:
         self.batch = _BATCH if self.field.compiled else cells_at_once(scene.fine, self.basis)
         edges = sampling.edges
         self.occupancy = scene.occupancy
-        #: Of the coarse pass, by pose alone.
-        self.coarse = None
+        #: Samples that the coarse pass places.
+        self.paths = None
         if self.swept:
-            self.coarse = FieldBounds(
-                scene.coarse, basis_of(dimensions, scene.coarse), device=device, compiled=compiled
-            )
+            coarse = FieldBounds(scene.coarse, basis_of(dimensions, scene.coarse), device=device, compiled=compiled)
+            self.paths = Paths(coarse, self.field, sampling, scene.occupancy, self.batch)
         self.distances = 0.5 * (edges[1:] + edges[:-1])
         self.lengths = edges[1:] - edges[:-1]
         self.taylor = min(_TAYLOR, max(1, self.basis.degree))
         self._bernstein: dict[tuple[int, ...], Tensor] = {}
         #: Where to begin to look for `RayBounds.displacement`.
-        self.displacement = 0.02
+        self.displacement = _DISPLACEMENT if self.paths is None else _FOLLOWED
 
     def rays(
         self,
@@ -349,24 +228,74 @@ class NerfBounds:
             shifts: Intervals of hue and saturation that are added to all colours; bounds hold over all of them.
             division: The cells, in place of those that suit the rays; bounds are then kept by part.
         """
-        n, samples, given_division = len(pixels), self.distances.size, division
-        pencil = Pencil(pose_set, box, pixels, self.taylor, self.swept)
+        asked = _Asked(pose_set, box, pixels, tolerance, known, aim, shifts or [])
+        if self.paths is None:
+            return self._apart(asked, division, division is not None, self.displacement)
+        found = self._followed(self.paths, asked, division)
+        loose = np.flatnonzero((found.upper - found.lower).max(axis=1) > _LOOSE)
+        if not loose.size:
+            return found
+        # samples anywhere in their bins
+        bins = self._apart(asked.take(loose), None, division is not None, _DISPLACEMENT)
+        found.lower[loose] = np.maximum(found.lower[loose], bins.lower)
+        found.upper[loose] = np.minimum(found.upper[loose], bins.upper)
+        found.alpha[loose] = bins.alpha
+        if found.parts is not None and bins.parts is not None:
+            low, high = (regrouped(*side, found.parts.shape[3:-1]) for side in zip(bins.parts, ENDS, strict=True))
+            found.parts[0][loose] = np.maximum(found.parts[0][loose], low)
+            found.parts[1][loose] = np.minimum(found.parts[1][loose], high)
+        found.cells += bins.cells
+        return found
+
+    def _nothing(self, asked: _Asked, parts: tuple[int, ...] | None) -> RayBounds:
+        """What holds of any rays; also by ``parts``, if there are any."""
+        n = len(asked.pixels)
+        found = np.zeros((n, 3)), np.ones((n, 3)), np.ones((n, self.distances.size), np.float32), 0, self.displacement
+        if parts is None:
+            return RayBounds(*found)
+        low = np.zeros((n, max(1, len(asked.shifts)), *parts, 3), np.float32)
+        return RayBounds(*found, np.stack([low, np.ones_like(low)]))
+
+    def _followed(self, paths: Paths, asked: _Asked, given: Division | None) -> RayBounds:
+        """Bounds from samples that are followed; [0, 1] where the box is too wide for that."""
+        pencil = Pencil(asked.pose_set, asked.box, asked.pixels, paths.degree)
         moves = pencil.displacement(self.distances, self.lengths)
+        division = self.division(moves) if given is None else given
+        parts = None if given is None else given.parts
+        if division is None or not pencil.finite:
+            return self._nothing(asked, parts)
+        start = np.zeros(len(moves), np.int64)
+        for level in range(division.levels):
+            wide = (moves / np.array(division.counts(level), np.float64)).sum(axis=2).max(axis=1, initial=0.0)
+            start[(start == level) & (wide > self.displacement)] = level + 1
+        work = Following(paths, pencil, division, start, asked.tolerance, asked.aim, asked.shifts)
+        work.run()
+        n, shifts = len(moves), work.lower.shape[2]
+        # [n, shifts, *parts, 3]
+        low, high = (np.moveaxis(end, 2, 1).reshape(n, shifts, *division.parts, 3) for end in (work.lower, work.upper))
+        return RayBounds(
+            work.lower.min(axis=(1, 2)), work.upper.max(axis=(1, 2)),
+            np.ones((n, self.distances.size), np.float32), work.cells, self.displacement * work.factor,
+            None if given is None else np.stack(outward(low, high)),
+        )  # fmt: skip
+
+    def _apart(self, asked: _Asked, given: Division | None, by_part: bool, displacement: float) -> RayBounds:
+        """Bounds from cells of every sample, or of the bins that samples lie in."""
+        n, samples, box = len(asked.pixels), self.distances.size, asked.box
+        pencil = Pencil(asked.pose_set, box, asked.pixels, self.taylor, self.swept)
+        moves = pencil.displacement(self.distances, self.lengths)
+        division = given
         if division is None:
-            division = self.division(moves)
-        if division is None or not (np.isfinite(pencil.direction).all() and np.isfinite(pencil.direction_radius).all()):
-            nothing = np.zeros((n, 3)), np.ones((n, 3)), np.ones((n, samples), np.float32)
-            if given_division is None:
-                return RayBounds(*nothing, 0, self.displacement)
-            parts = given_division.parts[: box.dimensions]
-            low = np.zeros((n, max(1, len(shifts or [])), *parts, 3), np.float32)
-            return RayBounds(*nothing, 0, self.displacement, np.stack([low, np.ones_like(low)]))
+            d = moves.shape[2]
+            division = divided(moves, displacement, _PARTS, _DEEPER.get(d, _DEEPER_MORE), _FINER.get(d, 0), self.swept)
+        if division is None or not pencil.finite:
+            parts = (1,) * box.dimensions if division is None else division.parts[: box.dimensions]
+            return self._nothing(asked, parts if by_part else None)
         if n > 1 and n * samples * math.prod(division.parts) > _NUMBERS:
-            halves = []
-            for which in (slice(0, n // 2), slice(n // 2, n)):
-                part = None if aim is None else (aim[0][which], aim[1][which])
-                given = None if known is None else known[which]
-                halves.append(self.rays(pose_set, box, pixels[which], tolerance, given, part, shifts, given_division))
+            halves = [
+                self._apart(asked.take(which), given, by_part, displacement)
+                for which in (np.arange(n // 2), np.arange(n // 2, n))
+            ]
             lower, upper, alpha = (
                 np.concatenate([getattr(half, name) for half in halves]) for name in ("lower", "upper", "alpha")
             )
@@ -376,35 +305,19 @@ class NerfBounds:
                 np.concatenate(parts, axis=1) if parts else None,
             )  # fmt: skip
         edges = None
-        if self.coarse is not None:
-            edges = self._edges(self.coarse, Pencil(pose_set, box, pixels, self.taylor), division)
-        work = _Work(self, pencil, division, moves, tolerance, known, aim, edges)
-        return work.run(shifts or [], given_division is not None)
+        if self.paths is not None:
+            edges = self._edges(self.paths, Pencil(asked.pose_set, box, asked.pixels, self.taylor), division)
+        work = _Work(self, pencil, division, moves, asked, displacement, edges)
+        return work.run(asked.shifts, by_part)
 
-    def _edges(self, coarse: FieldBounds, pencil: Pencil, division: Division) -> tuple[np.ndarray, np.ndarray]:
+    def _edges(self, paths: Paths, pencil: Pencil, division: Division) -> tuple[np.ndarray, np.ndarray]:
         """Bounds [n parts, .] of the fine samples' edges by parts of the poses (design.md, F14)."""
-        n, samples, parts = len(pencil.direction), self.distances.size, division.parts[:-1]
-        low, high = np.zeros((n, samples, math.prod(parts))), np.ones((n, samples, math.prod(parts)))
-        basis = coarse.basis
-        monomials = torch.from_numpy(np.prod(basis.nodes[:, None, :] ** pencil.exponents, axis=-1)).to(self.device)
-        bernstein = torch.from_numpy(basis.bernstein(parts)).to(self.device)
-        rays, places = (a.ravel() for a in np.mgrid[:n, :samples])
-        for first in range(0, rays.size, self.batch):
-            checkpoint()
-            ray, place = rays[first : first + self.batch], places[first : first + self.batch]
-            lines, radius = pencil.points(ray, self.distances[place], 0.0 * self.distances[place])
-            nodes = monomials @ torch.from_numpy(lines).to(self.device)
-            encoded = coarse.encode(nodes, torch.from_numpy(radius).to(self.device), coarse.position)
-            _, z = coarse.base(*encoded)
-            ends = _parts(z, bernstein)
-            length = torch.from_numpy(self.lengths[place]).to(self.device)[:, None]
-            alpha = [opacity(ends[up][..., 0], length, up=bool(up)).cpu().numpy() for up in (0, 1)]
-            good = ~z.failed.cpu().numpy()[:, None] & (alpha[0] <= alpha[1])
-            # density is 0 where it is declared
-            low[ray, place] = np.where(good & (self.occupancy is None), alpha[0], 0.0)
-            high[ray, place] = np.where(good, alpha[1], 1.0)
-        low, high = (np.moveaxis(a, 1, 2).reshape(-1, samples) for a in (low, high))
-        return edge_bounds(low, high, self.sampling)
+        monomials = np.prod(paths.coarse.basis.nodes[:, None, :] ** pencil.exponents, axis=-1)
+        origin, direction = monomials @ pencil.origin, monomials @ pencil.direction
+        low, high = paths.edges(
+            np.broadcast_to(origin, direction.shape), direction, pencil.rounded, division.parts[:-1]
+        )
+        return low.reshape(-1, low.shape[2]), high.reshape(-1, high.shape[2])
 
     def bernstein(self, parts: tuple[int, ...]) -> Tensor:
         """`ChebyshevBasis.bernstein` of the field's basis, kept."""
@@ -413,34 +326,13 @@ class NerfBounds:
         return self._bernstein[parts]
 
     def division(self, moves: np.ndarray, most: int = _PARTS, deeper: int | None = None) -> Division | None:
-        """Levels for samples that move by ``moves`` [n, samples, d]; the last ``deeper`` are for refinement.
-
-        None where that would be more than ``most`` parts and narrower boxes would need fewer.
-        """
+        """`divided` for samples that move by ``moves`` [n, samples, d], as wide as the network's bounds bear."""
         d = moves.shape[2]
-        if d == 0:
-            return Division((), 0)
-        widest = moves.reshape(-1, d).max(axis=0)
-        if not np.isfinite(widest).all():
-            return None
-        deeper = _DEEPER.get(d, _DEEPER_MORE) if deeper is None else deeper
-        finer = _FINER.get(d, 0)
-        levels = (most // 3 if d == 1 else most).bit_length() - 1 - deeper - d * finer
-        axes: list[int] = []
-        while widest.sum() > self.displacement:
-            if len(axes) >= levels:
-                # a sample's own interval is as wide in any box
-                if widest[: d - self.swept].sum() > self.displacement:
-                    return None
-                break
-            axis = int(np.argmax(widest))
-            axes.append(axis)
-            widest[axis] *= 0.5
-        for _ in range(deeper):
-            axis = int(np.argmax(widest))
-            axes.append(axis)
-            widest[axis] *= 0.5
-        return Division(tuple(axes), d, finer)
+        if self.paths is None:
+            usual, finer = _DEEPER.get(d, _DEEPER_MORE), _FINER.get(d, 0)
+        else:
+            usual, finer = _FOLLOWED_DEEPER * d, _FOLLOWED_FINER.get(d, _FOLLOWED_FINER_MORE)
+        return divided(moves, self.displacement, most, usual if deeper is None else deeper, finer)
 
 
 def typical_displacement(parts: Sequence[RayBounds]) -> float:
@@ -457,13 +349,13 @@ class _Work:
         pencil: Pencil,
         division: Division,
         moves: np.ndarray,
-        tolerance: float,
-        known: np.ndarray | None,
-        aim: tuple[np.ndarray, np.ndarray] | None,
+        asked: _Asked,
+        displacement: float,
         edges: tuple[np.ndarray, np.ndarray] | None = None,
     ) -> None:
-        self.edges = edges
-        self.owner, self.pencil, self.division, self.tolerance, self.aim = owner, pencil, division, tolerance, aim
+        self.edges, known = edges, asked.known
+        self.owner, self.pencil, self.division = owner, pencil, division
+        self.tolerance, self.aim = asked.tolerance * (_SWEPT if owner.swept else 1.0), asked.aim
         self.basis, self.field = owner.basis, owner.field
         n, samples = moves.shape[:2]
         parts = math.prod(division.parts)
@@ -474,18 +366,18 @@ class _Work:
         self.level = np.full((samples, n, parts), -1, np.int8)
         # light that reaches a sample, and what all samples so far let through
         self.before, self.light = np.ones((samples, n, parts), np.float32), np.ones((n, parts))
-        self.cells, self.displacement = 0, owner.displacement
+        self.cells, self.displacement = 0, displacement
         # cells of samples that were the first, those of them that were too wide, and whether the box is not narrow
         self.tried, self.lost, self.wide = 0, 0, False
         inverse = [1.0 / np.array(division.counts(level), np.float64) for level in range(division.levels + 1)]
         # the first level whose cells are narrow enough for the sample
-        displacement = [moves @ row for row in inverse]
+        moved = [moves @ row for row in inverse]
         self.start = np.zeros((n, samples), np.int64)
         for level in range(division.levels):
-            self.start[(self.start == level) & (displacement[level] > owner.displacement)] = level + 1
+            self.start[(self.start == level) & (moved[level] > displacement)] = level + 1
         self.quiet = np.zeros((n, samples), bool)
         if known is not None:
-            self.quiet = known <= _QUIET * tolerance
+            self.quiet = known <= _QUIET * self.tolerance
             for i, k in np.argwhere(self.quiet):
                 self.alpha_high[k, i] = known[i, k]
         self._levels: dict[int, tuple[Tensor, Tensor, np.ndarray]] = {}
@@ -733,7 +625,7 @@ class _Work:
         if not seen.size:
             return halve, lost
         items, sure, density = items.take(seen), sure[seen], density.without_columns(torch.from_numpy(seen).to(device))
-        low, high, error = _parts(density, bernstein)
+        low, high, error = bounds_by_part(density, bernstein)
         length = torch.from_numpy(self.owner.lengths[items.sample]).to(device)[:, None]
         alpha_low, alpha_high = opacity(low[..., 0], length, up=False), opacity(high[..., 0], length, up=True)
         bad = density.failed[:, None]
@@ -782,12 +674,9 @@ class _Work:
         radius = self.pencil.direction_radius[items.ray] + 96.0 * UNIT64
         encoded = field.encode(direction, torch.from_numpy(radius).to(device), field.direction)
         color = field.color(pieces, *encoded)
-        low, high, error = _parts(color, bernstein)
-        bad = color.failed[:, None, None]
-        low = torch.where(bad, 0.0, torch.sigmoid(low) * (1.0 - COMPOSITE_ROUNDING)).cpu().numpy()
-        high = torch.where(bad, 1.0, (torch.sigmoid(high) * (1.0 + COMPOSITE_ROUNDING)).clamp(max=1.0)).cpu().numpy()
+        low, high, error = brightness(color, bernstein)
         where = self._rows(level, items)
-        self._keep(self.color_low, self.color_high, where, low, high)
+        self._keep(self.color_low, self.color_high, where, low.cpu().numpy(), high.cpu().numpy())
         slack = 2.0 * torch.tanh(0.25 * error.amax(dim=1))
         slack = torch.where(color.failed, 1.0, slack).cpu().numpy()
         self.vague[where] = np.minimum(self.vague[where], slack[:, None])
@@ -838,16 +727,21 @@ class _Work:
         dim = weight <= self._negligible
         # what is negligible takes the colour of what is not, at the price of its weight
         price = along(np.where(dim, weight, 0.0)).reshape(rows, samples, inner).max(axis=2).sum(axis=1)
-        color_low = along(np.where(dim[..., None], np.inf, self.color_low))
-        color_high = along(np.where(dim[..., None], -np.inf, self.color_high))
+        colors = np.stack([
+            along(np.where(dim[..., None], np.inf, self.color_low)),
+            along(np.where(dim[..., None], -np.inf, self.color_high)),
+        ])  # fmt: skip
+        count = edges_low.shape[1] - 1
+        density, color = np.empty((2, rows, count)), np.empty((2, rows, count, 3))
+        near, far = owner.sampling.near, owner.sampling.far
+        hulls(
+            edges_low, edges_high, near, (far - near) / (samples * inner),
+            np.stack([along(density_low), along(density_high)]), colors, density, color,
+        )  # fmt: skip
         low = np.tile(np.array(owner.sampling.background, np.float64), (rows, 1))
         high = low.copy()
-        near, far = owner.sampling.near, owner.sampling.far
-        composite(
-            edges_low, edges_high, near, (far - near) / (samples * inner), along(density_low), along(density_high),
-            color_low, color_high, low, high,
-        )  # fmt: skip
-        slack = 4.0 * COMPOSITE_ROUNDING * (2 * edges_low.shape[1] + 5) + (price * (1.0 + 2.0**-20))[:, None]
+        composite(edges_low, edges_high, density, color, low, high)
+        slack = 4.0 * COMPOSITE_ROUNDING * (2 * count + 7) + (price * (1.0 + 2.0**-20))[:, None]
         ends = np.clip(low - slack, 0.0, 1.0), np.clip(high + slack, 0.0, 1.0)
         low, high = (np.repeat(end.reshape(n, rows // n, 3), inner, axis=1) for end in ends)
         return low, high
@@ -865,37 +759,3 @@ class _Work:
         slack = 4.0 * COMPOSITE_ROUNDING * (self.alpha_low.shape[0] + self.owner.sampling.importance + 5)
         low, high = low - rest - slack, high + rest + slack
         return np.clip(low, 0.0, 1.0), np.clip(high, 0.0, 1.0)
-
-
-def greatest(value: Affine) -> Tensor:
-    """Upper bounds [B, n] of an affine batch on whole cells."""
-    middle, spread = value.poly[:, 0], value.poly[:, 1:].abs().sum(dim=1)
-    return middle + spread + (value.radius + CHEBYSHEV_ROUNDING * (middle.abs() + spread))
-
-
-def _parts(value: Affine, bernstein: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Bounds [B, parts, n] of an affine batch on every part of its cell, and its radius [B, n]."""
-    error = value.radius
-    (batch, m, n), (parts, k, _) = value.poly.shape, bernstein.shape
-    # pieces and outputs side by side
-    controls = (bernstein.reshape(parts * k, m) @ value.poly.transpose(0, 1).reshape(m, batch * n)).view(parts, k, -1)
-    least, most = (ends.view(parts, batch, n).transpose(0, 1) for ends in (controls.amin(dim=1), controls.amax(dim=1)))
-    # on parts that are nearly the whole cell, Bernstein coefficients of high degrees are far from the values
-    spread = value.poly[:, 1:].abs().sum(dim=1)[:, None]
-    middle = value.poly[:, :1]
-    low = torch.maximum(least, middle - spread)
-    high = torch.minimum(most, middle + spread)
-    slack = (error + CHEBYSHEV_ROUNDING * (value.poly.abs().sum(dim=1) * bernstein.abs().amax()))[:, None]
-    return low - slack, high + slack, error
-
-
-def opacity(z: Tensor, length: Tensor, *, up: bool) -> Tensor:
-    """A bound of ``1 - exp(-length softplus(z))``, from above or below (design.md, F7).
-
-    torch returns z itself for the softplus of z > 20, which is less than the function by 2.1e-9.
-    """
-    if up:
-        density = (torch.clamp(z, min=0.0) + torch.log1p(torch.exp(-z.abs()))) * (1.0 + 2.0**-46)
-        return (-torch.expm1(-length * density) * (1.0 + 2.0**-46) + 2.0**-1000).clamp(max=1.0)
-    density = torch.where(z > 19.0, z, torch.clamp(z, min=0.0) + torch.log1p(torch.exp(-z.abs()))) * (1.0 - 2.0**-46)
-    return (-torch.expm1(-length * density) * (1.0 - 2.0**-46)).clamp(min=0.0)

@@ -51,17 +51,45 @@ def edge_bounds(alpha_low: np.ndarray, alpha_high: np.ndarray, sampling: Samplin
 
 
 @njit(cache=True, error_model="numpy")
-def composite(edges_low, edges_high, start, step, density_low, density_high, color_low, color_high, lower, upper):
-    """Bounds of rays' colours from where they are sampled and what the field is there (design.md, F14).
+def hulls(edges_low, edges_high, start, step, densities, colors, density, color):
+    """What the field is in the samples' middles, from what it is on parts of the rays (design.md, F14).
 
     Args:
         edges_low, edges_high: [r, S + 1] of `edge_bounds`.
         start, step: Where the first part begins, and the length of all.
-        density_low, density_high: [r, parts] densities on equal parts of the rays.
-        color_low, color_high: [r, parts, 3] colours; crossed where they do not count.
+        densities: [2, r, parts] least and largest, on equal parts of the rays.
+        colors: [2, r, parts, 3]; crossed where they do not count.
+        density, color: [2, r, S], [2, r, S, 3]; overwritten.
+    """
+    parts = densities.shape[2]
+    for r in range(edges_low.shape[0]):
+        for i in range(edges_low.shape[1] - 1):
+            near = 0.5 * (edges_low[r, i] + edges_low[r, i + 1])
+            far = 0.5 * (edges_high[r, i] + edges_high[r, i + 1])
+            begin = min(max(math.floor((near - start) / step - _PLACE), 0), parts - 1)
+            stop = min(max(math.floor((far - start) / step + _PLACE), begin), parts - 1)
+            least, most = np.inf, -np.inf
+            for k in range(begin, stop + 1):
+                least, most = min(least, densities[0, r, k]), max(most, densities[1, r, k])
+            density[0, r, i], density[1, r, i] = least, most
+            for c in range(3):
+                dark, bright = np.inf, -np.inf
+                for k in range(begin, stop + 1):
+                    dark, bright = min(dark, colors[0, r, k, c]), max(bright, colors[1, r, k, c])
+                color[0, r, i, c], color[1, r, i, c] = dark, bright
+
+
+@njit(cache=True, error_model="numpy")
+def composite(edges_low, edges_high, density, color, lower, upper):
+    """Bounds of rays' colours from where they are sampled and what the field is there (design.md, F14).
+
+    Args:
+        edges_low, edges_high: [r, S + 1] of `edge_bounds`.
+        density: [2, r, S] least and largest in the middle of the samples.
+        color: [2, r, S, 3]; crossed where it does not count.
         lower, upper: [r, 3] the background; overwritten.
     """
-    count, parts = edges_low.shape[1] - 1, density_low.shape[1]
+    count = edges_low.shape[1] - 1
     ends = np.empty(2 * count + 2)
     for r in range(edges_low.shape[0]):
         ends[: count + 1] = edges_low[r]
@@ -77,19 +105,14 @@ def composite(edges_low, edges_high, start, step, density_low, density_high, col
                 first -= 1
             while last > 0 and edges_low[r, last] >= ends[k + 1]:
                 last -= 1
-            near = 0.5 * (edges_low[r, first] + edges_low[r, first + 1])
-            far = 0.5 * (edges_high[r, last] + edges_high[r, last + 1])
-            # and the parts in which their middles may lie
-            begin = min(max(math.floor((near - start) / step - _PLACE), 0), parts - 1)
-            stop = min(max(math.floor((far - start) / step + _PLACE), begin), parts - 1)
-            least, most = density_low[r, begin], density_high[r, begin]
-            for i in range(begin + 1, stop + 1):
-                least, most = min(least, density_low[r, i]), max(most, density_high[r, i])
+            least, most = density[0, r, first], density[1, r, first]
+            for i in range(first + 1, last + 1):
+                least, most = min(least, density[0, r, i]), max(most, density[1, r, i])
             least, most = -math.expm1(-length * least), -math.expm1(-length * most)
             for c in range(3):
                 dark, bright = np.inf, -np.inf
-                for i in range(begin, stop + 1):
-                    dark, bright = min(dark, color_low[r, i, c]), max(bright, color_high[r, i, c])
+                for i in range(first, last + 1):
+                    dark, bright = min(dark, color[0, r, i, c]), max(bright, color[1, r, i, c])
                 if not dark <= bright:
                     dark, bright = 0.0, 1.0
                 rise, fall = bright - upper[r, c], dark - lower[r, c]

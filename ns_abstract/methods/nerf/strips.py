@@ -19,15 +19,15 @@ import numpy as np
 from ns_abstract.arithmetic.rounding import UNIT64
 from ns_abstract.geometry.box import ParameterBox
 from ns_abstract.geometry.poses import COLOR_SHIFTS, PoseSet
-from ns_abstract.methods.nerf.bounds import Division, NerfBounds, Pencil, RayBounds, Shifts
+from ns_abstract.methods.nerf.bounds import NerfBounds, RayBounds, Shifts
+from ns_abstract.methods.nerf.division import Division
+from ns_abstract.methods.nerf.pencil import Pencil
 from ns_abstract.methods.nerf.planes import fit_planes
 
 #: Rays that are bounded together by compiled kernels, and by torch alone, which wants many cells at a time.
 _GROUP, _GROUP_ON_DEVICE = 8, 64
 #: What an open sample may move a pixel by, by level.
 TOLERANCES = (0.02, 0.005, 0.0012, 3e-4)
-#: Times that, where samples may lie anywhere in their bins: bounds are loose there anyhow.
-_SWEPT = 8.0
 #: Strips by axis from each level to the next: with one parameter, and with more.
 _FINER_LINE, _FINER = 4, 2
 #: Most parts of a strip: with one parameter, and with more.
@@ -133,7 +133,7 @@ class Strips:
         self.bounds.displacement = displacement
         while True:
             box = self._strip(counts, [n // 2 for n in counts])
-            pencil = Pencil(self.geometry, box, pixels, self.bounds.taylor, self.bounds.swept)
+            pencil = Pencil(self.geometry, box, pixels, self.bounds.taylor)
             moves = pencil.displacement(self.bounds.distances, self.bounds.lengths)
             line = moves.shape[2] == 1
             most, deeper = (_PARTS_LINE, _DEEPER_LINE) if line else (_PARTS, None)
@@ -144,7 +144,7 @@ class Strips:
             counts[int(np.argmax(widest))] *= 2
         if division is None:
             # nothing is known then
-            counts, division = [1] * d, Division((), d + self.bounds.swept)
+            counts, division = [1] * d, Division((), d)
         return Layout(tuple(counts), division, displacement)
 
     def _strip(self, counts: Sequence[int], place: Sequence[int]) -> ParameterBox:
@@ -192,8 +192,7 @@ class Strips:
         self, strip: ParameterBox, pixels: np.ndarray, layout: Layout, level: int, known: np.ndarray | None
     ) -> tuple:
         shifts = self._shifts(level)
-        tolerance = TOLERANCES[level] * (_SWEPT if self.bounds.swept else 1.0)
-        return self.geometry, strip, pixels, tolerance, known, None, shifts, layout.division
+        return self.geometry, strip, pixels, TOLERANCES[level], known, None, shifts, layout.division
 
     def _ensure(self, level: int, place: tuple[int, ...], groups: Sequence[int]) -> list[_Kept]:
         """Bounds of ``groups`` over a strip, those that are missing worked out."""

@@ -1,0 +1,139 @@
+"""Nested equal cells of a box of poses, and the parts that results are kept for."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+
+@dataclass(frozen=True)
+class Division:
+    """Nested equal cells of a box, and the parts that results are kept for.
+
+    A line has levels of 3, 6, 12, ... cells between those of 2, 4, 8, ...: cells are then nearer to the width that
+    the network's bounds bear.
+
+    Attributes:
+        axes: Axis that is halved from each level to the next; of a line, to that with twice as many cells.
+        dimensions: Of the box.
+        finer: Halvings of the deepest level's cells into parts, by axis.
+    """
+
+    axes: tuple[int, ...]
+    dimensions: int
+    finer: int = 0
+
+    @cached_property
+    def _levels(self) -> list[tuple[int, ...]]:
+        """Cells by axis of every level."""
+        halved = len(self.axes)
+        found = [tuple(1 << self.axes[:level].count(j) for j in range(self.dimensions)) for level in range(halved + 1)]
+        if self.dimensions == 1:
+            found += [(3 << k,) for k in range(halved - 1)]
+        return sorted(found, key=math.prod)
+
+    @property
+    def levels(self) -> int:
+        """The deepest level."""
+        return len(self._levels) - 1
+
+    def counts(self, level: int) -> tuple[int, ...]:
+        """Cells by axis of a level."""
+        return self._levels[level]
+
+    @cached_property
+    def below(self) -> tuple[int, ...]:
+        """The level that halves the cells of each level, or -1."""
+        level_of = {math.prod(counts): level for level, counts in enumerate(self._levels)}
+        return tuple(level_of.get(2 * cells, -1) for cells in level_of)
+
+    @cached_property
+    def parts(self) -> tuple[int, ...]:
+        """Parts by axis of the whole box."""
+        # cells of halves and of thirds are made of the same parts
+        finer = (3 if self.dimensions == 1 else 1) << self.finer
+        return tuple(finer * n for n in self.counts(self.levels))
+
+    def inner(self, level: int) -> tuple[int, ...]:
+        """Parts by axis of one cell of a level."""
+        return tuple(p // c for p, c in zip(self.parts, self.counts(level), strict=True))
+
+    def boxes(self, level: int) -> tuple[np.ndarray, np.ndarray]:
+        """[cells, d] lower and upper ends in [-1, 1]."""
+        counts = np.array(self.counts(level), np.int64)
+        found = list(np.ndindex(*counts.tolist()))
+        places = np.array(found, np.float64).reshape(len(found), self.dimensions)
+        return 2.0 * places / counts - 1.0, 2.0 * (places + 1.0) / counts - 1.0
+
+    def members(self, level: int) -> np.ndarray:
+        """[cells, parts of a cell] flat numbers of the parts of every cell."""
+        counts, inner = self.counts(level), self.inner(level)
+        whole = np.arange(math.prod(self.parts)).reshape([n for pair in zip(counts, inner, strict=True) for n in pair])
+        order = [*range(0, 2 * self.dimensions, 2), *range(1, 2 * self.dimensions, 2)]
+        return whole.transpose(order).reshape(math.prod(counts), math.prod(inner))
+
+    def children(self, level: int, cells: np.ndarray) -> np.ndarray:
+        """[2 n] cells of the level `below` inside ``cells`` [n]."""
+        counts, halves = self.counts(level), self.counts(self.below[level])
+        axis = int(np.argmax(np.array(halves) > counts))
+        places = np.array(np.unravel_index(cells, counts)).reshape(self.dimensions, -1)
+        found = []
+        for half in (0, 1):
+            inside = places.copy()
+            inside[axis] = 2 * inside[axis] + half
+            found.append(np.ravel_multi_index(tuple(inside), halves))
+        return np.concatenate(found)
+
+
+def divided(
+    moves: np.ndarray, displacement: float, most: int, deeper: int, finer: int, swept: bool = False
+) -> Division | None:
+    """Levels of cells that bear ``displacement``, for samples that move by half of ``moves`` [n, samples, d].
+
+    Args:
+        deeper: Levels that are for refinement.
+        finer: See `Division`.
+        swept: Whether the last axis is a sample's own interval, which is as wide in any box.
+
+    Returns:
+        None where there would be more than ``most`` parts and narrower boxes would need fewer.
+    """
+    d = moves.shape[2]
+    if d == 0:
+        return Division((), 0)
+    widest = moves.reshape(-1, d).max(axis=0)
+    if not np.isfinite(widest).all():
+        return None
+    levels = (most // 3 if d == 1 else most).bit_length() - 1 - deeper - d * finer
+    axes: list[int] = []
+    while widest.sum() > displacement:
+        if len(axes) >= levels:
+            if widest[: d - swept].sum() > displacement:
+                return None
+            break
+        axis = int(np.argmax(widest))
+        axes.append(axis)
+        widest[axis] *= 0.5
+    for _ in range(deeper):
+        axis = int(np.argmax(widest))
+        axes.append(axis)
+        widest[axis] *= 0.5
+    return Division(tuple(axes), d, finer)
+
+
+#: What lower and upper bounds of several parts become.
+ENDS = (np.minimum, np.maximum)
+
+
+def regrouped(values: np.ndarray, end: np.ufunc, counts: tuple[int, ...]) -> np.ndarray:
+    """Bounds [n, shifts, *parts, 3] of equal parts of a box for others, ``counts`` by axis: ``end`` of all met."""
+    for axis, count in enumerate(counts, start=2):
+        size = values.shape[axis]
+        starts = np.arange(count) * size // count
+        stops = -(-(np.arange(count) + 1) * size // count)
+        met = (values.take(np.arange(a, b), axis=axis) for a, b in zip(starts, stops, strict=True))
+        values = np.stack([end.reduce(some, axis=axis) for some in met], axis=axis)
+    return values

@@ -1,0 +1,60 @@
+"""What a field's outputs are on parts of a cell, from polynomials and error terms (design.md, F2, F7)."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from ns_abstract.arithmetic.rounding import CHEBYSHEV_ROUNDING, COMPOSITE_ROUNDING
+from ns_abstract.methods.nerf.zonotope import Affine
+
+
+def greatest(value: Affine) -> Tensor:
+    """Upper bounds [B, n] of an affine batch on whole cells."""
+    middle, spread = value.poly[:, 0], value.poly[:, 1:].abs().sum(dim=1)
+    return middle + spread + (value.radius + CHEBYSHEV_ROUNDING * (middle.abs() + spread))
+
+
+def bounds_by_part(value: Affine, bernstein: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Bounds [B, parts, n] of an affine batch on every part of its cell, and its radius [B, n]."""
+    error = value.radius
+    (batch, m, n), (parts, k, _) = value.poly.shape, bernstein.shape
+    # pieces and outputs side by side
+    controls = (bernstein.reshape(parts * k, m) @ value.poly.transpose(0, 1).reshape(m, batch * n)).view(parts, k, -1)
+    least, most = (ends.view(parts, batch, n).transpose(0, 1) for ends in (controls.amin(dim=1), controls.amax(dim=1)))
+    # on parts that are nearly the whole cell, Bernstein coefficients of high degrees are far from the values
+    spread = value.poly[:, 1:].abs().sum(dim=1)[:, None]
+    middle = value.poly[:, :1]
+    rounding = CHEBYSHEV_ROUNDING * value.poly.abs().sum(dim=1)[:, None]
+    rough, slack = rounding * bernstein.abs().amax(), rounding + error[:, None]
+    low = torch.maximum(least - rough, middle - spread)
+    high = torch.minimum(most + rough, middle + spread)
+    return low - slack, high + slack, error
+
+
+def density(z: Tensor, *, up: bool) -> Tensor:
+    """A bound of ``softplus(z)``, from above or below (design.md, F7).
+
+    torch returns z itself for the softplus of z > 20, which is less than the function by 2.1e-9.
+    """
+    found = torch.clamp(z, min=0.0) + torch.log1p(torch.exp(-z.abs()))
+    if up:
+        return found * (1.0 + 2.0**-46)
+    return torch.where(z > 19.0, z, found) * (1.0 - 2.0**-46)
+
+
+def opacity(z: Tensor, length: Tensor, *, up: bool) -> Tensor:
+    """A bound of ``1 - exp(-length softplus(z))``, from above or below (design.md, F7)."""
+    found = -torch.expm1(-length * density(z, up=up))
+    if up:
+        return (found * (1.0 + 2.0**-46) + 2.0**-1000).clamp(max=1.0)
+    return (found * (1.0 - 2.0**-46)).clamp(min=0.0)
+
+
+def brightness(value: Affine, bernstein: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Bounds [B, parts, n] of the sigmoid on every part, [0, 1] for pieces that were given up, and radii [B, n]."""
+    low, high, error = bounds_by_part(value, bernstein)
+    bad = value.failed[:, None, None]
+    low = torch.where(bad, 0.0, torch.sigmoid(low) * (1.0 - COMPOSITE_ROUNDING))
+    high = torch.where(bad, 1.0, (torch.sigmoid(high) * (1.0 + COMPOSITE_ROUNDING)).clamp(max=1.0))
+    return low, high, error
