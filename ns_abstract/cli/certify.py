@@ -55,7 +55,7 @@ class Certify(GivenSet):
     its float64 evaluation."""
     sampling: Literal["uniform", "hierarchical"] | None = None
     """NeRF. uniform (default): the fine field in the middles of equal bins. hierarchical: Nerfstudio's own picture,
-    bounded by where samples may lie in the coarse pass' bins."""
+    its samples followed where the coarse pass puts them."""
     num_samples: int | None = None
     """NeRF: bins of every ray. Default: 64."""
     near_plane: float | None = None

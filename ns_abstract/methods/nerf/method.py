@@ -36,7 +36,7 @@ class NerfMethod:
         scene: The scene.
         renderer: "paper" (black behind the last sample) or None.
         arithmetic: "real" or None: float32 evaluations of a network are not enclosed.
-        sampling: "uniform" (None: the same), or "hierarchical": Nerfstudio's own picture, by bins (design.md, F10).
+        sampling: "uniform" (None: the same), or "hierarchical": Nerfstudio's own picture (design.md, F16).
         num_samples: N of uniform samples; None: 64.
         near_plane: Start of the rays, normalised units; None: 0, as in Nerfstudio's evaluation.
         workers: Processes that bound rays; on a GPU, as many of them as have room there.
@@ -188,8 +188,8 @@ class NerfMethod:
         shows = scene.coarse_samples + scene.importance_samples + 1
         if s.kind == "hierarchical":
             return (
-                f"bounded: Nerfstudio's own {shows} samples from {s.near:g} to {s.far:g}, by what the fine field can "
-                f"show in the {s.samples} bins of the coarse pass and by where in them the coarse field puts samples",
+                f"bounded: Nerfstudio's own {shows} samples from {s.near:g} to {s.far:g}, followed where the coarse "
+                f"field puts them; on cells too wide for that, anywhere in the {s.samples} bins of the coarse pass",
                 *declared,
             )
         return (
