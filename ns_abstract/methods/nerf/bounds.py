@@ -70,11 +70,12 @@ _SHARE = 0.125
 _ROUNDS = 32
 #: Half the way of a sample over a cell to begin with; of one that is followed, whose place the coarse pass moves, too.
 _DISPLACEMENT, _FOLLOWED = 0.02, 5e-4
-#: Halvings below first cells by axis, and of the deepest cells into parts, where samples are followed.
+#: Where samples are followed: halvings below first cells by axis, and of the deepest cells into parts; the least length.
 _FOLLOWED_DEEPER = 3
 _FOLLOWED_FINER, _FOLLOWED_FINER_MORE = {1: 2, 2: 2}, 1
-#: Rays that are left so open are bounded by bins, too, with a tolerance that is so many times as large: bounds by bins
-#: are loose anyhow.
+_LEAST_FOLLOWED = 2e-6
+#: Rays that one cell leaves so open are bounded by bins, too, with a tolerance so many times as large: these bounds are
+#: loose anyhow.
 _LOOSE, _SWEPT = 0.5, 8.0
 #: Numbers (rays, samples, parts) that are worked on together.
 _NUMBERS = 1 << 21
@@ -231,11 +232,11 @@ class NerfBounds:
         asked = _Asked(pose_set, box, pixels, tolerance, known, aim, shifts or [])
         if self.paths is None:
             return self._apart(asked, division, division is not None, self.displacement)
-        found = self._followed(self.paths, asked, division)
-        loose = np.flatnonzero((found.upper - found.lower).max(axis=1) > _LOOSE)
+        found, alone = self._followed(self.paths, asked, division)
+        loose = np.flatnonzero(alone & ((found.upper - found.lower).max(axis=1) > _LOOSE))
         if not loose.size:
             return found
-        # samples anywhere in their bins
+        # narrower boxes would not help: samples anywhere in their bins
         bins = self._apart(asked.take(loose), None, division is not None, _DISPLACEMENT)
         found.lower[loose] = np.maximum(found.lower[loose], bins.lower)
         found.upper[loose] = np.minimum(found.upper[loose], bins.upper)
@@ -256,14 +257,17 @@ class NerfBounds:
         low = np.zeros((n, max(1, len(asked.shifts)), *parts, 3), np.float32)
         return RayBounds(*found, np.stack([low, np.ones_like(low)]))
 
-    def _followed(self, paths: Paths, asked: _Asked, given: Division | None) -> RayBounds:
-        """Bounds from samples that are followed; [0, 1] where the box is too wide for that."""
+    def _followed(self, paths: Paths, asked: _Asked, given: Division | None) -> tuple[RayBounds, np.ndarray]:
+        """Bounds from samples that are followed; [0, 1] where the box is too wide for that.
+
+        Also [n] whether the box is so narrow that it is one cell to begin with.
+        """
         pencil = Pencil(asked.pose_set, asked.box, asked.pixels, paths.degree)
         moves = pencil.displacement(self.distances, self.lengths)
         division = self.division(moves) if given is None else given
         parts = None if given is None else given.parts
         if division is None or not pencil.finite:
-            return self._nothing(asked, parts)
+            return self._nothing(asked, parts), np.zeros(len(moves), bool)
         start = np.zeros(len(moves), np.int64)
         for level in range(division.levels):
             wide = (moves / np.array(division.counts(level), np.float64)).sum(axis=2).max(axis=1, initial=0.0)
@@ -273,11 +277,12 @@ class NerfBounds:
         n, shifts = len(moves), work.lower.shape[2]
         # [n, shifts, *parts, 3]
         low, high = (np.moveaxis(end, 2, 1).reshape(n, shifts, *division.parts, 3) for end in (work.lower, work.upper))
-        return RayBounds(
-            work.lower.min(axis=(1, 2)), work.upper.max(axis=(1, 2)),
-            np.ones((n, self.distances.size), np.float32), work.cells, self.displacement * work.factor,
+        rays = RayBounds(
+            work.lower.min(axis=(1, 2)), work.upper.max(axis=(1, 2)), np.ones((n, self.distances.size), np.float32),
+            work.cells, max(_LEAST_FOLLOWED, self.displacement * work.factor),
             None if given is None else np.stack(outward(low, high)),
         )  # fmt: skip
+        return rays, start == 0
 
     def _apart(self, asked: _Asked, given: Division | None, by_part: bool, displacement: float) -> RayBounds:
         """Bounds from cells of every sample, or of the bins that samples lie in."""
