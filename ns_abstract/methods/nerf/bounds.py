@@ -70,7 +70,7 @@ _SHARE = 0.125
 _ROUNDS = 32
 #: Half the way of a sample over a cell to begin with; of one that is followed, whose place the coarse pass moves, too.
 _DISPLACEMENT, _FOLLOWED = 0.02, 5e-4
-#: Where samples are followed: halvings below first cells by axis, and of the deepest cells into parts; the least length.
+#: Where samples are followed: halvings below first cells by axis, of the deepest cells into parts, and the least way.
 _FOLLOWED_DEEPER = 3
 _FOLLOWED_FINER, _FOLLOWED_FINER_MORE = {1: 2, 2: 2}, 1
 _LEAST_FOLLOWED = 2e-6
