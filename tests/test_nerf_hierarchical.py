@@ -29,9 +29,9 @@ SETS = {
 
 def by_bins(scene: NerfScene, pose_set: PoseSet) -> RayBounds:
     """Without samples that are followed."""
-    bounds = NerfBounds(scene, BINS, pose_set.box.dimensions)
-    asked = bounds_module._Asked(pose_set, pose_set.box, pixels_of(pose_set.camera)[:6], 0.05 / 8.0, None, None, [])
-    return bounds._apart(asked, None, False, 0.02)
+    bounds, tolerance = NerfBounds(scene, BINS, pose_set.box.dimensions), 0.05 / bounds_module._SWEPT
+    asked = bounds_module._Asked(pose_set, pose_set.box, pixels_of(pose_set.camera)[:6], tolerance, None, None, [])
+    return bounds._apart(asked, None, False, bounds_module._DISPLACEMENT)
 
 
 @pytest.mark.parametrize("name", SETS)

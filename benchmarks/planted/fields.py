@@ -317,7 +317,7 @@ FIELDS = (
     ),
     Fault(
         "followed samples: parts of a cell change places",
-        _PATHS, "Following._bound", "places // finer", "(np.array(inner) - 1 - places) // finer",
+        _PATHS, "_Level.of", "part.ravel()", "part.ravel()[::-1]",
         "test_nerf_paths.py::test_parts_hold_their_renders[yaw]",
     ),
     Fault(

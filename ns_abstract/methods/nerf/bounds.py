@@ -25,7 +25,7 @@ from ns_abstract.methods.nerf.division import ENDS, Division, divided, regrouped
 from ns_abstract.methods.nerf.hsv import Range, shifted_bounds
 from ns_abstract.methods.nerf.outputs import bounds_by_part, brightness, greatest, opacity
 from ns_abstract.methods.nerf.paths import Following, Paths
-from ns_abstract.methods.nerf.pencil import Pencil
+from ns_abstract.methods.nerf.pencil import TAYLOR, Pencil
 from ns_abstract.methods.nerf.render import Sampling
 from ns_abstract.methods.nerf.samples import composite, hulls
 from ns_abstract.methods.nerf.scene import FieldWeights, NerfScene
@@ -36,8 +36,6 @@ _DEGREES = {0: (1, 2), 1: (28, 112), 2: (6, 20), 3: (4, 10), 4: (2, 5)}
 #: The same of one parameter for a field whose base has at most so many layers: it bears cells as wide as its waves are
 #: followed, while deeper ones bend more.
 _SHALLOW, _SHALLOW_DEGREE = 4, (35, 126)
-#: Degree of the Taylor models of poses.
-_TAYLOR = 6
 #: Cells bounded at once by compiled kernels, whose numbers stay in a core's cache.
 _BATCH = 128
 #: Elsewhere: values of a layer's neurons on the grid, and how many arrays as large there may be at a time, about.
@@ -193,17 +191,14 @@ class NerfBounds:
         self.field = FieldBounds(scene.fine, self.basis, device=device, compiled=compiled)
         #: Cells bounded at once.
         self.batch = _BATCH if self.field.compiled else cells_at_once(scene.fine, self.basis)
-        edges = sampling.edges
         self.occupancy = scene.occupancy
         #: Samples that the coarse pass places.
         self.paths = None
         if self.swept:
             coarse = FieldBounds(scene.coarse, basis_of(dimensions, scene.coarse), device=device, compiled=compiled)
             self.paths = Paths(coarse, self.field, sampling, scene.occupancy, self.batch)
-        self.distances = 0.5 * (edges[1:] + edges[:-1])
-        self.lengths = edges[1:] - edges[:-1]
-        self.taylor = min(_TAYLOR, max(1, self.basis.degree))
-        self._bernstein: dict[tuple[int, ...], Tensor] = {}
+        self.distances, self.lengths = sampling.bins
+        self.taylor = min(TAYLOR, max(1, self.basis.degree))
         #: Where to begin to look for `RayBounds.displacement`.
         self.displacement = _DISPLACEMENT if self.paths is None else _FOLLOWED
 
@@ -268,10 +263,7 @@ class NerfBounds:
         parts = None if given is None else given.parts
         if division is None or not pencil.finite:
             return self._nothing(asked, parts), np.zeros(len(moves), bool)
-        start = np.zeros(len(moves), np.int64)
-        for level in range(division.levels):
-            wide = (moves / np.array(division.counts(level), np.float64)).sum(axis=2).max(axis=1, initial=0.0)
-            start[(start == level) & (wide > self.displacement)] = level + 1
+        start = division.first(moves, self.displacement).max(axis=1)
         work = Following(paths, pencil, division, start, asked.tolerance, asked.aim, asked.shifts)
         work.run()
         n, shifts = len(moves), work.lower.shape[2]
@@ -324,12 +316,6 @@ class NerfBounds:
         )
         return low.reshape(-1, low.shape[2]), high.reshape(-1, high.shape[2])
 
-    def bernstein(self, parts: tuple[int, ...]) -> Tensor:
-        """`ChebyshevBasis.bernstein` of the field's basis, kept."""
-        if parts not in self._bernstein:
-            self._bernstein[parts] = torch.from_numpy(self.basis.bernstein(parts)).to(self.device)
-        return self._bernstein[parts]
-
     def division(self, moves: np.ndarray, most: int = _PARTS, deeper: int | None = None) -> Division | None:
         """`divided` for samples that move by ``moves`` [n, samples, d], as wide as the network's bounds bear."""
         d = moves.shape[2]
@@ -374,12 +360,8 @@ class _Work:
         self.cells, self.displacement = 0, displacement
         # cells of samples that were the first, those of them that were too wide, and whether the box is not narrow
         self.tried, self.lost, self.wide = 0, 0, False
-        inverse = [1.0 / np.array(division.counts(level), np.float64) for level in range(division.levels + 1)]
         # the first level whose cells are narrow enough for the sample
-        moved = [moves @ row for row in inverse]
-        self.start = np.zeros((n, samples), np.int64)
-        for level in range(division.levels):
-            self.start[(self.start == level) & (moved[level] > displacement)] = level + 1
+        self.start = division.first(moves, displacement)
         self.quiet = np.zeros((n, samples), bool)
         if known is not None:
             self.quiet = known <= _QUIET * self.tolerance
@@ -438,7 +420,7 @@ class _Work:
             monomials = np.prod(nodes[:, :, None, :] ** self.pencil.exponents, axis=-1)
             self._levels[level] = (
                 torch.from_numpy(monomials).to(self.owner.device),
-                self.owner.bernstein(self.division.inner(level)),
+                self.field.bernstein(self.division.inner(level)),
                 self.division.members(level),
             )
         return self._levels[level]

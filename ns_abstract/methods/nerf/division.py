@@ -75,6 +75,14 @@ class Division:
         order = [*range(0, 2 * self.dimensions, 2), *range(1, 2 * self.dimensions, 2)]
         return whole.transpose(order).reshape(math.prod(counts), math.prod(inner))
 
+    def first(self, moves: np.ndarray, displacement: float) -> np.ndarray:
+        """[...] the first level on whose cells samples that move by ``moves`` [..., d] over the box bear it."""
+        inverse = (1.0 / np.array(self.counts(level), np.float64) for level in range(self.levels))
+        found = np.zeros(moves.shape[:-1], np.int64)
+        for level, row in enumerate(inverse):
+            found[(found == level) & (moves @ row > displacement)] = level + 1
+        return found
+
     def children(self, level: int, cells: np.ndarray) -> np.ndarray:
         """[2 n] cells of the level `below` inside ``cells`` [n]."""
         counts, halves = self.counts(level), self.counts(self.below[level])

@@ -10,20 +10,19 @@ import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import Tensor
 
-from ns_abstract.arithmetic.chebyshev import ChebyshevBasis
 from ns_abstract.arithmetic.rounding import COMPOSITE_ROUNDING, UNIT64
 from ns_abstract.execution.ending import checkpoint
 from ns_abstract.methods.nerf.division import Division
 from ns_abstract.methods.nerf.hsv import Range, shifted_bounds
 from ns_abstract.methods.nerf.occupancy import OccupancyGrid
 from ns_abstract.methods.nerf.outputs import bounds_by_part, brightness, density, opacity
-from ns_abstract.methods.nerf.pencil import Pencil
+from ns_abstract.methods.nerf.pencil import TAYLOR, Pencil
 from ns_abstract.methods.nerf.render import Sampling
 from ns_abstract.methods.nerf.samples import composite, edge_bounds
 from ns_abstract.methods.nerf.zonotope import Affine, FieldBounds, Pieces
@@ -60,10 +59,10 @@ class Cells:
         """Some of them."""
         return Cells(self.ray[which], self.cell[which])
 
-    def chunks(self, size: int) -> Iterator[tuple[int, Cells]]:
-        """At most ``size`` at a time, with the number of the first."""
+    def chunks(self, size: int) -> Iterator[Cells]:
+        """At most ``size`` at a time."""
         for start in range(0, len(self), size):
-            yield start, self.take(slice(start, start + size))
+            yield self.take(slice(start, start + size))
 
 
 @dataclass(frozen=True)
@@ -115,26 +114,16 @@ class Paths:
         self, coarse: FieldBounds, fine: FieldBounds, sampling: Sampling, occupancy: OccupancyGrid | None, batch: int
     ) -> None:
         self.coarse, self.fine, self.sampling, self.occupancy, self.batch = coarse, fine, sampling, occupancy, batch
-        edges = sampling.edges
-        self.distances, self.lengths = 0.5 * (edges[1:] + edges[:-1]), edges[1:] - edges[:-1]
-        self._bernstein: dict[tuple[ChebyshevBasis, tuple[int, ...]], Tensor] = {}
 
     @cached_property
     def degree(self) -> int:
         """Of the Taylor models of poses: along a line in the pose a point has one more."""
-        return max(1, min(6, self.fine.basis.degree - 1))
+        return max(1, min(TAYLOR, self.fine.basis.degree - 1))
 
     @property
     def straight(self) -> bool:
         """Whether the polynomials do not hold a sample that moves along a line."""
         return self.degree >= self.fine.basis.degree
-
-    def bernstein(self, field: FieldBounds, parts: tuple[int, ...]) -> Tensor:
-        """`ChebyshevBasis.bernstein` of a field's basis, kept."""
-        key = field.basis, parts
-        if key not in self._bernstein:
-            self._bernstein[key] = torch.from_numpy(field.basis.bernstein(parts)).to(field.device)
-        return self._bernstein[key]
 
     def edges(
         self, origin: np.ndarray, direction: np.ndarray, radii: tuple[np.ndarray, np.ndarray], counts: tuple[int, ...]
@@ -146,14 +135,14 @@ class Paths:
             radii: [3] and [k, 3], what they are off by.
             counts: Parts of every cell by axis.
         """
-        field, samples, parts = self.coarse, self.distances.size, math.prod(counts)
-        bernstein = self.bernstein(field, counts)
+        field, parts, (distances, lengths) = self.coarse, math.prod(counts), self.sampling.bins
+        samples, bernstein = distances.size, field.bernstein(counts)
         low, high = np.zeros((len(origin), samples, parts)), np.ones((len(origin), samples, parts))
         cell, place = (a.ravel() for a in np.mgrid[: len(origin), :samples])
         for first in range(0, cell.size, self.batch):
             checkpoint()
             k, i = cell[first : first + self.batch], place[first : first + self.batch]
-            there = self.distances[i]
+            there = distances[i]
             nodes = origin[k] + there[:, None, None] * direction[k]
             radius = radii[0] + there[:, None] * radii[1][k]
             seen, sure = self.look(field, nodes, radius)
@@ -163,7 +152,7 @@ class Paths:
                 continue
             z = self.base(field, nodes, radius)[1]
             ends = bounds_by_part(z, bernstein)
-            length = torch.from_numpy(self.lengths[i]).to(field.device)[:, None]
+            length = torch.from_numpy(lengths[i]).to(field.device)[:, None]
             least, most = (opacity(ends[up][..., 0], length, up=bool(up)).cpu().numpy() for up in (0, 1))
             good = ~z.failed.cpu().numpy()[:, None] & (least <= most)
             low[k, i] = np.where(good & sure[:, None], least, 0.0)
@@ -188,6 +177,32 @@ class Paths:
         spread = spread + 2.0**-40 * (np.abs(poly[:, 0]) + spread)
         empty, sure = self.occupancy.look(poly[:, 0] - spread, poly[:, 0] + spread)
         return ~empty, sure
+
+
+class _Level(NamedTuple):
+    """The cells of one level of a `Division`.
+
+    Attributes:
+        boxes: [cells, d] lower and upper ends in [-1, 1].
+        members: [cells, kept parts of a cell] flat numbers of the parts that are kept.
+        counts: Parts by axis that a cell is bounded by.
+        part: [kept parts of a cell] the one of ``counts`` that each lies in.
+    """
+
+    boxes: tuple[np.ndarray, np.ndarray]
+    members: np.ndarray
+    counts: tuple[int, ...]
+    part: np.ndarray
+
+    @staticmethod
+    def of(division: Division, level: int) -> _Level:
+        """See `_Level`."""
+        inner, most = division.inner(level), _INNER.get(division.dimensions, _INNER_MORE)
+        counts = tuple(max(k for k in range(1, most + 1) if n % k == 0) for n in inner)
+        part = np.arange(math.prod(counts)).reshape(counts)
+        for axis, (n, k) in enumerate(zip(inner, counts, strict=True)):
+            part = part.repeat(n // k, axis=axis)
+        return _Level(division.boxes(level), division.members(level), counts, part.ravel())
 
 
 class Following:
@@ -215,6 +230,7 @@ class Following:
         self.lower, self.upper = np.zeros(rows), np.ones(rows)
         #: First cells, those of them that were too wide, and cells in all.
         self.tried = self.lost = self.cells = 0
+        self._levels: dict[int, _Level] = {}
 
     def run(self) -> None:
         """Bound all rays."""
@@ -225,7 +241,7 @@ class Following:
             parts = waiting.pop(level)
             cells = Cells(*(np.concatenate([getattr(p, name) for p in parts]) for name in ("ray", "cell")))
             below, again = self.division.below[level], []
-            for _, chunk in cells.chunks(_CELLS):
+            for chunk in cells.chunks(_CELLS):
                 again.append(chunk.take(self._bound(level, chunk)))
             if below < 0:
                 continue
@@ -241,19 +257,19 @@ class Following:
     def samples(self, level: int, cells: Cells) -> Samples:
         """What the samples of cells of one level are."""
         owner, radii = self.owner, (self._radii[0], self._radii[1][cells.ray])
-        counts = self.counts(level)
+        counts = self._level(level).counts
         low, high = owner.edges(*self._at(owner.coarse, level, cells), radii, counts)
         return Samples(owner, self._at(owner.fine, level, cells), radii, low, high, counts, self.tolerance)
 
-    def counts(self, level: int) -> tuple[int, ...]:
-        """Parts by axis that a cell of a level is bounded by."""
-        most = _INNER.get(self.division.dimensions, _INNER_MORE)
-        return tuple(max(k for k in range(1, most + 1) if n % k == 0) for n in self.division.inner(level))
+    def _level(self, level: int) -> _Level:
+        if level not in self._levels:
+            self._levels[level] = _Level.of(self.division, level)
+        return self._levels[level]
 
     def _at(self, field: FieldBounds, level: int, cells: Cells) -> tuple[np.ndarray, np.ndarray]:
         """Origins and directions [k, nodes, 3] of ``cells`` at a field's nodes."""
         d = self.division.dimensions
-        low, high = (ends[cells.cell] for ends in self.division.boxes(level))
+        low, high = (ends[cells.cell] for ends in self._level(level).boxes)
         places = 0.5 * (low + high)[:, None] + 0.5 * (high - low)[:, None] * field.basis.nodes[:, :d]
         monomials = np.prod(places[:, :, None, :] ** self.pencil.exponents, axis=-1)
         return monomials @ self.pencil.origin, monomials @ self.pencil.direction[cells.ray]
@@ -262,19 +278,12 @@ class Following:
         """Bound cells of one level; [k] whether they are too wide."""
         checkpoint()
         self.cells += len(cells)
-        samples, counts = self.samples(level, cells), self.counts(level)
+        samples, there = self.samples(level, cells), self._level(level)
         plain = samples.composite(None)
         found = [samples.composite(shift) for shift in self.shifts] or [plain]
-        # parts of the cells as they are kept
-        inner = self.division.inner(level)
-        places = np.array(list(np.ndindex(*inner)), np.int64).reshape(math.prod(inner), len(inner))
-        finer = np.array(inner, np.int64) // np.array(counts, np.int64)
-        part = np.zeros(len(places), np.int64)
-        if counts:
-            part = np.ravel_multi_index(tuple((places // finer).T), counts)
-        rows = cells.ray[:, None], self.division.members(level)[cells.cell]
-        self.lower[rows] = np.maximum(self.lower[rows], np.stack([low for low, _ in found], axis=2)[:, part])
-        self.upper[rows] = np.minimum(self.upper[rows], np.stack([high for _, high in found], axis=2)[:, part])
+        rows = cells.ray[:, None], there.members[cells.cell]
+        self.lower[rows] = np.maximum(self.lower[rows], np.stack([low for low, _ in found], axis=2)[:, there.part])
+        self.upper[rows] = np.minimum(self.upper[rows], np.stack([high for _, high in found], axis=2)[:, there.part])
         low, high = plain
         if self.aim is None:
             wide = np.any((high - low) > _ENOUGH * self.tolerance, axis=(1, 2))
@@ -315,7 +324,7 @@ class Samples:
         least, most = (0.5 * (side[..., 1:] + side[..., :-1]) for side in (low, high))
         self.lines = Lines.around(least, most, counts, owner.straight, owner.sampling.far)
         k, parts, samples = low.shape[0], low.shape[1], low.shape[2] - 1
-        self.bernstein = owner.bernstein(owner.fine, (*counts, 1))
+        self.bernstein = owner.fine.bernstein((*counts, 1))
         self.negligible = _NEGLIGIBLE * tolerance
         self.density = np.zeros((2, k, parts, samples))
         self.density[1] = np.inf

@@ -10,6 +10,8 @@ from ns_abstract.geometry.box import ParameterBox
 from ns_abstract.geometry.poses import PoseSet
 from ns_abstract.methods.nerf.render import camera_rays
 
+#: Most that the degree of the Taylor models of poses may be.
+TAYLOR = 6
 #: Rounding of a point on a ray, in parts of its polynomials' coefficients.
 _POINT = 128.0 * UNIT64
 

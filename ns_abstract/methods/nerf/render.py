@@ -50,6 +50,12 @@ class Sampling:
     background: tuple[float, float, float]
 
     @property
+    def bins(self) -> tuple[np.ndarray, np.ndarray]:
+        """[samples] distances of the bins' middles, and their lengths."""
+        edges = self.edges
+        return 0.5 * (edges[1:] + edges[:-1]), edges[1:] - edges[:-1]
+
+    @property
     def edges(self) -> np.ndarray:
         """[samples + 1] float64 distances of the bins' ends (``UniformSampler`` outside training)."""
         bins = np.linspace(0.0, 1.0, self.samples + 1)

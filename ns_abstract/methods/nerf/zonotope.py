@@ -217,6 +217,14 @@ class FieldBounds:
         )
         self._decay = 4.0 * ellipses**-basis.degree / (ellipses - 1.0) * (1.0 + 2.0**-30)
 
+        self._bernstein: dict[tuple[int, ...], Tensor] = {}
+
+    def bernstein(self, parts: tuple[int, ...]) -> Tensor:
+        """`ChebyshevBasis.bernstein` of the basis, kept."""
+        if parts not in self._bernstein:
+            self._bernstein[parts] = torch.from_numpy(self.basis.bernstein(parts)).to(self.device)
+        return self._bernstein[parts]
+
     def _put(self, layer: Layer, narrow: bool, sees: tuple[Encoding, Waves] | None = None) -> _Linear:
         if sees is not None:
             layer = _seeing(layer, *sees)
