@@ -216,6 +216,21 @@ def bits(typingctx, mask):  # pyright: ignore[reportRedeclaration]
 
 
 @intrinsic
+def lane_sum(typingctx, a):  # pyright: ignore[reportRedeclaration]
+    """Sum of the lanes, in halves: rounded as often as there are halvings."""
+
+    def codegen(context, builder, sig, args):
+        value, width = args[0], sig.args[0].width
+        while width > 1:
+            width //= 2
+            low, high = (ir.Constant(ir.VectorType(_INT32, width), [_INT32(k + at) for k in range(width)]) for at in (0, width))
+            value = builder.fadd(builder.shuffle_vector(value, value, low), builder.shuffle_vector(value, value, high))
+        return builder.extract_element(value, _INT32(0))
+
+    return a.element(a), codegen
+
+
+@intrinsic
 def spans(typingctx, first, last):  # pyright: ignore[reportRedeclaration]
     """Byte k of an int64 has the bits from ``ceil(first)`` to ``floor(last)`` of lane k; 8 lanes of -1 to 8."""
 
@@ -362,6 +377,12 @@ if config.DISABLE_JIT:  # pyright: ignore[reportAttributeAccessIssue]
     def bits(mask):
         """Bit k of the result tells whether lane k of ``mask`` holds."""
         return sum(1 << k for k, holds in enumerate(mask) if holds)
+
+    def lane_sum(a):
+        """Sum of the lanes, in halves: rounded as often as there are halvings."""
+        while len(a) > 1:
+            a = a[: len(a) // 2] + a[len(a) // 2 :]
+        return a[0]
 
     def spans(first, last):
         """Byte k of the result has the bits from ``ceil(first)`` to ``floor(last)`` of lane k."""

@@ -68,7 +68,7 @@ class _Exponent(NamedTuple):
 
 
 class _Alpha(NamedTuple):
-    """Alphas of eight pixels: bounds, the form's centre and radius.
+    """Alphas of eight pixels: bounds, the form's centre and radius, and `_Drawn.jump`.
 
     The form's coefficients are ``weight`` times the exponent's, and ``curve`` times those of its linear part squared.
     """
@@ -77,6 +77,7 @@ class _Alpha(NamedTuple):
     high: Any
     center: Any
     radius: Any
+    jump: Any
     weight: Any
     curve: Any
 
@@ -106,13 +107,21 @@ class _Range(NamedTuple):
 
 
 class _Drawn(NamedTuple):
-    """Alphas of eight pixels after the thresholds: bounds, the form's centre and radius, 1 unless it is constant."""
+    """Alphas of eight pixels after the thresholds.
+
+    Attributes:
+        low, high: Bounds.
+        center, radius: Of the form.
+        keep: 1 unless it is constant.
+        jump: Alpha up to which the fragment may be skipped; 0 where it is not, or the form is constant.
+    """
 
     low: Any
     high: Any
     center: Any
     radius: Any
     keep: Any
+    jump: Any
 
 
 class _AffineForms(NamedTuple):
@@ -212,10 +221,10 @@ def _quadratic_alphas(record, begin, n, given, block, limits, charges, antialias
             continue
         high = minimum(high, s0 + top + radius + rounding)
         alpha, tilt, bent = _cubic_exponential(low, high, s0, radius, linear, quadratic, limits, charges)
-        # one parameter's forms hold its curvature: nothing reads the columns of its range
+        # one parameter's forms hold its curvature: nothing reads the second column of its range
         store_columns(
             values, given + 8 * q, 8,
-            (alpha.low, alpha.high, alpha.low, alpha.high, alpha.center, tilt, bent, alpha.radius),
+            (alpha.low, alpha.high, alpha.jump, alpha.high, alpha.center, tilt, bent, alpha.radius),
         )  # fmt: skip
         found |= (_ALL - bits(alpha.high < limits.alpha_min)) << q
     return found
@@ -252,8 +261,10 @@ def _affine_forms(record, m, antialiased):
 
 
 @njit(cache=True, error_model="numpy", forceinline=True)
-def _store_fragments(rows, alpha, values, at, width, m):
+def _store_fragments(rows, alpha, fragments, at, m):
     """Write eight fragments from their ``alpha``; ``rows`` [., 8] hold the exponent's slopes and alpha's curvature."""
+    values, width = fragments.values, fragments.width
+    store(rows, 8 * fragments.jump, alpha.jump)
     store(rows, 8 * ALPHA_LOW, alpha.low)
     store(rows, 8 * ALPHA_HIGH, alpha.high)
     store(rows, 8 * FORM, alpha.center)
@@ -364,7 +375,7 @@ def _set_curvature(alpha, rows, scratch, m):
 @njit(cache=True, error_model="numpy", forceinline=True)
 def _alphas_of_several(record, begin, n, given, block, limits, charges, antialiased, m):
     """`alphas` for several parameters, or none: curvature of forms of order 1 (design.md, B10)."""
-    batch, rows, values, width = block.batch, block.batch.rows, block.fragments.values, block.fragments.width
+    batch, rows, width = block.batch, block.batch.rows, block.fragments.width
     forms = _affine_forms(record, m, antialiased)
     found = 0
     for q in range(0, n, 8):
@@ -377,7 +388,7 @@ def _alphas_of_several(record, begin, n, given, block, limits, charges, antialia
             continue
         found |= reached << q
         _set_curvature(alpha, rows, 8 * width, m)
-        _store_fragments(rows, alpha, values, given + q * width, width, m)
+        _store_fragments(rows, alpha, block.fragments, given + q * width, m)
     return found
 
 
@@ -480,7 +491,7 @@ def _fitted_exponential(exponent, limits, charges):
     weight = fma(k2, turn, weight)
     alpha = _drawn(middle, error, sigma, limits, charges)
     return _Alpha(
-        alpha.low, alpha.high, alpha.center, alpha.radius,
+        alpha.low, alpha.high, alpha.center, alpha.radius, alpha.jump,
         alpha.keep * (sigma.scale * weight), alpha.keep * (sigma.scale * k2),
     )  # fmt: skip
 
@@ -514,7 +525,7 @@ def _drawn(middle, error, sigma, limits, charges):
     keep = where(radius < flat, sigma.fits * limits.sure, 0.0)
     center = where(keep == 1.0, center, 0.5 * (a_high + a_low))
     radius = where(keep == 1.0, radius, flat * UP)
-    return _Drawn(a_low, a_high, center, radius, keep)
+    return _Drawn(a_low, a_high, center, radius, keep, where(skips, keep * limits.alpha_min_high, 0.0))
 
 
 @njit(cache=True, error_model="numpy", forceinline=True)

@@ -28,10 +28,13 @@ from ns_abstract.methods.splat.block import (
     listed_fragment,
     parabola,
 )
+from ns_abstract.methods.splat.jumps import bound_by_parts, gather_jumps, set_blend
 from ns_abstract.methods.splat.lists import BLOCK, PIXELS
 
 #: Fragments ahead that are asked for.
 _AHEAD = 2
+#: Jumps are looked at together where they may widen a pixel by more than this part.
+_JUMPS_MATTER = 2.0**-5
 #: Reordering that moves no channel of a pixel by more is not examined beyond the swap bound.
 _REORDERING_MATTERS = 1e-4
 
@@ -51,6 +54,22 @@ class _Scratch(NamedTuple):
     numbers: Any
     keys: Any
     order: Any
+
+
+class _Blend(NamedTuple):
+    """A blended pixel; lanes are channels.
+
+    Attributes:
+        radius: Of the polynomials.
+        ends: The intervals.
+        jumps: Fragments that some poses skip, which the polynomials count as drawn.
+        since: The first of these that count.
+    """
+
+    radius: Any
+    ends: Any
+    jumps: int
+    since: Any
 
 
 @njit(cache=True, error_model="numpy")
@@ -221,11 +240,21 @@ def _sharpened(begin, end, ends, form_low, form_high, block, scratch):
 
 
 @njit(cache=True, error_model="numpy", forceinline=True)
-def blend_quadratic(begin, end, fragments, palette, moves, t):
+def _keep_distances(number, entry, nearest, farthest, size, jumps):
+    """Keep what a fragment's colour is beyond what lies behind, up to rounding of ``size``, for its skipping (B11)."""
+    room = FRAGMENT_ROUNDING * size
+    jumps.entries[number] = entry
+    store(jumps.distances, 8 * number, nearest - room)
+    store(jumps.distances, 8 * number + 4, farthest + room)
+
+
+@njit(cache=True, error_model="numpy", forceinline=True)
+def blend_quadratic(begin, end, fragments, palette, moves, t, jumps, split):
     """Blend the list entries [begin, end) of a pixel back to front, as forms and as intervals (design.md, B7).
 
-    For one parameter and order 2. ``t`` [m, 4] receives the polynomials; returns their radii, not yet rounded up, and
-    the intervals.
+    For one parameter and order 2. ``t`` [m, 4] receives the polynomials; returns a `_Blend` whose radii are not yet
+    rounded up. If ``split``, fragments that some poses skip are drawn and kept in ``jumps`` (B11); else their forms
+    hold both.
     """
     values, colors, forms = fragments.values, palette.values, palette.forms
     moving = forms > 1
@@ -234,9 +263,14 @@ def blend_quadratic(begin, end, fragments, palette, moves, t):
     p2 = 0.0 * p0
     r = 0.0 * p0
     ends = _Ends(p0, p0, p0, p0)
+    number = 0
     for entry in range(end - 1, begin - 1, -1):
         at, key, move = listed_fragment(fragments, entry, forms)
         a0, a1, a2 = values[at + FORM], values[at + FORM + 1], values[at + FORM + 2]
+        jump = 0.0
+        if split:
+            jump = 0.5 * min(values[at + fragments.jump], values[at + ALPHA_HIGH])
+            a0 += jump
         # colour - P, a form without radius
         v0 = load4(colors, key) - p0
         if moving:
@@ -245,6 +279,11 @@ def blend_quadratic(begin, end, fragments, palette, moves, t):
         else:
             v1 = -p1
             v2 = -p2
+        moved = abs(v1) + abs(v2)
+        size = abs(v0) + moved
+        if jump > 0.0:
+            _keep_distances(number, entry, v0 - moved, v0 + moved, size, jumps)
+            number += 1
         # p^3 = 3/4 p + T3/4 and p^4 = p^2 - 1/8 + T4/8
         cubic = fma(a1, v2, a2 * v1)
         quartic = a2 * v2
@@ -254,10 +293,9 @@ def blend_quadratic(begin, end, fragments, palette, moves, t):
         p2 = fma(a0, v2, fma(a2, v0, fma(a1, v1, p2 + quartic)))
         a1 = abs(a1)
         a2 = abs(a2)
-        size = abs(v0) + abs(v1) + abs(v2)
         dropped = fma(0.25, abs(cubic), 0.125 * abs(quartic))
         added = fma(values[at + ALPHA_HIGH], load4(colors, key + 4 * forms), dropped)
-        added = fma(values[at + FORM + 3], size, fma(FRAGMENT_ROUNDING, fma(1.0 + a1 + a2, size, abs(p0)), added))
+        added = fma(values[at + FORM + 3] - jump, size, fma(FRAGMENT_ROUNDING, fma(1.0 + a1 + a2, size, abs(p0)), added))
         r = fma(1.0 - values[at + ALPHA_LOW], r, added)
         ends = _blend_interval(ends, values, at, colors, key + color_ends(forms))
         if move != 0:
@@ -268,7 +306,7 @@ def blend_quadratic(begin, end, fragments, palette, moves, t):
     store(t, 0, p0)
     store(t, 4, p1)
     store(t, 8, p2)
-    return r, ends
+    return _Blend(r, ends, number, 0.0 * r)
 
 
 @njit(cache=True, error_model="numpy", forceinline=True)
@@ -297,9 +335,10 @@ def _curve_range(t, u, m):
 
 
 @njit(cache=True, error_model="numpy", forceinline=True)
-def _step_of_several(r, at, key, fragments, palette, t, u, m):
-    """One fragment over polynomials and radii ``r``; returns the new radii (design.md, B7, B10).
+def _step_of_several(r, at, key, jump, fragments, palette, t, u, m):
+    """One fragment over polynomials and radii ``r``, drawn also where it may be skipped by 2 ``jump`` (B7, B10, B11).
 
+    Returns the new radii, and the least and greatest of its colour beyond what lies behind, up to rounding of a size.
     ``t`` [m + bends, 4] holds the coefficients of order 0 and 1, then those of products of two parameters; ``u`` [m, 4]
     is scratch.
     """
@@ -311,7 +350,7 @@ def _step_of_several(r, at, key, fragments, palette, t, u, m):
     about, bent = values[at + BEND], values[at + BEND_SPREAD]
     sunk, risen = _curve_range(t, u, m)
     middle_curve, wound, curved = 0.5 * (sunk + risen), 0.5 * (risen - sunk), maximum(risen, -sunk)
-    a0 = form[0]
+    a0 = form[0] + jump
     kept = a0 + about
     p0 = load4(t, 0)
     value = load4(colors, key) - p0
@@ -339,16 +378,17 @@ def _step_of_several(r, at, key, fragments, palette, t, u, m):
                 product = fma(form[k], change, product)
             store(t, 4 * (m + pair), fma(-kept, curve, fma(bends[pair], shown, curve + product)))
             pair += 1
+    nearest, farthest = value - change_size - risen, value + change_size - sunk
     size = abs(value) + change_size + curved
     dropped = fma(steep, wound, bent * (change_size + wound)) * UP
     added = fma(values[at + ALPHA_HIGH], load4(colors, key + 4 * forms), dropped)
     rounding = fma(1.0 + steep + 2.0 * bent, size + 2.0 * curved, abs(middle))
-    added = fma(form[m], size * UP, fma(FRAGMENT_ROUNDING, rounding, added))
-    return fma(1.0 - values[at + ALPHA_LOW], r, added)
+    added = fma(form[m] - jump, size * UP, fma(FRAGMENT_ROUNDING, rounding, added))
+    return fma(1.0 - values[at + ALPHA_LOW], r, added), nearest, farthest, size
 
 
 @njit(cache=True, error_model="numpy", forceinline=True)
-def _flattened(t, r, u, m):
+def flattened(t, r, u, m):
     """Put the range of the curvature behind the polynomials ``t`` into their centres and the radii ``r`` (B10)."""
     low, high = _curve_range(t, u, m)
     store(t, 0, load4(t, 0) + 0.5 * (low + high))
@@ -356,10 +396,10 @@ def _flattened(t, r, u, m):
 
 
 @njit(cache=True, error_model="numpy", forceinline=True)
-def blend_several(begin, end, fragments, palette, moves, t, m):
+def blend_several(begin, end, fragments, palette, moves, t, m, jumps, split):
     """`blend_quadratic` for several parameters, or none (design.md, B7, B10).
 
-    ``t`` [m + bends, 4] receives the polynomials; the range of their curvature is part of centres and radii.
+    ``t`` [m + bends, 4] receives the polynomials with their curvature (see `flattened`).
     """
     values, colors, forms = fragments.values, palette.values, palette.forms
     p0 = load4(palette.background, 0)
@@ -369,12 +409,19 @@ def blend_several(begin, end, fragments, palette, moves, t, m):
     for k in range(1, m + fragments.bends):
         store(t, 4 * k, r)
     ends = _Ends(p0, p0, p0, p0)
+    number, since = 0, r
     for entry in range(end - 1, begin - 1, -1):
         ahead, _, _ = listed_fragment(fragments, max(entry - _AHEAD, begin), forms)
         for byte in range(0, 8 * fragments.width, LINE):
             prefetch(values, ahead, byte)
         at, key, move = listed_fragment(fragments, entry, forms)
-        r = _step_of_several(r, at, key, fragments, palette, t, u, m)
+        jump = 0.0
+        if split:
+            jump = 0.5 * min(values[at + fragments.jump], values[at + ALPHA_HIGH])
+        r, nearest, farthest, size = _step_of_several(r, at, key, jump, fragments, palette, t, u, m)
+        if jump > 0.0:
+            _keep_distances(number, entry, nearest, farthest, size, jumps)
+            number += 1
         ends = _blend_interval(ends, values, at, colors, key + color_ends(forms))
         if move != 0:
             falls, rises = load4(moves, move), load4(moves, move + 4)
@@ -389,7 +436,8 @@ def blend_several(begin, end, fragments, palette, moves, t, m):
             for k in range(1, m + fragments.bends):
                 store(t, 4 * k, where(wide, 0.0, load4(t, 4 * k)))
             r = where(wide, half * UP + FRAGMENT_ROUNDING * (abs(ends.low) + abs(ends.high)), r)
-    return _flattened(t, r, u, m), ends
+            since = where(wide, float(number), since)
+    return _Blend(r, ends, number, since)
 
 
 @njit(cache=True, error_model="numpy", forceinline=True)
@@ -447,11 +495,12 @@ def shade(pixels, left, above, reordered, block, inputs, bounds):
     fragments that are missing and have colours between the two of `Palette.unseen`.
     """
     fragments, palette, moves, t = block.fragments, block.palette, block.reordering.moves, block.sums
+    jumps, limit = block.jumps, inputs.rules.alpha_min * (1.0 - inputs.charges.threshold)
     lower, upper, linear, slopes = bounds.lower, bounds.upper, bounds.linear, bounds.slopes
     d, order, m = inputs.shape.dimensions, inputs.shape.order, inputs.shape.monomials
     # behind the polynomials: scratch, then sums of absolute linear coefficients
     u = advanced(t, 4 * (m + fragments.bends))
-    sums = advanced(u, 4 * m + 16)
+    sums = advanced(u, 4 * m + 20)
     scratch = _Scratch(u, block.entries.depth_radius, block.entries.first)
     for k in range(d):
         store(sums, 4 * k, 0.0 * load4(palette.background, 0))
@@ -461,13 +510,34 @@ def shade(pixels, left, above, reordered, block, inputs, bounds):
         begin = q * fragments.capacity
         end = begin + int(fragments.lengths[q])
         if order == 2:
-            r, ends = blend_quadratic(begin, end, fragments, palette, moves, t)
+            blended = blend_quadratic(begin, end, fragments, palette, moves, t, jumps, True)
         else:
-            r, ends = blend_several(begin, end, fragments, palette, moves, t, m)
+            blended = blend_several(begin, end, fragments, palette, moves, t, m, jumps, True)
+        r, ends = blended.radius, blended.ends
         # the radius' own rounding: three for every fragment
-        r = r * (UP + 4.0 * UNIT64 * fragments.lengths[q])
+        up = UP + 4.0 * UNIT64 * fragments.lengths[q]
+        falls, rises = 0.0 * r, 0.0 * r
+        if blended.jumps > 0:
+            store(u, 0, r * up)
+            set_blend(t, u, jumps, d)
+            store(u, 16, blended.since)
+            gather_jumps(begin, end, blended.jumps, advanced(u, 16), fragments, jumps, u, inputs.shape)
+            falls, rises = load4(u, 0), load4(u, 4)
+        if order == 1:
+            r = flattened(t, r, u, m)
+        r = r * up
         form_low, form_high = form_range(t, r, order, m)
         low, high = ends.low, ends.high
+        if blended.jumps > 0:
+            # as if nothing were skipped
+            spared_low, spared_high = maximum(low, form_low), minimum(high, form_high)
+            form_low, form_high = form_low - falls, form_high + rises
+            taken = (minimum(high, form_high) - spared_high) + (spared_low - maximum(low, form_low))
+            if d > 0 and bits(taken > _JUMPS_MATTER * (spared_high - spared_low)) & 7 != 0:
+                store(u, 0, falls)
+                store(u, 4, rises)
+                bound_by_parts(blended.jumps, limit, jumps, u, d)
+                form_low, form_high = maximum(form_low, load4(u, 0)), minimum(form_high, load4(u, 4))
         if reordered:
             low, high = _sharpened(begin, end, ends, form_low, form_high, block, scratch)
         for k in range(d):
@@ -486,7 +556,9 @@ def shade(pixels, left, above, reordered, block, inputs, bounds):
             lower[row, column, channel] = u[channel]
             upper[row, column, channel] = u[4 + channel]
         if linear.shape[0] > 0:
-            store(u, 0, r + maximum(fall, rise))
+            store(u, 0, (r + 0.5 * (falls + rises) + maximum(fall, rise)) * UP)
+            # skipping lowers by half of what it lowers and raises by half of what it raises, give or take as much
+            store(t, 0, load4(t, 0) + 0.5 * (rises - falls))
             for channel in range(3):
                 for k in range(m):
                     linear[0, row, column, channel, k] = t[4 * k + channel]

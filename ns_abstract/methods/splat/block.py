@@ -22,6 +22,8 @@ from ns_abstract.methods.splat.lists import BLOCK, PIXELS
 assert PIXELS == 64 and BLOCK == 8
 
 
+#: Lanes that are looked at together where they are fragments of one pixel.
+LANES = 8
 #: List entries that are looked at together: no step waits for the one before.
 BATCH = 8
 
@@ -32,7 +34,8 @@ BATCH = 8
 TLO, THI, LAST, RHO, LOST, OPEN, HIDDEN, NUMBERS = range(0, 8 * PIXELS, PIXELS)
 ROWS = 8
 #: Columns of a fragment: bounds of alpha, middle and half-width of the range of its curvature, alpha's coefficients and
-#: then its radius; where curvature is kept (B10), coefficients of products of two parameters follow.
+#: then its radius; where curvature is kept (B10), coefficients of products of two parameters follow, and the alpha up
+#: to which the fragment may be skipped, or 0 (`jump_column`).
 ALPHA_LOW, ALPHA_HIGH, BEND, BEND_SPREAD, FORM = range(5)
 #: What a list tells of the light at a fragment: behind it at its least, before it at its most.
 LEFT, LIGHT = range(2)
@@ -40,6 +43,8 @@ LEFT, LIGHT = range(2)
 LISTED = 4
 #: Columns of a row of moves: by how much reordering may lower and raise the pixel, found from sums and from maxima.
 MOVES = 16
+#: Rows of `Jumps` before the forms, and beside the slopes of their restrictions to a part of the box.
+JUMP_FORM, JUMP_RESTRICTED = 11, 13
 #: Fragments that each pixel's list has room for at first.
 _CAPACITY = 256
 #: Room for list positions at first.
@@ -64,6 +69,7 @@ class Fragments(NamedTuple):
             ``bends`` more.
         width: Numbers of a fragment.
         bends: Coefficients of products of two parameters that are kept beside forms of order 1.
+        jump: See `jump_column`.
         lists: [PIXELS, capacity, LISTED] each pixel's fragments, nearest first.
         light: [PIXELS, capacity, 2] the light at each: see `LEFT`.
         lengths: [PIXELS] of the lists.
@@ -74,6 +80,7 @@ class Fragments(NamedTuple):
     values: np.ndarray
     width: int
     bends: int
+    jump: int
     lists: np.ndarray
     light: np.ndarray
     lengths: np.ndarray
@@ -140,6 +147,22 @@ class Reordering(NamedTuple):
     moves: np.ndarray
 
 
+class Jumps(NamedTuple):
+    """Fragments of one pixel that some poses skip (design.md, B11), farthest first.
+
+    Attributes:
+        entries: [capacity] where they stand in the pixel's list.
+        distances: [capacity, 8] by channel, the least and then the greatest of a fragment's colour minus what is behind.
+        rows: [jump_rows, room] numbers of each, see `jumps`.
+        room: Whole lanes.
+    """
+
+    entries: np.ndarray
+    distances: np.ndarray
+    rows: np.ndarray
+    room: int
+
+
 class Batch(NamedTuple):
     """Scratch for `BATCH` list positions on the pixels that they may reach, one after the other.
 
@@ -164,7 +187,7 @@ class Block(NamedTuple):
 
     Attributes:
         shifted: Depths of one pixel's list against its own reference (see `depths`).
-        sums: [3 m + bends + 4, 4] scratch by channel: polynomials, then what `blend` and `depths` need beside them.
+        sums: [3 m + bends + 5, 4] scratch by channel: polynomials, then what `blend` and `depths` need beside them.
         ray: [3] the block's central ray at the cell's middle, world axes, of unit depth.
     """
 
@@ -174,6 +197,7 @@ class Block(NamedTuple):
     entries: Entries
     reordering: Reordering
     batch: Batch
+    jumps: Jumps
     sums: np.ndarray
     ray: np.ndarray
 
@@ -203,6 +227,9 @@ class Buffers(NamedTuple):
     places: np.ndarray
     moves: np.ndarray
     pairs: np.ndarray
+    skipped: np.ndarray
+    distances: np.ndarray
+    jumps: np.ndarray
 
 
 @njit(cache=True, error_model="numpy")
@@ -214,7 +241,26 @@ def bends_of(shape):
 @njit(cache=True, error_model="numpy")
 def fragment_width(shape):
     """Numbers of a fragment of forms of ``shape``: whole cache lines."""
-    return -(-(FORM + shape.monomials + 1 + bends_of(shape)) // 8) * 8
+    return -(-max(FORM + shape.monomials + 1 + bends_of(shape), jump_column(shape) + 1) // 8) * 8
+
+
+@njit(cache=True, error_model="numpy")
+def jump_column(shape):
+    """Where a fragment tells up to which alpha it may be skipped: one parameter's need no range of their curvature."""
+    return BEND if shape.order == 2 else FORM + shape.monomials + 1 + bends_of(shape)
+
+
+@njit(cache=True, error_model="numpy")
+def jump_rows(shape):
+    """Rows of `Jumps` (see `jumps`)."""
+    d = shape.dimensions
+    return JUMP_FORM + 1 + 2 * d + d * (d + 1) // 2 + JUMP_RESTRICTED
+
+
+@njit(cache=True, error_model="numpy")
+def _jump_room(shape, capacity):
+    """Columns of `Jumps`: lanes of the channels, then ``capacity``; the last row holds what a part needs beside them."""
+    return max(LANES + -(-capacity // LANES) * LANES, 20 * shape.dimensions + 80)
 
 
 @njit(cache=True, error_model="numpy")
@@ -243,7 +289,7 @@ def new_buffers(shape, forms, pair_limit, background):
         background=behind,
         nothing=np.zeros(4),
         unseen=np.zeros(8),
-        sums=np.zeros(4 * (3 * m + 4 + bends_of(shape))),
+        sums=np.zeros(4 * (3 * m + 5 + bends_of(shape))),
         ray=np.empty(3),
         positions=np.empty((7, _POSITIONS), np.int64),
         depths=np.empty((2, _POSITIONS)),
@@ -256,6 +302,9 @@ def new_buffers(shape, forms, pair_limit, background):
         places=np.empty((2 * _CAPACITY, PIXELS), np.uint32),
         moves=np.empty((32 * _CAPACITY, MOVES)),
         pairs=np.empty((pair_limit, 2), np.int64),
+        skipped=np.empty(_CAPACITY, np.int64),
+        distances=np.empty(8 * _CAPACITY),
+        jumps=np.zeros((jump_rows(shape), _jump_room(shape, _CAPACITY))),
     )
 
 
@@ -270,6 +319,7 @@ def resized(old, positions, capacity, shape, forms):
     values, lists, light, drawn, of_slots, moves = (
         old.values, old.lists, old.light, old.drawn, old.places, old.moves,
     )  # fmt: skip
+    skipped, distances, jumps = old.skipped, old.distances, old.jumps
     if capacity > lists.shape[1]:
         values = _aligned(capacity * PIXELS * fragment_width(shape))
         lists = np.empty((PIXELS, capacity, LISTED), np.uint32)
@@ -277,6 +327,8 @@ def resized(old, positions, capacity, shape, forms):
         drawn = np.empty(2 * capacity, np.int64)
         of_slots = np.empty((2 * capacity, PIXELS), np.uint32)
         moves = np.empty((32 * capacity, MOVES))
+        skipped, distances = np.empty(capacity, np.int64), np.empty(8 * capacity)
+        jumps = np.zeros((jump_rows(shape), _jump_room(shape, capacity)))
     return Buffers(
         per_pixel=old.per_pixel,
         offsets=old.offsets,
@@ -300,6 +352,9 @@ def resized(old, positions, capacity, shape, forms):
         places=of_slots,
         moves=moves,
         pairs=old.pairs,
+        skipped=skipped,
+        distances=distances,
+        jumps=jumps,
     )
 
 
@@ -311,6 +366,7 @@ def block_of(buffers, shape, forms):
         pointer(buffers.values),
         fragment_width(shape),
         bends_of(shape),
+        jump_column(shape),
         pointer(buffers.lists),
         pointer(buffers.light),
         pointer(buffers.lengths),
@@ -346,7 +402,12 @@ def block_of(buffers, shape, forms):
         pointer(buffers.batch[1]),
         pointer(buffers.rows),
     )
-    return Block(fragments, palette, shifted, entries, reordering, batch, pointer(buffers.sums), pointer(buffers.ray))
+    jumps = Jumps(
+        pointer(buffers.skipped), pointer(buffers.distances), pointer(buffers.jumps), buffers.jumps.shape[1]
+    )
+    return Block(
+        fragments, palette, shifted, entries, reordering, batch, jumps, pointer(buffers.sums), pointer(buffers.ray)
+    )
 
 
 @njit(cache=True, error_model="numpy", forceinline=True)
@@ -379,6 +440,7 @@ def set_unknown(fragments, at, high, m):
         values[at + k] = 0.0
     values[at + BEND] = 0.0
     values[at + BEND_SPREAD] = 0.0
+    values[at + fragments.jump] = 0.0
     values[at + ALPHA_LOW] = 0.0
     values[at + ALPHA_HIGH] = high
     values[at + FORM] = 0.5 * high

@@ -15,7 +15,7 @@ from numba import njit
 from ns_abstract.arithmetic.rounding import FRAGMENT_ROUNDING, UNIT64, UP
 from ns_abstract.arithmetic.simd.intrinsics import advanced, lowest_bit, signed
 from ns_abstract.arithmetic.simd.lanes import maximum, minimum, store
-from ns_abstract.methods.splat.blend import blend_quadratic, blend_several, form_range
+from ns_abstract.methods.splat.blend import blend_quadratic, blend_several, flattened, form_range
 from ns_abstract.methods.splat.block import (
     ALPHA_HIGH,
     FORM,
@@ -165,9 +165,12 @@ def shade_layers(pixels, left, above, block, inputs, bounds):
         _set_reference(begin, end, fragments, block.palette, reference, m)
         span = _shift_depths(begin, end, block, reference, m)
         if order == 2:
-            r, ends = blend_quadratic(begin, end, fragments, block.shifted, moves, t)
+            blended = blend_quadratic(begin, end, fragments, block.shifted, moves, t, block.jumps, False)
+            r = blended.radius
         else:
-            r, ends = blend_several(begin, end, fragments, block.shifted, moves, t, m)
+            blended = blend_several(begin, end, fragments, block.shifted, moves, t, m, block.jumps, False)
+            r = flattened(t, blended.radius, advanced(t, 4 * (m + fragments.bends)), m)
+        ends = blended.ends
         r = r * (UP + 4.0 * UNIT64 * n)
         bottom, top = form_range(t, r, order, m)
         store(by_lane, 0, maximum(ends.low, bottom))

@@ -1,0 +1,176 @@
+"""Fragments that some poses skip, against exact arithmetic (design.md, B11)."""
+
+from __future__ import annotations
+
+import itertools
+from fractions import Fraction
+
+import numpy as np
+import pytest
+from numba import njit
+
+from ns_abstract.arithmetic.simd.intrinsics import advanced, pointer
+from ns_abstract.arithmetic.simd.lanes import load4, store
+from ns_abstract.methods.splat.blend import blend_quadratic, blend_several, flattened
+from ns_abstract.methods.splat.block import (
+    ALPHA_HIGH,
+    ALPHA_LOW,
+    BEND,
+    BEND_SPREAD,
+    FORM,
+    LANES,
+    LISTED,
+    Fragments,
+    Jumps,
+    Palette,
+    bends_of,
+    color_ends,
+    color_size,
+    fragment_width,
+    jump_column,
+    jump_rows,
+)
+from ns_abstract.methods.splat.jumps import bound_by_parts, gather_jumps, set_blend
+from ns_abstract.methods.splat.stage_data import FormShape
+
+THRESHOLD = 2.0**-8
+CAPACITY = 64
+
+
+@njit(error_model="numpy")
+def _bounds(values_, lists_, colors_, background_, shape, count, limit, jumps_, t_, out_):
+    """Bounds of three channels by parts into the first 8 of ``out_``, then by constants; the number of jumps last."""
+    values, lists, colors, background = pointer(values_), pointer(lists_), pointer(colors_), pointer(background_)
+    t, out = pointer(t_), pointer(out_)
+    entries, distances, rows = jumps_
+    jumps = Jumps(pointer(entries), pointer(distances), pointer(rows), rows.shape[1])
+    fragments = Fragments(
+        values, fragment_width(shape), bends_of(shape), jump_column(shape), lists, values, lists, CAPACITY, values
+    )
+    palette = Palette(colors, 1, background, background)
+    d, m = shape.dimensions, shape.monomials
+    u = advanced(t, 4 * (m + bends_of(shape)))
+    if shape.order == 2:
+        blended = blend_quadratic(0, count, fragments, palette, values, t, jumps, True)
+    else:
+        blended = blend_several(0, count, fragments, palette, values, t, m, jumps, True)
+    up = 1.0 + 2.0**-40
+    store(out, 0, blended.radius * up)
+    set_blend(t, out, jumps, d)
+    store(out, 20, blended.since)
+    gather_jumps(0, count, blended.jumps, advanced(out, 20), fragments, jumps, out, shape)
+    falls, rises = load4(out, 0), load4(out, 4)
+    r = blended.radius
+    if shape.order == 1:
+        r = flattened(t, r, u, m)
+    reach = r * up
+    for k in range(1, m):
+        reach = reach + abs(load4(t, 4 * k))
+    store(out, 8, load4(t, 0) - reach - falls)
+    store(out, 12, load4(t, 0) + reach + rises)
+    store(out, 0, falls)
+    store(out, 4, rises)
+    bound_by_parts(blended.jumps, limit, jumps, out, d)
+    out[24] = blended.jumps
+
+
+def _fragments(shape, alphas, radii, colors):
+    """Values, lists and colours of fragments whose alphas are polynomials, within ``radii`` of them."""
+    d, m, count = shape.dimensions, shape.monomials, len(alphas)
+    values = np.zeros((count, int(fragment_width(shape))))
+    palette, lists = np.zeros((count, color_size(1) // 4, 4)), np.zeros((count, LISTED), np.uint32)
+    ends = color_ends(1) // 4
+    for e, (alpha, radius) in enumerate(zip(alphas, radii, strict=True)):
+        spread = np.abs(alpha[1:]).sum() + radius
+        low, high = max(0.0, alpha[0] - spread), min(1.0, alpha[0] + spread)
+        skips = low < THRESHOLD
+        jump = min(THRESHOLD, high) if skips else 0.0
+        values[e, int(jump_column(shape))] = THRESHOLD if skips else 0.0
+        values[e, ALPHA_LOW], values[e, ALPHA_HIGH] = 0.0 if skips else low, high
+        values[e, FORM : FORM + 1 + d] = alpha[: 1 + d]
+        values[e, FORM] -= 0.5 * jump
+        values[e, FORM + m] = (radius + 0.5 * jump) * (1.0 + 2.0**-46)
+        if shape.order == 2:
+            values[e, FORM + 2] = alpha[2]
+        else:
+            values[e, FORM + m + 1 : FORM + m + 1 + alpha.size - 1 - d] = alpha[1 + d :]
+            sizes = np.abs(alpha[1 + d :]).sum()
+            values[e, BEND], values[e, BEND_SPREAD] = 0.0, sizes
+        palette[e, 0, :3] = palette[e, ends, :3] = palette[e, ends + 1, :3] = colors[e]
+        lists[e, :2] = e, e
+    return values, palette, lists
+
+
+def _monomials(place, d):
+    return [Fraction(1), *place, *(place[i] * place[k] for i, k in itertools.combinations_with_replacement(range(d), 2))]
+
+
+def _picture(alphas, errors, colors, background, place, d):
+    """The exact blend at a place: what is below the threshold is skipped."""
+    terms = _monomials([Fraction(float(x)) for x in place], d)
+    shown = [Fraction(float(b)) for b in background]
+    for alpha, error, color in reversed(list(zip(alphas, errors, colors, strict=True))):
+        value = sum((Fraction(float(c)) * t for c, t in zip(alpha, terms, strict=True)), Fraction(float(error)))
+        if value < Fraction(THRESHOLD):
+            continue
+        shown = [old + value * (Fraction(float(c)) - old) for c, old in zip(color, shown, strict=True)]
+    return shown
+
+
+def _case(d, count, generator, size=0.8, radius=0.0):
+    """Alphas about the threshold, a few far above it, and colours."""
+    pairs = d * (d + 1) // 2
+    alphas, radii = [], np.full(count, radius * THRESHOLD)
+    for e in range(count):
+        if e % 5 == 4:
+            middle, reach = generator.uniform(0.1, 0.3), 0.02
+        else:
+            middle, reach = generator.uniform(0.9, 1.6) * THRESHOLD, size * THRESHOLD
+        linear = generator.uniform(-1.0, 1.0, d)
+        linear *= reach / np.abs(linear).sum()
+        bend = generator.uniform(-1.0, 1.0, pairs) * 0.05 * reach / pairs
+        alphas.append(np.maximum(np.array([middle, *linear, *bend]), -1.0))
+    return alphas, radii, generator.random((count, 3))
+
+
+def _bounded(d, order, alphas, radii, colors, background):
+    shape = FormShape(d, order, 3 if order == 2 else d + 1)
+    values, palette, lists = _fragments(shape, alphas, radii, colors)
+    jumps = np.zeros(CAPACITY, np.int64), np.zeros(8 * CAPACITY), np.zeros((int(jump_rows(shape)), 272))
+    t, out = np.zeros(4 * (3 * shape.monomials + 5 + d * (d + 1) // 2)), np.zeros(25)
+    _bounds(
+        values.ravel(), lists.ravel(), palette.ravel(), background, shape, len(alphas), THRESHOLD * (1.0 - 2.0**-52),
+        jumps, t, out,
+    )  # fmt: skip
+    low, high = out[0:3], out[4:7]
+    return low, high, out[8:11], out[12:15], int(out[24])
+
+
+@pytest.mark.parametrize("radius", [0.0, 0.05])
+@pytest.mark.parametrize("d, order", [(1, 2), (1, 1), (2, 1), (3, 1), (6, 1)])
+def test_skipped_fragments(d, order, radius):
+    """No pose is outside; bounds by parts say more than by constants (B11)."""
+    generator = np.random.default_rng(10 * d + order)
+    shares = []
+    for count in (1, 3, 12, 40):
+        alphas, radii, colors = _case(d, count, generator, radius=radius)
+        background = np.array([*generator.random(3), 0.0])
+        low, high, flat_low, flat_high, jumps = _bounded(d, order, alphas, radii, colors, background)
+        assert jumps > 0
+        least, most = np.full(3, np.inf), np.full(3, -np.inf)
+        places = [*generator.choice([-1.0, 1.0], (40, d)), *generator.uniform(-1.0, 1.0, (100, d)), np.zeros(d)]
+        for place in places:
+            errors = radii * generator.choice([-1.0, 0.0, 1.0], count)
+            shown = _picture(alphas, errors, colors, background[:3], place, d)
+            for channel in range(3):
+                value = shown[channel]
+                assert Fraction(float(low[channel])) <= value <= Fraction(float(high[channel])), (count, place)
+                assert Fraction(float(flat_low[channel])) <= value <= Fraction(float(flat_high[channel]))
+            shown = np.array([float(x) for x in shown])
+            least, most = np.minimum(least, shown), np.maximum(most, shown)
+        low, high = np.maximum(low, flat_low), np.minimum(high, flat_high)
+        if count > 3:
+            excess = (high - low).sum() - (most - least).sum()
+            shares.append(excess / ((flat_high - flat_low).sum() - (most - least).sum()))
+    if radius == 0.0:
+        assert max(shares) < {1: 0.35, 2: 0.6, 3: 0.75, 6: 0.9}[d], shares
