@@ -18,7 +18,6 @@ from ns_abstract.methods.splat.block import (
     BEND,
     BEND_SPREAD,
     FORM,
-    LANES,
     LISTED,
     Fragments,
     Jumps,
@@ -102,7 +101,11 @@ def _fragments(shape, alphas, radii, colors):
 
 
 def _monomials(place, d):
-    return [Fraction(1), *place, *(place[i] * place[k] for i, k in itertools.combinations_with_replacement(range(d), 2))]
+    return [
+        Fraction(1),
+        *place,
+        *(place[i] * place[k] for i, k in itertools.combinations_with_replacement(range(d), 2)),
+    ]
 
 
 def _picture(alphas, errors, colors, background, place, d):
@@ -174,3 +177,23 @@ def test_skipped_fragments(d, order, radius):
             shares.append(excess / ((flat_high - flat_low).sum() - (most - least).sum()))
     if radius == 0.0:
         assert max(shares) < {1: 0.35, 2: 0.6, 3: 0.75, 6: 0.9}[d], shares
+
+
+@pytest.mark.parametrize("d, order", [(1, 2), (3, 1)])
+def test_skipped_fragments_over_what_moves(d, order):
+    """Fragments that are skipped in front of one that fades: what they take away is not the same everywhere."""
+    generator = np.random.default_rng(d)
+    for _ in range(20):
+        # drawn but near the first corner, where what is behind differs most
+        toward = generator.choice([-1.0, 1.0], d)
+        pairs = np.zeros(d * (d + 1) // 2)
+        front = np.array([1.5 * THRESHOLD, *(0.9 * THRESHOLD / d * toward), *pairs])
+        behind = np.array([0.5, *(0.4 / d * -toward * generator.choice([-1.0, 1.0])), *pairs])
+        colors, background = np.array([[0.5, 0.2, 0.9], [1.0, 0.0, 0.3]]), np.array([0.0, 1.0, 0.8, 0.0])
+        low, high, flat_low, flat_high, jumps = _bounded(d, order, [front, behind], np.zeros(2), colors, background)
+        assert jumps == 1
+        for place in [*generator.choice([-1.0, 1.0], (30, d)), *generator.uniform(-1.0, 1.0, (30, d))]:
+            shown = _picture([front, behind], [0.0, 0.0], colors, background[:3], place, d)
+            for channel in range(3):
+                assert Fraction(float(low[channel])) <= shown[channel] <= Fraction(float(high[channel])), place
+                assert Fraction(float(flat_low[channel])) <= shown[channel] <= Fraction(float(flat_high[channel]))

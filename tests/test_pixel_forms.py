@@ -11,7 +11,7 @@ import pytest
 from numba import njit
 
 from ns_abstract.arithmetic.rounding import REAL, charges
-from ns_abstract.arithmetic.simd.intrinsics import pointer
+from ns_abstract.arithmetic.simd.intrinsics import advanced, pointer
 from ns_abstract.arithmetic.simd.lanes import load8, store
 from ns_abstract.methods.splat.alphas import (
     _affine_forms,
@@ -22,7 +22,7 @@ from ns_abstract.methods.splat.alphas import (
     _Limits,
     _set_curvature,
 )
-from ns_abstract.methods.splat.blend import blend_quadratic, blend_several
+from ns_abstract.methods.splat.blend import blend_quadratic, blend_several, flattened
 from ns_abstract.methods.splat.block import (
     ALPHA_HIGH,
     ALPHA_LOW,
@@ -31,11 +31,13 @@ from ns_abstract.methods.splat.block import (
     FORM,
     LISTED,
     Fragments,
+    Jumps,
     Palette,
     bends_of,
     color_ends,
     color_size,
     fragment_width,
+    jump_column,
 )
 from ns_abstract.methods.splat.records import FORMS, columns
 from ns_abstract.methods.splat.stage_data import FormShape
@@ -246,13 +248,20 @@ def test_the_range_of_alpha_s_curvature(d):
 @njit(error_model="numpy")
 def _blended(values_, lists_, colors_, background_, shape, forms, count, t_, out_):
     values, lists, colors, background = pointer(values_), pointer(lists_), pointer(colors_), pointer(background_)
-    nothing = pointer(out_)
-    fragments = Fragments(values, fragment_width(shape), bends_of(shape), lists, values, lists, 64, values)
+    nothing, t, m = pointer(out_), pointer(t_), shape.monomials
+    fragments = Fragments(
+        values, fragment_width(shape), bends_of(shape), jump_column(shape), lists, values, lists, 64, values
+    )
     palette = Palette(colors, forms, background, background)
+    # fragments are blended as they are, skipped or not
+    unused = Jumps(pointer(np.empty(1, np.int64)), values, values, 0)
     if shape.order == 2:
-        radius, ends = blend_quadratic(0, count, fragments, palette, values, pointer(t_))
+        blended = blend_quadratic(0, count, fragments, palette, values, t, unused, False)
+        radius = blended.radius
     else:
-        radius, ends = blend_several(0, count, fragments, palette, values, pointer(t_), shape.monomials)
+        blended = blend_several(0, count, fragments, palette, values, t, m, unused, False)
+        radius = flattened(t, blended.radius, advanced(t, 4 * (m + bends_of(shape))), m)
+    ends = blended.ends
     store(nothing, 0, radius)
     store(nothing, 4, ends.low)
     store(nothing, 8, ends.high)
@@ -351,7 +360,7 @@ def test_blends_of_exact_alphas(d, moving):
             colors[e, ends, :3], colors[e, ends + 1, :3] = colors[e, 0, :3] - drift, colors[e, 0, :3] + drift
             lists[e, :2] = e, e
         background = np.array([0.2, 0.9, 0.5, 0.0])
-        t, out = np.zeros(4 * (3 * shape.monomials + 4 + d * (d + 1) // 2)), np.zeros(12)
+        t, out = np.zeros(4 * (3 * shape.monomials + 5 + d * (d + 1) // 2)), np.zeros(12)
         _blended(values.ravel(), lists.ravel(), colors.ravel(), background, shape, forms, count, t, out)
         linear, radius, low, high = t.reshape(-1, 4)[: d + 1], out[:4], out[4:8], out[8:12]
         least, most = [Fraction(10)] * 3, [Fraction(-10)] * 3
@@ -391,7 +400,7 @@ def _two_layers(front, behind, radius=0.0, bounds=None):
         colors[e, :, 0] = 1.0 - e
         colors[e, 1, 0] = 0.0
         lists[e, :2] = e, e
-    t, out = np.zeros(4 * (3 * m + 4 + 3)), np.zeros(12)
+    t, out = np.zeros(4 * (3 * m + 5 + 3)), np.zeros(12)
     background = np.array([0.5, 0.0, 0.0, 0.0])
     _blended(values.ravel(), lists.ravel(), colors.ravel(), background, shape, 1, 2, t, out)
     return t.reshape(-1, 4)[:m, 0], out[0], out[4], out[8]

@@ -223,7 +223,9 @@ def lane_sum(typingctx, a):  # pyright: ignore[reportRedeclaration]
         value, width = args[0], sig.args[0].width
         while width > 1:
             width //= 2
-            low, high = (ir.Constant(ir.VectorType(_INT32, width), [_INT32(k + at) for k in range(width)]) for at in (0, width))
+            low, high = (
+                ir.Constant(ir.VectorType(_INT32, width), [_INT32(k + at) for k in range(width)]) for at in (0, width)
+            )
             value = builder.fadd(builder.shuffle_vector(value, value, low), builder.shuffle_vector(value, value, high))
         return builder.extract_element(value, _INT32(0))
 

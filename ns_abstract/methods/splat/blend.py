@@ -1,4 +1,4 @@
-"""Blending of a pixel's fragments back to front, as forms and as intervals (design.md, B7-B9, O2-O4).
+"""Blending of a pixel's fragments back to front, as forms and as intervals (design.md, B7-B11, O2-O4).
 
 SIMD lanes are the three channels, and a fourth one of nothing.
 """
@@ -34,7 +34,7 @@ from ns_abstract.methods.splat.lists import BLOCK, PIXELS
 #: Fragments ahead that are asked for.
 _AHEAD = 2
 #: Jumps are looked at together where they may widen a pixel by more than this part.
-_JUMPS_MATTER = 2.0**-5
+_JUMPS_MATTER = 2.0**-4
 #: Reordering that moves no channel of a pixel by more is not examined beyond the swap bound.
 _REORDERING_MATTERS = 1e-4
 
@@ -295,7 +295,9 @@ def blend_quadratic(begin, end, fragments, palette, moves, t, jumps, split):
         a2 = abs(a2)
         dropped = fma(0.25, abs(cubic), 0.125 * abs(quartic))
         added = fma(values[at + ALPHA_HIGH], load4(colors, key + 4 * forms), dropped)
-        added = fma(values[at + FORM + 3] - jump, size, fma(FRAGMENT_ROUNDING, fma(1.0 + a1 + a2, size, abs(p0)), added))
+        added = fma(
+            values[at + FORM + 3] - jump, size, fma(FRAGMENT_ROUNDING, fma(1.0 + a1 + a2, size, abs(p0)), added)
+        )
         r = fma(1.0 - values[at + ALPHA_LOW], r, added)
         ends = _blend_interval(ends, values, at, colors, key + color_ends(forms))
         if move != 0:
@@ -488,7 +490,7 @@ def _slack(q, ends, block, inputs, u):
 
 @njit(cache=True, error_model="numpy")
 def shade(pixels, left, above, reordered, block, inputs, bounds):
-    """Blend the fragments of each of a block's ``pixels`` and write its bounds (design.md, B7-B9).
+    """Blend the fragments of each of a block's ``pixels`` and write its bounds (design.md, B7-B9, B11).
 
     The block begins at column ``left`` and row ``above`` of its tile, whose parts of `PixelBounds` are ``bounds``;
     ``reordered`` tells whether fragments may move. Row OPEN of `Fragments.per_pixel` bounds the light that comes to

@@ -1,4 +1,4 @@
-"""What the pixel stage keeps of a block of pixels, and where (design.md, B1-B9).
+"""What the pixel stage keeps of a block of pixels, and where (design.md, B1-B11).
 
 A fragment is one Gaussian on one pixel: what is known of its alpha, and of the light before and behind it. Fragments
 lie one after the other; each pixel lists those that may contribute to it, nearest first, with the places of their
@@ -152,7 +152,7 @@ class Jumps(NamedTuple):
 
     Attributes:
         entries: [capacity] where they stand in the pixel's list.
-        distances: [capacity, 8] by channel, the least and then the greatest of a fragment's colour minus what is behind.
+        distances: [capacity, 8] by channel, the least and then the greatest of its colour minus what is behind.
         rows: [jump_rows, room] numbers of each, see `jumps`.
         room: Whole lanes.
     """
@@ -259,7 +259,7 @@ def jump_rows(shape):
 
 @njit(cache=True, error_model="numpy")
 def _jump_room(shape, capacity):
-    """Columns of `Jumps`: lanes of the channels, then ``capacity``; the last row holds what a part needs beside them."""
+    """Columns of `Jumps`: the channels, then ``capacity``; the last row holds what a part needs beside them."""
     return max(LANES + -(-capacity // LANES) * LANES, 20 * shape.dimensions + 80)
 
 
@@ -402,9 +402,7 @@ def block_of(buffers, shape, forms):
         pointer(buffers.batch[1]),
         pointer(buffers.rows),
     )
-    jumps = Jumps(
-        pointer(buffers.skipped), pointer(buffers.distances), pointer(buffers.jumps), buffers.jumps.shape[1]
-    )
+    jumps = Jumps(pointer(buffers.skipped), pointer(buffers.distances), pointer(buffers.jumps), buffers.jumps.shape[1])
     return Block(
         fragments, palette, shifted, entries, reordering, batch, jumps, pointer(buffers.sums), pointer(buffers.ray)
     )

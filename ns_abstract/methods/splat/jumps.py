@@ -54,7 +54,7 @@ def _columns(count):
 
 @njit(cache=True, error_model="numpy")
 def gather_jumps(begin, end, count, since, fragments, jumps, out, shape):
-    """Fill the rows of ``count`` fragments of the list entries [begin, end), and bound what skipping changes.
+    """Fill the rows of ``count`` fragments of the list entries [begin, end), and bound what skipping changes (B11).
 
     By channel, only those from number ``since`` [4] on count. ``out`` [16] receives by how much it lowers and raises
     the channels at most, without regard to where; the rest is scratch.
@@ -223,9 +223,13 @@ def _by_planes(columns, side, place, bounds, jumps, d):
         for k in range(d):
             alpha = fma(place[k], load8(rows, (part + 1 + k) * room + column), alpha)
         near = alpha < load8(rows, _THRESHOLD * room + column)
-        above = where(near, load8(rows, (behind + _ABOVE) * room + column), load8(rows, (behind + _FAR_ABOVE) * room + column))
+        above = where(
+            near, load8(rows, (behind + _ABOVE) * room + column), load8(rows, (behind + _FAR_ABOVE) * room + column)
+        )
         above_at_0 = where(near, 0.0, load8(rows, (behind + _FAR_ABOVE_AT_0) * room + column))
-        below = where(near, load8(rows, (behind + _BELOW) * room + column), load8(rows, (behind + _FAR_BELOW) * room + column))
+        below = where(
+            near, load8(rows, (behind + _BELOW) * room + column), load8(rows, (behind + _FAR_BELOW) * room + column)
+        )
         below_at_0 = where(near, load8(rows, (behind + _BELOW_AT_0) * room + column), 0.0)
         # the values of either plane, without slopes
         above_at_0 = fma(above, center + where(above > 0.0, high, low), above_at_0)
@@ -317,7 +321,7 @@ def _place_part(number, pieces, middle, half, d):
 
 @njit(cache=True, error_model="numpy", forceinline=True)
 def _foremost(foretold, left):
-    """Of the parts ``left`` the one for which most is ``foretold`` [_PARTS, 8] of a channel and side, against the others."""
+    """Of the parts ``left`` the one for which most is ``foretold`` [_PARTS, 8] of the channels, up or down."""
     best, most = 0, -float("inf")
     for number in range(_PARTS):
         if left & (1 << number) == 0:
@@ -333,7 +337,7 @@ def _foremost(foretold, left):
 
 @njit(cache=True, error_model="numpy")
 def bound_by_parts(count, limit, jumps, out, d):
-    """Bounds of three channels, whose blends `set_blend` wrote, with ``count`` fragments that may be skipped.
+    """Bounds of three channels, whose blends `set_blend` wrote, with ``count`` fragments that may be skipped (B11).
 
     ``out`` [8] holds by how much skipping lowers the channels at most, then by how much it raises them; it receives
     lower bounds, then upper ones, each of three channels and one of none. ``d`` is positive.
@@ -361,7 +365,8 @@ def bound_by_parts(count, limit, jumps, out, d):
             foretold[8 * number + channel] = (reach - low + out[channel]) * UP - center
             foretold[8 * number + 4 + channel] = (reach + high + out[4 + channel]) * UP + center
     for k in range(8):
-        out[k] = -float("inf")
+        # nothing is known of the channel of nothing
+        out[k] = -float("inf") if k % 4 < 3 else float("inf")
     left = (1 << _PARTS) - 1
     while left != 0:
         number = _foremost(foretold, left)

@@ -1,4 +1,4 @@
-"""Per-pixel stage of the bounds: the tiles of a picture, block by block, on all threads (design.md, B1-B9, R4).
+"""Per-pixel stage of the bounds: the tiles of a picture, block by block, on all threads (design.md, B1-B11, R4).
 
 A block of `PIXELS` pixels passes two steps: `fragments` collects what may be drawn, with alphas from `alphas`, and
 `blend` blends it, each pixel by itself; `block` tells how fragments are kept.
