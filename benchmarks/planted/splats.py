@@ -326,14 +326,6 @@ SPLATS = (
         "test_jumps.py::test_skipped_fragments[1-2-0.0]",
     ),
     Fault(
-        "planes take the wrong end of what alpha is off",
-        _JUMPS,
-        "_by_planes",
-        "where(above > 0.0, high, low)",
-        "where(above > 0.0, low, high)",
-        "test_jumps.py::test_skipped_fragments[1-2-0.05]",
-    ),
-    Fault(
         "only the foremost part is bounded",
         _JUMPS,
         "bound_by_parts",
