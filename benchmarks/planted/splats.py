@@ -366,6 +366,14 @@ SPLATS = (
         "test_bounds.py::test_many_layers_at_the_threshold[one-classic]",
     ),
     Fault(
+        "linear sets: half of what is off the slopes",
+        _BLEND,
+        "shade",
+        "0.5 * (most - least)",
+        "0.25 * (most - least)",
+        "test_bounds.py::test_many_layers_at_the_threshold[one-classic]",
+    ),
+    Fault(
         "1/255 is not a jump",
         _ALPHAS,
         "_drawn",

@@ -28,7 +28,7 @@ from ns_abstract.methods.splat.block import (
     listed_fragment,
     parabola,
 )
-from ns_abstract.methods.splat.jumps import bound_by_parts, gather_jumps, set_blend
+from ns_abstract.methods.splat.jumps import bound_by_parts, gather_jumps, set_blend, set_straight
 from ns_abstract.methods.splat.lists import BLOCK, PIXELS
 
 #: Fragments ahead that are asked for.
@@ -530,6 +530,8 @@ def shade(pixels, left, above, reordered, block, inputs, bounds):
         r = r * up
         form_low, form_high = form_range(t, r, order, m)
         low, high = ends.low, ends.high
+        # skipping lowers by half of what it lowers and raises by half of what it raises, give or take as much
+        middle, spread = load4(t, 0) + 0.5 * (rises - falls), (r + 0.5 * (falls + rises)) * UP
         if blended.jumps > 0:
             # as if nothing were skipped
             spared_low, spared_high = maximum(low, form_low), minimum(high, form_high)
@@ -540,6 +542,16 @@ def shade(pixels, left, above, reordered, block, inputs, bounds):
                 store(u, 4, rises)
                 bound_by_parts(blended.jumps, limit, jumps, u, d)
                 form_low, form_high = maximum(form_low, load4(u, 0)), minimum(form_high, load4(u, 4))
+                if linear.shape[0] > 0:
+                    # what is off the slopes alone
+                    set_straight(jumps, d, order)
+                    store(u, 0, falls)
+                    store(u, 4, rises)
+                    bound_by_parts(blended.jumps, limit, jumps, u, d)
+                    least, most = load4(u, 0), load4(u, 4)
+                    half = 0.5 * (most - least) + FRAGMENT_ROUNDING * (abs(least) + abs(most))
+                    middle = where(half < spread, 0.5 * (least + most), middle)
+                    spread = minimum(spread, half)
         if reordered:
             low, high = _sharpened(begin, end, ends, form_low, form_high, block, scratch)
         for k in range(d):
@@ -558,9 +570,8 @@ def shade(pixels, left, above, reordered, block, inputs, bounds):
             lower[row, column, channel] = u[channel]
             upper[row, column, channel] = u[4 + channel]
         if linear.shape[0] > 0:
-            store(u, 0, (r + 0.5 * (falls + rises) + maximum(fall, rise)) * UP)
-            # skipping lowers by half of what it lowers and raises by half of what it raises, give or take as much
-            store(t, 0, load4(t, 0) + 0.5 * (rises - falls))
+            store(t, 0, middle)
+            store(u, 0, (spread + maximum(fall, rise)) * UP)
             for channel in range(3):
                 for k in range(m):
                     linear[0, row, column, channel, k] = t[4 * k + channel]

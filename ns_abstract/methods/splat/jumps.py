@@ -133,6 +133,15 @@ def set_blend(t, radii, jumps, d):
 
 
 @njit(cache=True, error_model="numpy")
+def set_straight(jumps, d, order):
+    """Take out of the blends what linear sets follow: slopes, and of one parameter and order 2 the curvature (B11)."""
+    rows, room = jumps.rows, jumps.room
+    for row in range(1, 1 + d + (1 if order == 2 else 0)):
+        for channel in range(3):
+            rows[(JUMP_FORM + row) * room + channel] = 0.0
+
+
+@njit(cache=True, error_model="numpy")
 def _restrict(start, columns, middle, half, limit, jumps, d):
     """Forms over the part of the box about ``middle`` [d] of the half-widths ``half`` [d], and planes of what is taken.
 
