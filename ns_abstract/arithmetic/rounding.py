@@ -34,6 +34,8 @@ FORM_ROUNDING = 12.0 * UNIT64
 SUM_ROUNDING = 8.0 * UNIT64
 #: A whitened offset, an alpha or a blend of forms, 12 at most; 4 to spare.
 FRAGMENT_ROUNDING = 16.0 * UNIT64
+#: Quadratic forms over a part of the box: a coefficient is a sum of at most 44 products (d <= 8) of two roundings each.
+PART_ROUNDING = 128.0 * UNIT64
 #: Pixels, tiles and radii that are computed from bounds: at most 2^20 roundings.
 REGION = 1.0 + 2.0**-30
 #: Taylor models: radii are sums of fewer than 2^10 terms, of two roundings each.

@@ -602,8 +602,9 @@ class Refinement:
             probe, affordable = self._probe(part, everything)
             excess = self._beyond(part, probe)
             aim = _AIM_SHARE * goal.excess(self._mpg(self.witness_lower, self.witness_upper))
-            # it falls with the square of the width
-            wanted = math.ceil(count * math.sqrt(min(excess / aim, 1e6))) if aim > 0.0 < excess else count
+            # it falls with the square of the width, and of wider cells faster, where intervals take the place of forms
+            share = min(excess / aim, 1e6) if aim > 0.0 < excess else 1.0
+            wanted = math.ceil(count * (math.sqrt(share) if share > 1.0 else share**0.25))
             most = int(min(affordable, _COVER_CELLS))
             helped = self._helped(excess, before, _HELPS)
             if wanted < 2 * count or 2 * count > most or not helped:

@@ -22,7 +22,7 @@ import math
 from numba import njit
 
 from ns_abstract.arithmetic.elementary import fma
-from ns_abstract.arithmetic.rounding import UNIT64, UP
+from ns_abstract.arithmetic.rounding import PART_ROUNDING, UNIT64, UP
 from ns_abstract.arithmetic.simd.intrinsics import advanced
 from ns_abstract.arithmetic.simd.lanes import lane_sum, load4, load8, maximum, minimum, store, where
 from ns_abstract.methods.splat.block import ALPHA_HIGH, ALPHA_LOW, FORM, JUMP_FORM, LANES, LISTED
@@ -31,8 +31,6 @@ from ns_abstract.methods.splat.block import ALPHA_HIGH, ALPHA_LOW, FORM, JUMP_FO
 _PARTS = 8
 #: Planes whose steepness would divide by less than this part of the threshold are left out.
 _STEEP = 2.0**-20
-#: Rounding of a form restricted to a part, in units of its size.
-_RESTRICTION = 2.0**7 * UNIT64
 
 _RADIUS, _TOP, _THRESHOLD, _SIZE, _SIZES, _WEIGHTS = range(6)
 # from `_restricted_rows` on: centre, then behind the slopes
@@ -106,7 +104,7 @@ def gather_jumps(begin, end, count, since, fragments, jumps, out, shape):
                 bend = values[at + products + pair]
                 rows[(JUMP_FORM + 1 + d + pair) * room + column] = bend
                 size += abs(bend)
-            radius = (values[at + FORM + shape.monomials] - 0.5 * jump + _RESTRICTION * size) * UP
+            radius = (values[at + FORM + shape.monomials] - 0.5 * jump + PART_ROUNDING * size) * UP
             rows[_RADIUS * room + column] = radius
             rows[_TOP * room + column] = top
             rows[_THRESHOLD * room + column] = threshold
@@ -128,7 +126,7 @@ def set_blend(t, radii, jumps, d):
             value = t[4 * row + channel] if channel < 3 else 0.0
             rows[(JUMP_FORM + row) * room + channel] = value
             size += abs(value)
-        rows[_RADIUS * room + channel] = (radii[channel] + _RESTRICTION * size) * UP if channel < 3 else 0.0
+        rows[_RADIUS * room + channel] = (radii[channel] + PART_ROUNDING * size) * UP if channel < 3 else 0.0
         rows[_SIZE * room + channel] = size
 
 
