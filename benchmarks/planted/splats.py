@@ -360,7 +360,7 @@ SPLATS = (
     Fault(
         "linear sets: skipping lowers nothing",
         _BLEND,
-        "shade",
+        "_form_bounds",
         "load4(t, 0) + 0.5 * (rises - falls)",
         "load4(t, 0) + 0.5 * (rises + falls)",
         "test_bounds.py::test_many_layers_at_the_threshold[one-classic]",
@@ -368,7 +368,7 @@ SPLATS = (
     Fault(
         "linear sets: half of what is off the slopes",
         _BLEND,
-        "shade",
+        "_form_bounds",
         "0.5 * (most - least)",
         "0.25 * (most - least)",
         "test_bounds.py::test_many_layers_at_the_threshold[one-classic]",

@@ -56,6 +56,22 @@ class _Scratch(NamedTuple):
     order: Any
 
 
+class _Shown(NamedTuple):
+    """What is known of a pixel; lanes are channels.
+
+    Attributes:
+        low, high: Bounds by forms.
+        ends: By intervals.
+        center, radius: Of the linear sets, whose slopes are those of the polynomials.
+    """
+
+    low: Any
+    high: Any
+    ends: Any
+    center: Any
+    radius: Any
+
+
 class _Blend(NamedTuple):
     """A blended pixel; lanes are channels.
 
@@ -488,6 +504,59 @@ def _slack(q, ends, block, inputs, u):
     return slack + fall, slack + rise
 
 
+@njit(cache=True, error_model="numpy", forceinline=True)
+def _form_bounds(begin, end, block, inputs, linear):
+    """What forms and intervals say of the list entries [begin, end) of a pixel: a `_Shown` (design.md, B7-B11).
+
+    The block's sums receive the polynomials, scratch behind them; ``linear`` tells whether their sets are asked for.
+    """
+    fragments, palette, moves, jumps = block.fragments, block.palette, block.reordering.moves, block.jumps
+    t, limit = block.sums, inputs.rules.alpha_min * (1.0 - inputs.charges.threshold)
+    d, order, m = inputs.shape.dimensions, inputs.shape.order, inputs.shape.monomials
+    u = advanced(t, 4 * (m + fragments.bends))
+    if order == 2:
+        blended = blend_quadratic(begin, end, fragments, palette, moves, t, jumps, True)
+    else:
+        blended = blend_several(begin, end, fragments, palette, moves, t, m, jumps, True)
+    radius, ends = blended.radius, blended.ends
+    # the radius' own rounding: three for every fragment
+    up = UP + 4.0 * UNIT64 * (end - begin)
+    falls, rises = 0.0 * radius, 0.0 * radius
+    if blended.jumps > 0:
+        store(u, 0, radius * up)
+        set_blend(t, u, jumps, d)
+        store(u, 16, blended.since)
+        gather_jumps(begin, end, blended.jumps, advanced(u, 16), fragments, jumps, u, inputs.shape)
+        falls, rises = load4(u, 0), load4(u, 4)
+    if order == 1:
+        radius = flattened(t, radius, u, m)
+    radius = radius * up
+    drawn_low, drawn_high = form_range(t, radius, order, m)
+    low, high = drawn_low - falls, drawn_high + rises
+    # skipping lowers by half of what it lowers and raises by half of what it raises, give or take as much
+    center, radius = load4(t, 0) + 0.5 * (rises - falls), (radius + 0.5 * (falls + rises)) * UP
+    # what skipping adds to bounds without it
+    drawn_low, drawn_high = maximum(ends.low, drawn_low), minimum(ends.high, drawn_high)
+    added = (minimum(ends.high, high) - drawn_high) + (drawn_low - maximum(ends.low, low))
+    if blended.jumps == 0 or d == 0 or bits(added > _JUMPS_MATTER * (drawn_high - drawn_low)) & 7 == 0:
+        return _Shown(low, high, ends, center, radius)
+    store(u, 0, falls)
+    store(u, 4, rises)
+    bound_by_parts(blended.jumps, limit, jumps, u, d)
+    low, high = maximum(low, load4(u, 0)), minimum(high, load4(u, 4))
+    if linear:
+        # what is off the slopes alone
+        set_straight(jumps, d, order)
+        store(u, 0, falls)
+        store(u, 4, rises)
+        bound_by_parts(blended.jumps, limit, jumps, u, d)
+        least, most = load4(u, 0), load4(u, 4)
+        half = 0.5 * (most - least) + FRAGMENT_ROUNDING * (abs(least) + abs(most))
+        center = where(half < radius, 0.5 * (least + most), center)
+        radius = minimum(radius, half)
+    return _Shown(low, high, ends, center, radius)
+
+
 @njit(cache=True, error_model="numpy")
 def shade(pixels, left, above, reordered, block, inputs, bounds):
     """Blend the fragments of each of a block's ``pixels`` and write its bounds (design.md, B7-B9, B11).
@@ -496,10 +565,9 @@ def shade(pixels, left, above, reordered, block, inputs, bounds):
     ``reordered`` tells whether fragments may move. Row OPEN of `Fragments.per_pixel` bounds the light that comes to
     fragments that are missing and have colours between the two of `Palette.unseen`.
     """
-    fragments, palette, moves, t = block.fragments, block.palette, block.reordering.moves, block.sums
-    jumps, limit = block.jumps, inputs.rules.alpha_min * (1.0 - inputs.charges.threshold)
+    fragments, palette, t = block.fragments, block.palette, block.sums
     lower, upper, linear, slopes = bounds.lower, bounds.upper, bounds.linear, bounds.slopes
-    d, order, m = inputs.shape.dimensions, inputs.shape.order, inputs.shape.monomials
+    d, m = inputs.shape.dimensions, inputs.shape.monomials
     # behind the polynomials: scratch, then sums of absolute linear coefficients
     u = advanced(t, 4 * (m + fragments.bends))
     sums = advanced(u, 4 * m + 20)
@@ -511,47 +579,9 @@ def shade(pixels, left, above, reordered, block, inputs, bounds):
         pixels = signed(pixels & (pixels - 1))
         begin = q * fragments.capacity
         end = begin + int(fragments.lengths[q])
-        if order == 2:
-            blended = blend_quadratic(begin, end, fragments, palette, moves, t, jumps, True)
-        else:
-            blended = blend_several(begin, end, fragments, palette, moves, t, m, jumps, True)
-        r, ends = blended.radius, blended.ends
-        # the radius' own rounding: three for every fragment
-        up = UP + 4.0 * UNIT64 * fragments.lengths[q]
-        falls, rises = 0.0 * r, 0.0 * r
-        if blended.jumps > 0:
-            store(u, 0, r * up)
-            set_blend(t, u, jumps, d)
-            store(u, 16, blended.since)
-            gather_jumps(begin, end, blended.jumps, advanced(u, 16), fragments, jumps, u, inputs.shape)
-            falls, rises = load4(u, 0), load4(u, 4)
-        if order == 1:
-            r = flattened(t, r, u, m)
-        r = r * up
-        form_low, form_high = form_range(t, r, order, m)
+        shown = _form_bounds(begin, end, block, inputs, linear.shape[0] > 0)
+        form_low, form_high, ends = shown.low, shown.high, shown.ends
         low, high = ends.low, ends.high
-        # skipping lowers by half of what it lowers and raises by half of what it raises, give or take as much
-        middle, spread = load4(t, 0) + 0.5 * (rises - falls), (r + 0.5 * (falls + rises)) * UP
-        if blended.jumps > 0:
-            # as if nothing were skipped
-            spared_low, spared_high = maximum(low, form_low), minimum(high, form_high)
-            form_low, form_high = form_low - falls, form_high + rises
-            taken = (minimum(high, form_high) - spared_high) + (spared_low - maximum(low, form_low))
-            if d > 0 and bits(taken > _JUMPS_MATTER * (spared_high - spared_low)) & 7 != 0:
-                store(u, 0, falls)
-                store(u, 4, rises)
-                bound_by_parts(blended.jumps, limit, jumps, u, d)
-                form_low, form_high = maximum(form_low, load4(u, 0)), minimum(form_high, load4(u, 4))
-                if linear.shape[0] > 0:
-                    # what is off the slopes alone
-                    set_straight(jumps, d, order)
-                    store(u, 0, falls)
-                    store(u, 4, rises)
-                    bound_by_parts(blended.jumps, limit, jumps, u, d)
-                    least, most = load4(u, 0), load4(u, 4)
-                    half = 0.5 * (most - least) + FRAGMENT_ROUNDING * (abs(least) + abs(most))
-                    middle = where(half < spread, 0.5 * (least + most), middle)
-                    spread = minimum(spread, half)
         if reordered:
             low, high = _sharpened(begin, end, ends, form_low, form_high, block, scratch)
         for k in range(d):
@@ -570,8 +600,8 @@ def shade(pixels, left, above, reordered, block, inputs, bounds):
             lower[row, column, channel] = u[channel]
             upper[row, column, channel] = u[4 + channel]
         if linear.shape[0] > 0:
-            store(t, 0, middle)
-            store(u, 0, (spread + maximum(fall, rise)) * UP)
+            store(t, 0, shown.center)
+            store(u, 0, (shown.radius + maximum(fall, rise)) * UP)
             for channel in range(3):
                 for k in range(m):
                     linear[0, row, column, channel, k] = t[4 * k + channel]

@@ -23,7 +23,7 @@ from numba import njit
 
 from ns_abstract.arithmetic.elementary import fma
 from ns_abstract.arithmetic.rounding import PART_ROUNDING, UNIT64, UP
-from ns_abstract.arithmetic.simd.intrinsics import advanced
+from ns_abstract.arithmetic.simd.intrinsics import advanced, lowest_bit
 from ns_abstract.arithmetic.simd.lanes import lane_sum, load4, load8, maximum, minimum, store, where
 from ns_abstract.methods.splat.block import ALPHA_HIGH, ALPHA_LOW, FORM, JUMP_FORM, LANES, LISTED
 
@@ -252,6 +252,7 @@ def _by_planes(columns, side, place, bounds, jumps, d):
         weight = load8(rows, weights + 2 * room + column)
         store(rows, products + 2 * room + column, weight * where(weight > 0.0, above, below))
         third = fma(weight, where(weight > 0.0, above_at_0, below_at_0), third)
+    # rounding of the sums and of what they are of
     slack = (columns + 64.0) * UNIT64 * lane_sum(sizes)
     bounds[0], bounds[1], bounds[2] = lane_sum(first) + slack, lane_sum(second) + slack, lane_sum(third) + slack
     for channel in range(3):
@@ -329,7 +330,7 @@ def _place_part(number, pieces, middle, half, d):
 @njit(cache=True, error_model="numpy", forceinline=True)
 def _foremost(foretold, left):
     """Of the parts ``left`` the one for which most is ``foretold`` [_PARTS, 8] of the channels, up or down."""
-    best, most = 0, -float("inf")
+    best, most = lowest_bit(left), -float("inf")
     for number in range(_PARTS):
         if left & (1 << number) == 0:
             continue
