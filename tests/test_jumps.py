@@ -7,11 +7,12 @@ from fractions import Fraction
 
 import numpy as np
 import pytest
+from blends import CAPACITY, blended
 from numba import njit
 
 from ns_abstract.arithmetic.simd.intrinsics import advanced, pointer
 from ns_abstract.arithmetic.simd.lanes import load4, store
-from ns_abstract.methods.splat.blend import blend_quadratic, blend_several, flattened
+from ns_abstract.methods.splat.blend import flattened
 from ns_abstract.methods.splat.block import (
     ALPHA_HIGH,
     ALPHA_LOW,
@@ -19,9 +20,7 @@ from ns_abstract.methods.splat.block import (
     BEND_SPREAD,
     FORM,
     LISTED,
-    Fragments,
     Jumps,
-    Palette,
     bends_of,
     color_ends,
     color_size,
@@ -33,33 +32,24 @@ from ns_abstract.methods.splat.jumps import bound_by_parts, gather_jumps, set_bl
 from ns_abstract.methods.splat.stage_data import FormShape
 
 THRESHOLD = 2.0**-8
-CAPACITY = 64
 
 
 @njit(error_model="numpy")
-def _bounds(values_, lists_, colors_, background_, shape, count, limit, jumps_, t_, out_):
+def _bounds(values, lists, colors, background, shape, count, limit, jumps_, t_, out_):
     """Bounds of three channels by parts into the first 8 of ``out_``, then by constants; the number of jumps last."""
-    values, lists, colors, background = pointer(values_), pointer(lists_), pointer(colors_), pointer(background_)
     t, out = pointer(t_), pointer(out_)
     entries, distances, rows = jumps_
     jumps = Jumps(pointer(entries), pointer(distances), pointer(rows), rows.shape[1])
-    fragments = Fragments(
-        values, fragment_width(shape), bends_of(shape), jump_column(shape), lists, values, lists, CAPACITY, values
-    )
-    palette = Palette(colors, 1, background, background)
     d, m = shape.dimensions, shape.monomials
     u = advanced(t, 4 * (m + bends_of(shape)))
-    if shape.order == 2:
-        blended = blend_quadratic(0, count, fragments, palette, values, t, jumps, True)
-    else:
-        blended = blend_several(0, count, fragments, palette, values, t, m, jumps, True)
+    fragments, blend = blended(values, lists, colors, background, shape, 1, count, t, jumps, True)
     up = 1.0 + 2.0**-40
-    store(out, 0, blended.radius * up)
+    store(out, 0, blend.radius * up)
     set_blend(t, out, jumps, d)
-    store(out, 20, blended.since)
-    gather_jumps(0, count, blended.jumps, advanced(out, 20), fragments, jumps, out, shape)
+    store(out, 20, blend.since)
+    gather_jumps(0, count, blend.jumps, advanced(out, 20), fragments, jumps, out, shape)
     falls, rises = load4(out, 0), load4(out, 4)
-    r = blended.radius
+    r = blend.radius
     if shape.order == 1:
         r = flattened(t, r, u, m)
     reach = r * up
@@ -69,8 +59,8 @@ def _bounds(values_, lists_, colors_, background_, shape, count, limit, jumps_, 
     store(out, 12, load4(t, 0) + reach + rises)
     store(out, 0, falls)
     store(out, 4, rises)
-    bound_by_parts(blended.jumps, limit, jumps, out, d)
-    out[24] = blended.jumps
+    bound_by_parts(blend.jumps, limit, jumps, out, d)
+    out[24] = blend.jumps
 
 
 def _fragments(shape, alphas, radii, colors):

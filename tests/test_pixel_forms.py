@@ -8,6 +8,7 @@ from fractions import Fraction
 
 import numpy as np
 import pytest
+from blends import blended
 from numba import njit
 
 from ns_abstract.arithmetic.rounding import REAL, charges
@@ -22,7 +23,7 @@ from ns_abstract.methods.splat.alphas import (
     _Limits,
     _set_curvature,
 )
-from ns_abstract.methods.splat.blend import blend_quadratic, blend_several, flattened
+from ns_abstract.methods.splat.blend import flattened
 from ns_abstract.methods.splat.block import (
     ALPHA_HIGH,
     ALPHA_LOW,
@@ -30,14 +31,11 @@ from ns_abstract.methods.splat.block import (
     BEND_SPREAD,
     FORM,
     LISTED,
-    Fragments,
     Jumps,
-    Palette,
     bends_of,
     color_ends,
     color_size,
     fragment_width,
-    jump_column,
 )
 from ns_abstract.methods.splat.records import FORMS, columns
 from ns_abstract.methods.splat.stage_data import FormShape
@@ -246,22 +244,14 @@ def test_the_range_of_alpha_s_curvature(d):
 
 
 @njit(error_model="numpy")
-def _blended(values_, lists_, colors_, background_, shape, forms, count, t_, out_):
-    values, lists, colors, background = pointer(values_), pointer(lists_), pointer(colors_), pointer(background_)
+def _blended(values, lists, colors, background, shape, forms, count, t_, out_):
     nothing, t, m = pointer(out_), pointer(t_), shape.monomials
-    fragments = Fragments(
-        values, fragment_width(shape), bends_of(shape), jump_column(shape), lists, values, lists, 64, values
-    )
-    palette = Palette(colors, forms, background, background)
     # fragments are blended as they are, skipped or not
-    unused = Jumps(pointer(np.empty(1, np.int64)), values, values, 0)
-    if shape.order == 2:
-        blended = blend_quadratic(0, count, fragments, palette, values, t, unused, False)
-        radius = blended.radius
-    else:
-        blended = blend_several(0, count, fragments, palette, values, t, m, unused, False)
-        radius = flattened(t, blended.radius, advanced(t, 4 * (m + bends_of(shape))), m)
-    ends = blended.ends
+    unused = Jumps(pointer(np.empty(1, np.int64)), t, t, 0)
+    _, blend = blended(values, lists, colors, background, shape, forms, count, t, unused, False)
+    radius, ends = blend.radius, blend.ends
+    if shape.order == 1:
+        radius = flattened(t, radius, advanced(t, 4 * (m + bends_of(shape))), m)
     store(nothing, 0, radius)
     store(nothing, 4, ends.low)
     store(nothing, 8, ends.high)

@@ -312,7 +312,7 @@ SPLATS = (
     Fault(
         "planes above what is taken begin at half of the threshold",
         _JUMPS,
-        "_restrict",
+        "_set_planes",
         "where(skipped | steep, 0.0, share * most)",
         "where(skipped | steep, 0.0, 0.5 * share * most)",
         "test_jumps.py::test_skipped_fragments[1-2-0.0]",
@@ -320,7 +320,7 @@ SPLATS = (
     Fault(
         "planes below what is taken fall to it at twice the threshold",
         _JUMPS,
-        "_restrict",
+        "_set_planes",
         "where(skipped, 0.0, share * limit)",
         "where(skipped, 0.0, 2.0 * share * limit)",
         "test_jumps.py::test_skipped_fragments[1-2-0.0]",

@@ -25,6 +25,7 @@ from ns_abstract.methods.splat.block import (
     RHO,
     color_ends,
     color_size,
+    jump_of,
     listed_fragment,
     parabola,
 )
@@ -285,7 +286,7 @@ def blend_quadratic(begin, end, fragments, palette, moves, t, jumps, split):
         a0, a1, a2 = values[at + FORM], values[at + FORM + 1], values[at + FORM + 2]
         jump = 0.0
         if split:
-            jump = 0.5 * min(values[at + fragments.jump], values[at + ALPHA_HIGH])
+            jump = 0.5 * jump_of(fragments, at)
             a0 += jump
         # colour - P, a form without radius
         v0 = load4(colors, key) - p0
@@ -435,7 +436,7 @@ def blend_several(begin, end, fragments, palette, moves, t, m, jumps, split):
         at, key, move = listed_fragment(fragments, entry, forms)
         jump = 0.0
         if split:
-            jump = 0.5 * min(values[at + fragments.jump], values[at + ALPHA_HIGH])
+            jump = 0.5 * jump_of(fragments, at)
         r, nearest, farthest, size = _step_of_several(r, at, key, jump, fragments, palette, t, u, m)
         if jump > 0.0:
             _keep_distances(number, entry, nearest, farthest, size, jumps)

@@ -23,7 +23,7 @@ assert PIXELS == 64 and BLOCK == 8
 
 
 #: Lanes that are looked at together where they are fragments of one pixel.
-LANES = 8
+JUMP_LANES = 8
 #: List entries that are looked at together: no step waits for the one before.
 BATCH = 8
 
@@ -260,7 +260,7 @@ def jump_rows(shape):
 @njit(cache=True, error_model="numpy")
 def _jump_room(shape, capacity):
     """Columns of `Jumps`: the channels, then ``capacity``; the last row holds what a part needs beside them."""
-    return max(LANES + -(-capacity // LANES) * LANES, 20 * shape.dimensions + 80)
+    return max(JUMP_LANES + -(-capacity // JUMP_LANES) * JUMP_LANES, 20 * shape.dimensions + 80)
 
 
 @njit(cache=True, error_model="numpy")
@@ -445,6 +445,12 @@ def set_unknown(fragments, at, high, m):
     for k in range(1, m):
         values[at + FORM + k] = 0.0
     values[at + FORM + m] = 0.5 * high * UP
+
+
+@njit(cache=True, error_model="numpy", forceinline=True)
+def jump_of(fragments, at):
+    """By how much alpha of the fragment at ``at`` may fall where it is skipped; half of it is in its form (B4, B11)."""
+    return min(fragments.values[at + fragments.jump], fragments.values[at + ALPHA_HIGH])
 
 
 @njit(cache=True, error_model="numpy", inline="always")

@@ -25,7 +25,16 @@ from ns_abstract.arithmetic.elementary import fma
 from ns_abstract.arithmetic.rounding import PART_ROUNDING, UNIT64, UP
 from ns_abstract.arithmetic.simd.intrinsics import advanced, lowest_bit
 from ns_abstract.arithmetic.simd.lanes import lane_sum, load4, load8, maximum, minimum, store, where
-from ns_abstract.methods.splat.block import ALPHA_HIGH, ALPHA_LOW, FORM, JUMP_FORM, LANES, LISTED
+from ns_abstract.methods.splat.block import (
+    ALPHA_HIGH,
+    ALPHA_LOW,
+    FORM,
+    JUMP_FORM,
+    JUMP_LANES,
+    JUMP_RESTRICTED,
+    LISTED,
+    jump_of,
+)
 
 #: Parts of a cell, a power of two.
 _PARTS = 8
@@ -37,6 +46,8 @@ _RADIUS, _TOP, _THRESHOLD, _SIZE, _SIZES, _WEIGHTS = range(6)
 _LOW, _HIGH, _ABOVE, _FAR_ABOVE, _FAR_ABOVE_AT_0, _BELOW, _BELOW_AT_0, _FAR_BELOW, _PRODUCTS = range(1, 10)
 _SCRATCH = _PRODUCTS + 3
 
+assert JUMP_FORM == _WEIGHTS + 6 and JUMP_RESTRICTED == _SCRATCH + 1
+
 
 @njit(cache=True, error_model="numpy", forceinline=True)
 def _restricted_rows(d):
@@ -47,7 +58,7 @@ def _restricted_rows(d):
 @njit(cache=True, error_model="numpy", forceinline=True)
 def _columns(count):
     """Columns of `Jumps.rows` in use: whole lanes."""
-    return LANES + -(-count // LANES) * LANES
+    return JUMP_LANES + -(-count // JUMP_LANES) * JUMP_LANES
 
 
 @njit(cache=True, error_model="numpy")
@@ -63,7 +74,7 @@ def gather_jumps(begin, end, count, since, fragments, jumps, out, shape):
     first = load4(since, 0)
     falls = 0.0 * first
     rises = falls
-    for column in range(LANES + count, _columns(count)):
+    for column in range(JUMP_LANES + count, _columns(count)):
         for row in range(_restricted_rows(d)):
             rows[row * room + column] = 0.0
         rows[_THRESHOLD * room + column] = 1.0
@@ -80,13 +91,12 @@ def gather_jumps(begin, end, count, since, fragments, jumps, out, shape):
             counts = first <= float(number)
             up = where(counts, where(nearest < 0.0, -most * grow, -least * (2.0 - grow)) * nearest, 0.0)
             down = where(counts, where(farthest > 0.0, most * grow, least * (2.0 - grow)) * farthest, 0.0)
-            threshold, top = values[at + fragments.jump], values[at + ALPHA_HIGH]
-            jump = min(threshold, top)
+            jump = jump_of(fragments, at)
             rises = fma(maximum(0.0, up), jump, rises)
             falls = fma(maximum(0.0, down), jump, falls)
             store(out, 8, up)
             store(out, 12, down)
-            column = LANES + number
+            column = JUMP_LANES + number
             weights = 0.0
             for channel in range(3):
                 rows[(_WEIGHTS + channel) * room + column] = out[8 + channel]
@@ -106,8 +116,8 @@ def gather_jumps(begin, end, count, since, fragments, jumps, out, shape):
                 size += abs(bend)
             radius = (values[at + FORM + shape.monomials] - 0.5 * jump + PART_ROUNDING * size) * UP
             rows[_RADIUS * room + column] = radius
-            rows[_TOP * room + column] = top
-            rows[_THRESHOLD * room + column] = threshold
+            rows[_TOP * room + column] = values[at + ALPHA_HIGH]
+            rows[_THRESHOLD * room + column] = values[at + fragments.jump]
             rows[_SIZE * room + column] = (size + radius) * UP
             number -= 1
         most *= 1.0 - values[at + ALPHA_LOW]
@@ -120,7 +130,7 @@ def gather_jumps(begin, end, count, since, fragments, jumps, out, shape):
 def set_blend(t, radii, jumps, d):
     """Write the polynomials ``t`` [., 4] and ``radii`` [4] of the three channels before the fragments' forms."""
     rows, room = jumps.rows, jumps.room
-    for channel in range(LANES):
+    for channel in range(JUMP_LANES):
         size = 0.0
         for row in range(1 + d + d * (d + 1) // 2):
             value = t[4 * row + channel] if channel < 3 else 0.0
@@ -140,31 +150,28 @@ def set_straight(jumps, d, order):
 
 
 @njit(cache=True, error_model="numpy")
-def _restrict(start, columns, middle, half, limit, jumps, d):
-    """Forms over the part of the box about ``middle`` [d] of the half-widths ``half`` [d], and planes of what is taken.
-
-    Of the columns from ``start`` to ``columns``. A fragment surely is skipped below alpha ``limit``.
-    """
+def _restrict(columns, middle, half, jumps, d):
+    """The first ``columns`` forms over the part of the box about ``middle`` [d] of the half-widths ``half`` [d]."""
     rows, room = jumps.rows, jumps.room
     part = _restricted_rows(d)
     behind = part + d
     shared = advanced(rows, (behind + _SCRATCH) * room)
-    for column in range(start, columns, LANES):
+    for column in range(0, columns, JUMP_LANES):
         center = load8(rows, JUMP_FORM * room + column)
         low = 0.0 * center
-        high, reach = low, low
+        high = low
         for k in range(d):
             slope = load8(rows, (JUMP_FORM + 1 + k) * room + column)
             center = fma(middle[k], slope, center)
             store(rows, (part + 1 + k) * room + column, slope)
-            store(shared, LANES * k, low)
+            store(shared, JUMP_LANES * k, low)
         row = JUMP_FORM + 1 + d
         for j in range(d):
             bend = load8(rows, row * room + column)
             row += 1
             center = fma(middle[j] * middle[j], bend, center)
             slope = fma(2.0 * middle[j], bend, load8(rows, (part + 1 + j) * room + column))
-            own, both = half[j] * half[j] * bend, load8(shared, LANES * j)
+            own, both = half[j] * half[j] * bend, load8(shared, JUMP_LANES * j)
             for k in range(j + 1, d):
                 bend = load8(rows, row * room + column)
                 row += 1
@@ -175,40 +182,61 @@ def _restrict(start, columns, middle, half, limit, jumps, d):
                 # |p_j p_k| is at most half the sum of their squares
                 size = 0.5 * half[j] * half[k] * abs(bend)
                 both = both + size
-                store(shared, LANES * k, load8(shared, LANES * k) + size)
+                store(shared, JUMP_LANES * k, load8(shared, JUMP_LANES * k) + size)
             low = low + minimum(0.0, own - both)
             high = high + maximum(0.0, own + both)
             slope = half[j] * slope
-            reach = reach + abs(slope)
             store(rows, (part + 1 + j) * room + column, slope)
         radius = load8(rows, _RADIUS * room + column)
         low, high = low - radius, high + radius
         store(rows, part * room + column, center)
         store(rows, (behind + _LOW) * room + column, low)
         store(rows, (behind + _HIGH) * room + column, high)
-        if column > 0:
-            threshold = load8(rows, _THRESHOLD * room + column)
-            least = maximum(center - reach + low, 0.0)
-            most = minimum(center + reach + high, load8(rows, _TOP * room + column))
-            drawn, skipped = least >= threshold, most < limit
-            # from above: alpha itself, and what falls from the threshold to 0 at the greatest alpha
-            beyond = most - threshold
-            steep = beyond <= _STEEP * threshold
-            share = threshold / where(steep, 1.0, beyond)
-            far = where(skipped | steep, 1.0, -share)
-            far_at_0 = where(skipped | steep, 0.0, share * most)
-            # from below: 0, and what falls to it from the least alpha to the threshold
-            before = limit - least
-            steep = (least <= 0.0) | (before <= _STEEP * limit)
-            share = where(steep, 0.0, least) / where(steep, 1.0, before)
-            near = where(skipped, 1.0, -share)
-            near_at_0 = where(skipped, 0.0, share * limit)
-            store(rows, (behind + _ABOVE) * room + column, where(drawn, 0.0, 1.0 + 0.0 * least))
-            store(rows, (behind + _FAR_ABOVE) * room + column, where(drawn, 0.0, far))
-            store(rows, (behind + _FAR_ABOVE_AT_0) * room + column, where(drawn, 0.0, far_at_0))
-            store(rows, (behind + _BELOW) * room + column, where(drawn, 0.0, near))
-            store(rows, (behind + _BELOW_AT_0) * room + column, where(drawn, 0.0, near_at_0))
-            store(rows, (behind + _FAR_BELOW) * room + column, where(skipped, 1.0 + 0.0 * least, 0.0))
+
+
+@njit(cache=True, error_model="numpy")
+def _set_planes(columns, limit, jumps, d):
+    """Planes above and below what skipping takes of each fragment over a part, from what `_restrict` left (B11).
+
+    A fragment surely is skipped below alpha ``limit``.
+    """
+    rows, room = jumps.rows, jumps.room
+    part = _restricted_rows(d)
+    behind = part + d
+    for column in range(JUMP_LANES, columns, JUMP_LANES):
+        center, reach = load8(rows, part * room + column), 0.0 * load8(rows, 0)
+        for k in range(d):
+            reach = reach + abs(load8(rows, (part + 1 + k) * room + column))
+        low, high = load8(rows, (behind + _LOW) * room + column), load8(rows, (behind + _HIGH) * room + column)
+        threshold = load8(rows, _THRESHOLD * room + column)
+        least = maximum(center - reach + low, 0.0)
+        most = minimum(center + reach + high, load8(rows, _TOP * room + column))
+        drawn, skipped = least >= threshold, most < limit
+        # from above: alpha itself, and what falls from the threshold to 0 at the greatest alpha
+        beyond = most - threshold
+        steep = beyond <= _STEEP * threshold
+        share = threshold / where(steep, 1.0, beyond)
+        far = where(skipped | steep, 1.0, -share)
+        far_at_0 = where(skipped | steep, 0.0, share * most)
+        # from below: 0, and what falls to it from the least alpha to the threshold
+        before = limit - least
+        steep = (least <= 0.0) | (before <= _STEEP * limit)
+        share = where(steep, 0.0, least) / where(steep, 1.0, before)
+        near = where(skipped, 1.0, -share)
+        near_at_0 = where(skipped, 0.0, share * limit)
+        store(rows, (behind + _ABOVE) * room + column, where(drawn, 0.0, 1.0 + 0.0 * least))
+        store(rows, (behind + _FAR_ABOVE) * room + column, where(drawn, 0.0, far))
+        store(rows, (behind + _FAR_ABOVE_AT_0) * room + column, where(drawn, 0.0, far_at_0))
+        store(rows, (behind + _BELOW) * room + column, where(drawn, 0.0, near))
+        store(rows, (behind + _BELOW_AT_0) * room + column, where(drawn, 0.0, near_at_0))
+        store(rows, (behind + _FAR_BELOW) * room + column, where(skipped, 1.0 + 0.0 * least, 0.0))
+
+
+@njit(cache=True, error_model="numpy", forceinline=True)
+def _weighted(weight, above, below, above_at_0, below_at_0, before):
+    """Slope of a weighted term by the plane that its sign asks for, and its value at 0 added to those ``before``."""
+    raised = weight > 0.0
+    return weight * where(raised, above, below), fma(weight, where(raised, above_at_0, below_at_0), before)
 
 
 @njit(cache=True, error_model="numpy")
@@ -223,7 +251,7 @@ def _by_planes(columns, side, place, bounds, jumps, d):
     weights, products = (_WEIGHTS if side > 0.0 else _WEIGHTS + 3) * room, (behind + _PRODUCTS) * room
     zero = 0.0 * load8(rows, 0)
     first, second, third, sizes = zero, zero, zero, zero
-    for column in range(LANES, columns, LANES):
+    for column in range(JUMP_LANES, columns, JUMP_LANES):
         center = load8(rows, part * room + column)
         low, high = load8(rows, (behind + _LOW) * room + column), load8(rows, (behind + _HIGH) * room + column)
         alpha = fma(0.5, low + high, center)
@@ -244,14 +272,14 @@ def _by_planes(columns, side, place, bounds, jumps, d):
         steepest = maximum(abs(above), abs(below))
         sizes = fma(load8(rows, _SIZES * room + column), fma(steepest, load8(rows, _SIZE * room + column), 1.0), sizes)
         weight = load8(rows, weights + column)
-        store(rows, products + column, weight * where(weight > 0.0, above, below))
-        first = fma(weight, where(weight > 0.0, above_at_0, below_at_0), first)
+        product, first = _weighted(weight, above, below, above_at_0, below_at_0, first)
+        store(rows, products + column, product)
         weight = load8(rows, weights + room + column)
-        store(rows, products + room + column, weight * where(weight > 0.0, above, below))
-        second = fma(weight, where(weight > 0.0, above_at_0, below_at_0), second)
+        product, second = _weighted(weight, above, below, above_at_0, below_at_0, second)
+        store(rows, products + room + column, product)
         weight = load8(rows, weights + 2 * room + column)
-        store(rows, products + 2 * room + column, weight * where(weight > 0.0, above, below))
-        third = fma(weight, where(weight > 0.0, above_at_0, below_at_0), third)
+        product, third = _weighted(weight, above, below, above_at_0, below_at_0, third)
+        store(rows, products + 2 * room + column, product)
     # rounding of the sums and of what they are of
     slack = (columns + 64.0) * UNIT64 * lane_sum(sizes)
     bounds[0], bounds[1], bounds[2] = lane_sum(first) + slack, lane_sum(second) + slack, lane_sum(third) + slack
@@ -261,7 +289,7 @@ def _by_planes(columns, side, place, bounds, jumps, d):
         bounds[channel] += side * ends
     for k in range(d):
         first, second, third = zero, zero, zero
-        for column in range(LANES, columns, LANES):
+        for column in range(JUMP_LANES, columns, JUMP_LANES):
             slope = load8(rows, (part + 1 + k) * room + column)
             first = fma(load8(rows, products + column), slope, first)
             second = fma(load8(rows, products + room + column), slope, second)
@@ -301,7 +329,7 @@ def _choose_parts(columns, pieces, jumps, d):
     steepness = advanced(pieces, d)
     for k in range(d):
         varies = 0.0 * load8(rows, 0)
-        for column in range(LANES, columns, LANES):
+        for column in range(JUMP_LANES, columns, JUMP_LANES):
             slope = load8(rows, (JUMP_FORM + 1 + k) * room + column)
             varies = fma(load8(rows, _SIZES * room + column), abs(slope), varies)
         steepness[k] = lane_sum(varies)
@@ -353,7 +381,7 @@ def bound_by_parts(count, limit, jumps, out, d):
     rows, room = jumps.rows, jumps.room
     columns, part = _columns(count), _restricted_rows(d)
     # behind what `_restrict` shares
-    pieces = advanced(rows, (part + d + _SCRATCH) * room + LANES * d)
+    pieces = advanced(rows, (part + d + _SCRATCH) * room + JUMP_LANES * d)
     middle = advanced(pieces, 2 * d)
     half = advanced(middle, d)
     place = advanced(half, d)
@@ -363,7 +391,7 @@ def bound_by_parts(count, limit, jumps, out, d):
     # what a part may reach at most, wherever fragments are skipped
     for number in range(_PARTS):
         _place_part(number, pieces, middle, half, d)
-        _restrict(0, LANES, middle, half, limit, jumps, d)
+        _restrict(JUMP_LANES, middle, half, jumps, d)
         for channel in range(3):
             reach = 0.0
             for k in range(d):
@@ -386,7 +414,8 @@ def bound_by_parts(count, limit, jumps, out, d):
         if wanted == 0:
             continue
         _place_part(number, pieces, middle, half, d)
-        _restrict(0, columns, middle, half, limit, jumps, d)
+        _restrict(columns, middle, half, jumps, d)
+        _set_planes(columns, limit, jumps, d)
         for side in range(2):
             if (wanted >> 4 * side) & 15 == 0:
                 continue
