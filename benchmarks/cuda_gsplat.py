@@ -101,10 +101,10 @@ def add_cell(
 ) -> None:  # fmt: skip
     """Bound a cell of the set with this number and pick its poses."""
     from ns_abstract.arithmetic.outward import outward
+    from ns_abstract.bench.soundness import bounded_both_ways
     from ns_abstract.geometry.tiles import assemble
 
-    of_cell = bounds.cell(poses.camera, poses.enclosure(cell, 1), layers=layers)
-    lower, upper = outward(assemble(of_cell.lower, poses.camera), assemble(of_cell.upper, poses.camera))
+    of_cell, lower, upper = bounded_both_ways(bounds, poses, cell, layers)
     if of_cell.layers is not None:
         values = assemble(of_cell.layers, poses.camera)
         ends = outward(np.ascontiguousarray(values[..., ::2]), np.ascontiguousarray(values[..., 1::2]))

@@ -31,9 +31,9 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
 
 from gsplat_kernels import Kernels, Unavailable
 
-from ns_abstract.arithmetic.outward import outward
 from ns_abstract.arithmetic.rounding import FLOAT32
 from ns_abstract.bench.sets import open_jobs, pose_set, splat_of
+from ns_abstract.bench.soundness import bounded_both_ways
 from ns_abstract.bench.stiff import all_cases
 from ns_abstract.bench.tables import markdown, write
 from ns_abstract.geometry.box import ParameterBox
@@ -75,8 +75,7 @@ def attack(
     compared = violations = 0
     worst, gaps = 0.0, []
     for cell in cells:
-        found = bounds.cell(poses.camera, poses.enclosure(cell, 1), layers=layers)
-        lower, upper = outward(assemble(found.lower, poses.camera), assemble(found.upper, poses.camera))
+        found, lower, upper = bounded_both_ways(bounds, poses, cell, layers)
         gaps.append(float(np.linalg.norm(upper.astype(np.float64) - lower, axis=-1).mean()))
         corners = np.asarray(cell.corners())
         picked = corners[rng.permutation(len(corners))[: max(1, renders // 2)]]

@@ -17,7 +17,16 @@ def blended(values_, lists_, colors_, background_, shape, forms, count, t, jumps
     """The fragments of arrays, and their blend; ``t`` is a pointer and receives the polynomials."""
     values, lists, colors, background = pointer(values_), pointer(lists_), pointer(colors_), pointer(background_)
     fragments = Fragments(
-        values, fragment_width(shape), bends_of(shape), jump_column(shape), lists, values, lists, CAPACITY, values
+        values,
+        fragment_width(shape),
+        bends_of(shape),
+        jump_column(shape),
+        shape.parts,
+        lists,
+        values,
+        lists,
+        CAPACITY,
+        values,
     )
     palette = Palette(colors, forms, background, background)
     if shape.order == 2:

@@ -19,12 +19,13 @@ from ns_abstract.geometry.camera_path import Camera
 from ns_abstract.geometry.poses import PoseSet
 from ns_abstract.geometry.tiles import assemble
 from ns_abstract.methods.splat.activate import Splats, rotation_matrices
-from ns_abstract.methods.splat.blend import _sort as sort_group
 from ns_abstract.methods.splat.bounds import SplatBounds
 from ns_abstract.methods.splat.constants import GSPLAT_1_4_0, PAPER
 from ns_abstract.methods.splat.frame import SplatFrame
 from ns_abstract.methods.splat.records import FORMS, SPREAD, UNBOUNDED, columns
 from ns_abstract.methods.splat.render import Renderer
+from ns_abstract.methods.splat.reordering import _sort as sort_group
+from ns_abstract.methods.splat.stage_data import shared_out
 from ns_abstract.perturbation.specification import Perturbation
 
 both_orders = pytest.mark.parametrize("order", [1, 2])
@@ -91,7 +92,8 @@ class Case:
     ) -> tuple[np.ndarray, np.ndarray]:
         """Bounds of the set from ``parts`` cells along the first parameter, after checking each cell.
 
-        Returns the width of the bounds and the width of the sampled images, [H, W, 3].
+        With forms of order 1 bounds over parts of each cell are checked, too. Returns the width of the bounds by forms
+        and the width of the sampled images, [H, W, 3].
         """
         lowest, highest = np.ones((2, self.camera.height, self.camera.width, 3)) * [[[[1.0]]], [[[0.0]]]]
         least, most = lowest.copy(), highest.copy()
@@ -100,6 +102,12 @@ class Case:
             assert cell.statistics[4] == 0
             lower, upper = assemble(cell.lower, self.camera), assemble(cell.upper, self.camera)
             linear = assemble(cell.linear, self.camera)
+            found = [(lower, upper)]
+            if order == 1:
+                divided = shared_out(np.ones(box.dimensions), 16)
+                by_parts = self.bounds(box, 1, arithmetic, floor=floor, parts=divided)
+                assert by_parts.statistics[4] == 0
+                found.append((assemble(by_parts.lower, self.camera), assemble(by_parts.upper, self.camera)))
             pairs = self.poses.enclosure(box, order).rotation.basis.pairs
             for values in self.samples(box, count):
                 image = self.image(values)
@@ -109,7 +117,8 @@ class Case:
                 radius = linear[..., -1] + 1e-12
                 assert (np.minimum(1.0, middle - radius) <= image).all(), (box, values)
                 assert (np.maximum(0.0, middle + radius) >= image).all(), (box, values)
-                assert (lower <= image).all() and (image <= upper).all(), (box, values, worst(lower, image, upper))
+                for low, high in found:
+                    assert (low <= image).all() and (image <= high).all(), (box, values, worst(low, image, high))
                 least, most = np.minimum(least, image), np.maximum(most, image)
             lowest, highest = np.minimum(lowest, lower), np.maximum(highest, upper)
         return highest - lowest, most - least

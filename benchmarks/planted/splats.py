@@ -11,6 +11,9 @@ _BLEND = "methods/splat/blend.py"
 _BOUNDS = "methods/splat/bounds.py"
 _ALPHAS = "methods/splat/alphas.py"
 _JUMPS = "methods/splat/jumps.py"
+_INTERVALS = "methods/splat/intervals.py"
+_REORDERING = "methods/splat/reordering.py"
+_STAGE_DATA = "methods/splat/stage_data.py"
 _BLOCK = "methods/splat/block.py"
 _LISTS = "methods/splat/lists.py"
 _PIXELS = "methods/splat/pixels.py"
@@ -247,7 +250,7 @@ SPLATS = (
     ),
     Fault(
         "antichain sorted the wrong way",
-        _BLEND,
+        _REORDERING,
         "_interval_group",
         "colors[ends] if side == 0 else -colors[ends + 4]",
         "-colors[ends] if side == 0 else colors[ends + 4]",
@@ -263,7 +266,7 @@ SPLATS = (
     ),
     Fault(
         "order swap counts at the first pixel only",
-        _BLEND,
+        _REORDERING,
         "swap_bounds",
         "reordering.drawn[front] & reordering.drawn[back]",
         "reordering.drawn[front] & reordering.drawn[back] & 1",
@@ -519,11 +522,99 @@ SPLATS = (
     ),
     Fault(
         "blend picks alpha's other end",
-        _BLEND,
-        "_blend_interval",
+        _INTERVALS,
+        "_most",
         "where(v > 0.0, a_high, a_low)",
         "where(v > 0.0, a_low, a_high)",
         "test_bounds.py::test_one_layer[2]",
+    ),
+    Fault(
+        "parts are half as wide as they are",
+        _ALPHAS,
+        "_alphas_over_parts",
+        "fma(half[k - 1], abs(g1), e1)",
+        "fma(0.5 * half[k - 1], abs(g1), e1)",
+        "test_bounds.py::test_one_layer[1]",
+    ),
+    Fault(
+        "parts are where their ends begin",
+        _STAGE_DATA,
+        "cell_parts",
+        "(2.0 * np.arange(n) + 1.0) / n - 1.0",
+        "(2.0 * np.arange(n)) / n - 1.0",
+        "test_intervals.py::test_blends_over_parts_hold_every_exact_blend[2.0-counts0]",
+    ),
+    Fault(
+        "parts: both squares move as the first",
+        _INTERVALS,
+        "_alphas_of_parts",
+        "fma(middle, values[e + 1], y2)",
+        "fma(middle, values[e], y2)",
+        "test_intervals.py::test_blends_over_parts_hold_every_exact_blend[0.3-counts0]",
+    ),
+    Fault(
+        "parts: the least exponent is that of the middle",
+        _INTERVALS,
+        "_alphas_of_parts",
+        "maximum(0.0, y1 - e1)",
+        "y1",
+        "test_intervals.py::test_blends_over_parts_hold_every_exact_blend[0.3-counts0]",
+    ),
+    Fault(
+        "parts: what may be skipped is drawn",
+        _INTERVALS,
+        "_alphas_of_parts",
+        "where(low < values[ends + 4], 0.0, low)",
+        "low",
+        "test_bounds.py::test_alpha_threshold[1]",
+    ),
+    Fault(
+        "parts: only the first eight count",
+        _INTERVALS,
+        "blend_parts",
+        "range(PART_LANES, inputs.shape.parts, PART_LANES)",
+        "range(0)",
+        "test_intervals.py::test_blends_over_parts_hold_every_exact_blend[2.0-counts3]",
+    ),
+    Fault(
+        "parts: fragments that may change places stay",
+        _INTERVALS,
+        "_blend_eight",
+        "high0 + moves[move + 4]",
+        "high0",
+        "test_bounds.py::test_depth_swap[1]",
+    ),
+    Fault(
+        "parts: the weakest part of the clamp is forgotten",
+        _INTERVALS,
+        "_alphas_of_parts",
+        "minimum(values[ends + 2] * exp_kernel(-farthest), thresholds.most)",
+        "values[ends + 2] * exp_kernel(-farthest)",
+        "test_bounds.py::test_alpha_clamp[1]",
+    ),
+    Fault(
+        "parts: what may miss its tile is drawn",
+        _ALPHAS,
+        "_alphas_over_parts",
+        "limits.sure * limits.opacity_low",
+        "limits.opacity_low",
+        "test_bounds.py::test_tile_cut[1]",
+    ),
+    Fault(
+        "parts: compensation is at its least everywhere",
+        _ALPHAS,
+        "_alphas_over_parts",
+        "exp_kernel(-min(forms.k_low * (1.0 - kappa), EXPONENT_CUT))",
+        "exp_kernel(-min(forms.k_high * (1.0 + kappa), EXPONENT_CUT))",
+        "test_bounds.py::test_antialiased[1]",
+    ),
+    Fault(
+        "parts: a fragment of which nothing is known is not there",
+        _BLOCK,
+        "set_unknown",
+        "(0.0, 1.0, 0.0)",
+        "(0.0, 0.0, 0.0)",
+        "test_intervals.py::test_blends_over_parts_hold_every_exact_blend[0.3-counts0]",
     ),
     Fault(
         "blend drops the radius of alpha",

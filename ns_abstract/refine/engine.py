@@ -49,8 +49,9 @@ _AIM_SHARE, _AIM_RATIO = 0.6, 1.05
 #: this part of the largest on may be cut off at 0 and 1.
 _HELPS, _CUT_OFF = 0.5, 0.25
 #: A first cover of several aims at so many times the excess that the goal allows, as long as halving its cells leaves
-#: less than this part of theirs.
-_AIM_PART, _STILL_HELPS = 3.0, 0.8
+#: less than this part of theirs. Far from that, so many halvings together may do as little, of which one gained next to
+#: nothing: of two axes that matter as much.
+_AIM_PART, _STILL_HELPS, _PATIENCE, _FAR_FROM_AIM = 3.0, 0.8, 2, 1.6
 #: Part of the gap beyond the witnesses that a goal allows which a leaf may leave open at a pixel for good.
 _CLOSED_SHARE = 0.25
 #: Leaves whose box is narrower than this part of the set are not split: rounding rules there.
@@ -569,13 +570,19 @@ class Refinement:
     ) -> tuple[list[_Part], _Part, Bounds]:
         """``parts`` halved again along what a cell in the middle varies most along, while its excess asks for it."""
         aim = _AIM_PART * self.goal.excess(self._mpg(self.witness_lower, self.witness_upper))
-        before = np.inf
+        best, least, idle = (parts, first, probe), np.inf, 0
         while True:
             excess = self._beyond(first, probe)
-            helped = self._helped(excess, before, _STILL_HELPS)
-            if excess <= aim or not helped or 2 * len(parts) > min(allowed, _COVER_CELLS):
+            if excess <= aim:
                 return parts, first, probe
-            parts, before = self._cut_all(parts, self._axis(first.box, probe.slopes)), excess
+            if self._helped(excess, least, _STILL_HELPS ** (idle + 1)):
+                best, least, idle = (parts, first, probe), excess, 0
+            else:
+                idle += 1
+            patient = idle == 0 or (idle < _PATIENCE and excess > _FAR_FROM_AIM * aim)
+            if not patient or 2 * len(parts) > min(allowed, _COVER_CELLS):
+                return best
+            parts = self._cut_all(parts, self._axis(first.box, probe.slopes))
             first = parts[len(parts) // 2]
             probe, allowed = self._probe(first, everything)
 

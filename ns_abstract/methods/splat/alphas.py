@@ -1,4 +1,4 @@
-"""Alphas as forms: one Gaussian on some pixels of a block, eight at a time (design.md, B1-B4).
+"""Alphas as forms: one Gaussian on some pixels of a block, eight at a time (design.md, B1-B4, B12).
 
 The exponent is half the sum of two squares, y1 = P ax - Q ay - W1 and y2 = S ay - W2, and K where opacity is
 compensated, of forms that the Gaussian's record holds. For one parameter its forms have order 2, else 1;
@@ -15,13 +15,22 @@ from ns_abstract.arithmetic.elementary import EXP_RELATIVE_ERROR, exp_kernel, fm
 from ns_abstract.arithmetic.rounding import FRAGMENT_ROUNDING, UP
 from ns_abstract.arithmetic.simd.intrinsics import signed
 from ns_abstract.arithmetic.simd.lanes import bits, load8, maximum, minimum, store, store_columns, where
-from ns_abstract.methods.splat.block import ALPHA_HIGH, ALPHA_LOW, BEND, BEND_SPREAD, FORM, parabola, set_unknown
+from ns_abstract.methods.splat.block import (
+    ALPHA_HIGH,
+    ALPHA_LOW,
+    BEND,
+    BEND_SPREAD,
+    EXPONENT,
+    EXPONENT_CUT,
+    FORM,
+    exponent_ends,
+    parabola,
+    set_unknown,
+)
 from ns_abstract.methods.splat.records import EXPONENT_LIMIT, FORMS, KAPPA, OPACITY_HIGH, OPACITY_LOW, UNBOUNDED
 
 #: Half-width of the exponent's range up to which exp(-t) is fitted by a polynomial.
 _FIT_LIMIT = 2.0
-#: Exponents are cut here; exp(-60) is far below any threshold.
-_EXPONENT_LIMIT = 60.0
 #: The set of all of 8 lanes.
 _ALL = 255
 
@@ -122,6 +131,17 @@ class _Drawn(NamedTuple):
     radius: Any
     keep: Any
     jump: Any
+
+
+class _Whitened(NamedTuple):
+    """Forms y1 and y2 of eight pixels: centres, sizes of their linear parts, radii."""
+
+    c1: Any
+    c2: Any
+    l1: Any
+    l2: Any
+    r1: Any
+    r2: Any
 
 
 class _AffineForms(NamedTuple):
@@ -263,7 +283,6 @@ def _affine_forms(record, m, antialiased):
 @njit(cache=True, error_model="numpy", forceinline=True)
 def _store_fragments(rows, alpha, fragments, at, m):
     """Write eight fragments from their ``alpha``; ``rows`` [., 8] hold the exponent's slopes and alpha's curvature."""
-    values, width = fragments.values, fragments.width
     store(rows, 8 * fragments.jump, alpha.jump)
     store(rows, 8 * ALPHA_LOW, alpha.low)
     store(rows, 8 * ALPHA_HIGH, alpha.high)
@@ -271,6 +290,13 @@ def _store_fragments(rows, alpha, fragments, at, m):
     store(rows, 8 * (FORM + m), alpha.radius)
     for k in range(FORM + 1, FORM + m):
         store(rows, 8 * k, alpha.weight * load8(rows, 8 * k))
+    _store_rows(rows, fragments, at)
+
+
+@njit(cache=True, error_model="numpy", forceinline=True)
+def _store_rows(rows, fragments, at):
+    """Write the columns of eight fragments, which stand in ``rows`` [width, 8], from ``at`` on."""
+    values, width = fragments.values, fragments.width
     for k in range(0, width, 8):
         row = 8 * k
         store_columns(
@@ -283,27 +309,42 @@ def _store_fragments(rows, alpha, fragments, at, m):
 
 
 @njit(cache=True, error_model="numpy", forceinline=True)
+def _whitened(record, f, ax, ay, rows, at, m):
+    """The `_Whitened` of pixels at offsets ``ax``, ``ay`` (design.md, B1).
+
+    ``rows`` [., 8] receives the slopes of y1 and y2 by parameter k = 1 ... m - 1 from ``at`` + 16 k on.
+    """
+    stride = m + 1
+    c1 = fma(f.p, ax, -fma(f.q, ay, f.w1))
+    c2 = fma(f.s, ay, -f.w2)
+    l1 = 0.0 * ax
+    l2 = l1
+    for k in range(1, m):
+        g1 = fma(record[FORMS + k], ax, -fma(record[FORMS + stride + k], ay, record[FORMS + 3 * stride + k]))
+        g2 = fma(record[FORMS + 2 * stride + k], ay, -record[FORMS + 4 * stride + k])
+        store(rows, at + 16 * k, g1)
+        store(rows, at + 16 * k + 8, g2)
+        l1 = l1 + abs(g1)
+        l2 = l2 + abs(g2)
+    r1 = f.p_radius * abs(ax) + f.q_radius * abs(ay) + f.w1_radius + FRAGMENT_ROUNDING * l1
+    r2 = f.s_radius * abs(ay) + f.w2_radius + FRAGMENT_ROUNDING * l2
+    return _Whitened(c1, c2, l1, l2, r1, r2)
+
+
+@njit(cache=True, error_model="numpy", forceinline=True)
 def _exponent_of_several(record, f, ax, ay, rows, scratch, m, antialiased):
     """The `_Exponent` of pixels at offsets ``ax``, ``ay`` (design.md, B1-B3, B10).
 
     ``rows`` [., 8] receives its slopes and behind the radius its curvature; ``scratch`` is the first that is free.
     """
-    stride, bends = m + 1, 8 * (FORM + m + 1)
-    c1 = fma(f.p, ax, -fma(f.q, ay, f.w1))
-    c2 = fma(f.s, ay, -f.w2)
-    l1 = 0.0 * ax
-    l2, sl, bend = l1, l1, l1
+    bends = 8 * (FORM + m + 1)
+    c1, c2, l1, l2, r1, r2 = _whitened(record, f, ax, ay, rows, scratch, m)
+    sl, bend = 0.0 * ax, 0.0 * ax
     for k in range(1, m):
-        g1 = fma(record[FORMS + k], ax, -fma(record[FORMS + stride + k], ay, record[FORMS + 3 * stride + k]))
-        g2 = fma(record[FORMS + 2 * stride + k], ay, -record[FORMS + 4 * stride + k])
-        slope = fma(c1, g1, c2 * g2)
+        slope = fma(c1, load8(rows, scratch + 16 * k), c2 * load8(rows, scratch + 16 * k + 8))
         if antialiased:
-            slope = slope + record[FORMS + 5 * stride + k]
+            slope = slope + record[FORMS + 5 * (m + 1) + k]
         store(rows, 8 * (FORM + k), slope)
-        store(rows, scratch + 16 * k, g1)
-        store(rows, scratch + 16 * k + 8, g2)
-        l1 = l1 + abs(g1)
-        l2 = l2 + abs(g2)
         sl = sl + abs(slope)
     for j in range(1, m):
         g1, g2 = load8(rows, scratch + 16 * j), load8(rows, scratch + 16 * j + 8)
@@ -316,8 +357,6 @@ def _exponent_of_several(record, f, ax, ay, rows, scratch, m, antialiased):
             bends += 8
     c1 = abs(c1)
     c2 = abs(c2)
-    r1 = f.p_radius * abs(ax) + f.q_radius * abs(ay) + f.w1_radius + FRAGMENT_ROUNDING * l1
-    r2 = f.s_radius * abs(ay) + f.w2_radius + FRAGMENT_ROUNDING * l2
     s0 = 0.5 * (c1 * c1 + c2 * c2)
     bend = bend * UP
     e1 = l1 + r1
@@ -393,10 +432,60 @@ def _alphas_of_several(record, begin, n, given, block, limits, charges, antialia
 
 
 @njit(cache=True, error_model="numpy", forceinline=True)
+def _alphas_over_parts(record, begin, n, given, block, limits, inputs):
+    """`alphas` where pixels are bounded over parts of the cell: bounds over all of it, exponents (design.md, B12)."""
+    batch, rows, fragments = block.batch, block.batch.rows, block.fragments
+    charges, half, m = inputs.charges, inputs.parts.half, inputs.shape.monomials
+    forms = _affine_forms(record, m, inputs.rules.antialiased)
+    kappa, ends = limits.kappa, 8 * exponent_ends(m)
+    slack = charges.exponential + EXPONENT_CUT * charges.exponential_by_argument + 8.0 * EXP_RELATIVE_ERROR
+    zero = 0.0 * load8(rows, 0)
+    least = limits.sure * limits.opacity_low * exp_kernel(-min(forms.k_high * (1.0 + kappa), EXPONENT_CUT))
+    most = limits.opacity_high * exp_kernel(-min(forms.k_low * (1.0 - kappa), EXPONENT_CUT))
+    store(rows, ends + 16, zero + least * (1.0 - slack))
+    store(rows, ends + 24, zero + most * (1.0 + slack))
+    store(rows, ends + 32, zero + limits.alpha_min_high)
+    found = 0
+    for q in range(0, n, 8):
+        ax = load8(batch.offset_x, begin + q)
+        ay = load8(batch.offset_y, begin + q)
+        c1, c2, l1, l2, r1, r2 = _whitened(record, forms, ax, ay, rows, 8 * EXPONENT, m)
+        store(rows, 8 * EXPONENT, c1)
+        store(rows, 8 * EXPONENT + 8, c2)
+        slope, e1, e2 = 0.0 * ax, r1, r2
+        for k in range(1, m):
+            at = 8 * EXPONENT + 16 * k
+            g1, g2 = load8(rows, at), load8(rows, at + 8)
+            slope = slope + abs(fma(c1, g1, c2 * g2))
+            e1 = fma(half[k - 1], abs(g1), e1)
+            e2 = fma(half[k - 1], abs(g2), e2)
+        c1 = abs(c1)
+        c2 = abs(c2)
+        # float evaluation moves the exponent by kappa, and a part's centre is rounded
+        off = kappa + FRAGMENT_ROUNDING
+        store(rows, ends, fma(off, c1 + l1 + r1, e1) * UP)
+        store(rows, ends + 8, fma(off, c2 + l2 + r2, e2) * UP)
+        # over the whole cell
+        s0 = 0.5 * (c1 * c1 + c2 * c2)
+        radius = fma(c1, r1, fma(c2, r2, fma(FRAGMENT_ROUNDING, fma(c1, l1 + r1, fma(c2, l2 + r2, s0)), slope)))
+        low, high = _square_sum_range(c1, c2, l1 + r1, l2 + r2, forms.k_low, forms.k_high)
+        low = maximum(low, s0 + forms.k_low - radius * UP - FRAGMENT_ROUNDING * (s0 + forms.k_low))
+        drawn = _drawn(zero, zero, _exponential_range(low, high, zero, limits, charges), limits, charges)
+        reached = _ALL - bits(drawn.high < limits.alpha_min)
+        if reached == 0:
+            continue
+        found |= reached << q
+        store(rows, 8 * ALPHA_LOW, drawn.low)
+        store(rows, 8 * ALPHA_HIGH, drawn.high)
+        _store_rows(rows, fragments, given + q * fragments.width)
+    return found
+
+
+@njit(cache=True, error_model="numpy", forceinline=True)
 def _exponential_range(low, high, radius, limits, charges):
     """The `_Range` of exponents from ``low`` to ``high`` whose form has the ``radius`` (design.md, B3)."""
     kappa = limits.kappa
-    low = minimum(maximum(0.0, low * (1.0 - kappa)), _EXPONENT_LIMIT)
+    low = minimum(maximum(0.0, low * (1.0 - kappa)), EXPONENT_CUT)
     high = maximum(low, high * (1.0 + kappa))
     width = 0.5 * (high - low) * UP
     half = minimum(width, _FIT_LIMIT)
@@ -408,7 +497,7 @@ def _exponential_range(low, high, radius, limits, charges):
         half=half,
         fits=where(width < _FIT_LIMIT, 1.0, 0.0),
         # float evaluation moves the exponent by kappa
-        radius=radius + kappa * minimum(high, 4.0 * _EXPONENT_LIMIT),
+        radius=radius + kappa * minimum(high, 4.0 * EXPONENT_CUT),
         at_low=at_low,
         fall=fall,
         scale=0.5 * (limits.opacity_low + limits.opacity_high) * (at_low * fall),
@@ -555,6 +644,8 @@ def alphas(record, begin, n, given, sure, block, inputs):
         )  # fmt: skip
         if shape.order == 2:
             found = _quadratic_alphas(record, begin, n, given, block, limits, charges, rules.antialiased)
+        elif shape.parts > 0:
+            found = _alphas_over_parts(record, begin, n, given, block, limits, inputs)
         else:
             found = _alphas_of_several(
                 record, begin, n, given, block, limits, charges, rules.antialiased, shape.monomials

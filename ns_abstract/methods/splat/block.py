@@ -1,4 +1,4 @@
-"""What the pixel stage keeps of a block of pixels, and where (design.md, B1-B11).
+"""What the pixel stage keeps of a block of pixels, and where (design.md, B1-B12).
 
 A fragment is one Gaussian on one pixel: what is known of its alpha, and of the light before and behind it. Fragments
 lie one after the other; each pixel lists those that may contribute to it, nearest first, with the places of their
@@ -37,6 +37,12 @@ ROWS = 8
 #: then its radius; where curvature is kept (B10), coefficients of products of two parameters follow, and the alpha up
 #: to which the fragment may be skipped, or 0 (`jump_column`).
 ALPHA_LOW, ALPHA_HIGH, BEND, BEND_SPREAD, FORM = range(5)
+#: Where pixels are bounded over parts of the cell (B12), a fragment is bounds of alpha and then: centres of y1 and y2,
+#: their slopes, parameter by parameter, their radii over a part; alpha at exponent 0, at its least and its most; and
+#: the alpha below which the fragment may be skipped.
+EXPONENT = 2
+#: Exponents are cut here; exp(-60) is far below any threshold.
+EXPONENT_CUT = 60.0
 #: What a list tells of the light at a fragment: behind it at its least, before it at its most.
 LEFT, LIGHT = range(2)
 #: Columns of an entry of a pixel's list: the fragment's number, its list position, its row of moves; one is spare.
@@ -70,6 +76,7 @@ class Fragments(NamedTuple):
         width: Numbers of a fragment.
         bends: Coefficients of products of two parameters that are kept beside forms of order 1.
         jump: See `jump_column`.
+        parts: Parts of the cell that pixels are bounded over; 0: fragments have forms.
         lists: [PIXELS, capacity, LISTED] each pixel's fragments, nearest first.
         light: [PIXELS, capacity, 2] the light at each: see `LEFT`.
         lengths: [PIXELS] of the lists.
@@ -81,6 +88,7 @@ class Fragments(NamedTuple):
     width: int
     bends: int
     jump: int
+    parts: int
     lists: np.ndarray
     light: np.ndarray
     lengths: np.ndarray
@@ -187,6 +195,7 @@ class Block(NamedTuple):
 
     Attributes:
         shifted: Depths of one pixel's list against its own reference (see `depths`).
+        part_ends: [6, 8] scratch: least of three channels, and most, over parts of the cell.
         sums: [3 m + bends + 5, 4] scratch by channel: polynomials, then what `blend` and `depths` need beside them.
         ray: [3] the block's central ray at the cell's middle, world axes, of unit depth.
     """
@@ -198,6 +207,7 @@ class Block(NamedTuple):
     reordering: Reordering
     batch: Batch
     jumps: Jumps
+    part_ends: np.ndarray
     sums: np.ndarray
     ray: np.ndarray
 
@@ -214,6 +224,7 @@ class Buffers(NamedTuple):
     background: np.ndarray
     nothing: np.ndarray
     unseen: np.ndarray
+    part_ends: np.ndarray
     sums: np.ndarray
     ray: np.ndarray
     positions: np.ndarray
@@ -241,7 +252,15 @@ def bends_of(shape):
 @njit(cache=True, error_model="numpy")
 def fragment_width(shape):
     """Numbers of a fragment of forms of ``shape``: whole cache lines."""
+    if shape.parts > 0:
+        return -(-(exponent_ends(shape.monomials) + 5) // 8) * 8
     return -(-max(FORM + shape.monomials + 1 + bends_of(shape), jump_column(shape) + 1) // 8) * 8
+
+
+@njit(cache=True, error_model="numpy", inline="always")
+def exponent_ends(m):
+    """Where in a fragment the radii stand that follow the exponent's slopes, see `EXPONENT`."""
+    return EXPONENT + 2 * m
 
 
 @njit(cache=True, error_model="numpy")
@@ -289,6 +308,7 @@ def new_buffers(shape, forms, pair_limit, background):
         background=behind,
         nothing=np.zeros(4),
         unseen=np.zeros(8),
+        part_ends=np.empty(48),
         sums=np.zeros(4 * (3 * m + 5 + bends_of(shape))),
         ray=np.empty(3),
         positions=np.empty((7, _POSITIONS), np.int64),
@@ -339,6 +359,7 @@ def resized(old, positions, capacity, shape, forms):
         background=old.background,
         nothing=old.nothing,
         unseen=old.unseen,
+        part_ends=old.part_ends,
         sums=old.sums,
         ray=old.ray,
         positions=places,
@@ -367,6 +388,7 @@ def block_of(buffers, shape, forms):
         fragment_width(shape),
         bends_of(shape),
         jump_column(shape),
+        shape.parts,
         pointer(buffers.lists),
         pointer(buffers.light),
         pointer(buffers.lengths),
@@ -404,8 +426,9 @@ def block_of(buffers, shape, forms):
     )
     jumps = Jumps(pointer(buffers.skipped), pointer(buffers.distances), pointer(buffers.jumps), buffers.jumps.shape[1])
     return Block(
-        fragments, palette, shifted, entries, reordering, batch, jumps, pointer(buffers.sums), pointer(buffers.ray)
-    )
+        fragments, palette, shifted, entries, reordering, batch, jumps, pointer(buffers.part_ends),
+        pointer(buffers.sums), pointer(buffers.ray),
+    )  # fmt: skip
 
 
 @njit(cache=True, error_model="numpy", forceinline=True)
@@ -434,13 +457,20 @@ def longest_list(lengths):
 def set_unknown(fragments, at, high, m):
     """Let the fragment at ``at`` have any alpha from 0 to ``high``."""
     values = fragments.values
+    values[at + ALPHA_LOW] = 0.0
+    values[at + ALPHA_HIGH] = high
+    if fragments.parts > 0:
+        for k in range(EXPONENT, exponent_ends(m)):
+            values[at + k] = 0.0
+        ends = at + exponent_ends(m)
+        values[ends], values[ends + 1] = 0.0, 0.0
+        values[ends + 2], values[ends + 3], values[ends + 4] = (0.0, 1.0, 0.0)
+        return
     for k in range(FORM + m + 1, FORM + m + 1 + fragments.bends):
         values[at + k] = 0.0
     values[at + BEND] = 0.0
     values[at + BEND_SPREAD] = 0.0
     values[at + fragments.jump] = 0.0
-    values[at + ALPHA_LOW] = 0.0
-    values[at + ALPHA_HIGH] = high
     values[at + FORM] = 0.5 * high
     for k in range(1, m):
         values[at + FORM + k] = 0.0

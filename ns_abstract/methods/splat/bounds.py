@@ -30,6 +30,8 @@ from ns_abstract.methods.splat.stage_data import (
     SceneColors,
     SceneGaussians,
     ViewingAxes,
+    cell_parts,
+    check_parts,
     form_shape,
 )
 from ns_abstract.methods.splat.variations import VariedSplats
@@ -152,6 +154,7 @@ class SplatBounds:
         floor: float = -1.0,
         layers: bool = False,
         pixels: np.ndarray | None = None,
+        parts: np.ndarray | None = None,
     ) -> CellBounds:
         """Bounds of the tiles ``wanted`` over the poses enclosed by ``forms`` (design.md, G10).
 
@@ -165,9 +168,18 @@ class SplatBounds:
                 without a stop: every layer counts.
             layers: Whether to bound accumulation and expected depth, too.
             pixels: [t, side, side] which of the tiles' pixels are wanted, nothing is said of the others; all if None.
+            parts: [d] numbers of parts along the cell's axes, powers of two and at least `PART_LANES` together: bound
+                pixels by intervals over each of them, not by forms (B12).
+
+        Raises:
+            ValueError: Linear sets or layers are asked for together with ``parts``, or these are not as above.
         """
         splats = self.splats
-        shape = form_shape(forms.rotation.basis)
+        if parts is not None:
+            check_parts(parts, forms.rotation.basis.dimensions)
+            if keep_linear or layers:
+                raise ValueError("intervals over parts of a cell have no linear sets and no layers")
+        shape = form_shape(forms.rotation.basis, 0 if parts is None else int(parts.prod()))
         d, m = shape.dimensions, shape.monomials
         across, down = tile_grid(camera, self.side)
         if wanted is None:
@@ -214,6 +226,7 @@ class SplatBounds:
             self.charges,
             self._cutoffs(floor),
             shape,
+            cell_parts(np.ones(d, np.int64) if parts is None else parts),
             found,
         )
         return CellBounds(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -22,6 +23,7 @@ from ns_abstract.methods.splat.constants import Rasteriser
 from ns_abstract.methods.splat.depths import ACCUMULATION_HIGH, ACCUMULATION_LOW, DEPTH_HIGH, DEPTH_LOW
 from ns_abstract.methods.splat.lists import summed_area, touching
 from ns_abstract.methods.splat.render import Renderer
+from ns_abstract.methods.splat.stage_data import shared_out
 from ns_abstract.methods.splat.variations import VariedSplats
 from ns_abstract.perturbation.specification import ROTATIONS
 from ns_abstract.refine.protocol import COLORS, LinearSets, Score
@@ -39,6 +41,8 @@ _SHEAR_MATTERS = 2.0**-7
 #: Light that is not followed further: the part of the excess that may be allowed, and at most, and no less than so many
 #: times the rasteriser's stop.
 _FLOOR_SHARE, _BRIGHTEST_FLOOR, _WORTH_IT = 0.2, 2.0**-7, 1.5
+#: Where typical Gaussians move by more pixels, a cell is bounded over so many parts, not by forms (B12).
+_WIDE, _PARTS = 0.35, 32
 #: A context that is larger than this part of the one around it is not kept beside it.
 _WORTH_KEEPING = 0.8
 
@@ -270,7 +274,8 @@ class SplatFrame:
         checkpoint()
         forms = self.pose_set.enclosure(box, self.order)
         layers = self.channels > COLORS
-        cell = self.bounds.cell(self.camera, forms, tiles, candidates, keep_linear, self._floor, layers, pixels)
+        parts = None if keep_linear or layers else self._parts(box)
+        cell = self.bounds.cell(self.camera, forms, tiles, candidates, keep_linear, self._floor, layers, pixels, parts)
         lower, upper = cell.lower, cell.upper
         if cell.layers is not None:
             low, high = (
@@ -285,7 +290,31 @@ class SplatFrame:
         if keep_linear:
             assert cell.linear is not None
             linear = linear_sets(cell.linear, cell.lower, cell.upper, box.dimensions)
-        return TileBounds(lower, upper, cell.slopes, context, linear, int(cell.statistics[3]))
+        slopes = cell.slopes if parts is None else self._all_slopes(box, cell.slopes, parts)
+        return TileBounds(lower, upper, slopes, context, linear, int(cell.statistics[3]))
+
+    @cached_property
+    def _pace(self) -> np.ndarray:
+        """[d] pixels that typical Gaussians move by for each unit of a parameter; 0 where none moves."""
+        width = np.array(self.box.upper) - np.array(self.box.lower)
+        moved = np.nan_to_num(np.array(self.motion(self.box), np.float64), nan=0.0, posinf=0.0)
+        return moved / np.where(width > 0.0, width, np.inf)
+
+    def _parts(self, box: ParameterBox) -> np.ndarray | None:
+        """Numbers of parts [d] along the axes of a cell that is too wide for forms (B12); None: it is not.
+
+        One parameter's forms fit much more, and colours that vary with a parameter ask for them.
+        """
+        moved = self._pace * (np.array(box.upper) - np.array(box.lower))
+        if box.dimensions < 2 or not np.all(self._pace > 0.0) or np.linalg.norm(moved) <= _WIDE:
+            return None
+        return shared_out(moved, _PARTS)
+
+    def _all_slopes(self, box: ParameterBox, slopes: np.ndarray, parts: np.ndarray) -> np.ndarray:
+        """``slopes`` [d] found over ``parts``, with those of axes that are not divided told by how far things move."""
+        moved = self._pace * (np.array(box.upper) - np.array(box.lower))
+        rate = slopes[parts > 1].sum() / moved[parts > 1].sum()
+        return np.where(parts > 1, slopes, rate * moved)
 
     def candidates(self, tiles: np.ndarray, within: Context | None, pixels: np.ndarray | None) -> np.ndarray | None:
         """What may be seen on ``pixels`` of ``tiles`` in a cell ``within`` another; None: everything."""

@@ -1,4 +1,4 @@
-"""Per-pixel stage of the bounds: the tiles of a picture, block by block, on all threads (design.md, B1-B11, R4).
+"""Per-pixel stage of the bounds: the tiles of a picture, block by block, on all threads (design.md, B1-B12, R4).
 
 A block of `PIXELS` pixels passes two steps: `fragments` collects what may be drawn, with alphas from `alphas`, and
 `blend` blends it, each pixel by itself; `block` tells how fragments are kept.
@@ -14,17 +14,19 @@ from numba import njit
 from ns_abstract.arithmetic.rounding import Charges
 from ns_abstract.arithmetic.simd.intrinsics import borrowed, lowest_bit, pointer, signed, taken
 from ns_abstract.geometry.camera_path import Intrinsics
-from ns_abstract.methods.splat.blend import shade, swap_bounds
+from ns_abstract.methods.splat.blend import shade
 from ns_abstract.methods.splat.block import Place, block_of, longest_list, new_buffers, resized
 from ns_abstract.methods.splat.constants import RasterRules
 from ns_abstract.methods.splat.depths import ACCUMULATION_HIGH, ACCUMULATION_LOW, DEPTH_HIGH, DEPTH_LOW, shade_layers
 from ns_abstract.methods.splat.fragments import GIVE_UP, GROW, apply_stops, collect_fragments, number_groups
 from ns_abstract.methods.splat.lists import BLOCK, TileLists, block_lists, longest_first
+from ns_abstract.methods.splat.reordering import swap_bounds
 from ns_abstract.methods.splat.sharing import by_tiles
 from ns_abstract.methods.splat.stage_data import (
     Colors,
     Cutoffs,
     FormShape,
+    Parts,
     PixelBounds,
     PixelInputs,
     ProjectedGaussians,
@@ -92,7 +94,7 @@ def _bound_block(numbers, place, inputs, block, bounds):
 
 
 @njit(cache=True, error_model="numpy")
-def _borrowed_inputs(gaussians, axes, intrinsics, colors, rules, charges, cutoffs, shape):
+def _borrowed_inputs(gaussians, axes, intrinsics, colors, rules, charges, cutoffs, shape, parts):
     """The `PixelInputs` without references to the arrays' owners."""
     gaussians = ProjectedGaussians(
         borrowed(gaussians.record), borrowed(gaussians.box), borrowed(gaussians.tiles), borrowed(gaussians.depth),
@@ -102,7 +104,8 @@ def _borrowed_inputs(gaussians, axes, intrinsics, colors, rules, charges, cutoff
     colors = Colors(
         borrowed(colors.values), borrowed(colors.background), colors.error, colors.channels, borrowed(colors.common)
     )
-    return PixelInputs(gaussians, axes, intrinsics, colors, rules, charges, cutoffs, shape)
+    parts = Parts(pointer(parts.middles), pointer(parts.half), pointer(parts.slope))
+    return PixelInputs(gaussians, axes, intrinsics, colors, rules, charges, cutoffs, shape, parts)
 
 
 @njit(cache=True, error_model="numpy")
@@ -117,10 +120,12 @@ def _tile_bounds(bounds, number, thread):
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def _pixel_worker(share, lists, pixels, gaussians, axes, intrinsics, colors, rules, charges, cutoffs, shape, bounds):
+def _pixel_worker(
+    share, lists, pixels, gaussians, axes, intrinsics, colors, rules, charges, cutoffs, shape, parts, bounds
+):
     """One thread's tiles; see `Share` and `pixel_stage`."""
     sequence, counter = borrowed(share.sequence), pointer(share.counter)
-    inputs = _borrowed_inputs(gaussians, axes, intrinsics, colors, rules, charges, cutoffs, shape)
+    inputs = _borrowed_inputs(gaussians, axes, intrinsics, colors, rules, charges, cutoffs, shape, parts)
     camera = inputs.intrinsics
     side = bounds.lower.shape[1]
     tiles_x = int(math.ceil(camera.width / side))
@@ -161,7 +166,8 @@ def _pixel_worker(share, lists, pixels, gaussians, axes, intrinsics, colors, rul
 
 def pixel_stage(
     lists: TileLists, pixels: np.ndarray, gaussians: ProjectedGaussians, axes: ViewingAxes, intrinsics: Intrinsics,
-    colors: Colors, rules: RasterRules, charges: Charges, cutoffs: Cutoffs, shape: FormShape, bounds: PixelBounds,
+    colors: Colors, rules: RasterRules, charges: Charges, cutoffs: Cutoffs, shape: FormShape, parts: Parts,
+    bounds: PixelBounds,
 ) -> None:  # fmt: skip
     """Bounds of the pixels of the tiles ``lists.wanted`` (design.md, B).
 
@@ -177,9 +183,10 @@ def pixel_stage(
         charges: For the program's rounding.
         cutoffs: What is left out.
         shape: Of the Gaussians' forms.
+        parts: Of the cell, where ``shape`` has some; then no linear sets and no layers are found.
         bounds: The output; one row of its statistics for each thread.
     """
     by_tiles(
         _pixel_worker, longest_first(lists.wanted, lists.offsets), bounds.statistics.shape[0],
-        lists, pixels, gaussians, axes, intrinsics, colors, rules, charges, cutoffs, shape, bounds,
+        lists, pixels, gaussians, axes, intrinsics, colors, rules, charges, cutoffs, shape, parts, bounds,
     )  # fmt: skip

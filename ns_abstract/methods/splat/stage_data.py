@@ -16,16 +16,23 @@ from ns_abstract.arithmetic.rounding import Charges
 from ns_abstract.geometry.camera_path import Intrinsics
 from ns_abstract.methods.splat.constants import RasterRules
 
+#: Parts of a cell that are blended side by side; cells have a multiple of them.
+PART_LANES = 8
+
 
 class FormShape(NamedTuple):
-    """The forms of a cell, as `Basis` tells: ``order`` 2 for one parameter, else 1."""
+    """The forms of a cell, as `Basis` tells: ``order`` 2 for one parameter, else 1.
+
+    Pixels have no forms where the cell has ``parts``, over which intervals bound them (B12).
+    """
 
     dimensions: int
     order: int
     monomials: int
+    parts: int = 0
 
 
-def form_shape(basis: Basis) -> FormShape:
+def form_shape(basis: Basis, parts: int = 0) -> FormShape:
     """``basis`` as kernels take it.
 
     Raises:
@@ -33,7 +40,9 @@ def form_shape(basis: Basis) -> FormShape:
     """
     if basis.order == 2 and basis.dimensions != 1:
         raise ValueError(f"forms of order 2 have one parameter, not {basis.dimensions}")
-    return FormShape(basis.dimensions, basis.order, basis.monomials)
+    if basis.order == 2 and parts:
+        raise ValueError("cells of one parameter have no parts")
+    return FormShape(basis.dimensions, basis.order, basis.monomials, parts)
 
 
 class SceneGaussians(NamedTuple):
@@ -177,6 +186,49 @@ class Cutoffs(NamedTuple):
     pairs: int
 
 
+class Parts(NamedTuple):
+    """Equal parts of a cell, at places and of widths in [-1, 1] (design.md, B12).
+
+    Attributes:
+        middles: [d, parts].
+        half: [d] half-widths.
+        slope: [d] turns the sum of ``middles`` times the ends of a quantity over the parts into its slope; 0 where an
+            axis is not divided.
+    """
+
+    middles: np.ndarray
+    half: np.ndarray
+    slope: np.ndarray
+
+
+def check_parts(counts: np.ndarray, dimensions: int) -> None:
+    """Refuse numbers of parts along axes that `cell_parts` and kernels do not take.
+
+    Raises:
+        ValueError: They are not ``dimensions`` powers of two, at least `PART_LANES` together.
+    """
+    one_bit = counts.shape == (dimensions,) and bool(np.all((counts > 0) & (counts & (counts - 1) == 0)))
+    if not one_bit or counts.prod() % PART_LANES:
+        raise ValueError(f"{counts.tolist()} are no numbers of parts along {dimensions} axes")
+
+
+def shared_out(weights: np.ndarray, parts: int) -> np.ndarray:
+    """Numbers of parts [d] along axes, ``parts`` together (a power of two), more where ``weights`` [d] are larger."""
+    counts = np.ones(weights.size, np.int64)
+    while counts.prod() < parts:
+        counts[np.argmax(weights / counts)] *= 2
+    return counts
+
+
+def cell_parts(counts: np.ndarray) -> Parts:
+    """The parts of a cell, ``counts`` [d] of them along its axes: powers of two, so that all is exact (B12)."""
+    along = [(2.0 * np.arange(n) + 1.0) / n - 1.0 for n in counts.tolist()]
+    grid = np.array(np.meshgrid(*along, indexing="ij"), np.float64)
+    middles = np.ascontiguousarray(grid.reshape(counts.size, counts.prod()))
+    squares = np.square(middles).sum(axis=1)
+    return Parts(middles, 1.0 / counts, np.where(counts > 1, 0.5 / np.where(counts > 1, squares, 1.0), 0.0))
+
+
 class PixelBounds(NamedTuple):
     """What the pixel stage leaves.
 
@@ -212,3 +264,4 @@ class PixelInputs(NamedTuple):
     charges: Charges
     cutoffs: Cutoffs
     shape: FormShape
+    parts: Parts

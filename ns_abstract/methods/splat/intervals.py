@@ -1,0 +1,177 @@
+"""Blending of a pixel's fragments back to front as intervals, over a cell and over parts of it (design.md, B7, B12).
+
+SIMD lanes are the three channels, and a fourth one of nothing; or eight parts of the cell.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any, NamedTuple
+
+from numba import njit
+
+from ns_abstract.arithmetic.elementary import exp_kernel, fma
+from ns_abstract.arithmetic.rounding import FRAGMENT_ROUNDING, UP
+from ns_abstract.arithmetic.simd.intrinsics import prefetch
+from ns_abstract.arithmetic.simd.lanes import LINE, lane_sum, load4, load8, maximum, minimum, store, where
+from ns_abstract.methods.splat.block import (
+    ALPHA_HIGH,
+    ALPHA_LOW,
+    EXPONENT,
+    EXPONENT_CUT,
+    color_ends,
+    exponent_ends,
+    listed_fragment,
+)
+from ns_abstract.methods.splat.stage_data import PART_LANES
+
+#: Fragments ahead that are asked for.
+AHEAD = 2
+
+
+class Ends(NamedTuple):
+    """Bounds of a blend, and of the colours in it; lanes are channels."""
+
+    low: Any
+    high: Any
+    darkest: Any
+    brightest: Any
+
+
+class _Thresholds(NamedTuple):
+    """Least alpha that may be drawn, and what larger ones are lowered to at least."""
+
+    drawn: float
+    most: float
+
+
+@njit(cache=True, error_model="numpy", forceinline=True)
+def _least(behind, color, a_low, a_high):
+    """Least of a fragment of ``color`` over what is at least ``behind`` (design.md, B7)."""
+    v = color - behind
+    return fma(where(v < 0.0, a_high, a_low), v, behind)
+
+
+@njit(cache=True, error_model="numpy", forceinline=True)
+def _most(behind, color, a_low, a_high):
+    """Most of a fragment of ``color`` over what is at most ``behind`` (design.md, B7)."""
+    v = color - behind
+    return fma(where(v > 0.0, a_high, a_low), v, behind)
+
+
+@njit(cache=True, error_model="numpy", forceinline=True)
+def blend_interval(behind, values, at, colors, ends):
+    """One fragment over what is ``behind`` (design.md, B7); its colour's bounds stand at ``ends``."""
+    a_low, a_high = values[at + ALPHA_LOW], values[at + ALPHA_HIGH]
+    c_low, c_high = load4(colors, ends), load4(colors, ends + 4)
+    return Ends(
+        _least(behind.low, c_low, a_low, a_high), _most(behind.high, c_high, a_low, a_high),
+        minimum(behind.darkest, c_low), maximum(behind.brightest, c_high),
+    )  # fmt: skip
+
+
+@njit(cache=True, error_model="numpy", forceinline=True)
+def _alphas_of_parts(values, at, part, inputs, thresholds):
+    """Least and most alpha of the fragment at ``at`` over eight parts of the cell from ``part`` on (design.md, B12)."""
+    middles, count = inputs.parts.middles, inputs.shape.parts
+    e = at + EXPONENT
+    zero = 0.0 * load8(middles, part)
+    y1, y2 = zero + values[e], zero + values[e + 1]
+    for k in range(inputs.shape.dimensions):
+        e += 2
+        middle = load8(middles, count * k + part)
+        y1 = fma(middle, values[e], y1)
+        y2 = fma(middle, values[e + 1], y2)
+    y1, y2 = abs(y1), abs(y2)
+    ends = at + exponent_ends(inputs.shape.monomials)
+    e1, e2 = values[ends], values[ends + 1]
+    near1, near2, far1, far2 = maximum(0.0, y1 - e1), maximum(0.0, y2 - e2), y1 + e1, y2 + e2
+    nearest = minimum((0.5 * (1.0 - FRAGMENT_ROUNDING)) * fma(near1, near1, near2 * near2), EXPONENT_CUT)
+    farthest = minimum((0.5 * UP) * fma(far1, far1, far2 * far2), EXPONENT_CUT)
+    high = minimum(values[ends + 3] * exp_kernel(-nearest), values[at + ALPHA_HIGH])
+    low = minimum(values[ends + 2] * exp_kernel(-farthest), thresholds.most)
+    low = maximum(where(low < values[ends + 4], 0.0, low), values[at + ALPHA_LOW])
+    return low, where(high < thresholds.drawn, 0.0, high)
+
+
+@njit(cache=True, error_model="numpy", forceinline=True)
+def _add_parts(out, slopes, channel, low, high, part, inputs):
+    """Take eight parts' ends of a channel into ``out`` and the sums ``slopes``, see `blend_parts`."""
+    least, most = PART_LANES * channel, PART_LANES * (3 + channel)
+    store(out, least, minimum(load8(out, least), low))
+    store(out, most, maximum(load8(out, most), high))
+    for k in range(inputs.shape.dimensions):
+        middle = load8(inputs.parts.middles, inputs.shape.parts * k + part)
+        slopes[4 * k + channel] += lane_sum(middle * (low + high))
+
+
+@njit(cache=True, error_model="numpy")
+def _blend_eight(begin, end, part, block, inputs, slopes):
+    """`blend_parts` of eight parts from ``part`` on; returns the darkest and the brightest colour."""
+    fragments, palette, moves, out = block.fragments, block.palette, block.reordering.moves, block.part_ends
+    values, colors, forms = fragments.values, palette.values, palette.forms
+    rules, charges = inputs.rules, inputs.charges
+    thresholds = _Thresholds(rules.alpha_min * (1.0 - charges.threshold), rules.alpha_max * (1.0 - charges.threshold))
+    darkest = load4(palette.background, 0)
+    brightest = darkest
+    zero = 0.0 * load8(inputs.parts.middles, part)
+    low0 = zero + palette.background[0]
+    low1 = zero + palette.background[1]
+    low2 = zero + palette.background[2]
+    high0, high1, high2 = low0, low1, low2
+    for entry in range(end - 1, begin - 1, -1):
+        ahead, _, _ = listed_fragment(fragments, max(entry - AHEAD, begin), forms)
+        for byte in range(0, 8 * fragments.width, LINE):
+            prefetch(values, ahead, byte)
+        at, key, move = listed_fragment(fragments, entry, forms)
+        a_low, a_high = _alphas_of_parts(values, at, part, inputs, thresholds)
+        c = key + color_ends(forms)
+        darkest, brightest = minimum(darkest, load4(colors, c)), maximum(brightest, load4(colors, c + 4))
+        low0 = _least(low0, colors[c], a_low, a_high)
+        low1 = _least(low1, colors[c + 1], a_low, a_high)
+        low2 = _least(low2, colors[c + 2], a_low, a_high)
+        high0 = _most(high0, colors[c + 4], a_low, a_high)
+        high1 = _most(high1, colors[c + 5], a_low, a_high)
+        high2 = _most(high2, colors[c + 6], a_low, a_high)
+        if move != 0:
+            low0 = low0 - moves[move]
+            low1 = low1 - moves[move + 1]
+            low2 = low2 - moves[move + 2]
+            high0 = high0 + moves[move + 4]
+            high1 = high1 + moves[move + 5]
+            high2 = high2 + moves[move + 6]
+    _add_parts(out, slopes, 0, low0, high0, part, inputs)
+    _add_parts(out, slopes, 1, low1, high1, part, inputs)
+    _add_parts(out, slopes, 2, low2, high2, part, inputs)
+    return darkest, brightest
+
+
+@njit(cache=True, error_model="numpy")
+def blend_parts(begin, end, block, inputs, slopes):
+    """Bounds of the list entries [begin, end) of a pixel by intervals over the parts of the cell (design.md, B12).
+
+    ``slopes`` [d, 4] receives how much the channels vary along the parameters, as far as the parts tell.
+    """
+    out, parts, d = block.part_ends, inputs.parts, inputs.shape.dimensions
+    zero = 0.0 * load8(parts.middles, 0)
+    for channel in range(3):
+        store(out, PART_LANES * channel, zero + math.inf)
+        store(out, PART_LANES * (3 + channel), zero - math.inf)
+    for k in range(4 * d):
+        slopes[k] = 0.0
+    darkest, brightest = _blend_eight(begin, end, 0, block, inputs, slopes)
+    for part in range(PART_LANES, inputs.shape.parts, PART_LANES):
+        _blend_eight(begin, end, part, block, inputs, slopes)
+    for k in range(d):
+        store(slopes, 4 * k, parts.slope[k] * load4(slopes, 4 * k))
+    for side in range(2):
+        for channel in range(3):
+            at = PART_LANES * (3 * side + channel)
+            value = out[at]
+            for lane in range(1, PART_LANES):
+                value = max(value, out[at + lane]) if side else min(value, out[at + lane])
+            # what stands there is not read any more
+            out[4 * side + channel] = value
+        # the lane of nothing
+        out[4 * side + 3] = 0.0
+    return Ends(load4(out, 0), load4(out, 4), darkest, brightest)
