@@ -63,7 +63,7 @@ _EARLY_CORNERS = 4
 #: Other scenes of the set that are rendered at the middle, and at every other witness.
 _MEMBERS, _MEMBERS_BY_WITNESS = 48, 2
 #: Part of the time that the first cover of the set may take.
-_COVER_SHARE = 0.5
+_COVER_SHARE = 0.7
 #: Most cells of the first cover.
 _COVER_CELLS = 4096
 #: Part of the gap beyond the witnesses that a goal allows which parts of a frame share by their pixels.
