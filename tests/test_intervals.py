@@ -130,6 +130,31 @@ def test_blends_over_parts_hold_every_exact_blend(counts, size):
                     assert low[channel] - room <= value <= high[channel] + room
 
 
+def test_one_fragment_over_parts():
+    """A fragment that moves along one axis: its least and most alpha are those at the ends, parts or not."""
+    pixel = _Pixel((4, 2), 1, 0)
+    pixel.centers[:], pixel.slopes[:], pixel.radii[:] = (0.75, 0.5), 0.0, 0.0
+    pixel.slopes[0, 0, 0], pixel.opacity[:], pixel.unknown[:], pixel.colors[:] = 0.5, 0.8, False, 1.0
+    low, high, slopes = pixel.bounds()
+    for found, place in ((high, -1.0), (low, 1.0)):
+        with mpmath.workdps(40):
+            (value, *_) = pixel.picture(np.array([place, 0.0]), np.random.default_rng(0))
+        assert found[0] == pytest.approx(float(value), abs=1e-12)
+    assert (low[0] - high[0]) / 2.0 == pytest.approx(-abs(slopes[0, 0]), rel=0.1)
+
+
+@pytest.mark.parametrize("counts", [(8,), (4, 2), (1, 16), (2, 1, 4, 1, 1, 2)])
+def test_parts_cover_the_cell(counts):
+    """Every point, ends included, is in a part, exactly."""
+    parts = cell_parts(np.array(counts))
+    low, high = parts.middles.T - parts.half, parts.middles.T + parts.half
+    assert parts.middles.shape == (len(counts), np.prod(counts)) and np.prod(parts.half) * np.prod(counts) == 1.0
+    generator = np.random.default_rng(0)
+    places = [np.ones(len(counts)), -np.ones(len(counts)), *generator.uniform(-1.0, 1.0, (200, len(counts)))]
+    for place in [*places, *low, *high]:
+        assert ((low <= place) & (place <= high)).all(axis=1).any()
+
+
 def test_more_parts_say_more():
     """Parts of parts are never worse, and with many of them hardly more is left than what poses show."""
     pixel = _Pixel((2, 2, 2), 24, 1, 0.5)
