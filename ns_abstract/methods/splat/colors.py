@@ -204,7 +204,7 @@ def _set_directions(work, numbers, scene, position, origin, m):
 @njit(cache=True, error_model="numpy")
 def _set_bands(work, numbers, filled, scratch, scene, shape):
     """Forms 16 to 18 of ``work``: the three channels, from the directions; ``scratch.low``: squared lengths."""
-    d, order, m, _ = shape
+    d, order, m = shape.dimensions, shape.order, shape.monomials
     sh, low, weights = borrowed(scene.sh), scratch.low, scratch.weights
     for channel in range(3):
         form = work[16 + channel]
@@ -236,7 +236,7 @@ def _set_bands(work, numbers, filled, scratch, scene, shape):
 @njit(cache=True, error_model="numpy")
 def _clamp_at_zero(form, low, high, shape):
     """Replace ``form`` by its maximum with 0; ``low`` and ``high`` [LANES] are scratch."""
-    d, order, m, _ = shape
+    d, order, m = shape.dimensions, shape.order, shape.monomials
     bounds(form, low, high, d, order, m)
     clamp_below(form, 0.0, low, high, d, order, m)
 
@@ -244,7 +244,7 @@ def _clamp_at_zero(form, low, high, shape):
 @njit(cache=True, error_model="numpy")
 def _clamp_channel(form, channel, numbers, filled, scratch, scene, charges, shape):
     """Charge a channel's form for float evaluation, clamp it and add the scene's range (design.md, C3, S4)."""
-    d, order, m, _ = shape
+    d, order, m = shape.dimensions, shape.order, shape.monomials
     magnitudes, least_of, most_of = borrowed(scene.magnitudes), borrowed(scene.low), borrowed(scene.high)
     low, high, angle = scratch.low, scratch.high, scratch.angle
     set_norms(form, d, order, m)

@@ -39,7 +39,7 @@ def rotate(w, rotation, r, v, offset, shifted, spread, out, shape):
 
     ``rotation`` [rows, 9] and ``offset`` [rows, 3], both flat, are the pose's forms.
     """
-    d, order, m, _ = shape
+    d, order, m = shape.dimensions, shape.order, shape.monomials
     x, y, z = v
     a, b, c = 3 * r, 3 * r + 1, 3 * r + 2
     for k in range(m):

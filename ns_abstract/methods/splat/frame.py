@@ -300,19 +300,23 @@ class SplatFrame:
         moved = np.nan_to_num(np.array(self.motion(self.box), np.float64), nan=0.0, posinf=0.0)
         return moved / np.where(width > 0.0, width, np.inf)
 
+    def _moved(self, box: ParameterBox) -> np.ndarray:
+        """[d] pixels that typical Gaussians move by over a cell along each axis."""
+        return self._pace * (np.array(box.upper) - np.array(box.lower))
+
     def _parts(self, box: ParameterBox) -> np.ndarray | None:
         """Numbers of parts [d] along the axes of a cell that is too wide for forms (B12); None: it is not.
 
         One parameter's forms fit much more, and colours that vary with a parameter ask for them.
         """
-        moved = self._pace * (np.array(box.upper) - np.array(box.lower))
+        moved = self._moved(box)
         if box.dimensions < 2 or not np.all(self._pace > 0.0) or np.linalg.norm(moved) <= _WIDE:
             return None
         return shared_out(moved, _PARTS)
 
     def _all_slopes(self, box: ParameterBox, slopes: np.ndarray, parts: np.ndarray) -> np.ndarray:
         """``slopes`` [d] found over ``parts``, with those of axes that are not divided told by how far things move."""
-        moved = self._pace * (np.array(box.upper) - np.array(box.lower))
+        moved = self._moved(box)
         rate = slopes[parts > 1].sum() / moved[parts > 1].sum()
         return np.where(parts > 1, slopes, rate * moved)
 

@@ -162,7 +162,7 @@ def _cull_block(candidates, block, inputs, scratch, state, alive, count):
     rotation, offset = pointer(poses.rotation), pointer(poses.offset)
     work, s_ = pointer(scratch.work), scratch.rows
     s = pointer(s_)
-    d, order, m, _ = inputs.shape
+    d, order, m = inputs.shape.dimensions, inputs.shape.order, inputs.shape.monomials
     fx, fy, cx, cy, width, height = inputs.camera
     gather_means(candidates, block, scene, poses.origin, s_)
     filled = block.shape[0]
