@@ -1,0 +1,51 @@
+"""The documentation site: it builds, and browsers show its formulas."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from browser import Browser, chromium
+from waiting import until
+
+ROOT = Path(__file__).resolve().parents[1]
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of the built site."""
+    pytest.importorskip("latex2mathml", reason="the extra [docs] is not installed")
+    folder = tmp_path_factory.mktemp("site")
+    command = [sys.executable, "-m", "mkdocs", "build", "--strict", "--quiet", "--site-dir", str(folder)]
+    built = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+    assert built.returncode == 0, built.stderr
+    return folder
+
+
+def test_no_formula_stays_raw(site):
+    formulas = 0
+    for page in site.rglob("index.html"):
+        html = re.sub(r"<(code|script|pre)\b.*?</\1>", "", page.read_text(encoding="utf-8"), flags=re.DOTALL)
+        assert "$" not in html, f"{page.parent.name}: {html[html.index('$') - 40 : html.index('$') + 40]!r}"
+        assert "arithmatex" not in html, page.parent.name
+        formulas += html.count("<math")
+    assert formulas > 700
+
+
+@pytest.mark.skipif(chromium() is None, reason="Chromium is not installed")
+def test_browser_shows_formulas(site, tmp_path):
+    with Browser((site / "design" / "index.html").as_uri(), tmp_path / "profile") as page:
+        until(lambda: page.ask("document.querySelectorAll('math').length > 700"), "the page")
+        hidden = page.ask(
+            "[...document.querySelectorAll('math')].filter(f => f.getBoundingClientRect().height < 1)"
+            ".map(f => f.outerHTML)"
+        )
+        assert hidden == []
+        # a fraction is higher than a line of text only where the browser lays formulas out
+        fractions = page.ask(
+            "[...document.querySelectorAll('math[display=block] mfrac')].map(f => f.getBoundingClientRect().height)"
+        )
+        assert max(fractions) > 25
