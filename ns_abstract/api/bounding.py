@@ -13,7 +13,7 @@ import numpy as np
 
 from ns_abstract.api.job import Job
 from ns_abstract.api.poses import PoseSet
-from ns_abstract.api.scenes import Scene, platform_problems
+from ns_abstract.api.scenes import Scene
 from ns_abstract.arithmetic.kernel_cache import store as kernels
 from ns_abstract.execution.ending import AbandonedError
 from ns_abstract.execution.engines import Engine, Here
@@ -412,7 +412,6 @@ def bound(
         scene, [poses.of(scene)], arithmetic=arithmetic, seed=seed, memory_limit=memory_limit, workers=workers,
         layers=[name for name in outputs if name != "rgb"],
     )  # fmt: skip
-    guarantee = "sampled" if platform_problems() else job.method.guarantee
     with interruptible() as stop:
         results = bound_frames(
             job, [0], engine=Here(), budget=time_budget, target_ratio=target_ratio, keep_leaves=keep_cells,
@@ -423,6 +422,7 @@ def bound(
         if stop():
             raise KeyboardInterrupt
         raise InputError("over before one picture was rendered", field="time_budget", fix="give more")
+    guarantee = "sampled" if frames[0].problems else job.method.guarantee
     about = {"guarantee": guarantee, "renderer": job.method.program, "scene": job.describe()}
     return BoundResult.of(frames[0], guarantee=guarantee, interrupted=stop(), target_ratio=target_ratio, about=about)
 

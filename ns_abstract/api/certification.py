@@ -18,8 +18,7 @@ import numpy as np
 import torch
 
 from ns_abstract.api.files import Settings, path_sets, resized
-from ns_abstract.api.job import Job, warm_up
-from ns_abstract.api.scenes import platform_problems
+from ns_abstract.api.job import Job, require_sound_platform, warm_up
 from ns_abstract.arithmetic.forms import MAX_DIMENSIONS
 from ns_abstract.execution.ending import abandoning
 from ns_abstract.execution.opening import Recipe, opened
@@ -252,11 +251,7 @@ class Certification:
                 field="preprocess.resize",
                 fix=f"write [{size[0]}, {size[1]}]",
             )
-        if problems := platform_problems():
-            raise InputError(
-                f"the platform's arithmetic failed the self-check ({problems[0]})",
-                fix="nothing can be certified here; use another machine",
-            )
+        require_sound_platform()
         self.model = NetworkModel(self.network, self.property.preprocess, memory, network_arithmetic)
         self._searches: dict[tuple[int, Grid], Search] = {}
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import hashlib
+import socket
 import time
 from collections.abc import Callable, Sequence
 from contextlib import suppress
@@ -15,6 +16,7 @@ from typing import Any
 import numpy as np
 
 from ns_abstract.api.scenes import Scene, SceneSource
+from ns_abstract.arithmetic.selfcheck import platform_problems
 from ns_abstract.execution.ending import AbandonedError, abandoning
 from ns_abstract.execution.opening import Recipe
 from ns_abstract.execution.threads import most_threads
@@ -205,7 +207,7 @@ class Job:
             frame, index, goal, seed=self.seed, keep_leaves=keep_leaves, stopped=over, progress=progress,
             members=frame.members(self.seed), tiles=tiles, known=known,
         )  # fmt: skip
-        return refinement.run_part()
+        return replace(refinement.run_part(), problems=platform_problems())
 
     def joined(self, parts: Sequence[PartResult]) -> FrameResult:
         """The frame that parts make up, with what was left out for it.
@@ -261,6 +263,19 @@ class Job:
     def describe(self) -> dict[str, Any]:
         """The scene for reports."""
         return self.method.describe()
+
+
+def require_sound_platform() -> None:
+    """Refuse to certify in a process whose elementary functions err by more than bounds are charged.
+
+    Raises:
+        InputError: What the self-check found, and on which machine.
+    """
+    if problems := platform_problems():
+        raise InputError(
+            f"the platform's arithmetic failed the self-check on {socket.gethostname()} ({problems[0]})",
+            fix="nothing can be certified there; use another machine",
+        )
 
 
 def _open(

@@ -20,9 +20,9 @@ import numpy as np
 
 from ns_abstract.api.bounding import listener
 from ns_abstract.api.certification import MEMORY
-from ns_abstract.api.job import Job
+from ns_abstract.api.job import Job, require_sound_platform
 from ns_abstract.api.margins import NOT_ASKED, SHARE, Margins, certified_cells
-from ns_abstract.api.scenes import Scene, platform_problems
+from ns_abstract.api.scenes import Scene
 from ns_abstract.api.searching import paced, search_blocks
 from ns_abstract.arithmetic.forms import MAX_DIMENSIONS
 from ns_abstract.execution.ending import AbandonedError, abandoning
@@ -111,11 +111,7 @@ class LoopJob:
         arithmetic: str | None = None,
         network_arithmetic: NetworkArithmetic = "float32",
     ) -> None:
-        if problems := platform_problems():
-            raise InputError(
-                f"the platform's arithmetic failed the self-check ({problems[0]})",
-                fix="nothing can be certified here; use another machine",
-            )
+        require_sound_platform()
         self.loop = loop
         self.network = load_network(loop.network)
         self.model = NetworkModel(self.network, loop.preprocess, MEMORY, network_arithmetic)
@@ -224,6 +220,7 @@ class LoopJob:
 
 
 def _open(open_job: Callable[[], Job], value: dict[str, Any], folder: Path, arithmetic: NetworkArithmetic) -> LoopJob:
+    require_sound_platform()
     job = LoopJob.__new__(LoopJob)
     job.loop, job.job = parse_loop(value, folder), open_job()
     job.network = load_network(job.loop.network)

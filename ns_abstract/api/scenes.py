@@ -4,12 +4,10 @@ from __future__ import annotations
 
 import os
 from dataclasses import dataclass, field
-from functools import cache
 from pathlib import Path
 
 import numpy as np
 
-from ns_abstract.arithmetic.selfcheck import check_functions
 from ns_abstract.geometry.camera_path import Camera
 from ns_abstract.geometry.poses import PoseSet
 from ns_abstract.geometry.tiles import assemble
@@ -18,12 +16,6 @@ from ns_abstract.methods.load import open_scene
 from ns_abstract.methods.representation import ProgramOptions
 from ns_abstract.perturbation.specification import Perturbation
 from ns_abstract.refine.protocol import Method
-
-
-@cache
-def platform_problems() -> tuple[str, ...]:
-    """What is wrong with this machine's arithmetic, one sentence each; with any, nothing is guaranteed."""
-    return tuple(check_functions())
 
 
 @dataclass(frozen=True)

@@ -14,6 +14,7 @@ value lies nearest to the middle of two float64 numbers, where a faulty last bit
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from functools import cache
 
 import numpy as np
 from numba import njit
@@ -117,6 +118,12 @@ def check_functions(
                 f" the assumed {relative / UNIT64:g} relative and {absolute / UNIT64:g} absolute units"
             )
     return problems
+
+
+@cache
+def platform_problems() -> tuple[str, ...]:
+    """What is wrong with this process' arithmetic, one sentence each; with any, nothing it computes is guaranteed."""
+    return tuple(check_functions())
 
 
 #: By function: lines of x, lower, upper.

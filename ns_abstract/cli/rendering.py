@@ -16,13 +16,12 @@ from ns_abstract.api import bounding
 from ns_abstract.api.compiling import compile_beside
 from ns_abstract.api.explaining import check_explained, explain
 from ns_abstract.api.files import PathJob, Settings, open_job
-from ns_abstract.api.job import Job, check_frames
-from ns_abstract.api.scenes import platform_problems
+from ns_abstract.api.job import Job, check_frames, platform_problems
 from ns_abstract.cli.common import Stop, plain_console
 from ns_abstract.execution.engines import Engine, EngineName, Tls, started
 from ns_abstract.io.folder import claim
 from ns_abstract.report.figures import listed
-from ns_abstract.report.record import Report, Run
+from ns_abstract.report.record import Report, Run, failed_self_check
 
 #: Seconds by frame where no time budget is given.
 _SECONDS_BY_FRAME = 60.0
@@ -61,7 +60,6 @@ class Order:
 
 def make_run(job: PathJob, order: Order, frames: tuple[int, ...], problems: tuple[str, ...]) -> Run:
     """What the report says about the command; ``problems`` of the platform take the guarantee away."""
-    limits = [f"The platform's arithmetic failed the self-check, so nothing is guaranteed: {p}" for p in problems]
     return Run(
         guarantee="sampled" if problems else job.method.guarantee,
         renderer=job.method.program,
@@ -71,7 +69,7 @@ def make_run(job: PathJob, order: Order, frames: tuple[int, ...], problems: tupl
         settings=order.options,
         plan=job.plan,
         command=("ns-abstract-render", *sys.argv[1:]),
-        limits=tuple(limits),
+        limits=tuple(map(failed_self_check, problems)),
         size=(job.path.cameras[0].height, job.path.cameras[0].width),
     )
 

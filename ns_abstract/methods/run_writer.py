@@ -124,7 +124,7 @@ def lpips_state(prefix: str) -> dict[str, Any]:
 
     def zeros(*shape: int) -> torch.Tensor:
         # One stored number stands for all.
-        return torch.zeros(1).expand(shape)
+        return torch.zeros(1, dtype=torch.float32).expand(shape)
 
     state = {}
     for name, shape in _LPIPS.items():

@@ -142,7 +142,7 @@ class AbstractNerfModel(AbstractOutputs, NeRFModel):
         """[3] colour behind the last sample; black where it is random (renderers.py:144-146)."""
         color = self.renderer_rgb.background_color
         if isinstance(color, str):
-            color = COLORS_DICT.get(color, torch.zeros(3))
+            color = COLORS_DICT.get(color, torch.zeros(3, dtype=torch.float32))
         return color.detach().cpu().numpy().astype(np.float32).reshape(3)
 
     def _concrete(self, camera: Any, obb_box: Any) -> dict[str, torch.Tensor]:

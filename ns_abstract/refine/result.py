@@ -117,6 +117,7 @@ class FrameResult:
         leaves: The leaf cells' linear sets, if they were asked for.
         layers: What else was bounded, by name, of `LAYERS`.
         views: Concrete renders across the set, where leaves are kept.
+        problems: What is wrong with the arithmetic of a process that bounded some of it; with any, nothing is guaranteed.
     """
 
     index: int
@@ -134,6 +135,7 @@ class FrameResult:
     leaves: Leaves | None = field(default=None, repr=False)
     layers: Mapping[str, Layer] = field(default_factory=dict, repr=False)
     views: Views | None = field(default=None, repr=False)
+    problems: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -168,6 +170,7 @@ class PartResult:
     leaves: Leaves | None = field(default=None, repr=False)
     layers: Mapping[str, Layer] | None = field(default=None, repr=False)
     views: Views | None = field(default=None, repr=False)
+    problems: tuple[str, ...] = ()
 
 
 #: Of a part that has no point yet: [0, 1] everywhere.
@@ -218,6 +221,7 @@ def joined(parts: Sequence[PartResult], camera: Any) -> FrameResult:
         leaves=_joined_leaves([part.leaves for part in parts]) if bounded else None,
         layers=layers,
         views=_joined_views([part.views for part in parts], order, camera) if bounded else None,
+        problems=tuple(dict.fromkeys(problem for part in parts for problem in part.problems)),
     )
 
 

@@ -163,6 +163,11 @@ def versions() -> dict[str, str | None]:
     return found
 
 
+def failed_self_check(problem: str) -> str:
+    """The condition on the guarantee that a problem of a platform's arithmetic makes."""
+    return f"The platform's arithmetic failed the self-check, so nothing is guaranteed: {problem}"
+
+
 @dataclass(frozen=True)
 class Run:
     """What a command is about to compute; all mappings must have a JSON form (see `plain`).
@@ -312,6 +317,18 @@ class Report:
         self._started = _now()
         self._page_due = 0.0
         self._packages = versions()
+        self._describe(run)
+        guarantee_text(run.guarantee)
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            remove_parts(folder)
+            self._found = sorted(path.name for kind in ("npz", "png") for path in folder.glob(f"frame_*.{kind}"))
+        except OSError as error:
+            raise unwritable(folder, error) from None
+
+    def _describe(self, run: Run) -> None:
+        """Take ``run`` for what report.json and the files of frames say from now on."""
+        self.run = run
         self._about = plain(
             {
                 "guarantee": run.guarantee,
@@ -321,13 +338,11 @@ class Report:
                 "target_ratio": run.settings.get("target_ratio"),
             }
         )
-        guarantee_text(run.guarantee)
-        try:
-            folder.mkdir(parents=True, exist_ok=True)
-            remove_parts(folder)
-            self._found = sorted(path.name for kind in ("npz", "png") for path in folder.glob(f"frame_*.{kind}"))
-        except OSError as error:
-            raise unwritable(folder, error) from None
+
+    def _without_guarantee(self, problems: Sequence[str]) -> None:
+        """Say of the whole report that a process whose self-check failed bounded some of it."""
+        limits = tuple(dict.fromkeys([*self.run.limits, *map(failed_self_check, problems)]))
+        self._describe(replace(self.run, guarantee="sampled", limits=limits))
 
     def _keep(self) -> None:
         run, path = self.run, self.folder / "report.json"
@@ -365,6 +380,9 @@ class Report:
                 self._digests[path.name] = digest
             if differences(stored.about.get("fingerprint") or {}, run.fingerprint):
                 self.ignored.append(f"{path.name}: computed with other settings")
+            elif stored.about.get("guarantee") != run.guarantee:
+                # the settings say which guarantee is meant: this one lost it on a machine that failed the self-check
+                self.ignored.append(f"{path.name}: has another guarantee, {stored.about.get('guarantee')}")
             elif path.name not in self._digests:
                 self.ignored.append(f"{path.name}: not as report.json knows it, so it is computed again")
             elif run.settings.get("save_cells") and not stored.has_leaves:
@@ -435,6 +453,8 @@ class Report:
             InputError: A file cannot be written.
         """
         check_frame(result)
+        if result.problems:
+            self._without_guarantee(result.problems)
         index = result.index
         path = self.folder / frame_name(index, "npz")
         stored = self.stored(index)

@@ -35,7 +35,7 @@ class Encoding:
         """[count] frequencies as Nerfstudio has them: a float32 power of a float32 exponent."""
         import torch
 
-        return (2.0 ** torch.linspace(self.least, self.most, self.count)).double().numpy()
+        return (2.0 ** torch.linspace(self.least, self.most, self.count, dtype=torch.float32)).double().numpy()
 
     @property
     def size(self) -> int:

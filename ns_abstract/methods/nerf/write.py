@@ -51,7 +51,7 @@ def _checkpoint_bytes(scene: NerfScene) -> bytes:
     """A checkpoint of plain tensors, numbers, lists and dictionaries: loads with weights_only."""
     import torch
 
-    pipeline = {"_model.device_indicator_param": torch.empty(0)}
+    pipeline = {"_model.device_indicator_param": torch.empty(0, dtype=torch.float32)}
     for name, weights in (("coarse", scene.coarse), ("fine", scene.fine)):
         for key, array in _named(weights).items():
             pipeline[f"_model.field_{name}.{key}"] = torch.tensor(array)

@@ -91,7 +91,7 @@ def _checkpoint_bytes(scene: SplatScene) -> bytes:
         "scales": scene.log_scales,
     }
 
-    pipeline: dict[str, torch.Tensor] = {"_model.device_indicator_param": torch.empty(0)}
+    pipeline: dict[str, torch.Tensor] = {"_model.device_indicator_param": torch.empty(0, dtype=torch.float32)}
     for name, value in gaussians.items():
         pipeline[f"_model.gauss_params.{name}"] = torch.from_numpy(np.array(value, np.float32))
     pipeline |= lpips_state("_model.lpips.net.")

@@ -221,7 +221,7 @@ def derivatives(
         if isinstance(node.layer, Linear):
             values.append(node.layer.apply(inputs))
         elif rows is None:
-            values.append(torch.zeros((count, *node.layer.shape)))
+            values.append(torch.zeros((count, *node.layer.shape), dtype=image.dtype))
         elif isinstance(node.layer, (Product, MaxPool)):
             values.append(others[k](torch.from_numpy(rows), inputs).reshape(count, *node.layer.shape))
         else:
