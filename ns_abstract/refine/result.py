@@ -117,7 +117,7 @@ class FrameResult:
         leaves: The leaf cells' linear sets, if they were asked for.
         layers: What else was bounded, by name, of `LAYERS`.
         views: Concrete renders across the set, where leaves are kept.
-        problems: What is wrong with the arithmetic of a process that bounded some of it; with any, nothing is guaranteed.
+        problems: What is wrong with the arithmetic of a process that bounded some of it; nothing is guaranteed then.
     """
 
     index: int
