@@ -9,8 +9,9 @@ import signal
 import numpy as np
 import pytest
 import torch
-from nerfs import UNIFORM, images, pixels_of, poses, tiny_scene
+from nerfs import BINS, UNIFORM, images, pixels_of, poses, tiny_scene
 
+from ns_abstract.arithmetic.rounding import UNIT32
 from ns_abstract.geometry.poses import PoseSet
 from ns_abstract.methods.nerf import bounds as bounds_module
 from ns_abstract.methods.nerf import frame as frame_module
@@ -18,7 +19,7 @@ from ns_abstract.methods.nerf.bounds import NerfBounds, RayBounds
 from ns_abstract.methods.nerf.division import Division
 from ns_abstract.methods.nerf.field import Field
 from ns_abstract.methods.nerf.frame import NerfFrame
-from ns_abstract.methods.nerf.render import NerfRenderer
+from ns_abstract.methods.nerf.render import NerfRenderer, Sampling
 from ns_abstract.methods.nerf.scene import NerfScene
 from ns_abstract.refine.engine import Goal, Refinement, groups
 from ns_abstract.refine.result import FrameResult, joined
@@ -106,6 +107,23 @@ def test_refinement_approaches_the_truth(spec: dict) -> None:
     many = images(scene, pose_set, pose_set.box.sample(200, np.random.default_rng(0)))
     for picture in many:
         assert (result.lower.reshape(-1, 3) <= picture).all() and (picture <= result.upper.reshape(-1, 3)).all()
+
+
+@pytest.mark.parametrize("sampling", [UNIFORM, BINS], ids=["uniform", "hierarchical"])
+@pytest.mark.parametrize("yaw", [1e-5, 1e-6])
+def test_bounds_of_narrow_sets_are_as_tight_as_their_renders_vary(yaw: float, sampling: Sampling) -> None:
+    scene, pose_set = tiny_scene(0), poses({"rotation": {"yaw": yaw}})
+    result = Refinement(NerfFrame(scene, sampling, pose_set), 0, Goal(ratio=1.45, seconds=300.0, cells=128)).run()
+    assert 0.0 < result.trace[-1].mpg < 1.5 * result.trace[-1].mpg_witness
+    for picture in images(scene, pose_set, pose_set.box.sample(40, np.random.default_rng(0)), sampling):
+        assert (result.lower.reshape(-1, 3) <= picture).all() and (picture <= result.upper.reshape(-1, 3)).all()
+
+
+def test_a_tolerance_is_not_finer_than_bounds_are_kept() -> None:
+    for yaw, least, most in ((1e-12, UNIT32, UNIT32), (1e-6, UNIT32, 1e-6), (0.1, 5e-4, 5e-4)):
+        frame = NerfFrame(tiny_scene(0), UNIFORM, poses({"rotation": {"yaw": yaw}}))
+        part = frame.box.split(0, 1 << 12)[0]
+        assert least <= frame._tolerance(part) <= most
 
 
 def test_the_whole_set_costs_nothing_and_rays_come_in_batches() -> None:

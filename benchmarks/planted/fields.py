@@ -23,6 +23,12 @@ _POINTS = "test_nerf_occupancy.py::test_ranges_of_points_are_enclosed_and_tight"
 
 FIELDS = (
     Fault(
+        "fields: narrow sets are bounded no better than wide ones",
+        "methods/nerf/frame.py", "NerfFrame._tolerance",
+        "min(_LEAST_TOLERANCE, max(_FINEST_TOLERANCE, _LEAST_SHARE * self._variation))", "_LEAST_TOLERANCE",
+        "test_nerf_frame.py::test_a_tolerance_is_not_finer_than_bounds_are_kept",
+    ),
+    Fault(
         "fields: the encoding's interpolation error is not charged",
         _ZONOTOPE, "FieldBounds.encode", "remainder + lebesgue**j * error", "remainder", _FIELDS, True,
     ),

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from ns_abstract.arithmetic.outward import outward
+from ns_abstract.arithmetic.rounding import UNIT32
 from ns_abstract.execution.ending import AbandonedError, checkpoint, is_over
 from ns_abstract.execution.engines import Processes
 from ns_abstract.geometry.box import ParameterBox
@@ -30,6 +31,9 @@ from ns_abstract.refine.protocol import LinearSets, Member
 #: variation over the set; less on narrower boxes.
 _TOLERANCE = 0.12
 _MOST_TOLERANCE, _LEAST_TOLERANCE = 0.03, 5e-4
+#: The least tolerance of sets over which pixels hardly vary, as a part of their mean variation; and of any set: bounds
+#: are kept in float32, where a finer one shows nowhere.
+_LEAST_SHARE, _FINEST_TOLERANCE = 0.02, UNIT32
 #: Rays and poses rendered to estimate that variation.
 _LOOK_RAYS, _LOOK_POSES = 256, 7
 #: Poses on the diagonal of a box that are rendered to see which colours it reaches, besides random ones.
@@ -434,7 +438,8 @@ class NerfFrame:
         whole = np.array(outer.upper) - np.array(outer.lower)
         width = np.array(box.upper) - np.array(box.lower)
         share = float(np.prod(width / whole)) ** (1.0 / box.dimensions)
-        return max(_LEAST_TOLERANCE, min(1.0, 4.0 * share) * min(_MOST_TOLERANCE, _TOLERANCE * self._variation))
+        least = min(_LEAST_TOLERANCE, max(_FINEST_TOLERANCE, _LEAST_SHARE * self._variation))
+        return max(least, min(1.0, 4.0 * share) * min(_MOST_TOLERANCE, _TOLERANCE * self._variation))
 
     @cached_property
     def _variation(self) -> float:
