@@ -45,7 +45,7 @@ data: &id003 !!python/object/apply:pathlib.PosixPath
 - data
 experiment_name: tiny
 load_dir: null
-load_step: 7
+load_step: null
 logging: !!python/object:nerfstudio.configs.base_config.LoggingConfig
   local_writer: !!python/object:nerfstudio.configs.base_config.LocalWriterConfig
     _target: !!python/name:nerfstudio.utils.writer.LocalWriter ''
