@@ -53,8 +53,8 @@ def open_jobs(
     """The runs, or the demo scene where none is named.
 
     Without ``arithmetic`` it is the strongest that the method has, without ``gsplat_version`` splats have their usual
-    rules; NeRFs are bounded on ``device``; ``overrides`` stand in place of what the files say. Without ``camera_path`` each run's own ``camera_path.json``, in the folder
-    that holds the method's folder, is used.
+    rules; NeRFs are bounded on ``device``; ``overrides`` stand in place of what the files say. Without ``camera_path``
+    each run's own ``camera_path.json``, in the folder that holds the method's folder, is used.
 
     Raises:
         InputError: A file cannot be used.

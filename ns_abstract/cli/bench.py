@@ -388,7 +388,8 @@ def loops(options: Loops) -> int:
         raise InputError(f"found {options.runs}", field="--runs", fix="give a number of at least 1")
     marks = [mark for mark in options.marks if mark <= options.seconds]
     found = measure(
-        SceneSource(options.load_config, overrides=overrides(options)).open(), options.loop, options.seconds, options.workers, options.runs, marks,
+        SceneSource(options.load_config, overrides=overrides(options)).open(), options.loop, options.seconds,
+        options.workers, options.runs, marks,
         options.seed, _said,
     )  # fmt: skip
     for name, rows in (("loops", found.search), ("loops-steps", found.steps)):

@@ -239,11 +239,11 @@ def step_assumption(run: RunConfig, checkpoint: Path, given: int | None) -> Assu
 def target_class(run: RunConfig) -> str:
     """Dotted name of the model's class that config.yml names; "" where it names none."""
     target = run.model.get("_target")
-    tagged = target if isinstance(target, Tagged) else run.model_node
+    tagged = run.model_node if target is None else target
     if not isinstance(tagged, Tagged):
-        return show(target) if target is not None else ""
-    name = tagged.tag.removeprefix(_PYTHON_TAG).rpartition(":")[2]
-    return name if tagged is target else name.removesuffix("Config")
+        return "" if target is None else show(target)
+    name = tagged.tag.rpartition(":")[2]
+    return name.removesuffix("Config") if target is None else name
 
 
 def read_dataparser_transform(run: RunConfig) -> tuple[DataparserTransform, tuple[str, ...]]:

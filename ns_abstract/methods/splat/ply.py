@@ -15,8 +15,9 @@ from ns_abstract.methods.splat.scene import SplatScene
 def write_ply(scene: SplatScene, file: Path) -> tuple[str, ...]:
     """Write ``scene``; `ns_abstract.methods.splat.load.load_scene` reads the same numbers back.
 
-    Its comment says how the scene is rasterised. The file holds what the standard has room for: means in the run's normalised frame, logarithms of
-    scales, logits of opacities, quaternions as stored, spherical harmonics channel by channel.
+    A comment says how the scene is rasterised. The file holds what the standard has room for: means in the run's
+    normalised frame, logarithms of scales, logits of opacities, quaternions as stored, spherical harmonics channel by
+    channel.
 
     Returns:
         What it has no room for, one sentence each.
@@ -39,7 +40,8 @@ def write_ply(scene: SplatScene, file: Path) -> tuple[str, ...]:
     if np.any(scene.background):
         red, green, blue = (float(value) for value in scene.background)
         lost.append(
-            f"the background ({red:.3g}, {green:.3g}, {blue:.3g}): this package takes black for a .ply unless --background says it"
+            f"the background ({red:.3g}, {green:.3g}, {blue:.3g}): this package takes black for a .ply unless "
+            "--background says it"
         )
     columns: dict[str, np.ndarray] = dict(zip("xyz", scene.means.T, strict=True))
     columns |= {name: np.zeros(scene.count, np.float32) for name in ("nx", "ny", "nz")}

@@ -1,0 +1,661 @@
+"""Scenes are those that their files say: step, mode, background, class, values that are not finite, other kinds.
+
+Pictures are compared with gsplat's own kernels, built for the processor, and with formulas in high precision.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import gzip
+import json
+import pickle
+import struct
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import mpmath
+import numpy as np
+import pytest
+import torch
+from conftest import blob_scene
+from gsplat_kernels import Kernels, Unavailable
+from nerfs import tiny_scene
+from numpy.typing import NDArray
+from plyfile import PlyData, PlyElement
+
+import ns_abstract as nsa
+from ns_abstract.api.files import Settings, open_job
+from ns_abstract.execution.opening import opened
+from ns_abstract.geometry.camera_path import Camera
+from ns_abstract.geometry.views import look_at
+from ns_abstract.io.assumptions import Assumption
+from ns_abstract.io.errors import InputError
+from ns_abstract.methods.load import load_any
+from ns_abstract.methods.nerf.write import write_nerf_run
+from ns_abstract.methods.overrides import Overrides
+from ns_abstract.methods.splat.load import load_scene
+from ns_abstract.methods.splat.ply import write_ply
+from ns_abstract.methods.splat.scene import SplatScene
+from ns_abstract.methods.splat.write import write_splatfacto_run
+from ns_abstract.report.record import guarantee_text
+
+torch.set_num_threads(1)
+NAN, INF = float("nan"), float("inf")
+CAMERA = Camera(np.asarray(look_at((1.6, 0.3, 0.4), (0.0, 0.0, 0.0)))[:3], 30.0, 30.0, 16.0, 12.0, 32, 24)
+SHIFT = {"x": 0.01}
+
+
+def thin_scene(mode: str = "classic") -> SplatScene:
+    """Blobs that are thin on the screen, so that compensated and plain opacities differ much."""
+    scene = blob_scene(60, degree=1)
+    thin = scene.log_scales - np.float32(1.5)
+    return dataclasses.replace(scene, log_scales=thin, rasterize_mode=mode)  # type: ignore[arg-type]
+
+
+def picture(scene: SplatScene) -> NDArray[np.float64]:
+    """The picture of gsplat's own kernels; skips where they cannot be built."""
+    try:
+        kernels = Kernels(scene, scalar="double")
+    except Unavailable as reason:
+        pytest.skip(str(reason))
+    pixels = np.stack(np.mgrid[: CAMERA.height, : CAMERA.width], axis=-1).reshape(-1, 2)
+    return kernels.pixels(CAMERA, CAMERA.camera_to_world[:3], pixels).reshape(CAMERA.height, CAMERA.width, 3)
+
+
+def shows(path: Path, expected: SplatScene, **options: Any) -> nsa.Scene:
+    """Check that bounds of the scene in ``path`` hold the picture of ``expected``, and that a render is that picture."""
+    scene = nsa.load_scene(path, **options)
+    wanted = picture(expected)
+    np.testing.assert_allclose(nsa.render(scene, CAMERA), wanted, atol=2e-6)
+    found = nsa.bound(scene, nsa.PoseSet(CAMERA, translation=SHIFT), target_ratio=3.0, time_budget=20.0)
+    assert found.guarantee == "float32-sound"
+    assert np.all(found.lower <= wanted) and np.all(wanted <= found.upper)
+    # bounds of everything would hold it, too
+    assert found.mpg < 0.5
+    return scene
+
+
+def differ(first: SplatScene, second: SplatScene) -> bool:
+    return bool(np.abs(picture(first) - picture(second)).max() > 0.05)
+
+
+def origin_of(scene: Any, name: str) -> Assumption:
+    (found,) = [record for record in scene.assumptions if record.name == name]
+    return found
+
+
+def refused(path: Path, *mentions: str, overrides: Overrides | None = None) -> str:
+    with pytest.raises(InputError) as caught:
+        load_any(path, overrides)
+    message = str(caught.value)
+    assert len(message.splitlines()) == 1 and caught.value.fix
+    for mention in mentions:
+        assert mention in message, message
+    return message
+
+
+# Steps
+
+
+@pytest.fixture
+def run(tmp_path: Path) -> Path:
+    """A run of Splatfacto with the steps 29999 and 9999, of which the first is another scene."""
+    return two_steps(tmp_path)
+
+
+EARLY = dataclasses.replace(blob_scene(40, seed=11), background=np.array([0, 1, 0], np.float32))
+LATE = dataclasses.replace(blob_scene(50, seed=7), background=np.array([0, 1, 0], np.float32))
+
+
+def two_steps(folder: Path) -> Path:
+    configs = [
+        write_splatfacto_run(scene, folder / name, timestamp="t", experiment_name="e")
+        for name, scene in (("early", EARLY), ("late", LATE))
+    ]
+    early, late = (next((config.parent / "nerfstudio_models").glob("step-*.ckpt")) for config in configs)
+    early.rename(late.with_name("step-000009999.ckpt"))
+    return configs[1]
+
+
+def edit(config: Path, *changes: tuple[str, str]) -> None:
+    text = config.read_text()
+    for old, new in changes:
+        assert old in text
+        text = text.replace(old, new, 1)
+    config.write_text(text)
+
+
+def test_the_step_of_the_configuration_is_shown(run: Path) -> None:
+    assert differ(EARLY, LATE)
+    shows(run, LATE)
+    # evaluation replaces load_dir by the run's own folder and does not read load_checkpoint
+    edit(run, ("load_step: null", "load_step: 9999"), ("load_dir: null", "load_dir: /elsewhere"))
+    edit(run, ("load_checkpoint: null", "load_checkpoint: /elsewhere/step-000000001.ckpt"))
+    scene = shows(run, EARLY)
+    assert origin_of(scene, "load_step") == Assumption("load_step", "9999", "config.yml: load_step")
+
+
+def test_the_option_wins_over_the_configuration(run: Path) -> None:
+    edit(run, ("load_step: null", "load_step: 9999"))
+    record = origin_of(shows(run, LATE, load_step=29999), "load_step")
+    assert record.value == "29999" and record.origin == "--load-step (in place of 9999, config.yml: load_step)"
+
+
+def test_a_missing_step_names_those_that_are_there(run: Path) -> None:
+    edit(run, ("load_step: null", "load_step: 5000"))
+    refused(run, "load_step: names step 5000", "9999, 29999", "--load-step", str(run))
+    message = refused(run, "--load-step: names step 7", "9999, 29999", overrides=Overrides(load_step=7))
+    assert str(run) not in message
+
+
+@pytest.mark.parametrize("value", ["-1", "9999.0", "true", "text", "[9999]", "!!python/name:os.system ''"])
+def test_a_step_that_is_none_is_refused(run: Path, value: str) -> None:
+    edit(run, ("load_step: null", f"load_step: {value}"))
+    refused(run, "load_step", "write a step")
+
+
+def test_the_name_that_nerfstudio_writes_comes_first(run: Path) -> None:
+    folder = run.parent / "nerfstudio_models"
+    other = write_splatfacto_run(blob_scene(3), run.parents[4] / "x", timestamp="t", experiment_name="e")
+    content = next((other.parent / "nerfstudio_models").glob("*.ckpt")).read_bytes()
+    for name in ("step-9999.ckpt", "step-0000009999.ckpt", "step-0000029999.ckpt"):
+        (folder / name).write_bytes(content)
+    assert load_scene(run).count == 50
+    assert load_scene(run, Overrides(load_step=9999)).count == 40
+    (folder / "step-000009999.ckpt").unlink()
+    assert load_scene(run, Overrides(load_step=9999)).count == 3
+
+
+def nerf_run(folder: Path) -> Path:
+    return write_nerf_run(tiny_scene(1), folder, timestamp="t", experiment_name="n")
+
+
+def checkpoint_of(config: Path) -> Path:
+    return max((config.parent / "nerfstudio_models").glob("step-*.ckpt"))
+
+
+def change(config: Path, edit: Callable[[dict[str, Any]], Any]) -> None:
+    """Edit the model's state in the latest checkpoint."""
+    file = checkpoint_of(config)
+    state = torch.load(file, weights_only=True)
+    edit(state["pipeline"])
+    torch.save(state, file)
+
+
+def test_a_nerf_is_of_the_step_of_the_configuration(tmp_path: Path) -> None:
+    late, early = nerf_run(tmp_path), write_nerf_run(tiny_scene(2), tmp_path / "2", timestamp="t", experiment_name="n")
+    checkpoint_of(early).rename(checkpoint_of(late).with_name("step-000009999.ckpt"))
+
+    def weights(scene: Any) -> np.ndarray:
+        return scene.fine.base[0].weight
+
+    assert np.array_equal(weights(load_any(late)), weights(tiny_scene(1)))
+    edit(late, ("load_step: null", "load_step: 9999"))
+    assert np.array_equal(weights(load_any(late)), weights(tiny_scene(2)))
+    assert np.array_equal(weights(load_any(late, Overrides(load_step=29999))), weights(tiny_scene(1)))
+    edit(late, ("load_step: 9999", "load_step: 10000"))
+    refused(late, "names step 10000", "9999, 29999", "--load-step")
+
+
+def test_workers_and_continued_results_see_what_was_given(run: Path, tmp_path: Path) -> None:
+    path = tmp_path / "path.json"
+    pose = [*CAMERA.camera_to_world[:3].ravel().tolist(), 0.0, 0.0, 0.0, 1.0]
+    entry = {"camera_to_world": pose, "fov": 45.0, "aspect": 1.0}
+    content = {"camera_path": [entry], "render_height": 8, "render_width": 8, "perturbation": {"version": 1}}
+    path.write_text(json.dumps(content))
+    given = Overrides(rasterize_mode="antialiased", background=(1.0, 0.0, 0.0), load_step=9999)
+    jobs = [open_job(Settings(run, path, overrides=overrides)) for overrides in (given, Overrides())]
+    assert jobs[0].fingerprint != jobs[1].fingerprint
+    again = opened(pickle.loads(pickle.dumps(jobs[0].recipe)))
+    assert again.fingerprint == jobs[0].fingerprint
+    scene = again.method.scene  # type: ignore[attr-defined]
+    assert (scene.count, scene.rasterize_mode, scene.background.tolist()) == (40, "antialiased", [1, 0, 0])
+
+
+# .ply files
+
+
+def ply(
+    path: Path, scene: SplatScene, comments: tuple[str, ...] = (), text: bool = False, order: str = "<",
+    **columns: Any,
+) -> Path:  # fmt: skip
+    """Write a standard file with more ``columns``; a column of None is left out."""
+    write_ply(scene, path)
+    data = PlyData.read(str(path))["vertex"].data
+    names = [name for name in data.dtype.names if columns.get(name, 0) is not None]
+    more = {name: value for name, value in columns.items() if value is not None}
+    table = np.zeros(len(data), [(name, "f4") for name in (*names, *(n for n in more if n not in names))])
+    for name in table.dtype.names or ():
+        table[name] = more[name] if name in more else data[name]
+    element = PlyElement.describe(table, "vertex")
+    PlyData([element], text=text, byte_order="=" if text else order, comments=list(comments)).write(str(path))
+    return path
+
+
+MIP = ("SplatRenderMode: mip",)
+COMMENTS = {
+    "Brush": (MIP, "antialiased"),
+    "Brush, default": (("SplatRenderMode: default",), "classic"),
+    "Postshot": (("antialiased 1",), "antialiased"),
+    "Postshot, off": (("antialiased 0",), "classic"),
+    "capitals": (("SPLATRENDERMODE: MIP",), "antialiased"),
+    "small letters": (("splatrendermode:mip",), "antialiased"),
+    "spaces": (("   SplatRenderMode   :   Mip   ",), "antialiased"),
+    "the last one is default": (("antialiased 1", "SplatRenderMode: default"), "classic"),
+    "the last one is 1": (("SplatRenderMode: default", "Antialiased 1"), "antialiased"),
+    "the last one is 0": ((*MIP, "antialiased 0"), "classic"),
+    "among others": (("Generated by us", *MIP, "Vertical axis: y", "mip is nice"), "antialiased"),
+    "other words": (("trained with antialiased 1",), "classic"),
+}
+
+
+@pytest.mark.parametrize("case", COMMENTS)
+@pytest.mark.parametrize("text", [False, True])
+def test_comments_say_the_mode(tmp_path: Path, case: str, text: bool) -> None:
+    comments, mode = COMMENTS[case]
+    path = ply(tmp_path / "a.ply", thin_scene(), comments, text)
+    scene = load_scene(path)
+    assert scene.rasterize_mode == origin_of(scene, "rasterize_mode").value == mode
+    assert origin_of(scene, "rasterize_mode").origin.startswith(("comment in the file", "default"))
+    assert any("assumed classic" in note for note in scene.notes) == (case == "other words")
+
+
+@pytest.mark.parametrize("comments", [MIP, ("antialiased 1",)])
+def test_a_file_of_compensated_opacities_is_shown_so(tmp_path: Path, comments: tuple[str, ...]) -> None:
+    scene = dataclasses.replace(thin_scene("antialiased"), background=np.zeros(3, np.float32))
+    assert differ(scene, dataclasses.replace(scene, rasterize_mode="classic"))
+    shows(ply(tmp_path / "a.ply", scene, comments), scene)
+
+
+@pytest.mark.parametrize("mode", ["classic", "antialiased"])
+def test_an_exported_scene_is_the_same_scene(tmp_path: Path, mode: str) -> None:
+    scene = thin_scene(mode)
+    write_ply(scene, tmp_path / "a.ply")
+    said = "mip" if mode == "antialiased" else "default"
+    assert f"comment SplatRenderMode: {said}\n".encode() in (tmp_path / "a.ply").read_bytes()
+    back = load_scene(tmp_path / "a.ply", Overrides(background=tuple(map(float, scene.background))))
+    assert np.array_equal(picture(back), picture(scene))
+
+
+def test_options_win_over_a_file_and_a_configuration(tmp_path: Path) -> None:
+    path = ply(tmp_path / "a.ply", thin_scene(), MIP)
+    expected = dataclasses.replace(thin_scene(), background=np.array([1, 0.5, 0], np.float32))
+    scene = shows(path, expected, rasterize_mode="classic", background=[1, 0.5, 0])
+    mode, color = origin_of(scene, "rasterize_mode"), origin_of(scene, "background")
+    assert (mode.value, color.value) == ("classic", "1 0.5 0")
+    assert mode.origin == "--rasterize-mode (in place of antialiased, comment in the file: SplatRenderMode: mip)"
+    assert color.origin.startswith("--background (in place of 0 0 0, default")
+    config = write_splatfacto_run(thin_scene("antialiased"), tmp_path, timestamp="t", experiment_name="e")
+    origin = origin_of(shows(config, expected, rasterize_mode="classic", background=(1, 0.5, 0)), "rasterize_mode")
+    assert origin.origin == "--rasterize-mode (in place of antialiased, config.yml: pipeline.model.rasterize_mode)"
+
+
+@pytest.mark.parametrize(
+    ("options", "field"),
+    [
+        ({"rasterize_mode": "mip"}, "--rasterize-mode"),
+        ({"background": (0, 1)}, "--background"),
+        ({"background": (0, 1, 2)}, "--background"),
+        ({"background": (0, 1, NAN)}, "--background"),
+        ({"load_step": -1}, "--load-step"),
+        ({"load_step": 3}, "--load-step"),
+        ({"assume_splatfacto": True}, "--assume-splatfacto"),
+    ],
+)
+def test_options_that_cannot_be_used(tmp_path: Path, options: dict[str, Any], field: str) -> None:
+    with pytest.raises(nsa.InputError, match=field):
+        nsa.load_scene(ply(tmp_path / "a.ply", thin_scene()), **options)
+
+
+@pytest.mark.parametrize("comment", ["SplatRenderMode: surfels", "antialiased 2", "SplatRenderMode:", "antialiased"])
+def test_a_mode_that_nobody_knows_is_refused(tmp_path: Path, comment: str) -> None:
+    path = ply(tmp_path / "a.ply", thin_scene(), (comment,))
+    refused(path, "comment", "--rasterize-mode")
+    assert load_scene(path, Overrides(rasterize_mode="antialiased")).rasterize_mode == "antialiased"
+
+
+def exactly_filtered(scene: SplatScene, width: np.ndarray) -> SplatScene:
+    """mip-splatting's 3-D filter (``get_scaling_with_3D_filter``, ``get_opacity_with_3D_filter``), in 40 digits."""
+    scales, opacities = scene.log_scales.copy(), scene.opacity_logits.copy()
+    with mpmath.workdps(40):
+        for i, f in enumerate(width):
+            squares = [mpmath.exp(mpmath.mpf(float(s))) ** 2 for s in scene.log_scales[i]]
+            after = [square + mpmath.mpf(float(f)) ** 2 for square in squares]
+            weight = mpmath.sqrt(mpmath.fprod(squares) / mpmath.fprod(after))
+            opacity = weight / (1 + mpmath.exp(-mpmath.mpf(float(scene.opacity_logits[i]))))
+            scales[i] = [float(mpmath.log(mpmath.sqrt(value))) for value in after]
+            opacities[i] = float(mpmath.log(opacity / (1 - opacity)))
+    return dataclasses.replace(scene, log_scales=scales, opacity_logits=opacities)
+
+
+def test_the_filter_of_mip_splatting_is_applied(tmp_path: Path) -> None:
+    scene = dataclasses.replace(thin_scene(), background=np.zeros(3, np.float32))
+    width = np.random.default_rng(0).uniform(0.0, 0.05, scene.count).astype(np.float32)
+    expected = exactly_filtered(scene, width)
+    assert differ(scene, expected)
+    found = load_scene(ply(tmp_path / "a.ply", scene, filter_3D=width))
+    np.testing.assert_allclose(found.log_scales, expected.log_scales, rtol=1.3e-7)
+    np.testing.assert_allclose(found.opacity_logits, expected.opacity_logits, rtol=1.3e-7, atol=1e-7)
+    assert any("filter_3D is applied" in note for note in found.notes)
+    shows(tmp_path / "a.ply", expected)
+    width[:] = 0.0
+    same = load_scene(ply(tmp_path / "b.ply", scene, filter_3D=width))
+    assert np.array_equal(same.log_scales, scene.log_scales)
+    assert np.array_equal(same.opacity_logits, scene.opacity_logits)
+
+
+def test_columns_that_are_not_used_are_named(tmp_path: Path) -> None:
+    scene = load_scene(ply(tmp_path / "a.ply", thin_scene(), label=1.0, red=0.0))
+    assert "not used: nx, ny, nz, label, red" in scene.notes
+
+
+OTHER_SPLATS = {
+    "no third scale": ({"scale_2": None}, (), "2-D Gaussians"),
+    "a comment": ({}, ("SplatRenderMode: 2dgs",), "2-D Gaussians"),
+    "a comment of capitals before another": ({}, ("SPLATRENDERMODE: 2DGS", "antialiased 1"), "2-D Gaussians"),
+    "spherical Gaussians": ({"sg_axis_0": 0.0}, (), "vertex.sg_axis_0"),
+    "spherical Gaussians in capitals": ({"SG_sharpness": 0.0}, (), "spherical Gaussians"),
+    "time": ({"trbf_center": 0.0}, (), "move in time"),
+    "anchors": ({"f_anchor_feat_0": 0.0}, (), "neural Gaussians"),
+    "points": (
+        dict.fromkeys(("scale_0", "scale_1", "scale_2", "opacity", "rot_0", "rot_1", "rot_2", "rot_3")),
+        (),
+        "a point cloud",
+    ),
+}
+
+
+@pytest.mark.parametrize("case", OTHER_SPLATS)
+def test_what_is_drawn_otherwise_is_refused_by_name(tmp_path: Path, case: str) -> None:
+    columns, comments, name = OTHER_SPLATS[case]
+    path = ply(tmp_path / "a.ply", thin_scene(), comments, **columns)
+    refused(path, name)
+    # no mode makes it another kind
+    refused(path, name, overrides=Overrides(rasterize_mode="classic"))
+
+
+def test_every_command_that_takes_a_scene_takes_the_options() -> None:
+    from ns_abstract.cli import bench, certify, export, reach, render, viewer
+    from ns_abstract.cli.scenes import GivenScene
+
+    count = 0
+    for module in (bench, certify, export, reach, render, viewer):
+        for found in vars(module).values():
+            if dataclasses.is_dataclass(found) and "load_config" in {entry.name for entry in dataclasses.fields(found)}:
+                assert isinstance(found, type) and issubclass(found, GivenScene), found
+                count += 1
+    assert count >= 10
+    assert {entry.name for entry in dataclasses.fields(GivenScene)} == {e.name for e in dataclasses.fields(Overrides)}
+
+
+# Models of other classes
+
+
+@pytest.fixture
+def plain(tmp_path: Path) -> Path:
+    return write_splatfacto_run(LATE, tmp_path / "plain", timestamp="t", experiment_name="e")
+
+
+STOCK = "_target: !!python/name:nerfstudio.models.splatfacto.SplatfactoModel ''"
+TAG = "!!python/object:nerfstudio.models.splatfacto.SplatfactoModelConfig"
+
+
+@pytest.mark.parametrize(
+    ("changes", "name"),
+    [
+        (((STOCK, "_target: !!python/name:sea.WaterModel ''"),), "sea.WaterModel"),
+        (((STOCK, "_target: !!python/name:mine.SplatfactoModel ''"),), "mine.SplatfactoModel"),
+        (((STOCK, "_target: sea.WaterModel"),), "sea.WaterModel"),
+        (((STOCK, ""), (TAG, "!!python/object:sea.WaterModelConfig")), "sea.WaterModel"),
+    ],
+)
+def test_another_class_is_refused_unless_it_is_declared(
+    plain: Path, changes: tuple[tuple[str, str], ...], name: str
+) -> None:
+    edit(plain, *changes)
+    refused(plain, "pipeline.model._target", name, "--assume-splatfacto")
+    scene = shows(plain, LATE, assume_splatfacto=True)
+    assert origin_of(scene, "bounded") == Assumption("bounded", "the Gaussians alone", "--assume-splatfacto")
+    assert "Gaussians alone" in scene.method().content
+
+
+MODULES = ("background_model.0.weight", "medium_mlp.bias", "gauss_params.features_medium", "exposure", "lpips_.x")
+
+
+@pytest.mark.parametrize("module", MODULES)
+def test_unknown_modules_are_refused_unless_they_are_declared(plain: Path, module: str) -> None:
+    change(plain, lambda state: state.update({f"_model.{module}": torch.ones(3)}))
+    shown = module if module.startswith("gauss_params") else module.partition(".")[0]
+    refused(plain, shown, "--assume-splatfacto")
+    scene = load_scene(plain, Overrides(assume_splatfacto=True))
+    assert scene.alone and shown in origin_of(scene, "bounded").value
+
+
+IDLE = (
+    "camera_optimizer.pose_adjustment",
+    "bil_grids.grids",
+    "ssim.win",
+    "psnr.total",
+    "lpips.net.lin0.model.1.weight",
+)
+
+
+def test_what_draws_nothing_is_accepted_and_listed(plain: Path) -> None:
+    change(plain, lambda state: state.update({f"_model.{name}": torch.ones(3) for name in IDLE}))
+    edit(plain, ("use_bilateral_grid: false", "use_bilateral_grid: true"))
+    ours = "_target: !!python/name:ns_abstract.nerfstudio.splat.AbstractSplatfactoModel ''"
+    edit(plain, (STOCK, ours))
+    scene = load_scene(plain)
+    listed = {record.name for record in scene.assumptions if record.value.startswith("left out")}
+    assert listed == {f"module {name.partition('.')[0]}" for name in IDLE}
+    assert not scene.alone
+    shows(plain, LATE)
+
+
+def test_an_assumption_that_nothing_needs_takes_nothing_away(plain: Path) -> None:
+    assert not load_scene(plain, Overrides(assume_splatfacto=True)).alone
+
+
+def test_the_guarantee_says_of_the_gaussians_alone(plain: Path) -> None:
+    edit(plain, (STOCK, "_target: !!python/name:sea.WaterModel ''"))
+    method = nsa.load_scene(plain, assume_splatfacto=True).method()
+    told = guarantee_text(method.guarantee, "gsplat", method.describe()["bounded"])
+    assert "of the Gaussians alone" in told
+    assert method.fingerprint["bounded"] == "Gaussians alone"
+    assert "alone" not in guarantee_text(method.guarantee, "gsplat", None)
+
+
+@pytest.mark.parametrize(
+    ("changes", "edits", "mention"),
+    [
+        ((("nerfstudio.models.vanilla_nerf.NeRFModel ''", "fog.FogModel ''"),), {}, "fog.FogModel"),
+        ((), {"_model.medium.weight": torch.ones(2)}, "medium.weight"),
+        ((), {"_model.field_fine.mlp_base.layers.3.weight": torch.ones(2)}, "layers.3"),
+        ((), {"_model.field_fine.embedding.weight": torch.ones(2)}, "field_fine.embedding.weight"),
+        ((), {"_model.temporal_distortion.mlp.weight": torch.ones(2)}, "temporal_distortion"),
+    ],
+)
+def test_a_nerf_of_another_class_or_with_more_is_refused(
+    tmp_path: Path, changes: tuple[tuple[str, str], ...], edits: dict[str, Any], mention: str
+) -> None:
+    config = nerf_run(tmp_path)
+    change(config, lambda state: state.update({"_model.psnr.total": torch.ones(1)}))
+    assert origin_of(load_any(config), "module psnr").value == "left out: a metric"
+    edit(config, *changes)
+    change(config, lambda state: state.update(edits))
+    refused(config, mention)
+
+
+def test_last_sample_is_not_supported(tmp_path: Path) -> None:
+    config = nerf_run(tmp_path)
+    edit(config, ("background_color: white", "background_color: last_sample"))
+    assert "not supported" in refused(config, "pipeline.model.background_color", "--background")
+    scene = load_any(config, Overrides(background=(0.0, 0.5, 1.0)))
+    assert scene.background.tolist() == [0.0, 0.5, 1.0]
+    assert "in place of last_sample" in origin_of(scene, "background").origin
+
+
+@pytest.mark.parametrize("name", ["rasterize_mode", "assume_splatfacto", "drop_nan_gaussians"])
+def test_options_of_splats_are_none_of_a_nerf(tmp_path: Path, name: str) -> None:
+    given = Overrides(**{name: "classic" if name == "rasterize_mode" else True})  # type: ignore[arg-type]
+    refused(nerf_run(tmp_path), "--" + name.replace("_", "-"), overrides=given)
+
+
+# Values that are not finite
+
+
+def spoiled(values: dict[str, list[tuple[Any, float]]], mode: str = "classic") -> SplatScene:
+    """A scene with some values replaced: by array, places and what stands there."""
+    scene = dataclasses.replace(blob_scene(30, degree=1), rasterize_mode=mode)  # type: ignore[arg-type]
+    arrays = {name: getattr(scene, name).copy() for name in values}
+    for name, changes in values.items():
+        for place, value in changes:
+            arrays[name][place] = value
+    return dataclasses.replace(scene, **arrays)
+
+
+FLAT = {"log_scales": [((slice(0, 10), 0), -INF), ((slice(10, 14), slice(0, 2)), -INF), (14, -INF)]}
+SURE = {"opacity_logits": [(slice(0, 4), INF), (slice(4, 9), -INF)]}
+
+
+@pytest.mark.parametrize("mode", ["classic", "antialiased"])
+@pytest.mark.parametrize("values", [FLAT, SURE, {**FLAT, **SURE}], ids=["flat", "sure", "both"])
+def test_flat_gaussians_and_opacities_of_0_and_1_are_bounded(tmp_path: Path, values: Any, mode: str) -> None:
+    scene = spoiled(values, mode)
+    assert differ(scene, dataclasses.replace(blob_scene(30, degree=1), rasterize_mode=mode))  # type: ignore[arg-type]
+    config = write_splatfacto_run(scene, tmp_path, timestamp="t", experiment_name="e")
+    loaded = load_scene(config)
+    assert (loaded.count, loaded.dropped) == (30, {})
+    shows(config, dataclasses.replace(scene, background=loaded.background))
+    write_ply(loaded, tmp_path / "a.ply")
+    assert np.array_equal(load_scene(tmp_path / "a.ply").opacity_logits, scene.opacity_logits)
+
+
+NEVER = {
+    "mean NaN": {"means": [((3, 1), NAN)]},
+    "mean inf": {"means": [((3, 1), INF)]},
+    "mean -inf": {"means": [(slice(3, 6), -INF)]},
+    "scale NaN": {"log_scales": [((3, 0), NAN)]},
+    "quaternion NaN": {"quats": [((3, 0), NAN), ((4, 1), NAN), ((5, 2), NAN), ((6, 3), NAN)]},
+    "quaternion inf": {"quats": [((3, 0), INF), ((4, 1), -INF), ((5, 2), INF), ((6, 3), INF)]},
+    "all NaN": {name: [(3, NAN)] for name in ("means", "log_scales", "quats", "opacity_logits", "sh")},
+}
+
+
+@pytest.mark.parametrize("mode", ["classic", "antialiased"])
+@pytest.mark.parametrize("case", NEVER)
+def test_gaussians_that_gsplat_never_draws_are_left_out_and_counted(tmp_path: Path, case: str, mode: str) -> None:
+    scene = spoiled(NEVER[case], mode)
+    bad = ~np.isfinite(scene.means).all(1) | np.isnan(scene.log_scales).any(1) | ~np.isfinite(scene.quats).all(1)
+    config = write_splatfacto_run(scene, tmp_path, timestamp="t", experiment_name="e")
+    loaded = load_scene(config)
+    assert list(loaded.dropped.values()) == [int(bad.sum())] and loaded.count == 30 - int(bad.sum())
+    assert loaded.stored is not None and loaded.stored.tolist() == np.flatnonzero(~bad).tolist()
+    # gsplat's kernels draw the whole scene
+    with_all = picture(scene)
+    assert np.isfinite(with_all).all()
+    shows(config, scene)
+    assert any("stored Gaussians left out" in line for line in nsa.load_scene(config).method().plan)
+
+
+DRAWN = {
+    "opacity NaN": {"opacity_logits": [(3, NAN)]},
+    "scale inf": {"log_scales": [((3, 0), INF)]},
+    "colour NaN": {"sh": [((3, 0, 1), NAN)]},
+    "colour inf": {"sh": [((3, 1, 1), INF)]},
+}
+
+
+@pytest.mark.parametrize("case", DRAWN)
+def test_gaussians_that_would_be_drawn_are_left_out_where_that_is_asked_for(tmp_path: Path, case: str) -> None:
+    from ns_abstract.cli.export import Ply, export
+
+    scene = spoiled({**DRAWN[case], "means": [(7, NAN)]})
+    config = write_splatfacto_run(scene, tmp_path, timestamp="t", experiment_name="e")
+    refused(config, "first is row 3", "1 rows", "--drop-nan-gaussians")
+    drop = Overrides(drop_nan_gaussians=True)
+    loaded = load_scene(config, drop)
+    assert list(loaded.dropped.values()) == [1, 1]
+    assert loaded.stored is not None and set(range(30)) - set(loaded.stored.tolist()) == {3, 7}
+    kept = np.delete(np.arange(30), [3, 7])
+    rest = {name: getattr(scene, name)[kept] for name in ("means", "log_scales", "quats", "opacity_logits", "sh")}
+    shows(config, dataclasses.replace(scene, **rest), drop_nan_gaussians=True)
+    assert export(Ply(config, tmp_path / "a.ply", drop_nan_gaussians=True)) == 0
+    assert load_scene(tmp_path / "a.ply").count == 28
+
+
+def test_a_nan_opacity_is_drawn_opaque_by_the_formulas() -> None:
+    """Why such Gaussians are not left out unasked: fminf(0.999, NaN) is 0.999."""
+    scene = spoiled({"opacity_logits": [(slice(0, 30), NAN)]})
+    assert differ(scene, spoiled({"opacity_logits": [(slice(0, 30), -INF)]}))
+
+
+def test_a_ply_with_nan_in_text(tmp_path: Path) -> None:
+    scene = spoiled({"means": [((3, 1), NAN)], "opacity_logits": [(5, INF)], "log_scales": [((6, 1), -INF)]})
+    loaded = load_scene(ply(tmp_path / "a.ply", scene, text=True))
+    assert loaded.count == 29 and list(loaded.dropped.values()) == [1]
+    assert loaded.opacity_logits[4] == INF and loaded.log_scales[5, 1] == -INF
+
+
+def test_far_coordinates_get_a_note(tmp_path: Path) -> None:
+    scene = blob_scene(30)
+    assert not any("float32 resolves" in note for note in load_scene(ply(tmp_path / "a.ply", scene)).notes)
+    far = dataclasses.replace(scene, means=scene.means + np.array([5e5, 4e6, 0], np.float32))
+    assert any("float32 resolves 0.25" in note for note in load_scene(ply(tmp_path / "b.ply", far)).notes)
+    near = dataclasses.replace(scene, means=scene.means + np.float32(100.0))
+    assert not any("float32 resolves" in note for note in load_scene(ply(tmp_path / "c.ply", near)).notes)
+
+
+# Files of other kinds
+
+
+def archive(path: Path, *names: str) -> None:
+    with zipfile.ZipFile(path, "w") as file:
+        for name in names:
+            file.writestr(name, b"{}")
+
+
+LFS = b"version https://git-lfs.github.com/spec/v1\noid sha256:00\nsize 12345\n"
+PAGE = b"\n<!DOCTYPE html>\n<html><body>Sign in</body></html>"
+SPZ = struct.pack("<IIIBBBB", 0x5053474E, 2, 1, 0, 12, 0, 0)
+KINDS: dict[str, tuple[Callable[[Path], Any], tuple[str, ...]]] = {
+    "a.sog": (lambda p: archive(p, "meta.json", "means_l.webp"), ("SOG", "splat-transform a.sog out.ply")),
+    "sog.zip": (lambda p: archive(p, "x/meta.json"), ("SOG", "splat-transform sog.zip out.ply")),
+    "run.zip": (lambda p: archive(p, "run/config.yml"), ("a zip archive", "unpack it")),
+    "a.ksplat": (lambda p: p.write_bytes(b"\0\1" + bytes(range(256)) * 20), (".ksplat", "splat-transform")),
+    "a.splat": (lambda p: p.write_bytes(bytes(range(256)) * 20), (".splat", "splat-transform a.splat out.ply")),
+    "a.spz": (lambda p: p.write_bytes(gzip.compress(SPZ)), ("SPZ", "splat-transform a.spz out.ply")),
+    "spz.ply": (lambda p: p.write_bytes(gzip.compress(SPZ)), ("SPZ", "splat-transform")),
+    "spz4": (lambda p: p.write_bytes(SPZ), ("SPZ",)),
+    "a.ply.gz": (lambda p: p.write_bytes(gzip.compress(b"ply\n" * 99)), ("gzip", "gunzip a.ply.gz")),
+    "a.glb": (lambda p: p.write_bytes(b"glTF\2\0\0\0" + bytes(99)), (".glb", "export the scene as .ply")),
+    "lfs.ply": (lambda p: p.write_bytes(LFS), ("Git LFS pointer", "git lfs pull")),
+    "config.yml": (lambda p: p.write_bytes(LFS), ("Git LFS pointer", "git lfs pull")),
+    "page.ply": (lambda p: p.write_bytes(PAGE), ("web page", "download")),
+    "page.yml": (lambda p: p.write_bytes(b"\xef\xbb\xbf" + PAGE), ("web page", "download")),
+    "sog.yml": (lambda p: archive(p, "meta.json"), ("SOG", "splat-transform")),
+    "a.usdz": (lambda p: archive(p, "scene.usdc"), ("USD", "export the scene as .ply")),
+    "meta.json": (lambda p: p.write_text("{}"), ("SOG", "splat-transform meta.json out.ply")),
+    "lod-meta.json": (lambda p: p.write_text("{}"), ("SOG", "splat-transform lod-meta.json out.ply")),
+}
+
+
+@pytest.mark.parametrize("name", KINDS)
+def test_other_kinds_are_refused_by_name(tmp_path: Path, name: str) -> None:
+    write, mentions = KINDS[name]
+    write(tmp_path / name)
+    message = refused(tmp_path / name, *mentions)
+    assert "UTF-8" not in message and "header" not in message
+
+
+@pytest.mark.parametrize(("content", "name"), [(LFS, "Git LFS pointer"), (PAGE, "web page")])
+def test_a_checkpoint_that_was_not_fetched(run: Path, content: bytes, name: str) -> None:
+    checkpoint_of(run).write_bytes(content)
+    refused(run, name, "step-000029999.ckpt")
+
+
+def test_a_ply_of_any_ending_is_read(tmp_path: Path) -> None:
+    ply(tmp_path / "a.ply", thin_scene(), MIP).rename(tmp_path / "point_cloud.bin")
+    assert load_any(tmp_path / "point_cloud.bin").rasterize_mode == "antialiased"
