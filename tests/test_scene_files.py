@@ -60,12 +60,12 @@ def picture(scene: SplatScene) -> NDArray[np.float64]:
         kernels = Kernels(scene, scalar="double")
     except Unavailable as reason:
         pytest.skip(str(reason))
-    pixels = np.stack(np.mgrid[: CAMERA.height, : CAMERA.width], axis=-1).reshape(-1, 2)
+    pixels = np.argwhere(np.ones((CAMERA.height, CAMERA.width)))
     return kernels.pixels(CAMERA, CAMERA.camera_to_world[:3], pixels).reshape(CAMERA.height, CAMERA.width, 3)
 
 
 def shows(path: Path, expected: SplatScene, **options: Any) -> nsa.Scene:
-    """Check that bounds of the scene in ``path`` hold the picture of ``expected``, and that a render is that picture."""
+    """Check that bounds of the scene in ``path`` hold the picture of ``expected``, which is what a render shows."""
     scene = nsa.load_scene(path, **options)
     wanted = picture(expected)
     np.testing.assert_allclose(nsa.render(scene, CAMERA), wanted, atol=2e-6)
@@ -199,12 +199,17 @@ def test_a_nerf_is_of_the_step_of_the_configuration(tmp_path: Path) -> None:
     refused(late, "names step 10000", "9999, 29999", "--load-step")
 
 
-def test_workers_and_continued_results_see_what_was_given(run: Path, tmp_path: Path) -> None:
-    path = tmp_path / "path.json"
+def path_of(folder: Path) -> Path:
+    """A camera path of one entry, 8 x 8 pixels, and a set of one pose."""
     pose = [*CAMERA.camera_to_world[:3].ravel().tolist(), 0.0, 0.0, 0.0, 1.0]
     entry = {"camera_to_world": pose, "fov": 45.0, "aspect": 1.0}
     content = {"camera_path": [entry], "render_height": 8, "render_width": 8, "perturbation": {"version": 1}}
-    path.write_text(json.dumps(content))
+    (folder / "path.json").write_text(json.dumps(content))
+    return folder / "path.json"
+
+
+def test_workers_and_continued_results_see_what_was_given(run: Path, tmp_path: Path) -> None:
+    path = path_of(tmp_path)
     given = Overrides(rasterize_mode="antialiased", background=(1.0, 0.0, 0.0), load_step=9999)
     jobs = [open_job(Settings(run, path, overrides=overrides)) for overrides in (given, Overrides())]
     assert jobs[0].fingerprint != jobs[1].fingerprint
@@ -275,7 +280,8 @@ def test_an_exported_scene_is_the_same_scene(tmp_path: Path, mode: str) -> None:
     write_ply(scene, tmp_path / "a.ply")
     said = "mip" if mode == "antialiased" else "default"
     assert f"comment SplatRenderMode: {said}\n".encode() in (tmp_path / "a.ply").read_bytes()
-    back = load_scene(tmp_path / "a.ply", Overrides(background=tuple(map(float, scene.background))))
+    red, green, blue = map(float, scene.background)
+    back = load_scene(tmp_path / "a.ply", Overrides(background=(red, green, blue)))
     assert np.array_equal(picture(back), picture(scene))
 
 
@@ -465,6 +471,21 @@ def test_the_guarantee_says_of_the_gaussians_alone(plain: Path) -> None:
     assert "of the Gaussians alone" in told
     assert method.fingerprint["bounded"] == "Gaussians alone"
     assert "alone" not in guarantee_text(method.guarantee, "gsplat", None)
+
+
+def test_the_report_says_of_the_gaussians_alone(plain: Path, tmp_path: Path, in_process: Any) -> None:
+    from ns_abstract.cli import render
+
+    edit(plain, (STOCK, "_target: !!python/name:sea.WaterModel ''"))
+    options = ["--load-config", str(plain), "--camera-path-filename", str(path_of(tmp_path)), "--time-budget", "5"]
+    code, _, said = in_process(render.main, [*options, "--output-dir", str(tmp_path / "refused")])
+    assert code == 2 and "--assume-splatfacto" in said and len(said.splitlines()) == 1
+    out = tmp_path / "out"
+    code, _, said = in_process(render.main, [*options, "--output-dir", str(out), "--assume-splatfacto"])
+    assert code == 0, said
+    report = json.loads((out / "report.json").read_text())
+    assert report["guarantee"] == "float32-sound" and "of the Gaussians alone" in report["guarantee_text"]
+    assert "of the Gaussians alone" in (out / "report.html").read_text()
 
 
 @pytest.mark.parametrize(

@@ -138,7 +138,9 @@ def _set_overrides(config: TrainerConfig, overrides: Overrides) -> None:
         model.rasterize_mode = overrides.rasterize_mode
     if overrides.background is not None:
         color = list(overrides.background)
-        model.background_color = color if isinstance(model, AbstractSplatfactoModelConfig) else torch.tensor(color)
+        # colors.get_color takes a list, RGBRenderer a tensor
+        splat = isinstance(config.pipeline.model, AbstractSplatfactoModelConfig)
+        model.background_color = color if splat else torch.tensor(color)
 
 
 def _prepared(config: TrainerConfig, file: Path) -> TrainerConfig:

@@ -121,7 +121,7 @@ def coordinates_note(means: Float32Array, log_scales: Float32Array) -> tuple[str
 
 def _all(good: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """[N] whether all values of a row are good."""
-    return good.reshape(good.shape[0], -1).all(axis=1)
+    return np.asarray(good.reshape(good.shape[0], -1).all(axis=1))
 
 
 def _require(
