@@ -60,7 +60,8 @@ def view(
     with tempfile.TemporaryDirectory(prefix="ns-abstract-viewer-") as scratch:
         config_file = load_config
         if config_file.suffix.lower() == ".ply":
-            config_file, overrides = run_of_ply(config_file, Path(scratch), overrides), Overrides()
+            config_file = run_of_ply(config_file, Path(scratch), overrides)
+            overrides = Overrides(background=overrides.background)
         config, pipeline, step = open_run(config_file, abstract, overrides)
         if options["websocket_host"] not in _LOOPBACK or options["make_share_url"]:
             print(
@@ -120,6 +121,9 @@ def open_run(
         raise InputError(
             f"nerfstudio cannot open it: {error}", file=run.file, fix="give a run of nerfstudio 1.1.5"
         ) from None
+    if overrides.background is not None and isinstance(config.pipeline.model, AbstractSplatfactoModelConfig):
+        model: Any = pipeline.model
+        model.set_background(torch.tensor(overrides.background))
     return config, pipeline, step
 
 
@@ -137,10 +141,9 @@ def _set_overrides(config: TrainerConfig, overrides: Overrides) -> None:
     if overrides.rasterize_mode is not None:
         model.rasterize_mode = overrides.rasterize_mode
     if overrides.background is not None:
-        color = list(overrides.background)
-        # colors.get_color takes a list, RGBRenderer a tensor
+        # splatfacto.py:498-509: "random" is the colour that the model's set_background was given
         splat = isinstance(config.pipeline.model, AbstractSplatfactoModelConfig)
-        model.background_color = color if splat else torch.tensor(color)
+        model.background_color = "random" if splat else torch.tensor(overrides.background)
 
 
 def _prepared(config: TrainerConfig, file: Path) -> TrainerConfig:
