@@ -6,12 +6,8 @@ Pictures are compared with gsplat's own kernels, built for the processor, and wi
 from __future__ import annotations
 
 import dataclasses
-import gzip
 import json
 import pickle
-import struct
-import zipfile
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -20,18 +16,31 @@ import numpy as np
 import pytest
 import torch
 from conftest import blob_scene
-from gsplat_kernels import Kernels, Unavailable
 from nerfs import tiny_scene
-from numpy.typing import NDArray
-from plyfile import PlyData, PlyElement
+from scene_files import (
+    EARLY,
+    LATE,
+    MIP,
+    NAN,
+    change,
+    checkpoint_of,
+    differ,
+    edit,
+    nerf_run,
+    origin_of,
+    path_of,
+    picture,
+    ply,
+    refused,
+    shows,
+    thin_scene,
+    two_steps,
+)
 
 import ns_abstract as nsa
 from ns_abstract.api.files import Settings, open_job
 from ns_abstract.execution.opening import opened
-from ns_abstract.geometry.camera_path import Camera
-from ns_abstract.geometry.views import look_at
 from ns_abstract.io.assumptions import Assumption
-from ns_abstract.io.errors import InputError
 from ns_abstract.methods.load import load_any
 from ns_abstract.methods.nerf.write import write_nerf_run
 from ns_abstract.methods.overrides import Overrides
@@ -42,58 +51,6 @@ from ns_abstract.methods.splat.write import write_splatfacto_run
 from ns_abstract.report.record import guarantee_text
 
 torch.set_num_threads(1)
-NAN, INF = float("nan"), float("inf")
-CAMERA = Camera(np.asarray(look_at((1.6, 0.3, 0.4), (0.0, 0.0, 0.0)))[:3], 30.0, 30.0, 16.0, 12.0, 32, 24)
-SHIFT = {"x": 0.01}
-
-
-def thin_scene(mode: str = "classic") -> SplatScene:
-    """Blobs that are thin on the screen, so that compensated and plain opacities differ much."""
-    scene = blob_scene(60, degree=1)
-    thin = scene.log_scales - np.float32(1.5)
-    return dataclasses.replace(scene, log_scales=thin, rasterize_mode=mode)  # type: ignore[arg-type]
-
-
-def picture(scene: SplatScene) -> NDArray[np.float64]:
-    """The picture of gsplat's own kernels; skips where they cannot be built."""
-    try:
-        kernels = Kernels(scene, scalar="double")
-    except Unavailable as reason:
-        pytest.skip(str(reason))
-    pixels = np.argwhere(np.ones((CAMERA.height, CAMERA.width)))
-    return kernels.pixels(CAMERA, CAMERA.camera_to_world[:3], pixels).reshape(CAMERA.height, CAMERA.width, 3)
-
-
-def shows(path: Path, expected: SplatScene, **options: Any) -> nsa.Scene:
-    """Check that bounds of the scene in ``path`` hold the picture of ``expected``, which is what a render shows."""
-    scene = nsa.load_scene(path, **options)
-    wanted = picture(expected)
-    np.testing.assert_allclose(nsa.render(scene, CAMERA), wanted, atol=2e-6)
-    found = nsa.bound(scene, nsa.PoseSet(CAMERA, translation=SHIFT), target_ratio=3.0, time_budget=20.0)
-    assert found.guarantee == "float32-sound"
-    assert np.all(found.lower <= wanted) and np.all(wanted <= found.upper)
-    # bounds of everything would hold it, too
-    assert found.mpg < 0.5
-    return scene
-
-
-def differ(first: SplatScene, second: SplatScene) -> bool:
-    return bool(np.abs(picture(first) - picture(second)).max() > 0.05)
-
-
-def origin_of(scene: Any, name: str) -> Assumption:
-    (found,) = [record for record in scene.assumptions if record.name == name]
-    return found
-
-
-def refused(path: Path, *mentions: str, overrides: Overrides | None = None) -> str:
-    with pytest.raises(InputError) as caught:
-        load_any(path, overrides)
-    message = str(caught.value)
-    assert len(message.splitlines()) == 1 and caught.value.fix
-    for mention in mentions:
-        assert mention in message, message
-    return message
 
 
 # Steps
@@ -103,28 +60,6 @@ def refused(path: Path, *mentions: str, overrides: Overrides | None = None) -> s
 def run(tmp_path: Path) -> Path:
     """A run of Splatfacto with the steps 29999 and 9999, of which the first is another scene."""
     return two_steps(tmp_path)
-
-
-EARLY = dataclasses.replace(blob_scene(40, seed=11), background=np.array([0, 1, 0], np.float32))
-LATE = dataclasses.replace(blob_scene(50, seed=7), background=np.array([0, 1, 0], np.float32))
-
-
-def two_steps(folder: Path) -> Path:
-    configs = [
-        write_splatfacto_run(scene, folder / name, timestamp="t", experiment_name="e")
-        for name, scene in (("early", EARLY), ("late", LATE))
-    ]
-    early, late = (next((config.parent / "nerfstudio_models").glob("step-*.ckpt")) for config in configs)
-    early.rename(late.with_name("step-000009999.ckpt"))
-    return configs[1]
-
-
-def edit(config: Path, *changes: tuple[str, str]) -> None:
-    text = config.read_text()
-    for old, new in changes:
-        assert old in text
-        text = text.replace(old, new, 1)
-    config.write_text(text)
 
 
 def test_the_step_of_the_configuration_is_shown(run: Path) -> None:
@@ -168,22 +103,6 @@ def test_the_name_that_nerfstudio_writes_comes_first(run: Path) -> None:
     assert load_scene(run, Overrides(load_step=9999)).count == 3
 
 
-def nerf_run(folder: Path) -> Path:
-    return write_nerf_run(tiny_scene(1), folder, timestamp="t", experiment_name="n")
-
-
-def checkpoint_of(config: Path) -> Path:
-    return max((config.parent / "nerfstudio_models").glob("step-*.ckpt"))
-
-
-def change(config: Path, edit: Callable[[dict[str, Any]], Any]) -> None:
-    """Edit the model's state in the latest checkpoint."""
-    file = checkpoint_of(config)
-    state = torch.load(file, weights_only=True)
-    edit(state["pipeline"])
-    torch.save(state, file)
-
-
 def test_a_nerf_is_of_the_step_of_the_configuration(tmp_path: Path) -> None:
     late, early = nerf_run(tmp_path), write_nerf_run(tiny_scene(2), tmp_path / "2", timestamp="t", experiment_name="n")
     checkpoint_of(early).rename(checkpoint_of(late).with_name("step-000009999.ckpt"))
@@ -197,15 +116,6 @@ def test_a_nerf_is_of_the_step_of_the_configuration(tmp_path: Path) -> None:
     assert np.array_equal(weights(load_any(late, Overrides(load_step=29999))), weights(tiny_scene(1)))
     edit(late, ("load_step: 9999", "load_step: 10000"))
     refused(late, "names step 10000", "9999, 29999", "--load-step")
-
-
-def path_of(folder: Path) -> Path:
-    """A camera path of one entry, 8 x 8 pixels, and a set of one pose."""
-    pose = [*CAMERA.camera_to_world[:3].ravel().tolist(), 0.0, 0.0, 0.0, 1.0]
-    entry = {"camera_to_world": pose, "fov": 45.0, "aspect": 1.0}
-    content = {"camera_path": [entry], "render_height": 8, "render_width": 8, "perturbation": {"version": 1}}
-    (folder / "path.json").write_text(json.dumps(content))
-    return folder / "path.json"
 
 
 def test_workers_and_continued_results_see_what_was_given(run: Path, tmp_path: Path) -> None:
@@ -222,24 +132,6 @@ def test_workers_and_continued_results_see_what_was_given(run: Path, tmp_path: P
 # .ply files
 
 
-def ply(
-    path: Path, scene: SplatScene, comments: tuple[str, ...] = (), text: bool = False, order: str = "<",
-    **columns: Any,
-) -> Path:  # fmt: skip
-    """Write a standard file with more ``columns``; a column of None is left out."""
-    write_ply(scene, path)
-    data = PlyData.read(str(path))["vertex"].data
-    names = [name for name in data.dtype.names if columns.get(name, 0) is not None]
-    more = {name: value for name, value in columns.items() if value is not None}
-    table = np.zeros(len(data), [(name, "f4") for name in (*names, *(n for n in more if n not in names))])
-    for name in table.dtype.names or ():
-        table[name] = more[name] if name in more else data[name]
-    element = PlyElement.describe(table, "vertex")
-    PlyData([element], text=text, byte_order="=" if text else order, comments=list(comments)).write(str(path))
-    return path
-
-
-MIP = ("SplatRenderMode: mip",)
 COMMENTS = {
     "Brush": (MIP, "antialiased"),
     "Brush, default": (("SplatRenderMode: default",), "classic"),
@@ -522,161 +414,3 @@ def test_last_sample_is_not_supported(tmp_path: Path) -> None:
 def test_options_of_splats_are_none_of_a_nerf(tmp_path: Path, name: str) -> None:
     given = Overrides(**{name: "classic" if name == "rasterize_mode" else True})  # type: ignore[arg-type]
     refused(nerf_run(tmp_path), "--" + name.replace("_", "-"), overrides=given)
-
-
-# Values that are not finite
-
-
-def spoiled(values: dict[str, list[tuple[Any, float]]], mode: str = "classic") -> SplatScene:
-    """A scene with some values replaced: by array, places and what stands there."""
-    scene = dataclasses.replace(blob_scene(30, degree=1), rasterize_mode=mode)  # type: ignore[arg-type]
-    arrays = {name: getattr(scene, name).copy() for name in values}
-    for name, changes in values.items():
-        for place, value in changes:
-            arrays[name][place] = value
-    return dataclasses.replace(scene, **arrays)
-
-
-FLAT = {"log_scales": [((slice(0, 10), 0), -INF), ((slice(10, 14), slice(0, 2)), -INF), (14, -INF)]}
-SURE = {"opacity_logits": [(slice(0, 4), INF), (slice(4, 9), -INF)]}
-
-
-@pytest.mark.parametrize("mode", ["classic", "antialiased"])
-@pytest.mark.parametrize("values", [FLAT, SURE, {**FLAT, **SURE}], ids=["flat", "sure", "both"])
-def test_flat_gaussians_and_opacities_of_0_and_1_are_bounded(tmp_path: Path, values: Any, mode: str) -> None:
-    scene = spoiled(values, mode)
-    assert differ(scene, dataclasses.replace(blob_scene(30, degree=1), rasterize_mode=mode))  # type: ignore[arg-type]
-    config = write_splatfacto_run(scene, tmp_path, timestamp="t", experiment_name="e")
-    loaded = load_scene(config)
-    assert (loaded.count, loaded.dropped) == (30, {})
-    shows(config, dataclasses.replace(scene, background=loaded.background))
-    write_ply(loaded, tmp_path / "a.ply")
-    assert np.array_equal(load_scene(tmp_path / "a.ply").opacity_logits, scene.opacity_logits)
-
-
-NEVER = {
-    "mean NaN": {"means": [((3, 1), NAN)]},
-    "mean inf": {"means": [((3, 1), INF)]},
-    "mean -inf": {"means": [(slice(3, 6), -INF)]},
-    "scale NaN": {"log_scales": [((3, 0), NAN)]},
-    "quaternion NaN": {"quats": [((3, 0), NAN), ((4, 1), NAN), ((5, 2), NAN), ((6, 3), NAN)]},
-    "quaternion inf": {"quats": [((3, 0), INF), ((4, 1), -INF), ((5, 2), INF), ((6, 3), INF)]},
-    "all NaN": {name: [(3, NAN)] for name in ("means", "log_scales", "quats", "opacity_logits", "sh")},
-}
-
-
-@pytest.mark.parametrize("mode", ["classic", "antialiased"])
-@pytest.mark.parametrize("case", NEVER)
-def test_gaussians_that_gsplat_never_draws_are_left_out_and_counted(tmp_path: Path, case: str, mode: str) -> None:
-    scene = spoiled(NEVER[case], mode)
-    bad = ~np.isfinite(scene.means).all(1) | np.isnan(scene.log_scales).any(1) | ~np.isfinite(scene.quats).all(1)
-    config = write_splatfacto_run(scene, tmp_path, timestamp="t", experiment_name="e")
-    loaded = load_scene(config)
-    assert list(loaded.dropped.values()) == [int(bad.sum())] and loaded.count == 30 - int(bad.sum())
-    assert loaded.stored is not None and loaded.stored.tolist() == np.flatnonzero(~bad).tolist()
-    # gsplat's kernels draw the whole scene
-    with_all = picture(scene)
-    assert np.isfinite(with_all).all()
-    shows(config, scene)
-    assert any("stored Gaussians left out" in line for line in nsa.load_scene(config).method().plan)
-
-
-DRAWN = {
-    "opacity NaN": {"opacity_logits": [(3, NAN)]},
-    "scale inf": {"log_scales": [((3, 0), INF)]},
-    "colour NaN": {"sh": [((3, 0, 1), NAN)]},
-    "colour inf": {"sh": [((3, 1, 1), INF)]},
-}
-
-
-@pytest.mark.parametrize("case", DRAWN)
-def test_gaussians_that_would_be_drawn_are_left_out_where_that_is_asked_for(tmp_path: Path, case: str) -> None:
-    from ns_abstract.cli.export import Ply, export
-
-    scene = spoiled({**DRAWN[case], "means": [(7, NAN)]})
-    config = write_splatfacto_run(scene, tmp_path, timestamp="t", experiment_name="e")
-    refused(config, "first is row 3", "1 rows", "--drop-nan-gaussians")
-    drop = Overrides(drop_nan_gaussians=True)
-    loaded = load_scene(config, drop)
-    assert list(loaded.dropped.values()) == [1, 1]
-    assert loaded.stored is not None and set(range(30)) - set(loaded.stored.tolist()) == {3, 7}
-    kept = np.delete(np.arange(30), [3, 7])
-    rest = {name: getattr(scene, name)[kept] for name in ("means", "log_scales", "quats", "opacity_logits", "sh")}
-    shows(config, dataclasses.replace(scene, **rest), drop_nan_gaussians=True)
-    assert export(Ply(config, tmp_path / "a.ply", drop_nan_gaussians=True)) == 0
-    assert load_scene(tmp_path / "a.ply").count == 28
-
-
-def test_a_nan_opacity_is_drawn_opaque_by_the_formulas() -> None:
-    """Why such Gaussians are not left out unasked: fminf(0.999, NaN) is 0.999."""
-    scene = spoiled({"opacity_logits": [(slice(0, 30), NAN)]})
-    assert differ(scene, spoiled({"opacity_logits": [(slice(0, 30), -INF)]}))
-
-
-def test_a_ply_with_nan_in_text(tmp_path: Path) -> None:
-    scene = spoiled({"means": [((3, 1), NAN)], "opacity_logits": [(5, INF)], "log_scales": [((6, 1), -INF)]})
-    loaded = load_scene(ply(tmp_path / "a.ply", scene, text=True))
-    assert loaded.count == 29 and list(loaded.dropped.values()) == [1]
-    assert loaded.opacity_logits[4] == INF and loaded.log_scales[5, 1] == -INF
-
-
-def test_far_coordinates_get_a_note(tmp_path: Path) -> None:
-    scene = blob_scene(30)
-    assert not any("float32 resolves" in note for note in load_scene(ply(tmp_path / "a.ply", scene)).notes)
-    far = dataclasses.replace(scene, means=scene.means + np.array([5e5, 4e6, 0], np.float32))
-    assert any("float32 resolves 0.25" in note for note in load_scene(ply(tmp_path / "b.ply", far)).notes)
-    near = dataclasses.replace(scene, means=scene.means + np.float32(100.0))
-    assert not any("float32 resolves" in note for note in load_scene(ply(tmp_path / "c.ply", near)).notes)
-
-
-# Files of other kinds
-
-
-def archive(path: Path, *names: str) -> None:
-    with zipfile.ZipFile(path, "w") as file:
-        for name in names:
-            file.writestr(name, b"{}")
-
-
-LFS = b"version https://git-lfs.github.com/spec/v1\noid sha256:00\nsize 12345\n"
-PAGE = b"\n<!DOCTYPE html>\n<html><body>Sign in</body></html>"
-SPZ = struct.pack("<IIIBBBB", 0x5053474E, 2, 1, 0, 12, 0, 0)
-KINDS: dict[str, tuple[Callable[[Path], Any], tuple[str, ...]]] = {
-    "a.sog": (lambda p: archive(p, "meta.json", "means_l.webp"), ("SOG", "splat-transform a.sog out.ply")),
-    "sog.zip": (lambda p: archive(p, "x/meta.json"), ("SOG", "splat-transform sog.zip out.ply")),
-    "run.zip": (lambda p: archive(p, "run/config.yml"), ("a zip archive", "unpack it")),
-    "a.ksplat": (lambda p: p.write_bytes(b"\0\1" + bytes(range(256)) * 20), (".ksplat", "splat-transform")),
-    "a.splat": (lambda p: p.write_bytes(bytes(range(256)) * 20), (".splat", "splat-transform a.splat out.ply")),
-    "a.spz": (lambda p: p.write_bytes(gzip.compress(SPZ)), ("SPZ", "splat-transform a.spz out.ply")),
-    "spz.ply": (lambda p: p.write_bytes(gzip.compress(SPZ)), ("SPZ", "splat-transform")),
-    "spz4": (lambda p: p.write_bytes(SPZ), ("SPZ",)),
-    "a.ply.gz": (lambda p: p.write_bytes(gzip.compress(b"ply\n" * 99)), ("gzip", "gunzip a.ply.gz")),
-    "a.glb": (lambda p: p.write_bytes(b"glTF\2\0\0\0" + bytes(99)), (".glb", "export the scene as .ply")),
-    "lfs.ply": (lambda p: p.write_bytes(LFS), ("Git LFS pointer", "git lfs pull")),
-    "config.yml": (lambda p: p.write_bytes(LFS), ("Git LFS pointer", "git lfs pull")),
-    "page.ply": (lambda p: p.write_bytes(PAGE), ("web page", "download")),
-    "page.yml": (lambda p: p.write_bytes(b"\xef\xbb\xbf" + PAGE), ("web page", "download")),
-    "sog.yml": (lambda p: archive(p, "meta.json"), ("SOG", "splat-transform")),
-    "a.usdz": (lambda p: archive(p, "scene.usdc"), ("USD", "export the scene as .ply")),
-    "meta.json": (lambda p: p.write_text("{}"), ("SOG", "splat-transform meta.json out.ply")),
-    "lod-meta.json": (lambda p: p.write_text("{}"), ("SOG", "splat-transform lod-meta.json out.ply")),
-}
-
-
-@pytest.mark.parametrize("name", KINDS)
-def test_other_kinds_are_refused_by_name(tmp_path: Path, name: str) -> None:
-    write, mentions = KINDS[name]
-    write(tmp_path / name)
-    message = refused(tmp_path / name, *mentions)
-    assert "UTF-8" not in message and "header" not in message
-
-
-@pytest.mark.parametrize(("content", "name"), [(LFS, "Git LFS pointer"), (PAGE, "web page")])
-def test_a_checkpoint_that_was_not_fetched(run: Path, content: bytes, name: str) -> None:
-    checkpoint_of(run).write_bytes(content)
-    refused(run, name, "step-000029999.ckpt")
-
-
-def test_a_ply_of_any_ending_is_read(tmp_path: Path) -> None:
-    ply(tmp_path / "a.ply", thin_scene(), MIP).rename(tmp_path / "point_cloud.bin")
-    assert load_any(tmp_path / "point_cloud.bin").rasterize_mode == "antialiased"

@@ -58,7 +58,7 @@ SCENES = (
         "scenes: Gaussians of a NaN opacity are left out unasked",
         _ROWS, "drawable", "~_all(~np.isnan(rows.log_scales))",
         "(~_all(~np.isnan(rows.log_scales)) | np.isnan(rows.opacity_logits))",
-        _FILES + "test_gaussians_that_would_be_drawn_are_left_out_where_that_is_asked_for[opacity NaN]",
+        "test_scene_values.py::test_gaussians_that_would_be_drawn_are_left_out_where_that_is_asked_for[opacity NaN]",
     ),
     Fault(
         "scenes: workers read the scene without what was given",
