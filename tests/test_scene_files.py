@@ -39,7 +39,6 @@ from scene_files import (
 
 import ns_abstract as nsa
 from ns_abstract.api.files import Settings, open_job
-from ns_abstract.execution.opening import opened
 from ns_abstract.io.assumptions import Assumption
 from ns_abstract.methods.load import load_any
 from ns_abstract.methods.nerf.write import write_nerf_run
@@ -123,7 +122,7 @@ def test_workers_and_continued_results_see_what_was_given(run: Path, tmp_path: P
     given = Overrides(rasterize_mode="antialiased", background=(1.0, 0.0, 0.0), load_step=9999)
     jobs = [open_job(Settings(run, path, overrides=overrides)) for overrides in (given, Overrides())]
     assert jobs[0].fingerprint != jobs[1].fingerprint
-    again = opened(pickle.loads(pickle.dumps(jobs[0].recipe)))
+    again = pickle.loads(pickle.dumps(jobs[0].recipe)).open()
     assert again.fingerprint == jobs[0].fingerprint
     scene = again.method.scene  # type: ignore[attr-defined]
     assert (scene.count, scene.rasterize_mode, scene.background.tolist()) == (40, "antialiased", [1, 0, 0])
