@@ -29,6 +29,7 @@ from ns_abstract.io.errors import InputError
 from ns_abstract.methods.load import load_any
 from ns_abstract.methods.nerf.render import NerfRenderer, Sampling
 from ns_abstract.methods.nerf.scene import Encoding, NerfScene
+from ns_abstract.methods.overrides import Overrides
 from ns_abstract.methods.runs import Tagged
 from ns_abstract.methods.splat.activate import activate
 from ns_abstract.methods.splat.constants import GSPLAT_1_4_0
@@ -151,11 +152,23 @@ def test_other_methods_are_refused(nerfstudio: SimpleNamespace, folder: Path, tm
     file = tmp_path / "blobs" / "splatfacto" / STAMP / "config.yml"
     text = file.read_text()
     file.write_text(text.replace("models.splatfacto.SplatfactoModel", "models.nerfacto.NerfactoModel"))
-    with pytest.raises(InputError, match="is not bounded"):
+    with pytest.raises(InputError, match=r"names the model class 'nerfstudio.models.nerfacto.NerfactoModel'"):
         nerfstudio.viewing.open_run(file)
     file.write_text(text.replace("engine.trainer.TrainerConfig", "engine.trainer.NoSuchConfig"))
     with pytest.raises(InputError, match="nerfstudio cannot open it"):
         nerfstudio.viewing.open_run(file)
+
+
+def test_options_of_the_scene_reach_the_viewer(nerfstudio: SimpleNamespace, folder: Path) -> None:
+    file = folder / "blobs" / "splatfacto" / STAMP / "config.yml"
+    overrides = Overrides(rasterize_mode="antialiased", background=(1.0, 0.5, 0.0), load_step=29999)
+    config, pipeline, step = nerfstudio.viewing.open_run(file, overrides=overrides)
+    assert (config.load_step, step) == (29999, 29999)
+    assert pipeline.model.config.rasterize_mode == "antialiased"
+    assert pipeline.model._get_background_color().tolist() == [1.0, 0.5, 0.0]
+    for refused in (Overrides(load_step=3), Overrides(assume_splatfacto=True), Overrides(drop_nan_gaussians=True)):
+        with pytest.raises(InputError, match="--"):
+            nerfstudio.viewing.open_run(file, overrides=refused)
 
 
 def test_ply_opens(nerfstudio: SimpleNamespace, tmp_path: Path) -> None:

@@ -8,9 +8,12 @@ from planted.forms import FORMS
 from planted.loops import LOOPS
 from planted.polynomials import POLYNOMIALS
 from planted.processes import PROCESSES
+from planted.scenes import SCENES
 from planted.splats import SPLATS
 from planted.verdicts import VERDICTS
 
-FAULTS = (*FORMS, *POLYNOMIALS, *FIELDS, *VERDICTS, *CERTIFICATES, *SPLATS, *DEPTHS, *LOOPS, *PROCESSES)
+FAULTS = (
+    *FORMS, *POLYNOMIALS, *FIELDS, *VERDICTS, *CERTIFICATES, *SPLATS, *DEPTHS, *LOOPS, *PROCESSES, *SCENES,
+)  # fmt: skip
 
 __all__ = ["FAULTS", "Fault", "apply"]

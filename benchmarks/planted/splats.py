@@ -21,12 +21,12 @@ _FORM_COLORS = "methods/splat/form_colors.py"
 _LINE_COLORS = "methods/splat/line_colors.py"
 _COLORS = "methods/splat/colors.py"
 _CONSTANTS = "methods/splat/constants.py"
-_LOAD = "methods/splat/load.py"
+_ROWS = "methods/splat/rows.py"
 
 SPLATS = (
     Fault(
         "quaternions whose squares a GPU flushes are taken",
-        _LOAD,
+        _ROWS,
         "",
         "_LEAST_QUATERNION = 2.0**-100",
         "_LEAST_QUATERNION = 2.0**-126",

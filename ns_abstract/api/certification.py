@@ -9,7 +9,7 @@ import json
 import math
 import time
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
@@ -29,6 +29,7 @@ from ns_abstract.geometry.poses import PoseSet
 from ns_abstract.geometry.tiles import assemble
 from ns_abstract.io.errors import InputError
 from ns_abstract.io.jsonio import load_json
+from ns_abstract.methods.overrides import Overrides
 from ns_abstract.perturbation.specification import Perturbation
 from ns_abstract.perturbation.variations import SceneVariation
 from ns_abstract.refine.protocol import Frame, Member, Method, RayFrame
@@ -590,6 +591,7 @@ class CertifySettings:
         picture: Whether the network is shown floats or pictures of 8 bits.
         memory: Bytes for the bounds of one process.
         given_set: The content of a perturbation file, in place of one; errors name its keys as options.
+        overrides: What the user says of the scene in place of its files.
     """
 
     load_config: Path
@@ -610,6 +612,7 @@ class CertifySettings:
     workers: int = 1
     given_set: Mapping[str, Any] | None = None
     device: str | None = None
+    overrides: Overrides = field(default_factory=Overrides)
 
 
 def open_certification(settings: CertifySettings) -> Certification:
@@ -632,6 +635,7 @@ def open_certification(settings: CertifySettings) -> Certification:
         occupancy_grid=settings.occupancy_grid,
         given_set=settings.given_set,
         device=settings.device,
+        overrides=settings.overrides,
     )
     path = load_camera_path(files.camera_path_filename)
     scene = files.scene.open()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +12,7 @@ from ns_abstract.api.scenes import Scene, SceneSource
 from ns_abstract.geometry.camera_path import CameraPath, load_camera_path
 from ns_abstract.geometry.poses import PoseSet
 from ns_abstract.io.errors import InputError
+from ns_abstract.methods.overrides import Overrides
 from ns_abstract.methods.representation import ProgramOptions
 from ns_abstract.perturbation.specification import Perturbation, load_perturbation, parse_perturbation
 
@@ -36,6 +37,7 @@ class Settings:
         occupancy_grid: File of a grid that is declared as part of a NeRF.
         sampling, num_samples, near_plane: Of the rays of a NeRF; None: the method's own.
         device: Where a NeRF is bounded, "cpu" or "cuda"; None: "cpu".
+        overrides: What the user says of the scene in place of its files.
     """
 
     load_config: Path
@@ -55,6 +57,7 @@ class Settings:
     given_set: Mapping[str, Any] | None = None
     outputs: tuple[str, ...] = ("rgb",)
     device: str | None = None
+    overrides: Overrides = field(default_factory=Overrides)
 
     @property
     def scene(self) -> SceneSource:
@@ -63,7 +66,7 @@ class Settings:
             self.renderer, self.sampling, self.num_samples, self.near_plane, self.occupancy_grid, self.gsplat_version,
             self.device,
         )  # fmt: skip
-        return SceneSource(self.load_config, options)
+        return SceneSource(self.load_config, options, self.overrides)
 
 
 class PathJob(Job):

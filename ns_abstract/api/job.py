@@ -87,7 +87,7 @@ class Job:
         """How another process opens this job; files are looked for under the same paths."""
         options = self.source.options
         grid = None if options.occupancy_grid is None else options.occupancy_grid.absolute()
-        source = SceneSource(self.source.file.absolute(), replace(options, occupancy_grid=grid))
+        source = replace(self.source, file=self.source.file.absolute(), options=replace(options, occupancy_grid=grid))
         again = partial(_open, source, self.pose_sets, self._arithmetic, self.seed, self.memory_limit, self.layers)
         return Recipe(again, self.fingerprint, Path(self.source.file))
 

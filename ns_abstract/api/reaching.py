@@ -496,7 +496,9 @@ class ReachRun:
                 "verdict": verdict(entries),
                 "questions": entries,
                 "guarantee": job.job.method.guarantee,
-                "guarantee_text": guarantee_text(job.job.method.guarantee, program["name"]),
+                "guarantee_text": guarantee_text(
+                    job.job.method.guarantee, program["name"], job.job.describe().get("bounded")
+                ),
                 "network_guarantee": job.network.guarantee(job.model.arithmetic),
                 "renderer": {name: program[name] for name in ("name", "version")},
                 "scene": job.job.describe(),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -11,8 +12,10 @@ import numpy as np
 from ns_abstract.geometry.camera_path import Camera
 from ns_abstract.geometry.poses import PoseSet
 from ns_abstract.geometry.tiles import assemble
+from ns_abstract.io.assumptions import Assumption
 from ns_abstract.io.errors import InputError
 from ns_abstract.methods.load import open_scene
+from ns_abstract.methods.overrides import Overrides
 from ns_abstract.methods.representation import ProgramOptions
 from ns_abstract.perturbation.specification import Perturbation
 from ns_abstract.refine.protocol import Method
@@ -25,10 +28,12 @@ class SceneSource:
     Attributes:
         file: config.yml of a run, or a .ply.
         options: Which program draws it.
+        overrides: What the user says of the scene in place of its files.
     """
 
     file: Path
     options: ProgramOptions = field(default_factory=ProgramOptions)
+    overrides: Overrides = field(default_factory=Overrides)
 
     def open(self) -> Scene:
         """Read it.
@@ -51,7 +56,7 @@ class Scene:
 
     def __init__(self, source: SceneSource) -> None:
         self.source = source
-        self._representation, self._content = open_scene(source.file)
+        self._representation, self._content = open_scene(source.file, source.overrides)
         self._methods: dict[tuple[str | None, int], Method] = {}
 
     def method(self, arithmetic: str | None = None, workers: int = 1) -> Method:
@@ -86,6 +91,11 @@ class Scene:
         """What was assumed on reading it, one sentence each."""
         return tuple(self.method().notes)
 
+    @property
+    def assumptions(self) -> tuple[Assumption, ...]:
+        """What was decided of the picture on reading it, and where each choice came from."""
+        return tuple(self._content.assumptions)
+
     def __repr__(self) -> str:
         method = self.method()
         return f"<Scene {self.name}: {method.content}, {method.program['name']} {method.program['version']}>"
@@ -101,6 +111,11 @@ def load_scene(
     occupancy_grid: str | os.PathLike[str] | None = None,
     gsplat_version: str | None = None,
     device: str | None = None,
+    rasterize_mode: str | None = None,
+    background: Sequence[float] | None = None,
+    load_step: int | None = None,
+    assume_splatfacto: bool = False,
+    drop_nan_gaussians: bool = False,
 ) -> Scene:
     """Read a scene; nothing in the files is executed.
 
@@ -114,13 +129,20 @@ def load_scene(
         occupancy_grid: NeRF: a grid outside of which the field is declared empty.
         gsplat_version: Splats: whose rules are bounded, "1.4.0" (default), "1.5.3" or "1.6.0".
         device: NeRF: where the field is bounded, "cpu" (default) or "cuda" (a GPU's float64).
+        rasterize_mode: Splats: "classic" or "antialiased", in place of what the files say.
+        background: RGB from 0 to 1 behind the scene, in place of what the files say; a .ply says nothing: black.
+        load_step: Training step of the checkpoint that is read; what config.yml says, or else the highest.
+        assume_splatfacto: Splats: bound the Gaussians alone of a run whose model may draw more.
+        drop_nan_gaussians: Splats: leave out Gaussians whose values are not finite.
 
     Raises:
         InputError: A file or an option cannot be used.
     """
     grid = None if occupancy_grid is None else Path(occupancy_grid)
     options = ProgramOptions(renderer, sampling, num_samples, near_plane, grid, gsplat_version, device)
-    scene = SceneSource(Path(path), options).open()
+    color = None if background is None else tuple(background)
+    overrides = Overrides(rasterize_mode, color, load_step, assume_splatfacto, drop_nan_gaussians)  # pyright: ignore[reportArgumentType]
+    scene = SceneSource(Path(path), options, overrides).open()
     # options that do not go with the scene are told at once
     scene.method()
     return scene

@@ -16,6 +16,7 @@ import numpy as np
 from ns_abstract.bench.cell import PART, measure, small_cell
 from ns_abstract.bench.sets import open_jobs, pose_set, splat_of
 from ns_abstract.bench.tightness import refine
+from ns_abstract.methods.overrides import Overrides
 from ns_abstract.methods.splat.activate import rotation_matrices
 from ns_abstract.methods.splat.frame import SplatFrame
 from ns_abstract.methods.splat.method import SplatMethod
@@ -52,11 +53,11 @@ def resampled(scene: SplatScene, count: int, seed: int = 0) -> SplatScene:
 
 def _row(
     config: Path, path: Path | None, frame: int, name: str, count: int, width: int, repeats: int, seconds: float,
-    gibibytes: float, version: str | None,
+    gibibytes: float, version: str | None, overrides: Overrides | None,
 ) -> dict[str, Any]:  # fmt: skip
     """One row; to be run in a process of its own, whose peak memory is told."""
-    (job,) = open_jobs((config,), path, 1.0)
-    (job,) = open_jobs((config,), path, job.path.cameras[frame].width / width)
+    (job,) = open_jobs((config,), path, 1.0, overrides=overrides)
+    (job,) = open_jobs((config,), path, job.path.cameras[frame].width / width, overrides=overrides)
     job.memory_limit = gibibytes
     job.method = splat = SplatMethod(resampled(splat_of(job).scene, count), None, None, version)
     poses = pose_set(job, name, frame, _WIDTH / width)
@@ -90,6 +91,7 @@ def _row(
 def curve(
     config: Path, path: Path | None, frame: int, name: str, counts: Sequence[int], widths: Sequence[int],
     repeats: int, seconds: float, gibibytes: float, version: str | None = None,
+    overrides: Overrides | None = None,
 ) -> Iterator[dict[str, Any]]:  # fmt: skip
     """Rows for every number of Gaussians and width; the last one, the largest, is refined for ``seconds``.
 
@@ -100,5 +102,5 @@ def curve(
             given = seconds if (count, width) == (counts[-1], widths[-1]) else 0.0
             # a process keeps its peak, so each row has its own
             with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as pool:
-                arguments = config, path, frame, name, count, width, repeats, given, gibibytes, version
+                arguments = config, path, frame, name, count, width, repeats, given, gibibytes, version, overrides
                 yield pool.submit(_row, *arguments).result()

@@ -13,6 +13,7 @@ import numpy as np
 from ns_abstract.api.files import PathJob, Settings, open_job
 from ns_abstract.geometry.poses import PoseSet
 from ns_abstract.io.errors import InputError
+from ns_abstract.methods.overrides import Overrides
 from ns_abstract.methods.splat.method import SplatMethod
 from ns_abstract.perturbation.specification import Perturbation, parse_perturbation
 
@@ -47,12 +48,13 @@ def open_jobs(
     occupancy_grid: Path | None = None,
     gsplat_version: str | None = None,
     device: str | None = None,
+    overrides: Overrides | None = None,
 ) -> list[PathJob]:
     """The runs, or the demo scene where none is named.
 
     Without ``arithmetic`` it is the strongest that the method has, without ``gsplat_version`` splats have their usual
-    rules; NeRFs are bounded on ``device``. Without ``camera_path`` each run's own ``camera_path.json``, in the folder
-    that holds the method's folder, is used.
+    rules; NeRFs are bounded on ``device``; ``overrides`` stand in place of what the files say. Without ``camera_path``
+    each run's own ``camera_path.json``, in the folder that holds the method's folder, is used.
 
     Raises:
         InputError: A file cannot be used.
@@ -68,7 +70,7 @@ def open_jobs(
         path = camera_path if camera_path is not None else config.resolve().parents[2] / "camera_path.json"
         settings = Settings(
             config, path, downscale_factor=downscale_factor, arithmetic=arithmetic, occupancy_grid=occupancy_grid,
-            gsplat_version=gsplat_version, device=device,
+            gsplat_version=gsplat_version, device=device, overrides=overrides or Overrides(),
         )  # fmt: skip
         jobs.append(open_job(settings, Perturbation()))
     return jobs

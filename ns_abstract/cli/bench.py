@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import tyro
 
 from ns_abstract.cli.common import BAD_INPUT, DONE, run
+from ns_abstract.cli.scenes import GivenScene, overrides
 from ns_abstract.io.errors import InputError
 
 if TYPE_CHECKING:
@@ -32,7 +33,7 @@ _TITLES = {
 
 
 @dataclass
-class Scenes:
+class Scenes(GivenScene):
     """What is measured."""
 
     load_config: tuple[Path, ...] = ()
@@ -184,7 +185,7 @@ class Certificates(Scenes):
 
 
 @dataclass
-class Loops:
+class Loops(GivenScene):
     """A network in the loop: certified fraction against time, tubes against runs, attacks on tubes."""
 
     load_config: Path
@@ -335,6 +336,7 @@ def scale(options: Scale) -> int:
     for row in curve(
         options.load_config[0], options.camera_path_filename, options.frame, options.set, options.gaussians,
         options.widths, options.repeats, options.seconds, options.memory_limit, options.gsplat_version,
+        overrides(options),
     ):  # fmt: skip
         rows.append(row)
         print("\n".join(markdown([row]).splitlines()[0 if len(rows) == 1 else 2 :]), flush=True)
@@ -345,7 +347,7 @@ def scale(options: Scale) -> int:
 
 def certificates(options: Certificates) -> int:
     """Measure how fast sets are certified; the table is written after every row."""
-    from ns_abstract.api.scenes import load_scene
+    from ns_abstract.api.scenes import SceneSource
     from ns_abstract.bench.certificates import SETS, curve
     from ns_abstract.bench.tables import markdown, write
     from ns_abstract.geometry.camera_path import load_camera_path
@@ -354,7 +356,10 @@ def certificates(options: Certificates) -> int:
         field = "--load-config, --model, --property"
         raise InputError("missing, or several runs", field=field, fix="give one run, a network and a property")
     file = options.camera_path_filename or options.load_config[0].resolve().parents[2] / "camera_path.json"
-    path, scene = load_camera_path(file, options.downscale_factor), load_scene(options.load_config[0])
+    path, scene = (
+        load_camera_path(file, options.downscale_factor),
+        SceneSource(options.load_config[0], overrides=overrides(options)).open(),
+    )
     known = SETS if path.perturbations[options.frame] is None else {**SETS, "path": path.perturbations[options.frame]}
     for name in options.sets:
         if name not in known:
@@ -375,7 +380,7 @@ def certificates(options: Certificates) -> int:
 
 def loops(options: Loops) -> int:
     """Measure a loop; the exit code is 1 if a run left a tube or a certified cell had a run that went wrong."""
-    from ns_abstract.api.scenes import load_scene
+    from ns_abstract.api.scenes import SceneSource
     from ns_abstract.bench.loops import measure
     from ns_abstract.bench.tables import markdown, write
 
@@ -383,7 +388,8 @@ def loops(options: Loops) -> int:
         raise InputError(f"found {options.runs}", field="--runs", fix="give a number of at least 1")
     marks = [mark for mark in options.marks if mark <= options.seconds]
     found = measure(
-        load_scene(options.load_config), options.loop, options.seconds, options.workers, options.runs, marks,
+        SceneSource(options.load_config, overrides=overrides(options)).open(), options.loop, options.seconds,
+        options.workers, options.runs, marks,
         options.seed, _said,
     )  # fmt: skip
     for name, rows in (("loops", found.search), ("loops-steps", found.steps)):
@@ -451,7 +457,7 @@ def bench(
     grid = options.occupancy_grid if isinstance(options, Rays | Tightness) else None
     jobs = open_jobs(
         options.load_config, options.camera_path_filename, options.downscale_factor, None, grid, options.gsplat_version,
-        options.device if isinstance(options, Rays) else None,
+        options.device if isinstance(options, Rays) else None, overrides(options),
     )  # fmt: skip
     rows: list[dict[str, Any]] = []
     tables: dict[int, list[dict[str, Any]]] = {}

@@ -11,6 +11,7 @@ from typing import Annotated, Literal
 import tyro
 
 from ns_abstract.cli.common import DONE, INTERRUPTED, Stop, run
+from ns_abstract.cli.scenes import GivenScene, overrides
 from ns_abstract.cli.sets import GivenSet, given_set
 from ns_abstract.io.errors import InputError
 
@@ -19,7 +20,7 @@ _SECONDS = 1800.0
 
 
 @dataclass
-class Certify(GivenSet):
+class Certify(GivenSet, GivenScene):
     """Prove, or break, a property of a network on every image that a scene shows over a set of poses.
 
     Splits the set into cells until each is certified, falsified or too small. Writes cells.sqlite,
@@ -115,7 +116,7 @@ def certify(options: Certify) -> int:
         given = {name: value for name, value in vars(options).items() if name in names}
         if options.workers is None:
             given["workers"] = 1 if options.engine == "dask" else len(os.sched_getaffinity(0))
-        given["given_set"] = given_set(options)
+        given |= {"given_set": given_set(options), "overrides": overrides(options)}
         tls = Tls.of(options.tls_ca_file, options.tls_cert, options.tls_key, options.scheduler_address)
         order = Order(
             CertifySettings(**given), options.frames, options.output_dir, options.time_budget or _SECONDS,

@@ -11,6 +11,7 @@ from typing import Annotated, Literal
 import tyro
 
 from ns_abstract.cli.common import DONE, run
+from ns_abstract.cli.scenes import GivenScene, overrides
 from ns_abstract.cli.sets import GivenSet, given_set
 from ns_abstract.io.errors import InputError, visible
 
@@ -58,7 +59,7 @@ class Mp4:
 
 
 @dataclass
-class Ply:
+class Ply(GivenScene):
     """The Gaussians of a run as a standard 3DGS .ply, in the run's normalised frame."""
 
     load_config: Path
@@ -68,7 +69,7 @@ class Ply:
 
 
 @dataclass
-class VnnLib(GivenSet):
+class VnnLib(GivenSet, GivenScene):
     """Abstract images, a network and a property as ONNX and VNN-LIB, for other verifiers.
 
     Cuts the set of poses of a frame into boxes and writes for each NAME.onnx, whose input is the box's parameters in
@@ -107,7 +108,7 @@ class VnnLib(GivenSet):
 
 
 @dataclass
-class Occupancy:
+class Occupancy(GivenScene):
     """Where a NeRF's field is not empty, by sampling it: a grid for the option --occupancy-grid.
 
     A proposal, not a proof: with the option, the grid is declared to be part of the scene. The npz holds occupied
@@ -155,7 +156,9 @@ def export(options: Npz | Png | Mp4 | Ply | VnnLib | Occupancy) -> int:
             from ns_abstract.methods.splat.load import load_scene
             from ns_abstract.methods.splat.ply import write_ply
 
-            notes = [f"not in the file: {sentence}" for sentence in write_ply(load_scene(options.load_config), target)]
+            scene = load_scene(options.load_config, overrides(options))
+            notes = [f"left out: {count:,} Gaussians with {reason}" for reason, count in scene.dropped.items()]
+            notes += [f"not in the file: {sentence}" for sentence in write_ply(scene, target)]
         else:
             notes = _path(options)
     except OSError as error:
@@ -182,7 +185,7 @@ def _occupancy(options: Occupancy) -> list[str]:
         raise InputError(f"found {options.resolution}", field="--resolution", fix=f"give 1 to {_MOST_VOXELS}")
     if not 0.0 <= options.threshold < float("inf"):
         raise InputError(f"found {options.threshold}", field="--threshold", fix="give 0 or more")
-    scene = load_any(options.load_config)
+    scene = load_any(options.load_config, overrides(options))
     if not isinstance(scene, NerfScene):
         raise InputError("this run is a splat", file=options.load_config, fix="give a run of vanilla-nerf")
     density = Field(scene.fine).density
@@ -210,7 +213,7 @@ def _vnnlib(options: VnnLib) -> list[str]:
         raise InputError(f"found {min(options.parts)}", field="--parts", fix="give numbers of at least 1")
     names = {entry.name for entry in fields(CertifySettings)} & {entry.name for entry in fields(VnnLib)}
     given = {name: getattr(options, name) for name in names}
-    job = open_certification(CertifySettings(**given, given_set=given_set(options)))
+    job = open_certification(CertifySettings(**given, given_set=given_set(options), overrides=overrides(options)))
     options.output_dir.mkdir(parents=True, exist_ok=True)
     lines, boxes = [], {}
     for frame in check_frames(options.frames, job.job.frame_count):

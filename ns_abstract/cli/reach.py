@@ -10,6 +10,7 @@ from typing import Annotated, Literal
 import tyro
 
 from ns_abstract.cli.common import DONE, INTERRUPTED, Stop, plain_console, run
+from ns_abstract.cli.scenes import GivenScene, overrides
 from ns_abstract.io.errors import InputError
 
 #: Seconds between lines of progress.
@@ -17,7 +18,7 @@ _EVERY = 10.0
 
 
 @dataclass
-class Reach:
+class Reach(GivenScene):
     """Prove of a network in the loop that no run from a box of initial states goes wrong, or find one that does.
 
     A camera is carried by a state, its picture goes through the network, and the network's output moves the state.
@@ -82,7 +83,7 @@ def reach(options: Reach) -> int:
             from ns_abstract.report.certificate_page import percent
 
             program = ProgramOptions(renderer=options.renderer, gsplat_version=options.gsplat_version)
-            scene = SceneSource(options.load_config, program).open()
+            scene = SceneSource(options.load_config, program, overrides(options)).open()
             job = open_loop(scene, options.loop, options.arithmetic, options.network_arithmetic, options.workers)
             found = ReachRun(job, options.output_dir, vars(options), ("ns-abstract-reach", *sys.argv[1:]))
         console = plain_console()

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import tyro
 
 from ns_abstract.cli.common import DONE, INTERRUPTED, Stop, run
+from ns_abstract.cli.scenes import GivenScene, overrides
 from ns_abstract.cli.sets import GivenSet, given_set
 from ns_abstract.io.errors import InputError
 
@@ -23,7 +24,7 @@ _EXPLAINED_S = 30.0
 
 
 @dataclass
-class Render(GivenSet):
+class Render(GivenSet, GivenScene):
     """Bound every image that Nerfstudio would show, for every pose in a set around each keyframe.
 
     Writes frame_00000.npz and .png by keyframe, report.json and report.html. Exit codes: 0 done;
@@ -117,7 +118,10 @@ def opened(options: Render, default: Perturbation | None = None) -> PathJob:
 
     names = {entry.name for entry in fields(Settings)}
     given = {name: value for name, value in vars(options).items() if name in names}
-    return open_job(Settings(**given | {"workers": 1, "given_set": given_set(options)}), default=default)
+    return open_job(
+        Settings(**given | {"workers": 1, "given_set": given_set(options), "overrides": overrides(options)}),
+        default=default,
+    )
 
 
 def explain(options: Explain) -> int:
@@ -193,7 +197,7 @@ def render(options: Render) -> int:
         given = {name: value for name, value in vars(options).items() if name in names}
         if options.workers is None:
             given["workers"] = 1 if options.engine == "dask" else len(os.sched_getaffinity(0))
-        given["given_set"] = given_set(options)
+        given |= {"given_set": given_set(options), "overrides": overrides(options)}
         tls = Tls.of(options.tls_ca_file, options.tls_cert, options.tls_key, options.scheduler_address)
         order = Order(
             Settings(**given), options.frames, options.output_dir, options.time_budget, options.target_ratio,

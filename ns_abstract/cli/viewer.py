@@ -10,6 +10,7 @@ from typing import Literal
 import tyro
 
 from ns_abstract.cli.common import DONE, run
+from ns_abstract.cli.scenes import GivenScene, overrides
 from ns_abstract.io.errors import InputError
 
 
@@ -42,7 +43,7 @@ class Viewer:
 
 
 @dataclass
-class View:
+class View(GivenScene):
     """View a trained run with lower and upper bounds of what its camera could show.
 
     nerfstudio's viewer with the output types abstract_lower, abstract_upper, abstract_gap and
@@ -76,7 +77,7 @@ def view(options: View) -> int:
         from ns_abstract.nerfstudio.viewing import view as serve
 
         abstract = {"depth": options.depth, "gsplat_version": options.gsplat_version}
-        serve(options.load_config, options.vis, vars(options.viewer), abstract)
+        serve(options.load_config, options.vis, vars(options.viewer), abstract, overrides(options))
     except ModuleNotFoundError as error:
         raise InputError(
             f"the package {error.name} is missing", field="nerfstudio", fix="pip install 'ns-abstract[nerfstudio]'"

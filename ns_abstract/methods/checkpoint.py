@@ -26,6 +26,7 @@ from numpy.typing import NDArray
 
 from ns_abstract.io.errors import InputError, first_line
 from ns_abstract.io.jsonio import file_size, show
+from ns_abstract.io.kinds import refuse_other_kind
 from ns_abstract.io.memory import check_memory
 
 PICKLE_BYTES_LIMIT = 16 * 2**20
@@ -78,12 +79,13 @@ class StoredTensor:
     offset: int = 0
     storage: NDArray[Any] | None = None
 
-    def float32(self, file: Path, field: str) -> NDArray[np.float32]:
+    def float32(self, file: Path, field: str, finite: bool = True) -> NDArray[np.float32]:
         """Its values, copied out of the file.
 
         Args:
             file: The checkpoint, for messages.
             field: Its name, for messages.
+            finite: Whether values that are not finite are refused.
 
         Raises:
             InputError: Not a dense tensor of float16, bfloat16, float32 or float64, or a value is not finite in
@@ -102,22 +104,24 @@ class StoredTensor:
         else:
             with np.errstate(over="ignore"):
                 array = np.array(view, np.float32, order="C")
-        require_finite(array, file, field)
+        if finite:
+            require_finite(array, file, field)
         return array
 
 
-def to_float32(value: Any, file: Path, field: str) -> NDArray[np.float32]:
+def to_float32(value: Any, file: Path, field: str, finite: bool = True) -> NDArray[np.float32]:
     """`StoredTensor.float32` of what a checkpoint holds under ``field``; arrays of float32 are checked alone.
 
     Raises:
         InputError: Also where that is neither.
     """
     if isinstance(value, np.ndarray) and value.dtype == np.float32:
-        require_finite(value, file, field)
+        if finite:
+            require_finite(value, file, field)
         return value
     if not isinstance(value, StoredTensor):
         raise InputError(f"found {show(value)}, not a tensor", file=file, field=field, fix=RECOPY)
-    return value.float32(file, field)
+    return value.float32(file, field, finite)
 
 
 def require_finite(array: NDArray[np.float32], file: Path, field: str) -> None:
@@ -142,6 +146,7 @@ def read_checkpoint(path: Path) -> Any:
         InputError: The file is damaged, or asks for other Python objects.
     """
     size = file_size(path, "checkpoint")
+    refuse_other_kind(path)
     check_memory(size, path, "the checkpoint")
     try:
         with path.open("rb") as stream:

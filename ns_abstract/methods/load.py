@@ -9,6 +9,7 @@ from typing import Any
 from ns_abstract.io.errors import InputError
 from ns_abstract.methods import runs
 from ns_abstract.methods.nerf.opening import NERF
+from ns_abstract.methods.overrides import Overrides
 from ns_abstract.methods.representation import Representation
 from ns_abstract.methods.splat.method import SPLAT
 
@@ -16,8 +17,12 @@ from ns_abstract.methods.splat.method import SPLAT
 REPRESENTATIONS: list[Representation] = [NERF, SPLAT]
 
 
-def open_scene(path: str | os.PathLike[str]) -> tuple[Representation, Any]:
+def open_scene(path: str | os.PathLike[str], overrides: Overrides | None = None) -> tuple[Representation, Any]:
     """Read the scene of a run (by the method that its config.yml names) or of a 3DGS ``.ply``.
+
+    Args:
+        path: config.yml, its folder, or a .ply.
+        overrides: What the user says in place of the files.
 
     Returns:
         The representation, and its scene.
@@ -30,10 +35,10 @@ def open_scene(path: str | os.PathLike[str]) -> tuple[Representation, Any]:
         source = runs.read_config(path)
     for found in REPRESENTATIONS:
         if found.reads(source):
-            return found, found.load(source)
+            return found, found.load(source, overrides or Overrides())
     raise InputError("holds no scene known here", file=str(path), fix="give config.yml of a run, or a .ply")
 
 
-def load_any(path: str | os.PathLike[str]) -> Any:
+def load_any(path: str | os.PathLike[str], overrides: Overrides | None = None) -> Any:
     """The scene alone; see `open_scene`."""
-    return open_scene(path)[1]
+    return open_scene(path, overrides)[1]

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from ns_abstract.io.errors import InputError
+from ns_abstract.methods.overrides import Overrides
 from ns_abstract.methods.runs import RunConfig
 from ns_abstract.refine.protocol import Method
 
@@ -51,7 +52,7 @@ class Representation:
 
     Attributes:
         reads: Whether a scene file (config.yml, already parsed, or another file's path) is of this kind.
-        load: Reads it.
+        load: Reads it, with what the user says in place of its files.
         method: The scene with the program that is bounded: scene, options, arithmetic ("float32", "real" or None: the
             strongest there is) and number of processes that may be used.
         rays: Whether pictures are made ray by ray, each at a cost: frames are then of the kind
@@ -59,6 +60,6 @@ class Representation:
     """
 
     reads: Callable[[RunConfig | Path], bool]
-    load: Callable[[RunConfig | Path], Any]
+    load: Callable[[RunConfig | Path, Overrides], Any]
     method: Callable[[Any, ProgramOptions, str | None, int], Method]
     rays: bool = False

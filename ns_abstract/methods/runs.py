@@ -20,9 +20,12 @@ import yaml.composer
 import yaml.constructor
 from numpy.typing import NDArray
 
+from ns_abstract.io.assumptions import Assumption
 from ns_abstract.io.errors import InputError, first_line, visible
 from ns_abstract.io.jsonio import FIX_ACCESS, file_size, is_number, load_json, read_text, show
+from ns_abstract.io.kinds import refuse_other_kind
 from ns_abstract.methods.checkpoint import RECOPY, read_checkpoint
+from ns_abstract.methods.overrides import chosen
 from ns_abstract.methods.transform import DataparserTransform
 
 CONFIG_NAME = "config.yml"
@@ -38,6 +41,8 @@ TRANSFORMS_BYTES_LIMIT = 2**20
 _PYTHON_TAG = "tag:yaml.org,2002:python/"
 _MERGE_TAG = "tag:yaml.org,2002:merge"
 _NUMBER_TAGS = {f"tag:yaml.org,2002:{python}{kind}" for python in ("", "python/") for kind in ("int", "long", "float")}
+#: Steps that an error lists.
+_STEPS_SHOWN = 12
 _CHECKPOINT_NAME = re.compile(r"step-(\d{1,18})\.ckpt")
 # nerfstudio/utils/colors.py; "random" is what Splatfacto shows outside training.
 _COLORS = {
@@ -69,6 +74,7 @@ class RunConfig:
         model: ``pipeline.model`` as a mapping; Python objects in it are :class:`Tagged`.
         model_folder: The folder of the checkpoints.
         root: The whole file as a mapping.
+        model_node: ``pipeline.model`` with its tag.
     """
 
     file: Path
@@ -78,6 +84,7 @@ class RunConfig:
     model: dict[str, Any]
     model_folder: Path
     root: dict[str, Any]
+    model_node: Any = None
 
     def integer(self, name: str, default: int, least: int, most: int | None = None) -> int:
         """Integer field of ``pipeline.model`` in [least, most]; ``default`` if absent."""
@@ -131,6 +138,7 @@ def read_config(path: str | os.PathLike[str]) -> RunConfig:
     if os.path.isdir(file):
         file = file / CONFIG_NAME
         file_size(file, "run configuration", fix="give a folder that ns-train wrote, or its config.yml")
+    refuse_other_kind(file)
     text = read_text(file, "run configuration", CONFIG_BYTES_LIMIT)
     root = as_mapping(_parse_yaml(text, file))
     if root is None:
@@ -146,6 +154,7 @@ def read_config(path: str | os.PathLike[str]) -> RunConfig:
         model=model,
         model_folder=folder / _model_folder(root, file),
         root=root,
+        model_node=pipeline.get("model"),
     )
 
 
@@ -159,8 +168,13 @@ def as_mapping(value: Any) -> dict[str, Any] | None:
     return value if isinstance(value, dict) else None
 
 
-def find_checkpoint(run: RunConfig) -> Path:
-    """The checkpoint of the highest step in the run's model folder.
+def find_checkpoint(run: RunConfig, step: int | None = None) -> Path:
+    """The checkpoint that Nerfstudio shows (nerfstudio/utils/eval_utils.py, ``eval_load_checkpoint``).
+
+    Args:
+        run: The run's configuration; ``load_step`` in it names a step. Nerfstudio's evaluation replaces ``load_dir``
+            by the run's own folder and reads no ``load_checkpoint``.
+        step: The step to read in place of that; without either it is the highest one.
 
     Raises:
         InputError: There is none, or the folder cannot be listed.
@@ -178,10 +192,58 @@ def find_checkpoint(run: RunConfig) -> Path:
             file=folder,
             fix=FIX_ACCESS,
         ) from None
-    matches = [match for name in names if (match := _CHECKPOINT_NAME.fullmatch(name))]
-    if not matches:
+    found: dict[int, list[str]] = {}
+    for name in names:
+        if match := _CHECKPOINT_NAME.fullmatch(name):
+            found.setdefault(int(match[1]), []).append(name)
+    if not found:
         raise InputError("no step-*.ckpt here", file=folder, fix="train the run until it saves a checkpoint")
-    return folder / max(matches, key=lambda match: (int(match[1]), len(match[1])))[0]
+    wanted = load_step(run) if step is None else step
+    if wanted is not None and wanted not in found:
+        steps = ", ".join(map(str, sorted(found)[-_STEPS_SHOWN:]))
+        dots = "..., " if len(found) > _STEPS_SHOWN else ""
+        raise InputError(
+            f"names step {wanted}, and {folder} holds steps {dots}{steps}",
+            file=run.file if step is None else None,
+            field="load_step" if step is None else "--load-step",
+            fix=f"copy step-{wanted:09d}.ckpt there, or give --load-step with one of these",
+        )
+    taken = max(found) if wanted is None else wanted
+    # the name that Nerfstudio writes and reads comes first
+    return folder / min(found[taken], key=lambda name: (name != f"step-{taken:09d}.ckpt", -len(name), name))
+
+
+def load_step(run: RunConfig) -> int | None:
+    """The training step that config.yml names for evaluation; None: the highest one.
+
+    Raises:
+        InputError: It is not the number of a step.
+    """
+    value = run.root.get("load_step")
+    if value is not None and (isinstance(value, bool) or not isinstance(value, int) or not 0 <= value < 10**18):
+        raise InputError(f"found {show(value)}", file=run.file, field="load_step", fix="write a step, or null")
+    return value
+
+
+def step_assumption(run: RunConfig, checkpoint: Path, given: int | None) -> Assumption:
+    """Which training step is shown, and what decided it."""
+    match = _CHECKPOINT_NAME.fullmatch(checkpoint.name)
+    step = int(match[1]) if match else checkpoint.name
+    stored = load_step(run)
+    if stored is not None:
+        return chosen("load_step", given, "--load-step", stored, "config.yml: load_step")
+    default = step if given is None else "the highest one"
+    return chosen("load_step", given, "--load-step", default, "default: the highest step there is")
+
+
+def target_class(run: RunConfig) -> str:
+    """Dotted name of the model's class that config.yml names; "" where it names none."""
+    target = run.model.get("_target")
+    tagged = run.model_node if target is None else target
+    if not isinstance(tagged, Tagged):
+        return "" if target is None else show(target)
+    name = tagged.tag.rpartition(":")[2]
+    return name.removesuffix("Config") if target is None else name
 
 
 def read_dataparser_transform(run: RunConfig) -> tuple[DataparserTransform, tuple[str, ...]]:

@@ -20,7 +20,9 @@ from nerfstudio.utils.eval_utils import eval_setup
 
 from ns_abstract.geometry.views import around
 from ns_abstract.io.errors import InputError
-from ns_abstract.methods.runs import find_checkpoint, read_config, read_model_state
+from ns_abstract.methods.load import load_any
+from ns_abstract.methods.overrides import Overrides
+from ns_abstract.methods.runs import read_config
 from ns_abstract.methods.splat.load import load_scene
 from ns_abstract.methods.splat.write import write_splatfacto_run
 from ns_abstract.nerfstudio.loading import allow_numpy_scalars, check_tags
@@ -36,7 +38,11 @@ _FIX_DATA = "start the command in the folder that ns-train was started in, or pu
 
 
 def view(
-    load_config: Path, vis: Literal["viewer", "viewer_legacy"], options: dict[str, Any], abstract: dict[str, Any]
+    load_config: Path,
+    vis: Literal["viewer", "viewer_legacy"],
+    options: dict[str, Any],
+    abstract: dict[str, Any],
+    overrides: Overrides | None = None,
 ) -> None:
     """Open the run and serve the viewer until the process is interrupted.
 
@@ -45,15 +51,18 @@ def view(
         vis: Which of nerfstudio's viewers.
         options: Of its ``ViewerConfig``.
         abstract: Of splats' `AbstractConfig`.
+        overrides: What the user says of the scene in place of its files.
 
     Raises:
         InputError: The run cannot be opened.
     """
+    overrides = overrides or Overrides()
     with tempfile.TemporaryDirectory(prefix="ns-abstract-viewer-") as scratch:
         config_file = load_config
         if config_file.suffix.lower() == ".ply":
-            config_file = run_of_ply(config_file, Path(scratch))
-        config, pipeline, step = open_run(config_file, abstract)
+            config_file = run_of_ply(config_file, Path(scratch), overrides)
+            overrides = Overrides(background=overrides.background)
+        config, pipeline, step = open_run(config_file, abstract, overrides)
         if options["websocket_host"] not in _LOOPBACK or options["make_share_url"]:
             print(
                 "the viewer is open to others: whoever reaches this machine sees the scene, moves the camera and "
@@ -66,21 +75,24 @@ def view(
         _start_viewer(config, pipeline, step)
 
 
-def run_of_ply(file: Path, folder: Path) -> Path:
+def run_of_ply(file: Path, folder: Path, overrides: Overrides | None = None) -> Path:
     """Write the scene of a ``.ply`` as a run into ``folder``; returns its config.yml."""
-    scene = load_scene(file)
+    scene = load_scene(file, overrides)
     middle = np.median(scene.means.astype(np.float64), axis=0)
     distance = 3.0 * float(np.quantile(np.linalg.norm(scene.means - middle, axis=1), 0.8)) + 1e-3
     views = [around(middle, 45.0 * k, 20.0, distance) for k in range(8)]
     return write_splatfacto_run(scene, folder, timestamp="ply", experiment_name="scene", views=views)
 
 
-def open_run(config_file: Path, abstract: Mapping[str, Any] | None = None) -> tuple[TrainerConfig, Pipeline, int]:
+def open_run(
+    config_file: Path, abstract: Mapping[str, Any] | None = None, overrides: Overrides | None = None
+) -> tuple[TrainerConfig, Pipeline, int]:
     """nerfstudio's ``eval_setup`` with models that bound; the run may have been moved.
 
     config.yml is read by nerfstudio's own loader, which can run code, so it is read before by ours, which runs none,
     and so is the checkpoint: what names other objects than runs of nerfstudio do is refused. ``abstract`` are options
-    of splats' `AbstractConfig`.
+    of splats' `AbstractConfig`; ``overrides`` are set in the configuration. A model that is not known to draw what
+    Splatfacto or vanilla-nerf draws is refused.
 
     Returns:
         Configuration, pipeline and training step.
@@ -90,12 +102,17 @@ def open_run(config_file: Path, abstract: Mapping[str, Any] | None = None) -> tu
     """
     run = read_config(config_file)
     check_tags(run.root, run.file)
-    read_model_state(find_checkpoint(run))
+    overrides = overrides or Overrides()
+    problem = "does not change what the viewer loads; export the run with ns-abstract-export ply and open the .ply"
+    overrides.refuse(("assume_splatfacto", "drop_nan_gaussians"), problem)
+    # refuses classes and modules that draw more, and checkpoints that hold other objects
+    load_any(run.file, overrides)
     allow_numpy_scalars()
 
     def prepare(config: TrainerConfig) -> TrainerConfig:
         config = _prepared(config, run.file)
         _set_options(config.pipeline.model, abstract or {})
+        _set_overrides(config, overrides)
         return config
 
     try:
@@ -104,6 +121,9 @@ def open_run(config_file: Path, abstract: Mapping[str, Any] | None = None) -> tu
         raise InputError(
             f"nerfstudio cannot open it: {error}", file=run.file, fix="give a run of nerfstudio 1.1.5"
         ) from None
+    if overrides.background is not None and isinstance(config.pipeline.model, AbstractSplatfactoModelConfig):
+        model: Any = pipeline.model
+        model.set_background(torch.tensor(overrides.background))
     return config, pipeline, step
 
 
@@ -112,6 +132,18 @@ def _set_options(model: Any, abstract: Mapping[str, Any]) -> None:
         if value and not isinstance(model, AbstractSplatfactoModelConfig):
             raise InputError("this run is no splat", field="--" + name.replace("_", "-"), fix="leave it out")
         setattr(model.abstract, name, value)
+
+
+def _set_overrides(config: TrainerConfig, overrides: Overrides) -> None:
+    model: Any = config.pipeline.model
+    if overrides.load_step is not None:
+        config.load_step = overrides.load_step
+    if overrides.rasterize_mode is not None:
+        model.rasterize_mode = overrides.rasterize_mode
+    if overrides.background is not None:
+        # splatfacto.py:498-509: "random" is the colour that the model's set_background was given
+        splat = isinstance(config.pipeline.model, AbstractSplatfactoModelConfig)
+        model.background_color = "random" if splat else torch.tensor(overrides.background)
 
 
 def _prepared(config: TrainerConfig, file: Path) -> TrainerConfig:

@@ -144,7 +144,7 @@ def certificate_document(
             "property": run.property,
             "property_text": run.sentence,
             "guarantee": run.guarantee,
-            "guarantee_text": guarantee_text(run.guarantee, run.renderer["name"]),
+            "guarantee_text": guarantee_text(run.guarantee, run.renderer["name"], run.scene.get("bounded")),
             "network_guarantee": run.network_guarantee,
             "picture": run.picture,
             "renderer": run.renderer,

@@ -71,12 +71,13 @@ _LIMITS = {
 }
 
 
-def guarantee_text(guarantee: str, renderer: str = "gsplat") -> str:
+def guarantee_text(guarantee: str, renderer: str = "gsplat", bounded: str | None = None) -> str:
     """What a guarantee says, as the end of a sentence about an abstract image.
 
     Args:
         guarantee: "float32-sound", "real-sound" or "sampled".
         renderer: Name of the bounded renderer.
+        bounded: What of the scene is bounded, such as "of the Gaussians alone"; None: all of it.
 
     Raises:
         ValueError: The guarantee is not one of the three.
@@ -90,7 +91,9 @@ def guarantee_text(guarantee: str, renderer: str = "gsplat") -> str:
     }
     if guarantee not in texts:
         raise ValueError(f"guarantee {guarantee!r} is not one of {', '.join(texts)}")
-    return texts[guarantee]
+    if bounded is None or guarantee == "sampled":
+        return texts[guarantee]
+    return f"{texts[guarantee]}, {bounded}: the run's model may draw more, of which nothing is said"
 
 
 def plain(value: Any) -> Any:
@@ -577,7 +580,7 @@ class Report:
             {
                 "version": VERSION,
                 "guarantee": run.guarantee,
-                "guarantee_text": guarantee_text(run.guarantee, name),
+                "guarantee_text": guarantee_text(run.guarantee, name, run.scene.get("bounded")),
                 "limits": [*([_LIMITS[name]] if name in _LIMITS else []), *run.limits],
                 "renderer": run.renderer,
                 "scene": run.scene,

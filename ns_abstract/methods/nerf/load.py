@@ -11,11 +11,16 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from ns_abstract.io.errors import InputError
+import numpy as np
+from numpy.typing import NDArray
+
+from ns_abstract.io.assumptions import Assumption
+from ns_abstract.io.errors import InputError, visible
 from ns_abstract.io.jsonio import is_number, show
 from ns_abstract.methods import runs
 from ns_abstract.methods.checkpoint import to_float32
 from ns_abstract.methods.nerf.scene import Encoding, FieldWeights, Layer, NerfScene
+from ns_abstract.methods.overrides import Overrides, chosen
 
 _FIX = "give a run of vanilla-nerf or abstract-nerf"
 _LAYERS_LIMIT = 64
@@ -27,30 +32,109 @@ _EXPONENTS = (8.0, 4.0)
 _FREQUENCIES = {"num_frequencies": 6, "num_direction_frequencies": 2}
 _MAX_EXPONENT, _MAX_EXPONENT_LIMIT = 5.0, 60.0
 _FREQUENCIES_LIMIT = 64
-_STOCK, _OURS = ":nerfstudio.models.vanilla_nerf.NeRFModel", ":ns_abstract.nerfstudio.nerf.AbstractNerfModel"
+_STOCK, _OURS = "nerfstudio.models.vanilla_nerf.NeRFModel", "ns_abstract.nerfstudio.nerf.AbstractNerfModel"
+#: Modules of vanilla NeRF that draw nothing in evaluation, and what they are for.
+_IDLE = {
+    "device_indicator_param": "no values",
+    "lpips.": "a metric",
+    "psnr.": "a metric",
+    "ssim.": "a metric",
+    "camera_optimizer.": "poses of the training pictures, used in training alone",
+}
+_SHOWN = 8
 #: nerfstudio/models/base_model.py: default of ``collider_params``.
 _PLANES = {"near_plane": 2.0, "far_plane": 6.0}
 
 
 def holds_nerf(run: runs.RunConfig) -> bool:
     """Whether config.yml names vanilla NeRF: by its method or by its model class."""
-    return run.method_name in ("vanilla-nerf", "abstract-nerf") or _target(run).endswith((_STOCK, _OURS))
+    return run.method_name in ("vanilla-nerf", "abstract-nerf") or runs.target_class(run) in (_STOCK, _OURS)
 
 
-def _target(run: runs.RunConfig) -> str:
-    target = run.model.get("_target")
-    return target.tag if isinstance(target, runs.Tagged) else ""
-
-
-def load_nerf(run: runs.RunConfig) -> NerfScene:
+def load_nerf(run: runs.RunConfig, overrides: Overrides | None = None) -> NerfScene:
     """Read the fields and what evaluation needs besides.
 
     Args:
         run: The run's configuration.
+        overrides: What the user says in place of the files.
 
     Raises:
-        InputError: For any content of the files that cannot be used.
+        InputError: For any content of the files, or an override, that cannot be used.
     """
+    overrides = overrides or Overrides()
+    splats = ("rasterize_mode", "assume_splatfacto", "drop_nan_gaussians")
+    overrides.refuse(splats, "is for splats, this run is a NeRF")
+    _refuse_unbounded(run)
+    color = _background(run, overrides)
+    coarse_samples = run.integer("num_coarse_samples", 64, 1, _SAMPLES_LIMIT)
+    importance_samples = run.integer("num_importance_samples", 128, 1, _SAMPLES_LIMIT)
+    transform, notes = runs.read_dataparser_transform(run)
+    checkpoint = runs.find_checkpoint(run, overrides.load_step)
+    state = _ReadState(runs.read_model_state(checkpoint))
+    if not any(key.startswith("field_fine.") for key in state):
+        raise InputError(
+            f"no NeRF fields in this checkpoint (method {show(run.method_name)})",
+            file=checkpoint,
+            field="pipeline._model.field_fine",
+            fix=_FIX,
+        )
+    exponents, counts = _encodings(run)
+    coarse, fine = (
+        field_weights(state, name, checkpoint, exponents, counts) for name in ("field_coarse", "field_fine")
+    )
+    _refuse_unknown(state, checkpoint)
+    target = runs.target_class(run)
+    whose = "config.yml: pipeline.model._target" if target else "default: config.yml names no class"
+    units = "dataparser_transforms.json" if not notes else "default: dataparser_transforms.json is missing"
+    return NerfScene(
+        coarse=coarse,
+        fine=fine,
+        # nerfstudio/model_components/scene_colliders.py: reset_near_plane, outside training
+        near=0.0,
+        far=_far_plane(run),
+        coarse_samples=coarse_samples,
+        importance_samples=importance_samples,
+        background=color[1],
+        dataparser=transform,
+        name=run.experiment_name,
+        source=str(checkpoint),
+        notes=notes,
+        assumptions=(
+            color[0],
+            runs.step_assumption(run, checkpoint, overrides.load_step),
+            Assumption("model", target or _STOCK.rpartition(".")[2], whose),
+            *(
+                Assumption(f"module {prefix.rstrip('.')}", f"left out: {why}", "checkpoint")
+                for prefix, why in _IDLE.items()
+                if why != "no values" and any(key.startswith(prefix) for key in state)
+            ),
+            Assumption("units", f"1 of the data set is {transform.scale:.9g}", units),
+        ),
+    )
+
+
+class _ReadState(dict[str, Any]):
+    """A model's state that remembers which tensors were read."""
+
+    def __init__(self, state: Mapping[str, Any]) -> None:
+        super().__init__(state)
+        self.read: set[str] = set()
+
+    def __getitem__(self, key: str) -> Any:
+        self.read.add(key)
+        return super().__getitem__(key)
+
+
+def _refuse_unbounded(run: runs.RunConfig) -> None:
+    """Refuse model classes and options of which the picture is not that of the two fields."""
+    target = runs.target_class(run)
+    if target and target not in (_STOCK, _OURS):
+        raise InputError(
+            f"names the model class {show(target)}, which may draw another picture than vanilla-nerf",
+            file=run.file,
+            field="pipeline.model._target",
+            fix=_FIX,
+        )
     for name, why in (("enable_temporal_distortion", "scenes that move"), ("use_integrated_encoding", "mip-NeRF")):
         if run.model.get(name, False) is not False:
             raise InputError(
@@ -60,39 +144,42 @@ def load_nerf(run: runs.RunConfig) -> NerfScene:
         raise InputError(
             "rays without ends", file=run.file, field="pipeline.model.enable_collider", fix="train with a collider"
         )
-    background = run.color("background_color", "white", {"random": (0.0, 0.0, 0.0)})
-    coarse_samples = run.integer("num_coarse_samples", 64, 1, _SAMPLES_LIMIT)
-    importance_samples = run.integer("num_importance_samples", 128, 1, _SAMPLES_LIMIT)
-    transform, notes = runs.read_dataparser_transform(run)
-    checkpoint = runs.find_checkpoint(run)
-    state = runs.read_model_state(checkpoint)
-    if not any(key.startswith("field_fine.") for key in state):
+
+
+def _background(run: runs.RunConfig, overrides: Overrides) -> tuple[Assumption, NDArray[np.float32]]:
+    """The record of the background's choice, and its colour."""
+    named, origin = "background_color" in run.model, "config.yml: pipeline.model.background_color"
+    if run.model.get("background_color") == "last_sample":
+        if overrides.background is None:
+            raise InputError(
+                "last_sample, which continues the colour of a ray's last sample, is not supported",
+                file=run.file,
+                field="pipeline.model.background_color",
+                fix="give --background R G B to bound the field before a constant colour, which is another picture",
+            )
+        stored: Any = "last_sample"
+    else:
+        stored = tuple(float(part) for part in run.color("background_color", "white", {"random": (0.0, 0.0, 0.0)}))
+    given = overrides.background
+    record = chosen("background", given, "--background", stored, origin if named else "default of nerfstudio 1.1.5")
+    return record, np.array(stored if given is None else given, np.float32)
+
+
+def _refuse_unknown(state: _ReadState, checkpoint: Path) -> None:
+    unknown = sorted(key for key in state if key not in state.read and not key.startswith(tuple(_IDLE)))
+    if unknown:
+        more = f" and {len(unknown) - _SHOWN} more" if len(unknown) > _SHOWN else ""
         raise InputError(
-            f"no NeRF fields in this checkpoint (method {show(run.method_name)})",
+            f"holds tensors that vanilla-nerf does not have: {visible(', '.join(unknown[:_SHOWN]))}{more}",
             file=checkpoint,
-            field="pipeline._model.field_fine",
+            field="pipeline",
             fix=_FIX,
         )
-    exponents, counts = _encodings(run)
-    return NerfScene(
-        coarse=field_weights(state, "field_coarse", checkpoint, exponents, counts),
-        fine=field_weights(state, "field_fine", checkpoint, exponents, counts),
-        # nerfstudio/model_components/scene_colliders.py: reset_near_plane, outside training
-        near=0.0,
-        far=_far_plane(run),
-        coarse_samples=coarse_samples,
-        importance_samples=importance_samples,
-        background=background,
-        dataparser=transform,
-        name=run.experiment_name,
-        source=str(checkpoint),
-        notes=notes,
-    )
 
 
 def _encodings(run: runs.RunConfig) -> tuple[tuple[float, float], tuple[int | None, int | None]]:
     """Highest exponents and, where config.yml says them, numbers of the frequencies of positions and directions."""
-    ours = run.method_name == "abstract-nerf" or _target(run).endswith(_OURS)
+    ours = run.method_name == "abstract-nerf" or runs.target_class(run) == _OURS
     if not ours:
         return _EXPONENTS, (None, None)
     position, direction = (run.integer(name, n, 0, _FREQUENCIES_LIMIT) for name, n in _FREQUENCIES.items())

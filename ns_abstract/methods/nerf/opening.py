@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 from ns_abstract.methods.nerf.load import holds_nerf, load_nerf
 from ns_abstract.methods.nerf.scene import NerfScene
+from ns_abstract.methods.overrides import Overrides
 from ns_abstract.methods.representation import ProgramOptions, Representation
 from ns_abstract.methods.runs import RunConfig
 
@@ -14,9 +15,9 @@ if TYPE_CHECKING:
     from ns_abstract.methods.nerf.method import NerfMethod
 
 
-def _load(source: RunConfig | Path) -> NerfScene:
+def _load(source: RunConfig | Path, overrides: Overrides) -> NerfScene:
     assert isinstance(source, RunConfig)
-    return load_nerf(source)
+    return load_nerf(source, overrides)
 
 
 def _method(scene: NerfScene, options: ProgramOptions, arithmetic: str | None, workers: int) -> NerfMethod:

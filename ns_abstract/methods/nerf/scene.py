@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from ns_abstract.io.assumptions import Assumption
 from ns_abstract.methods.transform import DataparserTransform
 
 if TYPE_CHECKING:
@@ -149,6 +150,7 @@ class NerfScene:
         source: The file the parameters were read from.
         occupancy: Declared by the user: density is 0 outside of its occupied voxels.
         notes: What was assumed where the source says nothing, one sentence each.
+        assumptions: What was decided of the picture, and where each choice came from.
     """
 
     coarse: FieldWeights
@@ -163,3 +165,4 @@ class NerfScene:
     source: str = ""
     occupancy: OccupancyGrid | None = None
     notes: tuple[str, ...] = ()
+    assumptions: tuple[Assumption, ...] = ()

@@ -14,6 +14,7 @@ from ns_abstract.arithmetic.rounding import arithmetic as arithmetic_named
 from ns_abstract.geometry.box import ParameterBox
 from ns_abstract.geometry.poses import COLOR_SHIFTS, PoseSet
 from ns_abstract.io.errors import InputError
+from ns_abstract.methods.overrides import Overrides
 from ns_abstract.methods.representation import ProgramOptions, Representation
 from ns_abstract.methods.runs import RunConfig
 from ns_abstract.methods.splat.activate import SH_C0, Splats, activate
@@ -31,6 +32,8 @@ if TYPE_CHECKING:
 
     from ns_abstract.methods.splat.reference import Reference
 
+#: What bounds are of where the run's model may draw more.
+GAUSSIANS_ALONE = "of the Gaussians alone"
 #: Bytes that the kernels need by Gaussian and cell, beside the scene itself (record, boxes, colours, buffers).
 _BYTES_BY_GAUSSIAN = 1200
 #: The same of the ranges of a varied scene and of the member that is rendered.
@@ -87,7 +90,7 @@ class SplatMethod:
     @property
     def content(self) -> str:
         """The scene in a few words."""
-        return f"{self.scene.count:,} Gaussians"
+        return f"{self.scene.count:,} Gaussians{' alone, of a model that may draw more' if self.scene.alone else ''}"
 
     def frame(self, poses: PoseSet, slanted: bool = False, layers: bool = False) -> SplatFrame:
         """One frame, ready for refinement; ``slanted``, ``layers``: see `SplatFrame`.
@@ -174,6 +177,7 @@ class SplatMethod:
             "renderer": self.rasteriser.name,
             "version": self.rasteriser.version,
             "arithmetic": self.arithmetic.name,
+            **({"bounded": "Gaussians alone"} if scene.alone else {}),
         }
 
     def describe(self) -> dict[str, Any]:
@@ -188,6 +192,7 @@ class SplatMethod:
             "rasterize_mode": scene.rasterize_mode,
             "background": [float(v) for v in scene.background],
             "notes": list(scene.notes),
+            **({"bounded": GAUSSIANS_ALONE} if scene.alone else {}),
         }
 
     def elements(self) -> Elements:
@@ -211,8 +216,8 @@ class SplatMethod:
         return self._reference
 
 
-def _load(source: RunConfig | Path) -> SplatScene:
-    return load_scene(source.file if isinstance(source, RunConfig) else source)
+def _load(source: RunConfig | Path, overrides: Overrides) -> SplatScene:
+    return load_scene(source.file if isinstance(source, RunConfig) else source, overrides)
 
 
 def _method(scene: SplatScene, options: ProgramOptions, arithmetic: str | None, workers: int) -> SplatMethod:

@@ -8,6 +8,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from ns_abstract.io.assumptions import Assumption
 from ns_abstract.methods.transform import DataparserTransform
 
 Float32Array = NDArray[np.float32]
@@ -39,6 +40,8 @@ class SplatScene:
         dropped: Count of stored Gaussians that gsplat can never draw, by reason.
         stored: [N] numbers of the Gaussians in the source, ascending, where some were dropped; else None.
         notes: What was assumed where the source says nothing, one sentence each.
+        assumptions: What was decided of the picture, and where each choice came from.
+        alone: Whether the run's model draws more than these Gaussians, so that bounds are of the Gaussians alone.
     """
 
     means: Float32Array
@@ -56,6 +59,8 @@ class SplatScene:
     dropped: dict[str, int] = field(default_factory=dict)
     stored: NDArray[np.int64] | None = None
     notes: tuple[str, ...] = ()
+    assumptions: tuple[Assumption, ...] = ()
+    alone: bool = False
 
     def __post_init__(self) -> None:
         n = self.means.shape[0]

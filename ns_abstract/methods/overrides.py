@@ -1,0 +1,80 @@
+"""What the user says of a scene in place of its files, and where each choice came from."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+from ns_abstract.io.assumptions import Assumption
+from ns_abstract.io.errors import InputError
+from ns_abstract.io.jsonio import is_number, show
+
+#: How Splatfacto can rasterise.
+MODES = ("classic", "antialiased")
+_STEP_LIMIT = 10**15
+
+
+@dataclass(frozen=True)
+class Overrides:
+    """What the user says of a scene; None and False leave it to the scene's files.
+
+    Attributes:
+        rasterize_mode: "classic" or "antialiased" (splats).
+        background: RGB in [0, 1] behind the scene.
+        load_step: Training step whose checkpoint is read (runs).
+        assume_splatfacto: Read the Gaussians of a run whose class or modules are not Splatfacto's; bounds then hold of
+            the Gaussians alone.
+        drop_nan_gaussians: Leave out Gaussians whose values are not finite.
+
+    Raises:
+        InputError: A value cannot be used.
+    """
+
+    rasterize_mode: str | None = None
+    background: tuple[float, float, float] | None = None
+    load_step: int | None = None
+    assume_splatfacto: bool = False
+    drop_nan_gaussians: bool = False
+
+    def __post_init__(self) -> None:
+        mode, color, step = self.rasterize_mode, self.background, self.load_step
+        if mode not in (None, *MODES):
+            raise InputError(f"found {show(mode)}", field="--rasterize-mode", fix=f"use {' or '.join(MODES)}")
+        if color is not None:
+            parts = list(color)
+            if len(parts) != 3 or not all(is_number(part) and 0 <= part <= 1 for part in parts):
+                raise InputError(f"found {show(parts)}", field="--background", fix="give three numbers from 0 to 1")
+            object.__setattr__(self, "background", tuple(float(part) for part in parts))
+        if step is not None and (isinstance(step, bool) or not isinstance(step, int) or not 0 <= step < _STEP_LIMIT):
+            raise InputError(f"found {show(step)}", field="--load-step", fix="give the number of a step")
+
+    def refuse(self, names: Iterable[str], problem: str) -> None:
+        """Refuse what does not go with the scene.
+
+        Raises:
+            InputError: One of ``names`` is given.
+        """
+        for name in names:
+            if getattr(self, name) not in (None, False):
+                raise InputError(problem, field="--" + name.replace("_", "-"), fix="leave it out")
+
+
+def chosen(name: str, given: object, flag: str, stored: object, origin: str) -> Assumption:
+    """The record of a choice: what is given wins, and the record then names what it replaces.
+
+    Args:
+        name: Of the choice.
+        given: The value of the option ``flag``; None where it is not given.
+        flag: The option.
+        stored: The value that the scene's files, or a default, would give.
+        origin: Where ``stored`` is from.
+    """
+    if given is None:
+        return Assumption(name, _text(stored), origin)
+    return Assumption(name, _text(given), f"{flag} (in place of {_text(stored)}, {origin})")
+
+
+def _text(value: object) -> str:
+    if isinstance(value, (tuple, list)):
+        return " ".join(f"{part:.9g}" for part in value)
+    return str(value)
