@@ -79,12 +79,24 @@ def load_perturbation(path: str | Path, *, dataset_scale: float = 1.0) -> Pertur
     """
     path = Path(path)
     root = load_json(path, "perturbation file")
-    if isinstance(root, dict) and "camera_path" in root and "perturbation" in root:
-        root = root["perturbation"]
     try:
+        if isinstance(root, dict) and "camera_path" in root and "perturbation" in root:
+            _refuse_overrides(root["camera_path"])
+            root = root["perturbation"]
         return parse_perturbation(root, dataset_scale=dataset_scale, field_prefix="", folder=path.parent)
     except InputError as error:
         raise error.within(path) from None
+
+
+def _refuse_overrides(entries: object) -> None:
+    """Refuse entries of a camera path that have sets of their own, which one set for all cannot hold."""
+    for k, entry in enumerate(entries if isinstance(entries, list) else ()):
+        if isinstance(entry, dict) and entry.get("perturbation") is not None:
+            raise InputError(
+                "an entry of this path has a set of its own",
+                field=f"camera_path[{k}].perturbation",
+                fix="give this file as the camera path, or the set for all entries in a file of its own",
+            )
 
 
 def parse_perturbation(
@@ -153,6 +165,9 @@ def perturbation_object(perturbation: Perturbation) -> dict[str, Any]:
     }
     if (orbit := perturbation.orbit) is not None:
         found["orbit"] = {"target": list(orbit.target), "axis": list(orbit.axis), "azimuth": list(orbit.azimuth)}
+    for name in ("hue", "saturation"):
+        if (shift := getattr(perturbation, name)) is not None:
+            found[name] = list(shift)
     if perturbation.scene:
         found["scene"] = [
             {"select": selection_object(entry.select)}

@@ -13,7 +13,7 @@ from typing import Any
 
 from ns_abstract.io.errors import InputError
 from ns_abstract.io.jsonio import is_number, show
-from ns_abstract.methods import runs
+from ns_abstract.methods import config_keys, runs
 from ns_abstract.methods.checkpoint import to_float32
 from ns_abstract.methods.nerf.scene import Encoding, FieldWeights, Layer, NerfScene
 
@@ -51,15 +51,7 @@ def load_nerf(run: runs.RunConfig) -> NerfScene:
     Raises:
         InputError: For any content of the files that cannot be used.
     """
-    for name, why in (("enable_temporal_distortion", "scenes that move"), ("use_integrated_encoding", "mip-NeRF")):
-        if run.model.get(name, False) is not False:
-            raise InputError(
-                f"{why} cannot be bounded", file=run.file, field=f"pipeline.model.{name}", fix="train without it"
-            )
-    if run.model.get("enable_collider", True) is not True:
-        raise InputError(
-            "rays without ends", file=run.file, field="pipeline.model.enable_collider", fix="train with a collider"
-        )
+    unused = config_keys.check_keys(run, config_keys.VANILLA_NERF)
     background = run.color("background_color", "white", {"random": (0.0, 0.0, 0.0)})
     coarse_samples = run.integer("num_coarse_samples", 64, 1, _SAMPLES_LIMIT)
     importance_samples = run.integer("num_importance_samples", 128, 1, _SAMPLES_LIMIT)
@@ -86,7 +78,7 @@ def load_nerf(run: runs.RunConfig) -> NerfScene:
         dataparser=transform,
         name=run.experiment_name,
         source=str(checkpoint),
-        notes=notes,
+        notes=(*notes, *unused),
     )
 
 

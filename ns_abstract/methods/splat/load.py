@@ -19,7 +19,7 @@ import numpy as np
 from ns_abstract.io.errors import InputError, visible
 from ns_abstract.io.jsonio import file_size, show
 from ns_abstract.io.memory import check_memory
-from ns_abstract.methods import runs
+from ns_abstract.methods import config_keys, runs
 from ns_abstract.methods.checkpoint import require_finite, to_float32
 from ns_abstract.methods.splat.scene import DataparserTransform, Float32Array, SplatScene
 
@@ -144,6 +144,7 @@ class _Arrays:
 
 
 def _load_run(run: runs.RunConfig) -> SplatScene:
+    unused = config_keys.check_keys(run, config_keys.SPLATFACTO)
     degree_stored = run.integer("sh_degree", _MODEL_DEFAULTS["sh_degree"], 0, _MAX_DEGREE_STORED)
     interval = run.integer("sh_degree_interval", _MODEL_DEFAULTS["sh_degree_interval"], 1)
     mode = run.choice("rasterize_mode", _MODEL_DEFAULTS["rasterize_mode"], ("classic", "antialiased"))
@@ -175,7 +176,7 @@ def _load_run(run: runs.RunConfig) -> SplatScene:
         name=run.experiment_name,
         source=str(checkpoint),
         **dropped,
-        notes=(*notes, *_assumptions(run)),
+        notes=(*notes, *_assumptions(run), *unused),
     )
 
 
