@@ -1,0 +1,111 @@
+"""Tables of the keys that other programs' files hold: used, irrelevant to the picture, or refused."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal, NamedTuple
+
+from ns_abstract.io.errors import InputError
+from ns_abstract.io.jsonio import show
+
+
+class Key(NamedTuple):
+    """One key of a file.
+
+    Attributes:
+        name: Dotted path in the file, or in the section that the table is of.
+        status: "used", "irrelevant" (no value changes the evaluated picture) or "refused" (every value but
+            ``accepts``).
+        why: For what it is used, or why it is irrelevant or refused. Fragments between backquotes stand in the line of
+            ``where``.
+        where: File and line of Nerfstudio 1.1.5, such as "models/splatfacto.py:588"; "" where that has no such key.
+        accepts: Values of a refused key that change nothing.
+        refuses: Values of a used key that are not supported.
+        fix: What a user can do about a refused value.
+    """
+
+    name: str
+    status: Literal["used", "irrelevant", "refused"]
+    why: str
+    where: str = ""
+    accepts: tuple[Any, ...] = ()
+    refuses: tuple[Any, ...] = ()
+    fix: str = "give a run that was trained without it"
+
+
+def _plain(value: Any) -> Mapping[str, Any] | None:
+    return value if isinstance(value, Mapping) else None
+
+
+@dataclass(frozen=True)
+class KeyTable:
+    """The keys of a file or of a section of it. A key that is listed without keys below it covers all below it.
+
+    Attributes:
+        title: Of what these are the keys.
+        keys: One by key.
+    """
+
+    title: str
+    keys: tuple[Key, ...]
+
+    def find(self, name: str) -> Key | None:
+        """The entry that covers the dotted ``name``; None where there is none."""
+        known = {key.name: key for key in self.keys}
+        while True:
+            if name in known:
+                return known[name]
+            name, dot, _ = name.rpartition(".")
+            if not dot or any(key.startswith(f"{name}.") for key in known):
+                return None
+
+    def unknown(
+        self,
+        section: Mapping[Any, Any],
+        prefix: str = "",
+        mapping: Callable[[Any], Mapping[Any, Any] | None] = _plain,
+    ) -> list[str]:
+        """The dotted names of keys of ``section`` that are not in the table.
+
+        Args:
+            section: What the file holds.
+            prefix: What errors write before a key.
+            mapping: The mapping that a value holds, or None.
+
+        Raises:
+            InputError: A key has a value that is refused.
+        """
+        known = {key.name: key for key in self.keys}
+
+        def walk(inner: Mapping[Any, Any], above: str) -> Iterator[str]:
+            for part, value in inner.items():
+                name = above + (part if isinstance(part, str) else show(part))
+                key = known.get(name)
+                if key is None:
+                    yield name
+                    continue
+                bad = _among(value, key.refuses) or (key.status == "refused" and not _among(value, key.accepts))
+                if bad:
+                    raise InputError(f"found {show(value)}: {key.why}", field=prefix + name, fix=key.fix)
+                below = mapping(value)
+                if below is not None and any(other.startswith(f"{name}.") for other in known):
+                    yield from walk(below, f"{name}.")
+
+        return list(walk(section, ""))
+
+
+def _among(value: Any, values: Sequence[Any]) -> bool:
+    """Whether ``value`` is one of ``values``; texts in any case, and a number is no truth value."""
+    if isinstance(value, str):
+        return value.lower() in values
+    return any(type(value) is type(other) and value == other for other in values)
+
+
+def sentence(names: Sequence[str], file: str) -> tuple[str, ...]:
+    """A note that ``file`` holds unknown keys, which are not used; none where there are none."""
+    if not names:
+        return ()
+    found = sorted(dict.fromkeys(names))
+    shown = ", ".join(found[:10]) + (f" and {len(found) - 10} more" if len(found) > 10 else "")
+    return (f"unknown keys of {file}, which are not used: {shown}",)
