@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, Literal, NamedTuple
 
 from ns_abstract.io.errors import InputError
@@ -33,6 +34,10 @@ class Key(NamedTuple):
     refuses: tuple[Any, ...] = ()
     fix: str = "give a run that was trained without it"
 
+    def refused(self, value: Any) -> bool:
+        """Whether ``value`` of this key is refused."""
+        return _among(value, self.refuses) or (self.status == "refused" and not _among(value, self.accepts))
+
 
 def _plain(value: Any) -> Mapping[str, Any] | None:
     return value if isinstance(value, Mapping) else None
@@ -50,15 +55,23 @@ class KeyTable:
     title: str
     keys: tuple[Key, ...]
 
+    @cached_property
+    def _known(self) -> dict[str, Key]:
+        return {key.name: key for key in self.keys}
+
+    @cached_property
+    def _sections(self) -> set[str]:
+        """Names that have listed keys below them."""
+        parts = [key.name.split(".") for key in self.keys]
+        return {".".join(names[:k]) for names in parts for k in range(1, len(names))}
+
     def find(self, name: str) -> Key | None:
         """The entry that covers the dotted ``name``; None where there is none."""
-        known = {key.name: key for key in self.keys}
-        while True:
-            if name in known:
-                return known[name]
+        while name not in self._known:
             name, dot, _ = name.rpartition(".")
-            if not dot or any(key.startswith(f"{name}.") for key in known):
+            if not dot or name in self._sections:
                 return None
+        return self._known[name]
 
     def unknown(
         self,
@@ -76,21 +89,18 @@ class KeyTable:
         Raises:
             InputError: A key has a value that is refused.
         """
-        known = {key.name: key for key in self.keys}
 
         def walk(inner: Mapping[Any, Any], above: str) -> Iterator[str]:
             for part, value in inner.items():
                 name = above + (part if isinstance(part, str) else show(part))
-                key = known.get(name)
-                if key is None:
-                    yield name
-                    continue
-                bad = _among(value, key.refuses) or (key.status == "refused" and not _among(value, key.accepts))
-                if bad:
+                key = self._known.get(name)
+                if key is not None and key.refused(value):
                     raise InputError(f"found {show(value)}: {key.why}", field=prefix + name, fix=key.fix)
-                below = mapping(value)
-                if below is not None and any(other.startswith(f"{name}.") for other in known):
+                below = mapping(value) if name in self._sections else None
+                if below is not None:
                     yield from walk(below, f"{name}.")
+                elif key is None:
+                    yield name
 
         return list(walk(section, ""))
 

@@ -18,7 +18,8 @@ from ns_abstract.perturbation.variations import KEYS, VARIATIONS, SceneVariation
 TRANSLATIONS = ("x", "y", "z")
 ROTATIONS = ("yaw", "pitch", "roll")
 
-_KEYS = {
+#: Keys of the file, and what may stand there.
+FILE_KEYS = {
     "version": "1",
     "frame": '"camera" or "world"',
     "units": '"normalised" or "dataset"',
@@ -124,7 +125,7 @@ def parse_perturbation(
 
     if not isinstance(value, dict):
         raise fail("", f"found {show(value)}", "write an object")
-    known(value, _KEYS, "", fail)
+    known(value, FILE_KEYS, "", fail)
     if value.get("version", 1) != 1 or isinstance(value.get("version"), bool):
         raise fail("version", f"found {show(value['version'])}", "this program reads version 1")
     frame = _choice(value, "frame", ("camera", "world"), fail)
@@ -187,7 +188,7 @@ def _choice(value: Mapping[str, Any], name: str, choices: tuple[str, ...], fail:
 def _ranges(value: Mapping[str, Any], name: str, keys: tuple[str, ...], fail: Fail) -> dict[str, Range]:
     inner = value.get(name, {})
     if not isinstance(inner, dict):
-        raise fail(name, f"found {show(inner)}", f"write {_KEYS[name]}")
+        raise fail(name, f"found {show(inner)}", f"write {FILE_KEYS[name]}")
     known(inner, keys, f"{name}.", fail)
     return {key: interval(inner[key], f"{name}.{key}", fail) for key in keys if key in inner}
 
@@ -223,11 +224,11 @@ def _orbit(value: Mapping[str, Any], fail: Fail, turn: float) -> Orbit | None:
         return None
     inner = value["orbit"]
     if not isinstance(inner, dict):
-        raise fail("orbit", f"found {show(inner)}", f"write {_KEYS['orbit']}")
+        raise fail("orbit", f"found {show(inner)}", f"write {FILE_KEYS['orbit']}")
     known(inner, ("target", "axis", "azimuth"), "orbit.", fail)
     for name in ("target", "axis", "azimuth"):
         if name not in inner:
-            raise fail(f"orbit.{name}", "missing", f"write {_KEYS['orbit']}")
+            raise fail(f"orbit.{name}", "missing", f"write {FILE_KEYS['orbit']}")
     axis = vector(inner["axis"], "orbit.axis", fail)
     with np.errstate(over="ignore"):
         length = float(np.linalg.norm(axis))
