@@ -5,11 +5,12 @@ from planted.depths import DEPTHS
 from planted.fault import Fault, apply
 from planted.fields import FIELDS
 from planted.forms import FORMS
+from planted.inputs import INPUTS
 from planted.loops import LOOPS
 from planted.polynomials import POLYNOMIALS
 from planted.splats import SPLATS
 from planted.verdicts import VERDICTS
 
-FAULTS = (*FORMS, *POLYNOMIALS, *FIELDS, *VERDICTS, *CERTIFICATES, *SPLATS, *DEPTHS, *LOOPS)
+FAULTS = (*FORMS, *POLYNOMIALS, *FIELDS, *VERDICTS, *CERTIFICATES, *SPLATS, *DEPTHS, *LOOPS, *INPUTS)
 
 __all__ = ["FAULTS", "Fault", "apply"]
