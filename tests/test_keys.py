@@ -518,7 +518,7 @@ def test_keys_of_a_path_do_what_the_table_says(tmp_path: Path) -> None:
     def told(data: Any) -> list[Any]:
         path = read(tmp_path, data)
         cameras = [(c.camera_to_world.tolist(), c.fx, c.fy, c.width, c.height) for c in path.cameras]
-        return [cameras, path.perturbations, path.fps, path.is_cycle, path.notes]
+        return [cameras, path.perturbations, path.is_cycle, path.notes]
 
     new: dict[str, Any] = {
         "render_height": 21, "render_width": 31, "default_fov": 50.0, "fps": 12, "is_cycle": True,

@@ -25,7 +25,7 @@ PATH = KeyTable(
         Key("render_height", "used", "height of the picture", f"{_READ}:133"),
         Key("render_width", "used", "width of the picture", f"{_READ}:134"),
         Key("default_fov", "used", "the field of view of entries that have none", f"{_PANEL}:1082"),
-        Key("fps", "used", "frames per second of videos", f"{_PANEL}:1090"),
+        Key("fps", "irrelevant", "frames per second in the viewer", f"{_PANEL}:1090"),
         Key("is_cycle", "used", 'with "sweep": "segments": the leg from the last entry to the first', f"{_PANEL}:1092"),
         Key("crop", "refused", _CROP, f"{_RENDER}:395", (None,), fix=_NO_CROP),
         Key("seconds", "irrelevant", "length of the video", f"{_RENDER}:463"),
