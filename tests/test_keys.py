@@ -155,7 +155,7 @@ def pictures_that_differ(config: Any, names: list[str], picture: Any) -> set[str
         value = getattr(config, outer)
         new = {**value, inner: other(inner, value[inner])} if inner else other(name, value)
         if dataclasses.is_dataclass(value):
-            new = type(value)(**{"mode": "SO3xR3"})
+            new = type(value)(mode="SO3xR3")  # pyright: ignore[reportCallIssue]
         after = picture(dataclasses.replace(config, **{outer: new}))
         if after is None or any(not np.array_equal(a, b) for a, b in zip(before, after, strict=True)):
             found.add(name)

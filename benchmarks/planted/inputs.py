@@ -87,12 +87,12 @@ INPUTS = (
         "test_keys.py::test_unknown_keys_of_a_path_are_named_in_the_report",
     ),
     Fault(
-        "three.js' matrix of a keyframe is read row by row",
+        "three.js' matrix of a keyframe in the origin is read row by row",
         _PATH,
         "_keyframe_matrix",
-        "numbers if rows else [numbers[4 * i + k] for k in range(4) for i in range(4)]",
-        "numbers",
-        "test_keys.py::test_one_keyframe_is_the_camera[0.x]",
+        "numbers[3::4] != [0, 0, 0, 1]",
+        "True",
+        "test_keys.py::test_a_text_of_rows_is_told_from_one_of_columns",
     ),
     Fault(
         "sets of single entries are lost",
