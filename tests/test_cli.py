@@ -224,7 +224,7 @@ MISTAKES: dict[str, tuple[Change, tuple[str, ...]]] = {
     "config is binary": (text("config", b"\xff\xfe\x00\x01"), ("config.yml", "UTF-8")),
     "wrong degree": (swap("sh_degree: 3", "sh_degree: 2"), ("features_rest", "sh_degree")),
     "wrong mode": (swap("rasterize_mode: classic", "rasterize_mode: fast"), ("config.yml", "rasterize_mode")),
-    "wrong background": (swap("background_color:", "background_color: [2]\n    old:"), ("background_color",)),
+    "wrong background": (swap("background_color:", "background_color: [2]\n    noise_lr:"), ("background_color",)),
     "no checkpoint": (lambda i: i.checkpoint.unlink(), ("nerfstudio_models", "step-")),
     "half a checkpoint": (_half_checkpoint, ("step-000029999.ckpt",)),
     "checkpoint is text": (text("checkpoint", "weights"), ("step-000029999.ckpt", "not a PyTorch checkpoint")),

@@ -230,7 +230,7 @@ BAD: dict[str, tuple[Any, tuple[str, ...]]] = {
     "width huge": (_top(render_width=10**300), ("render_width",)),
     "width a list": (_top(render_width=[300]), ("render_width",)),
     "no cameras": (_top(camera_path=...), ("camera_path", "missing")),
-    "empty cameras": (_top(camera_path=[]), ("camera_path",)),
+    "empty cameras": (_top(camera_path=[], keyframes=[]), ("camera_path", "at least one")),
     "cameras an object": (_top(camera_path={}), ("camera_path",)),
     "entry a list": (_top(camera_path=[[1]]), ("camera_path[0]",)),
     "entry null": (_top(camera_path=[None]), ("camera_path[0]",)),

@@ -5,6 +5,7 @@ from planted.depths import DEPTHS
 from planted.fault import Fault, apply
 from planted.fields import FIELDS
 from planted.forms import FORMS
+from planted.inputs import INPUTS
 from planted.loops import LOOPS
 from planted.polynomials import POLYNOMIALS
 from planted.processes import PROCESSES
@@ -13,7 +14,7 @@ from planted.splats import SPLATS
 from planted.verdicts import VERDICTS
 
 FAULTS = (
-    *FORMS, *POLYNOMIALS, *FIELDS, *VERDICTS, *CERTIFICATES, *SPLATS, *DEPTHS, *LOOPS, *PROCESSES, *SCENES,
+    *FORMS, *POLYNOMIALS, *FIELDS, *VERDICTS, *CERTIFICATES, *SPLATS, *DEPTHS, *LOOPS, *INPUTS, *PROCESSES, *SCENES,
 )  # fmt: skip
 
 __all__ = ["FAULTS", "Fault", "apply"]

@@ -642,7 +642,7 @@ def open_certification(settings: CertifySettings) -> Certification:
     sets = [question.drawn(poses) for poses in path_sets(files, scene, path, default=Perturbation())]
     origin = settings.perturbation_filename or settings.camera_path_filename
     try:
-        job = Job(scene, sets, arithmetic=settings.arithmetic, workers=settings.workers)
+        job = Job(scene, sets, arithmetic=settings.arithmetic, workers=settings.workers, notes=path.notes)
     except InputError as error:
         raise error.within(origin) if error.field and not error.field.startswith("--") else error from None
     return Certification(job, question, settings.memory, origin, settings.network_arithmetic, settings.picture)

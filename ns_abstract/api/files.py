@@ -88,6 +88,7 @@ class PathJob(Job):
                 memory_limit=settings.memory_limit,
                 workers=settings.workers,
                 layers=[name for name in settings.outputs if name != "rgb"],
+                notes=path.notes,
             )
         except InputError as error:
             # options have no file

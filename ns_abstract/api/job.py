@@ -47,6 +47,7 @@ class Job:
         memory_limit: GiB; None: 80 % of what is free.
         workers: Processes that one frame may use, where pictures are made ray by ray.
         layers: What is bounded beside the colours, of `ns_abstract.refine.result.LAYERS`.
+        notes: What reports say of the files of the sets, one sentence each.
 
     Raises:
         InputError: The scene has no such layers, does not vary as asked, or the memory does not do.
@@ -62,7 +63,9 @@ class Job:
         memory_limit: float | None = None,
         workers: int = 1,
         layers: Sequence[str] = (),
+        notes: Sequence[str] = (),
     ) -> None:
+        self.notes = tuple(notes)
         self.layers = tuple(name for name in LAYERS if name in layers)
         if unknown := [name for name in layers if name not in LAYERS]:
             raise InputError(f"found {unknown[0]}", field="--outputs", fix=f"use rgb, {', '.join(LAYERS)}")
@@ -255,6 +258,8 @@ class Job:
             sets.update(np.ascontiguousarray(camera.camera_to_world).tobytes())
             sets.update(repr((camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height)).encode())
             sets.update(repr((poses.perturbation, poses.box, sorted(poses.fixed.items()))).encode())
+            if poses.target_camera is not None:
+                sets.update(np.ascontiguousarray(poses.target_camera.camera_to_world).tobytes())
             if poses.perturbation.scene:
                 sets.update(repr(poses.perturbation.scene).encode())
         more = {"outputs": list(self.layers)} if self.layers else {}
@@ -262,7 +267,8 @@ class Job:
 
     def describe(self) -> dict[str, Any]:
         """The scene for reports."""
-        return self.method.describe()
+        about = self.method.describe()
+        return {**about, "notes": [*about.get("notes", ()), *self.notes]} if self.notes else about
 
 
 def require_sound_platform() -> None:

@@ -19,6 +19,8 @@ from ns_abstract.io.errors import InputError
 from ns_abstract.perturbation.specification import Perturbation, parse_perturbation
 
 Limit = float | Sequence[float]
+#: Nothing is said of the next keyframe.
+_UNSAID: Any = object()
 
 
 class Camera(PinholeCamera):
@@ -110,7 +112,7 @@ class PoseSet:
         camera: PinholeCamera,
         specification: Mapping[str, Any] | None,
         *,
-        following: PinholeCamera | None = None,
+        following: PinholeCamera | None = _UNSAID,
         folder: str | os.PathLike[str] | None = None,
     ) -> PoseSet:
         """The set of an object as it stands in a perturbation file; all that the file can say.
@@ -118,14 +120,22 @@ class PoseSet:
         Args:
             camera: The camera.
             specification: The object; None: the camera's pose alone.
-            following: The next keyframe, for ``"sweep": "segments"``.
+            following: The next keyframe, which ``"sweep": "segments"`` needs: ``path.following(k)`` of
+                `load_camera_path`; None after the last entry of an open path.
             folder: Where index files of a selection lie; None: the working directory.
 
         Raises:
             InputError: The object cannot be used.
         """
         self = cls.__new__(cls)
-        self._fill(camera, {} if specification is None else specification, following, folder)
+        unsaid = following is _UNSAID
+        self._fill(camera, {} if specification is None else specification, None if unsaid else following, folder)
+        if unsaid and self.perturbation().sweep == "segments":
+            raise InputError(
+                "segments without the next keyframe",
+                field="sweep",
+                fix="give following=path.following(k), which is None after the last entry of an open path",
+            )
         return self
 
     def _fill(

@@ -40,6 +40,7 @@ def curve(
     workers: int,
     marks: Sequence[float],
     said: Callable[[str], object] = lambda text: None,
+    following: Camera | None = None,
 ) -> dict[str, Any]:
     """Search one set for ``seconds``.
 
@@ -50,6 +51,7 @@ def curve(
         marks: Times, in seconds from the call, at which the certified fraction is told; kernels have to be loaded, and
             compiled at the first time, within them.
         said: Told from time to time where the search stands.
+        following: The camera after ``camera`` on its path, for sets that sweep segments.
 
     Returns:
         A row: certified fraction at the marks and at the end, falsified and unknown ones, cells bounded by the network,
@@ -70,7 +72,7 @@ def curve(
             )
 
     found = certify(
-        scene, PoseSet.from_json(camera, specification), model, prop,
+        scene, PoseSet.from_json(camera, specification, following=following), model, prop,
         time_budget=seconds, workers=workers, on_progress=on_progress,
     )  # fmt: skip
     effort = found.report["effort"]

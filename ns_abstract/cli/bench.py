@@ -370,7 +370,7 @@ def certificates(options: Certificates) -> int:
         rows.append(
             curve(
                 scene, path.cameras[options.frame], name, known[name], options.model, options.property, options.seconds,
-                options.workers, marks, _said,
+                options.workers, marks, _said, path.following(options.frame),
             )
         )  # fmt: skip
         print("\n".join(markdown([rows[-1]]).splitlines()[0 if len(rows) == 1 else 2 :]), flush=True)

@@ -152,7 +152,7 @@ def _introduce(console: Console, job: Job, report: Report) -> None:
     method = job.method
     program = method.program
     console.print(f"{method.name}: {method.content}, {program['name']} {program['version']}", markup=False)
-    for note in (*method.notes, *job.plan):
+    for note in (*method.notes, *job.notes, *job.plan):
         console.print(f"  {note}", markup=False, soft_wrap=True)
     if report.kept:
         console.print(f"  kept from before: frames {listed(report.kept)}", markup=False, soft_wrap=True)

@@ -12,8 +12,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from ns_abstract.geometry.path_keys import ENTRY, KEYFRAME, PATH
 from ns_abstract.io.errors import InputError
-from ns_abstract.io.jsonio import is_number, load_json, show
+from ns_abstract.io.jsonio import is_number, load_json, parse_json, show
+from ns_abstract.io.keys import sentence
 
 SIDE_LIMIT = 16384
 _ROTATION_TOLERANCE = 1e-3
@@ -124,6 +126,7 @@ class CameraPath:
         fps: Frames per second, or None if the file does not say.
         is_cycle: Whether the path closes.
         source: The file.
+        notes: What of the file is not used because nothing is known of it, one sentence each.
     """
 
     cameras: tuple[Camera, ...]
@@ -132,6 +135,7 @@ class CameraPath:
     fps: float | None
     is_cycle: bool
     source: str
+    notes: tuple[str, ...] = ()
 
     def perturbation_of(self, index: int) -> Mapping[str, Any] | None:
         """The perturbation object that holds for camera ``index``: its own, else the path's."""
@@ -144,8 +148,10 @@ class CameraPath:
         return tuple(self.perturbation_of(k) for k in range(len(self.cameras)))
 
     def following(self, index: int) -> Camera | None:
-        """The camera after ``index``; None for the last."""
-        return self.cameras[index + 1] if index + 1 < len(self.cameras) else None
+        """The camera after ``index``: after the last one the first where the path closes, else None."""
+        if index + 1 < len(self.cameras):
+            return self.cameras[index + 1]
+        return self.cameras[0] if self.is_cycle and len(self.cameras) > 1 else None
 
 
 def load_camera_path(path: str | os.PathLike[str], downscale_factor: float = 1) -> CameraPath:
@@ -163,36 +169,20 @@ def load_camera_path(path: str | os.PathLike[str], downscale_factor: float = 1) 
     """
     path = Path(path)
     root = load_json(path, "camera path")
-    if not isinstance(root, dict):
-        raise InputError(f"the top level is {show(root)}, not an object", file=path, fix=_FIX_FILE)
     try:
+        _refuse_others(root)
         return _parse(root, str(path), downscale_factor)
     except InputError as error:
         raise error.within(path) from None
 
 
 def _parse(root: dict[str, Any], source: str, downscale_factor: float) -> CameraPath:
-    kind = root.get("camera_type", "perspective")
-    if not isinstance(kind, str) or kind.lower() != "perspective":
-        raise InputError(
-            f"found {show(kind)}: Splatfacto's rasteriser draws perspective cameras only",
-            field="camera_type",
-            fix="write perspective",
-        )
-    _refuse_crop(root, "crop")
+    unknown = PATH.unknown(root)
     height = checked_side(root.get("render_height"), "render_height")
     width = checked_side(root.get("render_width"), "render_width")
-    entries = root.get("camera_path")
-    if not isinstance(entries, list) or not entries:
-        found = "missing" if entries is None else f"found {show(entries)}"
-        raise InputError(found, field="camera_path", fix="write a list of at least one camera")
     cameras = []
     overrides = []
-    for i, entry in enumerate(entries):
-        field = f"camera_path[{i}]"
-        if not isinstance(entry, dict):
-            raise InputError(f"found {show(entry)}", field=field, fix="write an object")
-        _refuse_crop(entry, f"{field}.crop")
+    for field, entry in _entries(root, unknown):
         focal = _focal(entry, root, field, height)
         camera = Camera(
             camera_to_world=checked_pose(entry.get("camera_to_world"), f"{field}.camera_to_world"),
@@ -218,16 +208,90 @@ def _parse(root: dict[str, Any], source: str, downscale_factor: float) -> Camera
         fps=None if fps is None else float(fps),
         is_cycle=bool(is_cycle),
         source=source,
+        notes=sentence(unknown, Path(source).name),
     )
 
 
-def _refuse_crop(holder: dict[str, Any], field: str) -> None:
-    if holder.get("crop") is not None:
+#: Files of Nerfstudio and of this program that are taken for camera paths, by a key that these lack.
+_OTHERS = {
+    "frames": (
+        "a data set's transforms.json, not a camera path",
+        "make a path in Nerfstudio's viewer, or write one whose camera_to_world are the transform_matrix entries, "
+        "taken to the run's frame by dataparser_transforms.json",
+    ),
+    "transform": ("a run's dataparser_transforms.json, not a camera path", _FIX_FILE),
+    "dynamics": ("a loop, not a camera path", "give it to ns-abstract-reach as --loop"),
+    **dict.fromkeys(
+        ("translation", "rotation", "sweep", "orbit"),
+        ("a perturbation file, not a camera path", "give it as --perturbation-filename, beside a camera path"),
+    ),
+}
+
+
+def _refuse_others(root: Any) -> None:
+    """Refuse what is no camera path by the name of what it is."""
+    if isinstance(root, list) and root and all(isinstance(e, dict) and "transform" in e for e in root):
+        raise InputError("poses of photos as ns-export cameras writes them, not a camera path", fix=_FIX_FILE)
+    if not isinstance(root, dict):
+        raise InputError(f"the top level is {show(root)}, not an object", fix=_FIX_FILE)
+    if "camera_path" not in root:
+        for key, (kind, fix) in _OTHERS.items():
+            if key in root:
+                raise InputError(f"is {kind}", fix=fix)
+
+
+def _entries(root: dict[str, Any], unknown: list[str]) -> list[tuple[str, dict[str, Any]]]:
+    """The cameras of a path with the names of their fields; names of unknown keys are added to ``unknown``.
+
+    The viewer interpolates between keyframes, and writes no camera where there is but one of them: it is the camera.
+    """
+    found: dict[str, list[tuple[str, dict[str, Any]]]] = {}
+    for name, table in (("camera_path", ENTRY), ("keyframes", KEYFRAME)):
+        entries = root.get(name)
+        if entries is None and name == "keyframes":
+            entries = []
+        if not isinstance(entries, list):
+            problem = "missing" if entries is None else f"found {show(entries)}"
+            raise InputError(problem, field=name, fix="write a list of cameras")
+        found[name] = []
+        for i, entry in enumerate(entries):
+            field = f"{name}[{i}]"
+            if not isinstance(entry, dict):
+                raise InputError(f"found {show(entry)}", field=field, fix="write an object")
+            unknown += [f"{name}[].{key}" for key in table.unknown(entry, f"{field}.")]
+            found[name].append((field, entry))
+    if found["camera_path"]:
+        return found["camera_path"]
+    if len(found["keyframes"]) != 1:
+        count = len(found["keyframes"])
         raise InputError(
-            "a crop box changes the picture and is not supported",
-            field=field,
-            fix="switch the crop off in the viewer and save the path again",
+            f"the list is empty, and there are {count} keyframes: the viewer wrote no camera" if count else "empty",
+            field="camera_path",
+            fix="save the path again with a duration and a frame rate above 0"
+            if count
+            else "write a list of at least one camera",
         )
+    field, keyframe = found["keyframes"][0]
+    matrix = _keyframe_matrix(keyframe.get("matrix"), f"{field}.matrix")
+    return [(field, {**keyframe, "camera_to_world": matrix})]
+
+
+def _keyframe_matrix(value: Any, field: str) -> Any:
+    """The numbers of a keyframe's matrix, row by row.
+
+    Nerfstudio's viewer writes a list of rows; the one before 1.0 and the Blender add-on write a text with the list of
+    three.js, which is column by column.
+    """
+    if not isinstance(value, str):
+        return value
+    try:
+        numbers = parse_json(value)
+    except InputError as error:
+        raise InputError(error.problem, field=field, fix="write 16 numbers, row by row") from None
+    if not isinstance(numbers, list) or len(numbers) != 16:
+        return numbers
+    rows = numbers[12:] == [0, 0, 0, 1] and numbers[3::4] != [0, 0, 0, 1]
+    return numbers if rows else [numbers[4 * i + k] for k in range(4) for i in range(4)]
 
 
 def checked_side(value: Any, name: str) -> int:
@@ -292,22 +356,17 @@ def checked_pose(value: Any, field: str) -> NDArray[np.float64]:
         if not is_number(number) or abs(number) > limit:
             raise InputError(f"found {show(number)}", field=f"{field}[{i}]", fix="write a number that float32 can hold")
     matrix = np.array(value, np.float64).reshape(4, 4)
-    last = np.abs(matrix[3] - (0, 0, 0, 1)).max()
-    if last > _LAST_ROW_TOLERANCE:
-        raise InputError(
-            f"the last row is ({', '.join(f'{x:.6g}' for x in matrix[3])}), not (0, 0, 0, 1)",
-            field=field,
-            fix="write the matrix row by row, the position in the fourth column",
-        )
     rotation = matrix[:3, :3]
+    _refuse_scaled(matrix, field)
     with np.errstate(over="ignore", invalid="ignore"):
         distance = float(np.abs(rotation.T @ rotation - np.eye(3)).max())
     if not distance <= _ROTATION_TOLERANCE:
-        raise InputError(
-            f"the rotation part is {distance:.3g} away from orthonormal (limit {_ROTATION_TOLERANCE:g})",
-            field=field,
-            fix="remove scale and shear from the matrix",
-        )
+        with np.errstate(all="ignore"):
+            scale = float(np.cbrt(np.linalg.det(rotation)))
+            whole = scale > 0 and np.abs(rotation.T @ rotation / scale**2 - np.eye(3)).max() <= _ROTATION_TOLERANCE
+        fix = f"divide its nine numbers by {scale:.6g}" if whole else "remove scale and shear from the matrix"
+        problem = f"the rotation part is {distance:.3g} away from orthonormal (limit {_ROTATION_TOLERANCE:g})"
+        raise InputError(problem, field=field, fix=fix)
     if np.linalg.det(rotation) < 0:
         raise InputError(
             "the rotation part mirrors (determinant -1)", field=field, fix="use a right-handed OpenGL frame"
@@ -315,6 +374,28 @@ def checked_pose(value: Any, field: str) -> NDArray[np.float64]:
     pose = matrix[:3].copy()
     pose.flags.writeable = False
     return pose
+
+
+def _refuse_scaled(matrix: NDArray[np.float64], field: str) -> None:
+    """Refuse a matrix [4, 4] whose last row is not (0, 0, 0, 1); Nerfstudio does not read that row.
+
+    Raises:
+        InputError: The row, and whether the matrix is scaled as a whole.
+    """
+    row = matrix[3]
+    if np.abs(row - (0, 0, 0, 1)).max() <= _LAST_ROW_TOLERANCE:
+        return
+    shown = f"the last row is ({', '.join(f'{x:.6g}' for x in row)}), not (0, 0, 0, 1)"
+    scale = float(row[3])
+    if not row[:3].any() and scale != 0.0:
+        with np.errstate(all="ignore"):
+            square = matrix[:3, :3].T @ matrix[:3, :3]
+            whole = np.abs(square / scale**2 - np.eye(3)).max() <= _ROTATION_TOLERANCE
+        fix = (
+            f"divide all 16 numbers by {scale:.6g}" if whole else "write 1 at its end; the rotation is not scaled by it"
+        )
+        raise InputError(f"a scaled matrix: {shown}", field=field, fix=fix)
+    raise InputError(shown, field=field, fix="write the matrix row by row, the position in the fourth column")
 
 
 def _perturbation(holder: dict[str, Any], field: str) -> Mapping[str, Any] | None:

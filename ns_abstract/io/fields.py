@@ -15,9 +15,9 @@ Fail = Callable[[str, str, str], InputError]
 
 
 def known(value: Mapping[str, Any], keys: Collection[str], prefix: str, fail: Fail) -> None:
-    """Refuse a key of ``value`` that is none of ``keys``."""
+    """Refuse a key of ``value`` that is none of ``keys``; editors write "$schema" at the top of a file."""
     for key in value:
-        if key not in keys:
+        if key not in keys and (prefix or key != "$schema"):
             raise fail(f"{prefix}{show(key).strip(chr(39))}", "unknown key", f"the keys are {', '.join(keys)}")
 
 

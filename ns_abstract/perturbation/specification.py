@@ -18,7 +18,8 @@ from ns_abstract.perturbation.variations import KEYS, VARIATIONS, SceneVariation
 TRANSLATIONS = ("x", "y", "z")
 ROTATIONS = ("yaw", "pitch", "roll")
 
-_KEYS = {
+#: Keys of the file, and what may stand there.
+FILE_KEYS = {
     "version": "1",
     "frame": '"camera" or "world"',
     "units": '"normalised" or "dataset"',
@@ -79,12 +80,24 @@ def load_perturbation(path: str | Path, *, dataset_scale: float = 1.0) -> Pertur
     """
     path = Path(path)
     root = load_json(path, "perturbation file")
-    if isinstance(root, dict) and "camera_path" in root and "perturbation" in root:
-        root = root["perturbation"]
     try:
+        if isinstance(root, dict) and "camera_path" in root and "perturbation" in root:
+            _refuse_overrides(root["camera_path"])
+            root = root["perturbation"]
         return parse_perturbation(root, dataset_scale=dataset_scale, field_prefix="", folder=path.parent)
     except InputError as error:
         raise error.within(path) from None
+
+
+def _refuse_overrides(entries: object) -> None:
+    """Refuse entries of a camera path that have sets of their own, which one set for all cannot hold."""
+    for k, entry in enumerate(entries if isinstance(entries, list) else ()):
+        if isinstance(entry, dict) and entry.get("perturbation") is not None:
+            raise InputError(
+                "an entry of this path has a set of its own",
+                field=f"camera_path[{k}].perturbation",
+                fix="give this file as the camera path, or the set for all entries in a file of its own",
+            )
 
 
 def parse_perturbation(
@@ -112,7 +125,7 @@ def parse_perturbation(
 
     if not isinstance(value, dict):
         raise fail("", f"found {show(value)}", "write an object")
-    known(value, _KEYS, "", fail)
+    known(value, FILE_KEYS, "", fail)
     if value.get("version", 1) != 1 or isinstance(value.get("version"), bool):
         raise fail("version", f"found {show(value['version'])}", "this program reads version 1")
     frame = _choice(value, "frame", ("camera", "world"), fail)
@@ -153,6 +166,9 @@ def perturbation_object(perturbation: Perturbation) -> dict[str, Any]:
     }
     if (orbit := perturbation.orbit) is not None:
         found["orbit"] = {"target": list(orbit.target), "axis": list(orbit.axis), "azimuth": list(orbit.azimuth)}
+    for name in ("hue", "saturation"):
+        if (shift := getattr(perturbation, name)) is not None:
+            found[name] = list(shift)
     if perturbation.scene:
         found["scene"] = [
             {"select": selection_object(entry.select)}
@@ -172,7 +188,7 @@ def _choice(value: Mapping[str, Any], name: str, choices: tuple[str, ...], fail:
 def _ranges(value: Mapping[str, Any], name: str, keys: tuple[str, ...], fail: Fail) -> dict[str, Range]:
     inner = value.get(name, {})
     if not isinstance(inner, dict):
-        raise fail(name, f"found {show(inner)}", f"write {_KEYS[name]}")
+        raise fail(name, f"found {show(inner)}", f"write {FILE_KEYS[name]}")
     known(inner, keys, f"{name}.", fail)
     return {key: interval(inner[key], f"{name}.{key}", fail) for key in keys if key in inner}
 
@@ -208,11 +224,11 @@ def _orbit(value: Mapping[str, Any], fail: Fail, turn: float) -> Orbit | None:
         return None
     inner = value["orbit"]
     if not isinstance(inner, dict):
-        raise fail("orbit", f"found {show(inner)}", f"write {_KEYS['orbit']}")
+        raise fail("orbit", f"found {show(inner)}", f"write {FILE_KEYS['orbit']}")
     known(inner, ("target", "axis", "azimuth"), "orbit.", fail)
     for name in ("target", "axis", "azimuth"):
         if name not in inner:
-            raise fail(f"orbit.{name}", "missing", f"write {_KEYS['orbit']}")
+            raise fail(f"orbit.{name}", "missing", f"write {FILE_KEYS['orbit']}")
     axis = vector(inner["axis"], "orbit.axis", fail)
     with np.errstate(over="ignore"):
         length = float(np.linalg.norm(axis))

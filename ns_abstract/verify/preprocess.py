@@ -14,6 +14,7 @@ import torch
 
 from ns_abstract.arithmetic.rounding import UNIT64
 from ns_abstract.io.errors import InputError
+from ns_abstract.io.fields import known
 from ns_abstract.io.jsonio import FIX_MODERATE, is_moderate, show
 
 if TYPE_CHECKING:
@@ -145,9 +146,7 @@ def parse_preprocess(value: Any) -> Preprocess:
 
     if not isinstance(value, dict):
         raise fail("", value, "write an object")
-    for key in value:
-        if key not in _KEYS:
-            raise InputError("unknown key", field=f"preprocess.{key}", fix=f"the keys are {', '.join(_KEYS)}")
+    known(value, _KEYS, "preprocess.", lambda name, problem, fix: InputError(problem, field=name, fix=fix))
 
     def numbers(name: str, count: int, default: tuple[float, ...]) -> tuple[float, ...]:
         found = value.get(name, list(default))

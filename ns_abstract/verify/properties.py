@@ -23,6 +23,7 @@ from ns_abstract.geometry.box import ParameterBox
 from ns_abstract.geometry.differentiable_pose import differentiable_pose
 from ns_abstract.geometry.poses import PoseSet
 from ns_abstract.io.errors import InputError
+from ns_abstract.io.fields import known
 from ns_abstract.io.jsonio import FIX_MODERATE, MODERATE, file_beside, is_moderate, is_number, show
 from ns_abstract.verify.preprocess import Preprocess, parse_preprocess
 from ns_abstract.verify.vnnlib import UnsafeSet, load_vnnlib
@@ -514,10 +515,7 @@ def parse_property(root: Any, folder: Path, input_shape: tuple[int, ...], output
         raise InputError(
             "missing" if kind is None else f"found {show(kind)}", field="type", fix=f"write one of {', '.join(_KEYS)}"
         )
-    allowed = (*_COMMON, *_KEYS[kind])
-    for key in root:
-        if key not in allowed:
-            raise InputError("unknown key", field=key, fix=f"the keys of a {kind} are {', '.join(allowed)}")
+    known(root, (*_COMMON, *_KEYS[kind]), "", lambda name, problem, fix: InputError(problem, field=name, fix=fix))
     preprocess = parse_preprocess(root.get("preprocess", {}))
     height, width = preprocess.size(input_shape)
     common: dict[str, Any] = {"preprocess": preprocess, "partitions": _partitions(root)}

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from ns_abstract.io.assumptions import Assumption
 from ns_abstract.io.errors import InputError, visible
 from ns_abstract.io.jsonio import is_number, show
-from ns_abstract.methods import runs
+from ns_abstract.methods import config_keys, runs
 from ns_abstract.methods.checkpoint import to_float32
 from ns_abstract.methods.nerf.scene import Encoding, FieldWeights, Layer, NerfScene
 from ns_abstract.methods.overrides import Overrides, chosen
@@ -64,7 +64,8 @@ def load_nerf(run: runs.RunConfig, overrides: Overrides | None = None) -> NerfSc
     overrides = overrides or Overrides()
     splats = ("rasterize_mode", "assume_splatfacto", "drop_nan_gaussians")
     overrides.refuse(splats, "is for splats, this run is a NeRF")
-    _refuse_unbounded(run)
+    _refuse_other_class(run)
+    unused = config_keys.check_keys(run, config_keys.VANILLA_NERF)
     color = _background(run, overrides)
     coarse_samples = run.integer("num_coarse_samples", 64, 1, _SAMPLES_LIMIT)
     importance_samples = run.integer("num_importance_samples", 128, 1, _SAMPLES_LIMIT)
@@ -98,7 +99,7 @@ def load_nerf(run: runs.RunConfig, overrides: Overrides | None = None) -> NerfSc
         dataparser=transform,
         name=run.experiment_name,
         source=str(checkpoint),
-        notes=notes,
+        notes=(*notes, *unused),
         assumptions=(
             color[0],
             runs.step_assumption(run, checkpoint, overrides.load_step),
@@ -125,8 +126,8 @@ class _ReadState(dict[str, Any]):
         return super().__getitem__(key)
 
 
-def _refuse_unbounded(run: runs.RunConfig) -> None:
-    """Refuse model classes and options of which the picture is not that of the two fields."""
+def _refuse_other_class(run: runs.RunConfig) -> None:
+    """Refuse model classes whose picture may not be that of the two fields."""
     target = runs.target_class(run)
     if target and target not in (_STOCK, _OURS):
         raise InputError(
@@ -134,15 +135,6 @@ def _refuse_unbounded(run: runs.RunConfig) -> None:
             file=run.file,
             field="pipeline.model._target",
             fix=_FIX,
-        )
-    for name, why in (("enable_temporal_distortion", "scenes that move"), ("use_integrated_encoding", "mip-NeRF")):
-        if run.model.get(name, False) is not False:
-            raise InputError(
-                f"{why} cannot be bounded", file=run.file, field=f"pipeline.model.{name}", fix="train without it"
-            )
-    if run.model.get("enable_collider", True) is not True:
-        raise InputError(
-            "rays without ends", file=run.file, field="pipeline.model.enable_collider", fix="train with a collider"
         )
 
 

@@ -18,7 +18,7 @@ from ns_abstract.io.errors import InputError, visible
 from ns_abstract.io.jsonio import file_size, show
 from ns_abstract.io.kinds import is_ply, refuse_other_kind
 from ns_abstract.io.memory import check_memory
-from ns_abstract.methods import runs
+from ns_abstract.methods import config_keys, runs
 from ns_abstract.methods.checkpoint import to_float32
 from ns_abstract.methods.overrides import MODES, Overrides, chosen
 from ns_abstract.methods.splat.ply_read import load_ply
@@ -146,6 +146,7 @@ def _load_run(run: runs.RunConfig, overrides: Overrides) -> SplatScene:
     whole = runs.read_model_state(checkpoint)
     state = _gaussian_state(whole, checkpoint, run.method_name)
     alone, whose = _check_model(run, whole, checkpoint, overrides.assume_splatfacto)
+    unused = config_keys.check_keys(run, config_keys.SPLATFACTO, refuse_unknown=not overrides.assume_splatfacto)
     arrays = _run_arrays(state, checkpoint, degree_stored, degree)
     fields = {"scales": "scales", "quats": "quats", "opacities": "opacities", "colours": "features_dc"}
     fields = {name: _run_field(field) for name, field in fields.items()}
@@ -165,7 +166,7 @@ def _load_run(run: runs.RunConfig, overrides: Overrides) -> SplatScene:
         name=run.experiment_name,
         source=str(checkpoint),
         **dropped,
-        notes=(*notes, *_notes(run), *coordinates_note(arrays.means, arrays.log_scales)),
+        notes=(*notes, *_notes(run), *unused, *coordinates_note(arrays.means, arrays.log_scales)),
         assumptions=(
             *choices,
             runs.step_assumption(run, checkpoint, overrides.load_step),
