@@ -15,10 +15,16 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
+from ns_abstract.arithmetic.network_charges import (
+    FLUSH,
+    FLUSHES,
+    UP,
+    VARIANCE_PASSES,
+    VARIANCE_TERMS,
+    gamma,
+)
 from ns_abstract.verify.network.layers import Linear, Weighted
 from ns_abstract.verify.network.rows import Rows, full, grid
-
-_UNIT = 2.0**-24
 
 
 def _none() -> Tensor:
@@ -44,6 +50,10 @@ class Sparse(Linear):
     @property
     def bias(self) -> Tensor | None:
         return self.offset
+
+    @cached_property
+    def gain(self) -> float:
+        return max(1, self.terms) * (1.0 + float(self.weight.abs().max()))
 
     @cached_property
     def _sizes(self) -> tuple[int, int]:
@@ -92,14 +102,13 @@ class Variance(Sparse):
     """Means of squares of centred numbers, the first input; the second holds the numbers themselves.
 
     A program may work the variance out as mean of squares minus square of the mean: what that loses is
-    relative to the numbers and not to their spread.
+    relative to the numbers and not to their spread (N11).
     """
 
     def spare(self, sizes: Sequence[Tensor]) -> Tensor | float:
-        # n + 4 roundings of either term
         squares = sizes[1].flatten(1).square()
         mean = torch.sparse.mm(self._absolute, squares.T).T.reshape(-1, *self.shape)
-        return 2.0 * (self.terms + 4) * _UNIT * mean
+        return gamma(VARIANCE_PASSES * (self.terms + VARIANCE_TERMS)) * mean * UP + FLUSHES * FLUSH
 
     def backward(self, rows: Rows) -> list[Rows]:
         found = super().backward(rows)
@@ -135,6 +144,10 @@ class Differences(Linear):
 
     axis: int = 0
     mixes: ClassVar[bool] = True
+
+    @cached_property
+    def gain(self) -> float:
+        return 2.0 * max(1, self.terms)
 
     @cached_property
     def _apart(self) -> Tensor:
