@@ -16,6 +16,7 @@ import pytest
 import torch
 from onnx_files import OnnxFile, attack, image_sets, members, session
 
+from ns_abstract.arithmetic import network_charges
 from ns_abstract.io.errors import InputError
 from ns_abstract.verify.network import (
     ImageSets,
@@ -30,7 +31,6 @@ from ns_abstract.verify.network import (
     outputs,
     pooling,
     propagation,
-    rounding,
     schedule,
     selection,
 )

@@ -1,7 +1,8 @@
 """Error constants of networks: what bounds of their outputs are charged with (docs/design.md, N2, N9-N11, N19-N22).
 
 Beside `ns_abstract.arithmetic.rounding`, which holds those of pictures, this is the only place that knows how large a
-rounding error is. The charges of a layer hold for every program that computes it as sums of products in float32 or better:
+rounding error is. The charges of a layer hold for every program that computes it as sums of products in float32 or
+better:
 
 * sums in any order and any tree, with or without fused multiply-add (N2, N20);
 * norms by two passes, by one (mean of squares less square of the mean) or by an update of both (N11);
@@ -47,9 +48,10 @@ SPARE = 24
 
 # ---------------------------------------------------------------- norms and maps (N11, N19)
 
-#: Of n + `VARIANCE_TERMS` roundings each: the mean of squares (1) and the square of the mean (2), of the mean square.
+#: Sums of n numbers, n + 4 roundings each (products, sums, two of 1/n, one to spare), that one pass makes an error of,
+#: relative to the mean square: the mean of squares (1) and the square of the mean (2); an update of mean and squares
+#: number by number loses 2.4 n + 17 units of it.
 VARIANCE_PASSES = 3
-VARIANCE_TERMS = 8
 #: Roundings of a position in a map that is resized: four of float32, relative to it and one.
 POSITION = 4.0 * UNIT
 #: What float32 makes of a cubic weight: about 112 roundings of 1, of a t^3 - 5 a t^2 + 8 a t - 4 a with t up to 2.

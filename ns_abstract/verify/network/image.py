@@ -29,7 +29,10 @@ class ImagePlanes(NamedTuple):
 
 
 def finite(images: ImageSets) -> tuple[list[Float64], np.ndarray]:
-    """The fields of image sets without numbers that are not finite, and [m] which cells have none, and none past N22's limit."""
+    """The fields of image sets without numbers that are not finite, and [m] which cells have no others to begin with.
+
+    Cells with numbers past the limit of N22 are not among these.
+    """
     fields = [np.asarray(getattr(images, name), np.float64) for name in images.__dataclass_fields__]
     good = np.logical_and.reduce([np.isfinite(f).reshape(images.count, -1).all(axis=1) for f in fields])
     good &= (fields[4] <= fields[5]).all(axis=1)

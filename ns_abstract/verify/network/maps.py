@@ -18,11 +18,14 @@ from torch.nn import functional
 from ns_abstract.arithmetic.network_charges import (
     FLUSH,
     FLUSHES,
+    FOLDING,
+    MAGNITUDES_UP,
+    OWN_LINE,
     UP,
     VARIANCE_PASSES,
-    VARIANCE_TERMS,
     gamma,
 )
+from ns_abstract.verify.network.forms import Form
 from ns_abstract.verify.network.layers import Linear, Weighted
 from ns_abstract.verify.network.rows import Rows, full, grid
 
@@ -106,9 +109,25 @@ class Variance(Sparse):
     """
 
     def spare(self, sizes: Sequence[Tensor]) -> Tensor | float:
-        squares = sizes[1].flatten(1).square()
-        mean = torch.sparse.mm(self._absolute, squares.T).T.reshape(-1, *self.shape)
-        return gamma(VARIANCE_PASSES * (self.terms + VARIANCE_TERMS)) * mean * UP + FLUSHES * FLUSH
+        return gamma(VARIANCE_PASSES * self.terms) * self._means(sizes[1].square()) * UP + FLUSHES * FLUSH
+
+    def least(self, squares: Form, x: Form, single: bool) -> Tensor:
+        """[m, *shape] what the variance is at least, with its rounding if ``single``, but for flushes (N11).
+
+        Squares are not negative, and one pass loses a part of the variance itself and of the square of the mean.
+        """
+        low = self._means(squares.interval.lower.clamp(min=0.0)) * (2.0 - MAGNITUDES_UP)
+        if not single:
+            return low
+        reach = self._means(x.reference + x.c).abs() + self._means(x.r)
+        reach = reach + self._means(x.a.flatten(0, 1)).unflatten(0, x.a.shape[:2]).abs().sum(1)
+        ends = torch.maximum(*(self._means(end).abs() for end in x.interval))
+        reach = torch.minimum(reach, ends) * MAGNITUDES_UP + OWN_LINE * self._means(x.interval.size)
+        relative = gamma((1 + VARIANCE_PASSES) * self.terms + FOLDING)
+        return low * (1.0 - relative) - gamma(VARIANCE_PASSES * self.terms) * reach.square() * UP
+
+    def _means(self, value: Tensor) -> Tensor:
+        return torch.sparse.mm(self._absolute, value.flatten(1).T).T.reshape(-1, *self.shape)
 
     def backward(self, rows: Rows) -> list[Rows]:
         found = super().backward(rows)

@@ -24,7 +24,7 @@ from ns_abstract.arithmetic.network_charges import (
 )
 from ns_abstract.verify.network.forms import Form
 from ns_abstract.verify.network.known import Known
-from ns_abstract.verify.network.layers import Activation, LeakyRelu, Linear, Sum
+from ns_abstract.verify.network.layers import Activation, LeakyRelu, Linear, Scale, Sum
 from ns_abstract.verify.network.maps import Variance
 from ns_abstract.verify.network.passages import Offered, Passage
 from ns_abstract.verify.network.products import Product
@@ -79,10 +79,11 @@ class Propagation:
             def end(moves: Tensor = moves) -> Tensor:
                 return (reference + moved[:, 0]).abs() + moved[:, 1:].abs().sum(1) + radius + moves
 
-            moves = moves + self.rounding.charge(k, sources, layer, charged, size, end) + layer.spare(sizes)
+            moves = moves + self.rounding.charge(k, sources, layer, charged, size, end)
+            moves = moves + layer.spare([f.interval.size for f in charged])
         extremes = self.rounding.groupings(k, sources, layer, sizes)
-        if self.known.single:
-            moves = moves + self.rounding.flushed(extremes, layer)
+        flushed = self.rounding.flushed(extremes, layer) if self.known.single else 0.0
+        moves = moves + flushed
         roundings = layer.row_terms + SPARE + max(self.network.readers[i] for i in sources)
         form = Form.ranged(reference, moved[:, 0], moved[:, 1:], radius + moves, active)
         self.known.good &= self.rounding.bounded(extremes).numpy()
@@ -104,8 +105,14 @@ class Propagation:
                 noise = noise + passage.noise[source]
             passage.noise[k] = noise * (UP + passage.sums)
         if isinstance(layer, Variance):
-            # no program's squares are negative, but one pass may end below zero by its charge (N11)
-            return self.known.within(form, -moves * UP - reference - OWN_FEW * reference.abs(), form.upper)
+            least = layer.least(inputs[0], inputs[1], self.known.single)
+            least = least - flushed - own * size - FLUSH * (layer.terms + 1) - OWN_LINE * reference.abs()
+            return self.known.within(form, least - reference, form.upper)
+        if isinstance(layer, Scale):
+            # what is known of single numbers, beside their form
+            ends = torch.stack([layer.factor * inputs[0].lower, layer.factor * inputs[0].upper])
+            room = moves + OWN_FEW * ends.abs().amax(0)
+            return self.known.within(form, ends.amin(0) - room, ends.amax(0) + room)
         return self.known.within(form, form.lower, form.upper)
 
     def activation(self, k: int, source: int, layer: Activation, z: Form) -> Form:

@@ -62,7 +62,7 @@ class Rounding:
         self.shifts: dict[int, Tensor] = {}
 
     def groupings(self, k: int, sources: tuple[int, ...], layer: Linear, sizes: list[Tensor]) -> Extremes:
-        """`Extremes` of linear node k, for inputs of at most ``sizes`` [m or 1, *input_shapes[i]]; kept for later ones."""
+        """`Extremes` of linear node k, for inputs of at most ``sizes`` [m or 1, *input_shapes[i]]; kept for readers."""
         most = [size.flatten(1).amax(1) for size in sizes]
         before = [self._before(i, size) for i, size in zip(sources, most, strict=True)]
         scales = sum(e.scales + size + 1.0 for e, size in zip(before, most, strict=True))
