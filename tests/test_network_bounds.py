@@ -30,7 +30,6 @@ from ns_abstract.verify.network import (
     load_network,
     outputs,
     pooling,
-    propagation,
     schedule,
     selection,
 )

@@ -125,10 +125,8 @@ def test_norms_over_wide_sets_stay_bounded(op: bool, tmp_path: Path) -> None:
 @pytest.mark.parametrize(("kernel", "stride", "dilation"), [(5, 4, 4), (5, 4, 6), (4, 2, 3), (6, 3, 2), (5, 6, 4)])
 def test_counts_of_dilated_sums(kernel: int, stride: int, dilation: int) -> None:
     """No number of a transposed convolution, or of a row through a convolution, is a sum of more products."""
-    ones = torch.ones((1, 1, 60), dtype=torch.float64)
-    met = functional.conv_transpose1d(
-        ones, torch.ones((1, 1, kernel), dtype=torch.float64), None, stride, 0, 0, 1, dilation
-    )
+    taps = torch.ones((1, 1, kernel))
+    met = functional.conv_transpose1d(torch.ones((1, 1, 60)), taps, None, stride, 0, 0, 1, dilation)
     most = int(met.max())
     weight = np.ones((1, 1, kernel, kernel))
     b = Builder(Path("net.onnx"), (1, 200, 200))
@@ -291,9 +289,8 @@ def test_shifts_that_are_folded_forwards(kind: str, tmp_path: Path) -> None:
     for k in range(n):
         bias, total = bias + weight[:, k] * np.float32(-1000.0), total + weight[:, k] * np.float32(x[k])
     y = total + bias
-    exact = [
-        sum(Fraction(float(w)) * (Fraction(float(v)) - 1000) for w, v in zip(row, x, strict=True)) for row in weight
-    ]
+    apart = [Fraction(float(v)) - 1000 for v in x]
+    exact = [sum(Fraction(float(w)) * v for w, v in zip(row, apart, strict=True)) for row in weight]
     # a folded program is off by far more than sums of the differences
     assert max(abs(float(Fraction(float(v)) - e)) for v, e in zip(y, exact, strict=True)) > 1e-3
     assert not outside(y[None].astype(np.float64), low, high).any()
@@ -302,10 +299,10 @@ def test_shifts_that_are_folded_forwards(kind: str, tmp_path: Path) -> None:
 # ---------------------------------------------------------------- networks at random
 
 
-@pytest.mark.parametrize("first", range(0, 200, 50))
+@pytest.mark.parametrize("first", range(0, 90, 30))
 def test_extreme_networks(first: int, tmp_path: Path) -> None:
     compared = finite = 0
-    for seed in range(first, first + 50):
+    for seed in range(first, first + 30):
         net, middle = random_network(seed)
         size = np.maximum(np.abs(middle), 0.5 * np.abs(middle).max())
         try:
@@ -314,13 +311,13 @@ def test_extreme_networks(first: int, tmp_path: Path) -> None:
                 compared, finite = compared + number, finite + bool(np.isfinite(low).all())
         except InputError:
             continue
-    assert compared > 50_000 and finite > 60
+    assert compared > 30_000 and finite > 30
 
 
-@pytest.mark.parametrize("first", range(0, 60, 20))
+@pytest.mark.parametrize("first", range(0, 16, 8))
 def test_extreme_maps(first: int, tmp_path: Path) -> None:
     compared = 0
-    for seed in range(first, first + 20):
+    for seed in range(first, first + 8):
         net, middle = random_maps(seed)
         try:
             for radius in (0.0, 0.02):
@@ -328,4 +325,4 @@ def test_extreme_maps(first: int, tmp_path: Path) -> None:
                 compared += within(net, tmp_path, middle - size, middle + size, seed)[2]
         except InputError:
             continue
-    assert compared > 100_000
+    assert compared > 10_000

@@ -6,10 +6,11 @@ from planted.fault import Fault, apply
 from planted.fields import FIELDS
 from planted.forms import FORMS
 from planted.loops import LOOPS
+from planted.networks import NETWORKS
 from planted.polynomials import POLYNOMIALS
 from planted.splats import SPLATS
 from planted.verdicts import VERDICTS
 
-FAULTS = (*FORMS, *POLYNOMIALS, *FIELDS, *VERDICTS, *CERTIFICATES, *SPLATS, *DEPTHS, *LOOPS)
+FAULTS = (*FORMS, *POLYNOMIALS, *FIELDS, *VERDICTS, *CERTIFICATES, *SPLATS, *DEPTHS, *LOOPS, *NETWORKS)
 
 __all__ = ["FAULTS", "Fault", "apply"]

@@ -76,6 +76,8 @@ HARD = 16.0 * UNIT
 PRODUCT = 2.0 * UNIT
 #: Flushed numbers of a function of one number: what it reads, its constants, up to two numbers between, its result.
 FUNCTION_FLUSHES = 8.0
+#: More than exp(-30), what a softmax's share is at most where its sum is cut off.
+LOST_SHARE = 2.0**-43
 #: Largest argument of an exponential; 2^126 is past exp(87).
 LARGEST_EXPONENT = 80.0
 #: How far a constant in a file may be from the number that it stands for, relative: 2 roundings, 2 to spare.
@@ -91,6 +93,10 @@ OWN_LINE = 32.0 * DOUBLE_UNIT
 OWN_SUMS = 2.0**7 * DOUBLE_UNIT
 #: torch's float64 functions are within 2^5 units; slopes and tangents of them multiply that by up to 2^4.
 OWN_FUNCTION = 2.0**9 * DOUBLE_UNIT
+#: Slopes of sigmoid and tanh, which torch gives within 2^-44, from below.
+SLOPES_DOWN = 1.0 - 2.0**23 * DOUBLE_UNIT
+#: A proof's last steps, joined sets, margins: up to 2^8 roundings of each term, twice.
+OWN_MARGIN = 2.0**9 * DOUBLE_UNIT
 #: Windows of maxima: sums of at most 2^8 terms, of 4 roundings, twice.
 OWN_WINDOW = 2.0**11 * DOUBLE_UNIT
 #: Radii: sums of at most 2^12 terms that are not negative, of two roundings each.
@@ -99,6 +105,13 @@ UP = 1.0 + 2.0**13 * DOUBLE_UNIT
 MAGNITUDES_UP = 1.0 + 2.0**25 * DOUBLE_UNIT
 #: Ends of images: an offset and a reference, one difference of them, 1 each; 2 to spare.
 OWN_IMAGE = 4.0 * DOUBLE_UNIT
+
+# ---------------------------------------------------------------- pictures before a network, exchanged ones (V10, N8)
+
+#: Roundings of one float32 evaluation of 255 x + 1/2, in steps: two of numbers below 256 (2^-16 each), and as many.
+STEP = 4.0 * 256.0 * UNIT
+#: A cell written for another verifier: columns beside those of its sum, and what may be flushed.
+WRITTEN_TERMS, WRITTEN_FLUSH = 8, 64.0 * FLUSH
 
 
 def gamma(count: Any, unit: float | None = None) -> Any:

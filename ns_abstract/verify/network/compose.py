@@ -10,7 +10,16 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 
-from ns_abstract.arithmetic.network_charges import LEAST_DIVISOR, NEAR, OVERFLOW, POLYNOMIAL, POSITION
+from ns_abstract.arithmetic.network_charges import (
+    FOLDING,
+    LEAST_DIVISOR,
+    LIBRARY,
+    NEAR,
+    OVERFLOW,
+    POLYNOMIAL,
+    POSITION,
+    gamma,
+)
 from ns_abstract.io.errors import InputError
 from ns_abstract.verify.network import curves
 from ns_abstract.verify.network.build import Builder
@@ -31,8 +40,6 @@ from ns_abstract.verify.network.maps import Differences, Resized, Sparse, Transp
 from ns_abstract.verify.network.maxima import MaxPool
 from ns_abstract.verify.network.products import Product
 
-#: Sums of exponentials one of which is exp(0) are no less than this, rounding included.
-_ONE_AND_MORE = 1.0 - 2.0**-10
 _ONES = (1, 1)
 #: A preference: limits of one side up to this are those of a ReLU, whose slopes are chosen (N14).
 _NEAR_ZERO = 2.0**16
@@ -85,7 +92,8 @@ class Composer(Builder):
             return -math.inf
         if isinstance(layer, Scale) and bool((layer.factor >= 0.0).all()):
             low = layer.factor * least[0] + (0.0 if layer.offset is None else layer.offset)
-            return self._rounded(float(low.min()), layer.offset is None or bool((layer.offset >= 0.0).all()))
+            positive = layer.offset is None or bool((layer.offset >= 0.0).all())
+            return self._rounded(float(low.min()), positive, layer.terms)
         if type(layer) is Linear or isinstance(layer, MaxPool):
             return least[0]
         positive = (
@@ -96,9 +104,9 @@ class Composer(Builder):
         return 0.0 if positive and min(least) >= 0.0 and layer.bias is None else -math.inf
 
     @staticmethod
-    def _rounded(value: float, positive: bool) -> float:
-        """A sum of numbers that are not negative keeps its size when it is rounded."""
-        return value * (1.0 - 2.0**-16) if positive and value >= 0.0 else -math.inf
+    def _rounded(value: float, positive: bool, terms: int) -> float:
+        """A sum of numbers that are not negative keeps its size, but for ``terms`` roundings and folding."""
+        return value * (1.0 - gamma(terms + FOLDING)) if positive and value >= 0.0 else -math.inf
 
     # ------------------------------------------------------------ functions of one number
 
@@ -540,9 +548,11 @@ class Composer(Builder):
         # a program subtracts the greatest first
         layer = Differences((shape,), (*shape, count), count + 4, 2 * count, axis % len(shape))
         apart = self._add(layer, x)
+        # sums of exponentials one of which is exp(0)
+        least = 1.0 - gamma(2 * count + FOLDING) - 2.0 * LIBRARY
         if logarithm:
             total = self.reduce(self.curve(apart, curves.Exp), [len(shape)], False, False)
-            return self.scale(self.curve(total, curves.Log, floor=_ONE_AND_MORE), -np.ones(()), None)
+            return self.scale(self.curve(total, curves.Log, floor=least), -np.ones(()), None)
         powers = self.curve(apart, curves.CappedExp)
         if dropped is not None:
             if bool(dropped.all(axis).any()):
@@ -553,7 +563,7 @@ class Composer(Builder):
             powers = self._selected(powers, np.moveaxis(~others | np.eye(count, dtype=bool), -2, axis))
         total = self.reduce(powers, [len(shape)], False, False)
         total = self.curve(total, curves.Clip, least=0.0, most=math.exp(curves.CAP))
-        shares = self.curve(total, curves.Share, floor=_ONE_AND_MORE)
+        shares = self.curve(total, curves.Share, floor=least)
         return shares if dropped is None else self._selected(shares, ~dropped)
 
     def _selected(self, x: int, kept: np.ndarray) -> int:

@@ -23,6 +23,7 @@ from ns_abstract.arithmetic.network_charges import (
     HARD,
     LARGEST_EXPONENT,
     LIBRARY,
+    LOST_SHARE,
     OWN_FUNCTION,
     QUOTIENT,
     ROOT,
@@ -372,8 +373,8 @@ class Share(Reciprocal):
     """The reciprocal of a sum of capped exponentials: a softmax (N11)."""
 
     def missing(self, lower: Tensor, upper: Tensor) -> Tensor | float:
-        # the share and this are both less than exp(-CAP) and its roundings there
-        return torch.where(upper > math.exp(CAP) * (1.0 - 2.0**-10), 2.0**-43, 0.0)
+        # the share and this are both less than exp(-CAP) and its roundings there; sums keep half their size
+        return torch.where(upper > 0.5 * math.exp(CAP), LOST_SHARE, 0.0)
 
 
 def _unknown(lower: Tensor, upper: Tensor, where: Tensor) -> tuple[Tensor, Tensor]:

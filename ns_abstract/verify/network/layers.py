@@ -29,6 +29,7 @@ from ns_abstract.arithmetic.network_charges import (
     OWN_FUNCTION,
     OWN_LINE,
     OWN_SUMS,
+    SLOPES_DOWN,
 )
 from ns_abstract.verify.network.rows import Rows, full, grid, interleave, unflatten
 
@@ -506,7 +507,7 @@ class _Sigmoidal(Activation):
 
     def band(self, lower: Tensor, upper: Tensor) -> Lines:
         # with the least slope in the interval (at an end), f(z) - slope z does not decrease
-        slope = torch.minimum(self.slope(lower), self.slope(upper)) * (1.0 - 2.0**-30)
+        slope = torch.minimum(self.slope(lower), self.slope(upper)) * SLOPES_DOWN
         room = self.room + OWN_LINE * slope * torch.maximum(lower.abs(), upper.abs())
         low, high = self.function(lower) - slope * lower, self.function(upper) - slope * upper
         return Lines(slope, low - room, slope, high + room)
