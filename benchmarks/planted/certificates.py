@@ -118,7 +118,7 @@ CERTIFICATES = (
     Fault(
         "registration: the worst place of the scene is not taken",
         _REGISTRATION, "RegisteredModel.bound",
-        "found.b - lost - 2.0**-48 * (np.abs(found.b) + lost)", "found.b", _PLACES,
+        "found.b - lost - OWN_LINE * (np.abs(found.b) + lost)", "found.b", _PLACES,
     ),
     Fault(
         "registration: pictures of one corner of the places",
