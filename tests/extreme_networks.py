@@ -327,7 +327,8 @@ def random_maps(seed: int) -> tuple[Extreme, Array]:
             layers.append(convolution(w, b, turned, strides=[s, s], dilations=[d, d]))
             size = (size - 1) * s + extent if turned else (size - extent) // s + 1
         elif kind == 3:
-            layers.append(batch_norm(*(_constants(rng, (2,), step) for _ in range(3)), np.abs(rng.normal(size=2))))
+            gain, shift, mean = (_constants(rng, (2,), step) for _ in range(3))
+            layers.append(batch_norm(gain, shift, mean, np.abs(rng.normal(size=2))))
         elif kind == 4:
             a, t = (_constants(rng, (2, 1, 1), step) for _ in range(2))
             layers.append(scale(a, t, bool(rng.random() < 0.5)))

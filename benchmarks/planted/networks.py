@@ -13,7 +13,7 @@ NETWORKS = (
         "Variance.least",
         "gamma(VARIANCE_PASSES * self.terms) * reach.square()",
         "0.0 * reach.square()",
-        _TESTS + "test_norms_of_one_pass[5.1-0.001-True]",
+        _TESTS + "test_norms_of_one_pass[15.1-0.001-True]",
     ),
     Fault(
         "norm: one pass is not charged",
@@ -37,7 +37,7 @@ NETWORKS = (
         "Composer.normalise",
         "self.curve(root, curves.Root, inverse=True)",
         "self.curve(root, curves.Root, floor=epsilon * (1.0 - 2.0**-16), inverse=True)",
-        _TESTS + "test_norms_of_one_pass[5.1-0.001-True]",
+        _TESTS + "test_norms_of_one_pass[15.1-0.001-True]",
     ),
     Fault(
         "transposed convolution: dilated taps are taken to be side by side",

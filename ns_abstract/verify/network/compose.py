@@ -353,8 +353,9 @@ class Composer(Builder):
             return -1
         for x, mean in (apart.inputs, apart.inputs[::-1]):
             behind = self._node(self._moved(mean))
-            mixes = behind is not None and isinstance(behind.layer, (Sparse, Convolution))
-            if mixes and self._moved(behind.inputs[0]) == self._moved(x):
+            if behind is None or not isinstance(behind.layer, (Sparse, Convolution)):
+                continue
+            if self._moved(behind.inputs[0]) == self._moved(x):
                 return x
         return -1
 
