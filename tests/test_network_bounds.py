@@ -16,6 +16,7 @@ import pytest
 import torch
 from onnx_files import OnnxFile, attack, image_sets, members, session
 
+from ns_abstract.arithmetic import network_charges
 from ns_abstract.io.errors import InputError
 from ns_abstract.verify.network import (
     ImageSets,
@@ -29,8 +30,6 @@ from ns_abstract.verify.network import (
     load_network,
     outputs,
     pooling,
-    propagation,
-    rounding,
     schedule,
     selection,
 )
@@ -805,7 +804,7 @@ def test_float32_rounding_is_needed(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     rows = np.concatenate([np.eye(4), -np.eye(4)])
     for charged in (True, False):
         if not charged:
-            for part in (forward, known, propagation, rounding):
+            for part in (forward, known, network_charges):
                 monkeypatch.setattr(part, "UNIT", 0.0)
         lower = bound_outputs(network, images, rows, np.zeros(8)).lower
         broken[charged] = int((lower > y @ rows.T).sum())

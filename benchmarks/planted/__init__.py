@@ -7,6 +7,7 @@ from planted.fields import FIELDS
 from planted.forms import FORMS
 from planted.inputs import INPUTS
 from planted.loops import LOOPS
+from planted.networks import NETWORKS
 from planted.polynomials import POLYNOMIALS
 from planted.processes import PROCESSES
 from planted.scenes import SCENES
@@ -14,7 +15,7 @@ from planted.splats import SPLATS
 from planted.verdicts import VERDICTS
 
 FAULTS = (
-    *FORMS, *POLYNOMIALS, *FIELDS, *VERDICTS, *CERTIFICATES, *SPLATS, *DEPTHS, *LOOPS, *INPUTS, *PROCESSES, *SCENES,
+    *FORMS, *POLYNOMIALS, *FIELDS, *VERDICTS, *CERTIFICATES, *SPLATS, *DEPTHS, *LOOPS, *INPUTS, *NETWORKS, *PROCESSES, *SCENES,
 )  # fmt: skip
 
 __all__ = ["FAULTS", "Fault", "apply"]

@@ -78,7 +78,7 @@ CERTIFICATES = (
     ),
     Fault(
         "families: what follows the parameters has no width",
-        "verify/network/propagation.py", "_tilted", "z.r * (1.0 + 2.0**-40)", "0.0 * z.r", _SHARED + "[]",
+        "verify/network/propagation.py", "_tilted", "z.r * UP", "0.0 * z.r", _SHARED + "[]",
     ),
     Fault(
         "families: what is between the offsets does not follow the parameters",
@@ -118,7 +118,7 @@ CERTIFICATES = (
     Fault(
         "registration: the worst place of the scene is not taken",
         _REGISTRATION, "RegisteredModel.bound",
-        "found.b - lost - 2.0**-48 * (np.abs(found.b) + lost)", "found.b", _PLACES,
+        "found.b - lost - OWN_LINE * (np.abs(found.b) + lost)", "found.b", _PLACES,
     ),
     Fault(
         "registration: pictures of one corner of the places",
@@ -139,15 +139,15 @@ CERTIFICATES = (
     ),
     Fault(
         "8 bits: linear sets are not widened",
-        _ROUNDED, "rounded_sets", "(0.5 + _STEP_ERROR) / _STEPS + _QUOTIENT", "0.0", _LEVELS,
+        _ROUNDED, "rounded_sets", "(0.5 + STEP) / _STEPS + QUOTIENT", "0.0", _LEVELS,
     ),
     Fault(
         "8 bits: the rounding of 255 x is not charged",
-        _ROUNDED, "", "_STEP_ERROR = 2.0**-14", "_STEP_ERROR = 0.0", _LEVELS,
+        "arithmetic/network_charges.py", "", "STEP = 4.0 * 256.0 * UNIT", "STEP = 0.0", _LEVELS,
     ),
     Fault(
         "8 bits: the level above the lower bound",
-        _ROUNDED, "rounded_sets", "np.ceil(low - 0.5 - _STEP_ERROR)", "np.floor(low + 0.5 + _STEP_ERROR)", _LEVELS,
+        _ROUNDED, "rounded_sets", "np.ceil(low - 0.5 - STEP)", "np.floor(low + 0.5 + STEP)", _LEVELS,
     ),
     Fault(
         "8 bits: bounds that cross become one level",
@@ -156,7 +156,7 @@ CERTIFICATES = (
     ),
     Fault(
         "preprocessing: rounding is not charged",
-        _PREPROCESS, "Preprocess.sets.move", "_ROUNDINGS * _UNIT32 * size + 8.0 * UNIT64 * np.abs(b * factor)",
+        _PREPROCESS, "Preprocess.sets.move", "_ROUNDINGS * UNIT32 * size + 8.0 * UNIT64 * np.abs(b * factor)",
         "0.0 * np.abs(b * factor)", _TIGHT,
     ),
     Fault(
@@ -203,8 +203,8 @@ CERTIFICATES = (
     Fault(
         "regression: lines forget their slope",
         _PROPERTIES, "RegressionClaim._cell",
-        "b - signs * truth.center - truth.radius - np.abs(slope).sum(axis=-1) - _CHARGE * size",
-        "b - signs * truth.center - truth.radius - _CHARGE * size", _FOLLOWS,
+        "b - signs * truth.center - truth.radius - np.abs(slope).sum(axis=-1) - OWN_MARGIN * size",
+        "b - signs * truth.center - truth.radius - OWN_MARGIN * size", _FOLLOWS,
     ),
     Fault(
         "regression: the tolerance is relative to the farthest truth",
@@ -227,7 +227,7 @@ CERTIFICATES = (
     Fault(
         "detection: other classes are left out of the score",
         _PROPERTIES, "DetectionClaim._candidate",
-        "score / (1.0 + np.exp(-lower[:, 1:count]).sum(axis=1)) * (1.0 - _CHARGE)", "score * (1.0 - _CHARGE)",
+        "score / (1.0 + np.exp(-lower[:, 1:count]).sum(axis=1)) * (1.0 - OWN_MARGIN)", "score * (1.0 - OWN_MARGIN)",
         _DETECTION + "[None-7]",
     ),
     Fault(

@@ -14,6 +14,7 @@ from functools import cached_property
 
 import numpy as np
 
+from ns_abstract.arithmetic.network_charges import OWN_MARGIN
 from ns_abstract.execution.ending import checkpoint
 from ns_abstract.geometry.box import ParameterBox
 from ns_abstract.verify.network import ImageSets, OutputBounds
@@ -44,8 +45,6 @@ _CUTS = 6
 _SPARE, _STEP = 0.35, 0.6
 #: How many margins a part may miss a proof by for rows of its own before the last activation to help.
 _NEAR = 0.5
-#: Room for rounding of the joined sets: a few operations on each term.
-_ROOM = 2.0**-44
 
 
 @dataclass(frozen=True)
@@ -500,7 +499,7 @@ def joined(parts: Sequence[PictureSets]) -> PictureSets:
     # rounding of places, shares and the sums above; ends of boxes are rounded relative to themselves, not to widths
     ends = (np.abs(lower) + np.abs(upper)).max(axis=0) / reach
     sizes = np.abs(b_low) + np.abs(b_high) + np.abs(a_low).sum(axis=-1) + np.abs(a_high).sum(axis=-1)
-    room = _ROOM * (sizes + (np.abs(common) * (2.0 + ends)).sum(axis=-1))
+    room = OWN_MARGIN * (sizes + (np.abs(common) * (2.0 + ends)).sum(axis=-1))
     return PictureSets(
         around,
         (common, (low - room).min(axis=0), common, (high + room).max(axis=0)),

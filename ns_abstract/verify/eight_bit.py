@@ -6,16 +6,13 @@ from typing import Literal
 
 import numpy as np
 
+from ns_abstract.arithmetic.network_charges import QUOTIENT, STEP
 from ns_abstract.arithmetic.outward import outward
 
 #: What a network is shown: the renderer's floats, or these rounded to multiples of 1/255.
 Picture = Literal["float", "8-bit"]
 
 _STEPS = 255.0
-#: Roundings of one float32 evaluation of 255 x + 1/2, in steps: two of numbers below 256, and as many to spare.
-_STEP_ERROR = 2.0**-14
-#: Relative error of the quotient n / 255 in float32, or of n times the rounded 1/255.
-_QUOTIENT = 2.0**-22
 
 
 def rounded(image: np.ndarray) -> np.ndarray:
@@ -41,12 +38,12 @@ def rounded_sets(
         The same for the rounded pictures, float32, rounded outward.
     """
     low, high = (np.clip(np.asarray(bound, np.float64), 0.0, 1.0) * _STEPS for bound in (lower, upper))
-    least = np.maximum(np.ceil(low - 0.5 - _STEP_ERROR), 0.0) / _STEPS * (1.0 - _QUOTIENT)
-    most = np.minimum(np.floor(high + 0.5 + _STEP_ERROR), _STEPS) / _STEPS * (1.0 + _QUOTIENT)
+    least = np.maximum(np.ceil(low - 0.5 - STEP), 0.0) / _STEPS * (1.0 - QUOTIENT)
+    most = np.minimum(np.floor(high + 0.5 + STEP), _STEPS) / _STEPS * (1.0 + QUOTIENT)
     # rounding must not hide what is wrong: bounds that cross are no numbers afterwards
     least = np.where(lower <= upper, least, np.nan)
     a_lower, b_lower, a_upper, b_upper = linear
-    half = (0.5 + _STEP_ERROR) / _STEPS + _QUOTIENT
+    half = (0.5 + STEP) / _STEPS + QUOTIENT
     below, above = np.asarray(b_lower, np.float64) - half, np.asarray(b_upper, np.float64) + half
     # comparisons that a NaN fails keep it, so that it is noticed
     flat_lower, flat_upper = least > below, most < above

@@ -18,6 +18,7 @@ import numpy as np
 import onnx
 from onnx import TensorProto, helper, numpy_helper
 
+from ns_abstract.arithmetic.network_charges import UNIT, WRITTEN_FLUSH, WRITTEN_TERMS
 from ns_abstract.io.atomic import write_atomic
 from ns_abstract.io.errors import InputError
 from ns_abstract.verify.network import ImageSets, load_network
@@ -26,7 +27,6 @@ from ns_abstract.verify.network.onnx_tensors import parse_model
 Form = Literal["slice", "gemm"]
 
 #: Roundoff of float32; the layer's constants and sums are rounded to it.
-_UNIT = 2.0**-24
 
 
 def write_vnnlib(
@@ -88,7 +88,7 @@ def _parallel(images: ImageSets) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     lost = np.abs(A.astype(np.float64) - slopes).sum(axis=1) + np.abs(c.astype(np.float64) - center)
     # what a float32 evaluation of the layer may lose, and rounding of the lines above
     size = np.abs(slopes).sum(axis=1) + np.abs(center) + radius
-    radius = radius + lost + (slopes.shape[1] + 8) * _UNIT * size + 2.0**-120
+    radius = radius + lost + (slopes.shape[1] + WRITTEN_TERMS) * UNIT * size + WRITTEN_FLUSH
     return A, c, np.nextafter(radius.astype(np.float32), np.float32(np.inf))
 
 

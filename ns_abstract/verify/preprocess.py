@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 
-from ns_abstract.arithmetic.rounding import UNIT64
+from ns_abstract.arithmetic.rounding import UNIT32, UNIT64
 from ns_abstract.io.errors import InputError
 from ns_abstract.io.fields import known
 from ns_abstract.io.jsonio import FIX_MODERATE, is_moderate, show
@@ -21,7 +21,6 @@ if TYPE_CHECKING:
     from ns_abstract.verify.network import ImageSets
 
 _KEYS = ("resize", "mean", "std", "layout", "channels", "range")
-_UNIT32 = 2.0**-24
 #: Roundings of one float32 evaluation of V1, in units of the largest numbers met, and some to spare.
 _ROUNDINGS = 10.0
 
@@ -105,7 +104,7 @@ class Preprocess:
         def move(b: np.ndarray, a: np.ndarray | None, sign: float) -> np.ndarray:
             b = self._ordered(b, 0)
             value = (b * scale + low - mean) / std
-            charge = _ROUNDINGS * _UNIT32 * size + 8.0 * UNIT64 * np.abs(b * factor)
+            charge = _ROUNDINGS * UNIT32 * size + 8.0 * UNIT64 * np.abs(b * factor)
             if a is not None:
                 charge = charge + 8.0 * UNIT64 * np.abs(a).sum(axis=-1)
             return self._flat(value + sign * charge, 0)

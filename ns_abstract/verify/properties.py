@@ -19,6 +19,7 @@ import numpy as np
 import torch
 
 from ns_abstract.arithmetic.forms import FormArray
+from ns_abstract.arithmetic.network_charges import OWN_MARGIN
 from ns_abstract.geometry.box import ParameterBox
 from ns_abstract.geometry.differentiable_pose import differentiable_pose
 from ns_abstract.geometry.poses import PoseSet
@@ -31,8 +32,6 @@ from ns_abstract.verify.vnnlib import UnsafeSet, load_vnnlib
 if TYPE_CHECKING:
     from ns_abstract.verify.network import OutputBounds
 
-#: Relative charge for the few float64 operations of a proof's last steps, each at most 2^-53 (V2).
-_CHARGE = 2.0**-44
 _CLASSES, _ANCHORS = 20, 5
 #: Anchors of the VOC TinyYOLO head, widths and heights in grid cells.
 ANCHORS = ((1.19, 1.98), (2.79, 4.59), (4.53, 8.92), (8.06, 5.29), (10.32, 10.65))
@@ -258,20 +257,20 @@ class RegressionClaim(Claim):
         a, b = a.reshape(2, count, -1), b.reshape(2, count)
         slope = a - signs[..., None] * truth.linear.T
         size = np.abs(b) + np.abs(truth.center) + np.abs(a).sum(-1) + np.abs(truth.linear).sum(0) + truth.radius
-        lines = b - signs * truth.center - truth.radius - np.abs(slope).sum(axis=-1) - _CHARGE * size
-        ranges -= _CHARGE * (np.abs(lower.reshape(2, count)) + np.abs(high) + np.abs(low))
+        lines = b - signs * truth.center - truth.radius - np.abs(slope).sum(axis=-1) - OWN_MARGIN * size
+        ranges -= OWN_MARGIN * (np.abs(lower.reshape(2, count)) + np.abs(high) + np.abs(low))
         # fmax: where one says nothing the other holds
         sides = np.fmax(ranges, lines)
         error = np.maximum(-sides[0], -sides[1]).clip(min=0.0)
         if self.absolute is not None and len(self.absolute) > 1:
-            return float((np.array(self.absolute) * (1.0 - _CHARGE) - error).min())
-        length = float(np.sqrt((error * error).sum())) * (1.0 + _CHARGE)
+            return float((np.array(self.absolute) * (1.0 - OWN_MARGIN) - error).min())
+        length = float(np.sqrt((error * error).sum())) * (1.0 + OWN_MARGIN)
         if self.absolute is not None:
-            return float(min(self.absolute)) * (1.0 - _CHARGE) - length * (1.0 + _CHARGE)
+            return float(min(self.absolute)) * (1.0 - OWN_MARGIN) - length * (1.0 + OWN_MARGIN)
         assert self.relative is not None
         nearest = np.where((low <= 0.0) & (high >= 0.0), 0.0, np.minimum(np.abs(low), np.abs(high)))
-        radius = self.relative * float(np.sqrt((nearest * nearest).sum())) * (1.0 - _CHARGE)
-        return radius - length - _CHARGE * (radius + length)
+        radius = self.relative * float(np.sqrt((nearest * nearest).sum())) * (1.0 - OWN_MARGIN)
+        return radius - length - OWN_MARGIN * (radius + length)
 
 
 @dataclass(frozen=True)
@@ -413,8 +412,8 @@ class DetectionClaim(Claim):
         if self.label is not None:
             count += _CLASSES - 1
             # probability 1 / (1 + sum of exp(other - own)), each difference at its largest
-            score = score / (1.0 + np.exp(-lower[:, 1:count]).sum(axis=1)) * (1.0 - _CHARGE)
-        margin = score - self.confidence - _CHARGE * (score + self.confidence)
+            score = score / (1.0 + np.exp(-lower[:, 1:count]).sum(axis=1)) * (1.0 - OWN_MARGIN)
+        margin = score - self.confidence - OWN_MARGIN * (score + self.confidence)
         if self.iou is None:
             return margin
         return np.minimum(margin, self._overlap(lower[:, count : count + 4], -lower[:, count + 4 :], number))
@@ -430,7 +429,7 @@ class DetectionClaim(Claim):
             centre_high = (_sigmoid(high[:, axis])[1] + step) * self.stride
             factor = ANCHORS[anchor][axis] * self.stride
             side_low, side_high = factor * np.exp(low[:, 2 + axis]), factor * np.exp(high[:, 2 + axis])
-            charge = _CHARGE * (centre_high + side_high + abs(self.box[axis]) + abs(self.box[2 + axis]))
+            charge = OWN_MARGIN * (centre_high + side_high + abs(self.box[axis]) + abs(self.box[2 + axis]))
             first, last = self.box[axis], self.box[2 + axis]
             # the overlap of an interval of centre c and side s with [first, last]: each of the four ways
             # that it can be cut is monotone in s and monotone in c
@@ -445,13 +444,13 @@ class DetectionClaim(Claim):
         reference = (self.box[2] - self.box[0]) * (self.box[3] - self.box[1])
         # common / (area + reference - common) grows with the common part and falls with the area
         union = area_high + reference - common
-        return common / (union * (1.0 + _CHARGE)) - self.iou - _CHARGE
+        return common / (union * (1.0 + OWN_MARGIN)) - self.iou - OWN_MARGIN
 
 
 def _sigmoid(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Lower and upper bounds of the sigmoid of float64 numbers."""
     value = 1.0 / (1.0 + np.exp(-x))
-    return value * (1.0 - _CHARGE), np.minimum(value * (1.0 + _CHARGE), 1.0)
+    return value * (1.0 - OWN_MARGIN), np.minimum(value * (1.0 + OWN_MARGIN), 1.0)
 
 
 @dataclass(frozen=True)

@@ -13,6 +13,7 @@ from dataclasses import dataclass, field
 import numpy as np
 import torch
 
+from ns_abstract.arithmetic.network_charges import OWN_LINE
 from ns_abstract.geometry.box import ParameterBox
 from ns_abstract.refine.protocol import Frame, Member, Score
 from ns_abstract.verify.network import ImageSets, OutputBounds, Substitution
@@ -125,5 +126,5 @@ class RegisteredModel:
         kept = images.dimensions - PLACE
         lost = np.abs(found.a[..., kept:]).sum(axis=-1)
         with np.errstate(invalid="ignore"):
-            b = found.b - lost - 2.0**-48 * (np.abs(found.b) + lost)
+            b = found.b - lost - OWN_LINE * (np.abs(found.b) + lost)
         return OutputBounds(found.lower, found.a[..., :kept], b)

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from ns_abstract.arithmetic.network_charges import DOUBLE_UNIT
 from ns_abstract.execution.ending import checkpoint
 from ns_abstract.verify.network.known import Known
 from ns_abstract.verify.network.layers import Activation, Linear
@@ -203,7 +204,7 @@ class Backward:
             box += two
             sizes += np.abs(one).sum((1, 2)) + np.abs(two).sum(1)
             total = np.zeros_like(total)
-        lost = self.known.flush[batch.cell] + 2.0**-52 * len(batch.waiting) * sizes
+        lost = self.known.flush[batch.cell] + 2.0 * DOUBLE_UNIT * len(batch.waiting) * sizes
         lost = lost[:, None] * np.array([-1.0, 1.0])
         plane[:, :, -1] += lost
         box += lost

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -11,6 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from ns_abstract.arithmetic.network_charges import LEAST_DIVISOR, OVERFLOW, gamma
 from ns_abstract.io.errors import InputError
 from ns_abstract.verify.network.graph import Layer, Network, Node, as_double, item
 from ns_abstract.verify.network.layers import (
@@ -102,8 +104,11 @@ class Builder:
             value = getattr(layer, name, None)
             if isinstance(value, Tensor) and not bool(torch.isfinite(value).all()):
                 raise InputError("holds numbers that are not finite", fix="train the network again")
-            if isinstance(value, Tensor) and value.numel() and float(value.abs().max()) >= 2.0**126:
+            if isinstance(value, Tensor) and value.numel() and float(value.abs().max()) >= OVERFLOW:
                 raise InputError("holds numbers that float32 cannot compute with", fix="train the network again")
+        if isinstance(layer, Linear):
+            # refuses sums of which no digit is left
+            gamma(layer.terms + layer.row_terms)
         self.nodes.append(Node("", "", layer, inputs))
         return len(self.nodes)
 
@@ -145,7 +150,8 @@ class Builder:
             raise InputError(f"bias {item(bias.shape)} of {weight.shape[0]} channels")
         size = self.check_window(x, weight.shape[2:], stride, dilation, pads)
         terms = int(np.prod(weight.shape[1:]))
-        taps = int(np.prod([-(-k // s) for k, s in zip(weight.shape[2:], stride, strict=True)]))
+        axes = zip(weight.shape[2:], stride, dilation, strict=True)
+        taps = int(np.prod([-(-k // (s // math.gcd(s, d))) for k, s, d in axes]))
         layer = Convolution(
             (self.shape(x),),
             (weight.shape[0], *size),
@@ -218,8 +224,8 @@ class Builder:
         )
         return self._add(layer, x)
 
-    def scale(self, x: int, factor: np.ndarray, offset: np.ndarray | None) -> int:
-        """``factor * x + offset`` with constants that are spread over a batch of items."""
+    def scale(self, x: int, factor: np.ndarray, offset: np.ndarray | None, parts: float = 0.0) -> int:
+        """``factor * x + offset`` with constants that are spread over a batch of items; ``parts``: see `Scale`."""
         shape = self.shape(x)
         self.reserve(2.0 * float(np.prod(shape)))
         spread = []
@@ -232,7 +238,7 @@ class Builder:
             except ValueError:
                 raise InputError(f"constant {item(constant.shape)} with an item {item(shape)}") from None
             spread.append(as_double(fitted))
-        return self._add(Scale((shape,), shape, 3 + self._fused(x), 1, spread[0], spread[1]), x)
+        return self._add(Scale((shape,), shape, 3 + self._fused(x), 1, spread[0], spread[1], parts), x)
 
     def _fused(self, *inputs: int) -> int:
         """Roundings of sums that a program may start with what is added behind them (N2)."""
@@ -248,11 +254,16 @@ class Builder:
         if any(v.shape != shape[:1] for v in parts):
             raise InputError(f"statistics {[item(v.shape) for v in parts]} of {shape[0]} channels")
         scale, shift, mean, variance = (v.reshape(-1, *[1] * (len(shape) - 1)) for v in parts)
-        if not (variance + epsilon > 0.0).all():
-            raise InputError("variance + epsilon is not positive", fix="train the network again")
+        if not (variance + epsilon > LEAST_DIVISOR).all():
+            raise InputError("variance + epsilon is not positive, or below 1e-30", fix="train the network again")
+        if not all(np.abs(v).max(initial=0.0) < OVERFLOW for v in (scale, shift, mean, variance)):
+            raise InputError("holds numbers that float32 cannot compute with", fix="train the network again")
+        root = 1.0 / np.sqrt(variance + epsilon)
         factor = scale / np.sqrt(variance + epsilon)
+        # a program may take the mean away, divide and multiply one after the other, or put the factors together
+        grown = float(np.prod([1.0 + np.abs(v).max(initial=0.0) for v in (scale, mean, root)]))
         # shift - mean * factor may cancel: its parts are charged one after the other
-        index = self.scale(x, factor, -mean * factor)
+        index = self.scale(x, factor, -mean * factor, grown)
         return self.scale(index, np.ones(()), shift)
 
     def sum(self, inputs: tuple[int, ...], signs: tuple[int, ...], exact: bool = False) -> int:

@@ -10,6 +10,16 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 
+from ns_abstract.arithmetic.network_charges import (
+    FOLDING,
+    LEAST_DIVISOR,
+    LIBRARY,
+    NEAR,
+    OVERFLOW,
+    POLYNOMIAL,
+    POSITION,
+    gamma,
+)
 from ns_abstract.io.errors import InputError
 from ns_abstract.verify.network import curves
 from ns_abstract.verify.network.build import Builder
@@ -30,17 +40,11 @@ from ns_abstract.verify.network.maps import Differences, Resized, Sparse, Transp
 from ns_abstract.verify.network.maxima import MaxPool
 from ns_abstract.verify.network.products import Product
 
-#: Sums of exponentials one of which is exp(0) are no less than this, rounding included.
-_ONE_AND_MORE = 1.0 - 2.0**-10
-#: How far a float32 constant may be from the number that it stands for, relative.
-_NEAR = 2.0**-22
 _ONES = (1, 1)
+#: A preference: limits of one side up to this are those of a ReLU, whose slopes are chosen (N14).
+_NEAR_ZERO = 2.0**16
 #: Entries of a matrix that takes means away; where it would have more, the mean is a layer of its own.
 _CENTRED_AT_ONCE = 1 << 16
-#: Roundings of a position in a map that is resized: four of float32, relative to it and one.
-_POSITION = 4.0 * 2.0**-24
-#: What float32 makes of a cubic weight: about 112 roundings of 1, of a t^3 - 5 a t^2 + 8 a t - 4 a with t up to 2.
-_POLYNOMIAL = 2.0**-17
 
 
 class Composer(Builder):
@@ -79,13 +83,17 @@ class Composer(Builder):
         if isinstance(layer, curves.Clip):
             return layer.least
         least = [self.floor(k, depth - 1) for k in node.inputs]
-        if isinstance(layer, (Product, Variance)):
-            return 0.0 if (min(least) >= 0.0 or isinstance(layer, Variance)) else -math.inf
+        if isinstance(layer, Product):
+            return 0.0 if min(least) >= 0.0 else -math.inf
+        if isinstance(layer, Variance):
+            # one pass may end below zero (N11)
+            return -math.inf
         if min(least) == -math.inf or isinstance(layer, Activation):
             return -math.inf
         if isinstance(layer, Scale) and bool((layer.factor >= 0.0).all()):
             low = layer.factor * least[0] + (0.0 if layer.offset is None else layer.offset)
-            return self._rounded(float(low.min()), layer.offset is None or bool((layer.offset >= 0.0).all()))
+            positive = layer.offset is None or bool((layer.offset >= 0.0).all())
+            return self._rounded(float(low.min()), positive, layer.terms)
         if type(layer) is Linear or isinstance(layer, MaxPool):
             return least[0]
         positive = (
@@ -96,9 +104,9 @@ class Composer(Builder):
         return 0.0 if positive and min(least) >= 0.0 and layer.bias is None else -math.inf
 
     @staticmethod
-    def _rounded(value: float, positive: bool) -> float:
-        """A sum of numbers that are not negative keeps its size when it is rounded."""
-        return value * (1.0 - 2.0**-16) if positive and value >= 0.0 else -math.inf
+    def _rounded(value: float, positive: bool, terms: int) -> float:
+        """A sum of numbers that are not negative keeps its size, but for ``terms`` roundings and folding."""
+        return value * (1.0 - gamma(terms + FOLDING)) if positive and value >= 0.0 else -math.inf
 
     # ------------------------------------------------------------ functions of one number
 
@@ -110,18 +118,23 @@ class Composer(Builder):
         """``min(max(x, least), most)``, with infinite limits, too."""
         if not least <= most:
             raise InputError(f"clips to [{least}, {most}]", fix="the limits must not cross")
-        large = 2.0**100
-        if least <= -large and most >= large:
+        if least >= OVERFLOW or most <= -OVERFLOW:
+            raise InputError(f"clips to [{least}, {most}]", fix="float32 cannot compute with such numbers")
+        # numbers that are bounded at all never reach limits past that (N22)
+        open_below, open_above = least <= -OVERFLOW, most >= OVERFLOW
+        if open_below and open_above:
             return x
         if least == most:
             return self.scale(x, np.zeros(()), np.asarray(least))
-        if most >= large or least <= -large:
-            sign, limit = (1.0, least) if most >= large else (-1.0, most)
+        limit = least if open_above else most
+        if (open_below or open_above) and abs(limit) <= _NEAR_ZERO:
+            sign = 1.0 if open_above else -1.0
             moved = x if limit == 0.0 and sign > 0.0 else self.scale(x, np.asarray(sign), np.asarray(-sign * limit))
             if limit == 0.0 and sign > 0.0:
                 return self.leaky_relu(moved, 0.0)
             return self.scale(self.leaky_relu(moved, 0.0), np.asarray(sign), np.asarray(limit))
-        return self.curve(x, curves.Clip, least=least, most=most)
+        bounds = -math.inf if open_below else least, math.inf if open_above else most
+        return self.curve(x, curves.Clip, least=bounds[0], most=bounds[1])
 
     def prelu(self, x: int, slope: np.ndarray) -> int:
         """``max(x, 0) + slope min(x, 0)`` as ``slope x + (1 - slope) relu(x)``."""
@@ -145,7 +158,8 @@ class Composer(Builder):
 
     def _above(self, x: int) -> float:
         found = self.floor(x)
-        return found if found > 0.0 else -math.inf
+        # a smaller one may be flushed to zero
+        return found if found > LEAST_DIVISOR else -math.inf
 
     def reciprocal(self, x: int) -> int:
         """``1 / x``; 1 / sqrt is one function."""
@@ -172,7 +186,7 @@ class Composer(Builder):
         # softplus is less than 2^-23 from its argument there
         argument, other = self._affine(node.inputs[0]), self._affine(compared)
         same = argument[0] == other[0] == root and argument[2] == other[2] == 0.0 and argument[1] == other[1]
-        return same and abs(t * argument[1] - s) <= _NEAR * abs(s)
+        return same and abs(t * argument[1] - s) <= NEAR * abs(s)
 
     # ------------------------------------------------------------ two values that depend on the image
 
@@ -236,12 +250,12 @@ class Composer(Builder):
             return 0
         if isinstance(layer, Sigmoid) and c == 0.0 and shift == 0.0 and t != 0.0:
             return self._times(self.curve(self._times(root, t), curves.Silu), s * factor / t)
-        if isinstance(layer, curves.Erf) and c == 0.0 and abs(t * math.sqrt(2.0) - 1.0) < _NEAR and shift == factor:
+        if isinstance(layer, curves.Erf) and c == 0.0 and abs(t * math.sqrt(2.0) - 1.0) < NEAR and shift == factor:
             return self._times(self.curve(root, curves.Gelu), 2.0 * s * factor)
         if isinstance(layer, curves.Clip) and shift == 0.0 and layer.least == 0.0:
             # clip(a x + b, 0, m) of the root
             a, b = layer.factor * t / layer.most, (layer.factor * c + layer.offset) / layer.most
-            if abs(6.0 * a - 1.0) < _NEAR and abs(2.0 * b - 1.0) < _NEAR:
+            if abs(6.0 * a - 1.0) < NEAR and abs(2.0 * b - 1.0) < NEAR:
                 return self._times(self.curve(root, curves.HardSwish), s * factor * layer.most)
         return 0
 
@@ -302,13 +316,54 @@ class Composer(Builder):
         count = int(np.prod([shape[k] for k in axes]))
         kept = tuple(1 if k in axes else n for k, n in enumerate(shape))
         final = tuple(n for k, n in enumerate(shape) if k not in axes)
-        if mean and len(shape) == 3 and tuple(sorted(axes)) == (1, 2):
+        centred = self._centred(x) if mean else -1
+        if centred >= 0:
+            # programs compute such a norm in one pass, too
+            group = np.broadcast_to(np.arange(int(np.prod(kept))).reshape(kept), shape)
+            index = self._variance(x, centred, kept, group, count)
+        elif mean and len(shape) == 3 and tuple(sorted(axes)) == (1, 2):
             index = self.average_pool(x, shape[1:], _ONES, (0, 0, 0, 0), True)
         else:
             source = self.positions(x)
             to = np.broadcast_to(np.arange(int(np.prod(kept))).reshape(kept), shape)
             index = self._sparse(x, kept, to, source, 1.0 / count if mean else 1.0)
         return index if keep else self.reshape(index, final or (1,))
+
+    def _variance(self, squares: int, x: int, kept: Shape, group: np.ndarray, count: int) -> int:
+        """Means of ``squares`` of the centred numbers of ``x`` over groups [size]: one pass is charged (N11)."""
+        size = int(np.prod(self.shape(x)))
+        layer = Variance(
+            (self.shape(squares), self.shape(x)),
+            tuple(kept),
+            count + 4,
+            1,
+            torch.from_numpy(group.reshape(-1).copy()),
+            torch.from_numpy(np.arange(size)),
+            torch.full((size,), 1.0 / count, dtype=torch.float64),
+        )
+        return self._add(layer, squares, x)
+
+    def _centred(self, squares: int) -> int:
+        """The node whose numbers less a mean of them are squared in node ``squares``; -1: none."""
+        node = self._node(squares)
+        if node is None or not isinstance(node.layer, curves.Power) or node.layer.exponent != 2:
+            return -1
+        apart = self._node(node.inputs[0])
+        if apart is None or not isinstance(apart.layer, Sum) or sorted(apart.layer.signs) != [-1, 1]:
+            return -1
+        for x, mean in (apart.inputs, apart.inputs[::-1]):
+            behind = self._node(self._moved(mean))
+            if behind is None or not isinstance(behind.layer, (Sparse, Convolution)):
+                continue
+            if self._moved(behind.inputs[0]) == self._moved(x):
+                return x
+        return -1
+
+    def _moved(self, index: int) -> int:
+        """The node whose numbers node ``index`` holds in another shape or order, or repeated."""
+        while index and (type(self._node(index).layer) is Linear or isinstance(self._node(index).layer, Gather)):
+            index = self._node(index).inputs[0]
+        return index
 
     def greatest(self, x: int, axes: Sequence[int], keep: bool, most: bool = True) -> int:
         """Maximum or minimum over axes of the item."""
@@ -410,7 +465,8 @@ class Composer(Builder):
             if min(s, d, kernel) < 1 or min(pads) < 0 or min(more) < 0 or max(more) > 1 << 20:
                 raise InputError(f"strides {list(stride)}, dilations {list(dilation)}, pads {list(pads)}")
             sizes.append((shape[1 + k] - 1) * s + (kernel - 1) * d + 1 - pads[k] - pads[2 + k] + more[k])
-            taps *= -(-kernel // s)
+            # taps of one place are that many steps of the stride apart
+            taps *= -(-kernel // (s // math.gcd(s, d)))
         self._check_size(sizes)
         layer = TransposedConvolution(
             (shape,),
@@ -460,8 +516,8 @@ class Composer(Builder):
 
     def normalise(self, x: int, axes: Sequence[int], epsilon: float) -> int:
         """``(x - mean) / sqrt(variance + epsilon)`` over axes of the item (N11)."""
-        if not epsilon > 0.0:
-            raise InputError(f"attribute epsilon = {epsilon} is not supported", fix="it must be positive")
+        if not epsilon > LEAST_DIVISOR:
+            raise InputError(f"attribute epsilon = {epsilon} is not supported", fix="give at least 1e-30")
         shape = self.shape(x)
         kept = tuple(1 if k in axes else n for k, n in enumerate(shape))
         group = np.broadcast_to(np.arange(int(np.prod(kept))).reshape(kept), shape).reshape(-1)
@@ -478,22 +534,9 @@ class Composer(Builder):
             mean = self.spread(self._sparse(x, kept, group, np.arange(size), 1.0 / count), shape)
             centred = self.sum((x, mean), (1, -1))
         squares = self.curve(centred, curves.Power, exponent=2)
-        positions = np.arange(size)
-        variance = self._add(
-            Variance(
-                (shape, shape),
-                kept,
-                count + 4,
-                1,
-                torch.from_numpy(group.copy()),
-                torch.from_numpy(positions),
-                torch.full((size,), 1.0 / count, dtype=torch.float64),
-            ),
-            squares,
-            x,
-        )
+        variance = self._variance(squares, x, kept, group, count)
         root = self.scale(variance, np.ones(()), np.asarray(epsilon))
-        inverse = self.curve(root, curves.Root, floor=epsilon * (1.0 - 2.0**-16), inverse=True)
+        inverse = self.curve(root, curves.Root, inverse=True)
         return self.product(centred, self.spread(inverse, shape))
 
     def softmax(self, x: int, axis: int, logarithm: bool = False, dropped: np.ndarray | None = None) -> int:
@@ -506,9 +549,11 @@ class Composer(Builder):
         # a program subtracts the greatest first
         layer = Differences((shape,), (*shape, count), count + 4, 2 * count, axis % len(shape))
         apart = self._add(layer, x)
+        # sums of exponentials one of which is exp(0)
+        least = 1.0 - gamma(2 * count + FOLDING) - 2.0 * LIBRARY
         if logarithm:
             total = self.reduce(self.curve(apart, curves.Exp), [len(shape)], False, False)
-            return self.scale(self.curve(total, curves.Log, floor=_ONE_AND_MORE), -np.ones(()), None)
+            return self.scale(self.curve(total, curves.Log, floor=least), -np.ones(()), None)
         powers = self.curve(apart, curves.CappedExp)
         if dropped is not None:
             if bool(dropped.all(axis).any()):
@@ -519,7 +564,7 @@ class Composer(Builder):
             powers = self._selected(powers, np.moveaxis(~others | np.eye(count, dtype=bool), -2, axis))
         total = self.reduce(powers, [len(shape)], False, False)
         total = self.curve(total, curves.Clip, least=0.0, most=math.exp(curves.CAP))
-        shares = self.curve(total, curves.Share, floor=_ONE_AND_MORE)
+        shares = self.curve(total, curves.Share, floor=least)
         return shares if dropped is None else self._selected(shares, ~dropped)
 
     def _selected(self, x: int, kept: np.ndarray) -> int:
@@ -610,10 +655,10 @@ def interpolation(
     for tap, weight in zip(taps, weights, strict=True):
         np.add.at(matrix, (rows, np.clip(low + tap, 0, size - 1)), weight)
     # scale, quotient or product of a reciprocal, difference; exact where the scale is a power of two
-    moved = np.zeros(out) if np.frexp(step)[0] in (0.0, 0.5) else _POSITION * (np.abs(place) + 1.0)
+    moved = np.zeros(out) if np.frexp(step)[0] in (0.0, 0.5) else POSITION * (np.abs(place) + 1.0)
     steepest = 2.0 if cubic else 1.0
     # weights of a known place are exact but for the polynomials'
-    own = _POLYNOMIAL if cubic else 0.0
+    own = POLYNOMIAL if cubic else 0.0
     for tap in range(min(taps) - 1, max(taps) + 2):
         # one beside those of a place counts where the place may be past a number
         inside = min(taps) <= tap <= max(taps)

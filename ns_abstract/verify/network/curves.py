@@ -16,6 +16,19 @@ from typing import ClassVar, NamedTuple
 import torch
 from torch import Tensor
 
+from ns_abstract.arithmetic.network_charges import (
+    AFFINE,
+    FLUSH,
+    FUNCTION_FLUSHES,
+    HARD,
+    LARGEST_EXPONENT,
+    LIBRARY,
+    LOST_SHARE,
+    OWN_FUNCTION,
+    QUOTIENT,
+    ROOT,
+    SQUARE,
+)
 from ns_abstract.verify.network.layers import Activation, Lines
 
 #: Intervals worked on at a time.
@@ -26,11 +39,9 @@ CAP = 30.0
 _PARTS = 16
 #: Steps towards the best slope; any slope is sound.
 _STEPS = 6
-#: torch's float64 functions and slopes are relative to the largest within this.
-_OWN = 2.0**-44
-#: A float32 library's exponentials, logarithms and error functions are taken to be within this.
-_ASSUMED = 2.0**-20
-#: Better bounds of the input are asked for where the lines are this part of the width apart.
+#: What a number that is flushed to zero may change in a function whose slopes are 1 at most.
+_FLUSHED = FUNCTION_FLUSHES * FLUSH
+#: A preference: better bounds of the input are asked for where the lines are this part of the width apart.
 _APART = 2.0**-6
 
 
@@ -85,7 +96,7 @@ class Curve(Activation):
         bend = bends[torch.bucketize((0.5 * (z[1:] + z[:-1])).contiguous(), breaks)]
         value = self.function(z)
         slope = self.slope(z) if any(self.bends) else torch.zeros_like(z)
-        size = value.abs().amax(0) + (slope.abs().amax(0) + 1.0) * width + _OWN
+        size = value.abs().amax(0) + (slope.abs().amax(0) + 1.0) * width + OWN_FUNCTION
         return _Cuts(z, value, slope, bend, size)
 
     @staticmethod
@@ -100,7 +111,7 @@ class Curve(Activation):
         part = torch.where(inside, b / (b - a), torch.ones_like(a))
         dip = part * value[:-1] + (1.0 - part) * value[1:] + part * a * (cuts.z[1:] - cuts.z[:-1])
         least = torch.where(inside, torch.minimum(ends, dip), ends).amin(0)
-        room = _OWN * (cuts.size + line.abs() * cuts.z.abs().amax(0))
+        room = OWN_FUNCTION * (cuts.size + line.abs() * cuts.z.abs().amax(0))
         return -side * (least - room)
 
     def _tangent(self, cuts: _Cuts, side: float) -> Tensor:
@@ -156,10 +167,10 @@ class Curve(Activation):
         middle = 0.5 * (low + high)
         slope, value = self.straight(middle), self.function(middle)
         # a stored kink is off by a rounding
-        room = _OWN * (value.abs() + self.steepest * _size(low, high) + _OWN)
+        room = OWN_FUNCTION * (value.abs() + self.steepest * _size(low, high) + OWN_FUNCTION)
         if work == self._level:
             ends = self.function(low), self.function(high)
-            room = room + _OWN * _size(*ends)
+            room = room + OWN_FUNCTION * _size(*ends)
             found = [torch.zeros_like(low), torch.minimum(*ends) - room, slope, torch.maximum(*ends) + room]
         else:
             offset = value - slope * middle
@@ -246,10 +257,10 @@ class Clip(Curve):
         return torch.where((z >= low) & (z <= high), torch.full_like(z, self.factor), torch.zeros_like(z))
 
     def error(self, lower: Tensor, upper: Tensor) -> Tensor | float:
+        flushed = _FLUSHED * (1.0 + self.factor + _size(lower, upper))
         if (self.factor, self.offset) == (1.0, 0.0):
-            return 0.0
-        # constants, product and sum are rounded
-        return 2.0**-22 * (self.factor * _size(lower, upper) + abs(self.offset))
+            return flushed
+        return AFFINE * (self.factor * _size(lower, upper) + abs(self.offset)) + flushed
 
 
 @dataclass(frozen=True, eq=False)
@@ -269,6 +280,9 @@ class Abs(Curve):
 
     def straight(self, z: Tensor) -> Tensor:
         return torch.where(z >= 0.0, torch.ones_like(z), -torch.ones_like(z))
+
+    def error(self, lower: Tensor, upper: Tensor) -> Tensor | float:
+        return _FLUSHED
 
 
 # ---------------------------------------------------------------- algebraic
@@ -293,7 +307,7 @@ class HardSwish(Curve):
         return (2.0 * z + 3.0) / 6.0
 
     def error(self, lower: Tensor, upper: Tensor) -> Tensor | float:
-        return 2.0**-20 * _size(lower, upper)
+        return HARD * _size(lower, upper) + _FLUSHED
 
 
 @dataclass(frozen=True, eq=False)
@@ -318,8 +332,9 @@ class Power(Curve):
 
     def error(self, lower: Tensor, upper: Tensor) -> Tensor | float:
         # a square is one product; others may be a library's power
-        relative = 2.0**-23 if self.exponent == 2 else _ASSUMED
-        return relative * _size(lower, upper) ** self.exponent + 2.0**-126
+        relative = SQUARE if self.exponent == 2 else LIBRARY
+        size = _size(lower, upper)
+        return relative * size**self.exponent + _FLUSHED * (1.0 + size)
 
 
 @dataclass(frozen=True, eq=False)
@@ -351,15 +366,15 @@ class Reciprocal(Curve):
 
     def error(self, lower: Tensor, upper: Tensor) -> Tensor | float:
         lower, upper = self._inside(lower, upper)
-        return 2.0**-22 / torch.minimum(lower.abs(), upper.abs()) + 2.0**-126
+        return QUOTIENT / torch.minimum(lower.abs(), upper.abs()) + _FLUSHED
 
 
 class Share(Reciprocal):
     """The reciprocal of a sum of capped exponentials: a softmax (N11)."""
 
     def missing(self, lower: Tensor, upper: Tensor) -> Tensor | float:
-        # the share and this are both less than exp(-CAP) and its roundings there
-        return torch.where(upper > math.exp(CAP) * (1.0 - 2.0**-10), 2.0**-43, 0.0)
+        # the share and this are both less than exp(-CAP) and its roundings there; sums keep half their size
+        return torch.where(upper > 0.5 * math.exp(CAP), LOST_SHARE, 0.0)
 
 
 def _unknown(lower: Tensor, upper: Tensor, where: Tensor) -> tuple[Tensor, Tensor]:
@@ -390,11 +405,12 @@ class Root(Curve):
         return -0.5 * z.rsqrt() / z if self.inverse else 0.5 * z.rsqrt()
 
     def _cuts(self, lower: Tensor, upper: Tensor) -> _Cuts:
-        return super()._cuts(*_unknown(lower, upper, lower <= 0.0))
+        # a number below may be flushed to zero, whose root is far from its own
+        return super()._cuts(*_unknown(lower, upper, ~(lower >= FLUSH)))
 
     def error(self, lower: Tensor, upper: Tensor) -> Tensor | float:
         lower, upper = self._inside(lower, upper)
-        return 2.0**-21 * (lower.rsqrt() if self.inverse else upper.sqrt())
+        return ROOT * (lower.rsqrt() if self.inverse else upper.sqrt()) + _FLUSHED
 
 
 # ---------------------------------------------------------------- with exponentials
@@ -415,8 +431,8 @@ class Exp(Assumed):
         return z.exp()
 
     def error(self, lower: Tensor, upper: Tensor) -> Tensor | float:
-        # past this float32 may overflow
-        return torch.where(upper < 80.0, 2.0 * _ASSUMED * upper.exp() + 2.0**-126, torch.full_like(upper, math.nan))
+        known = upper < LARGEST_EXPONENT
+        return torch.where(known, 2.0 * LIBRARY * upper.exp() + _FLUSHED, torch.full_like(upper, math.nan))
 
 
 class CappedExp(Exp):
@@ -441,7 +457,7 @@ class CappedExp(Exp):
     def error(self, lower: Tensor, upper: Tensor) -> Tensor | float:
         # the smaller of a number and the cap is the cap where any evaluation is past it
         known = lower > self.cap + 1.0
-        return torch.where(known, 0.0, 2.0 * _ASSUMED * upper.clamp(max=self.cap).exp() + 2.0**-126)
+        return torch.where(known, 0.0, 2.0 * LIBRARY * upper.clamp(max=self.cap).exp() + _FLUSHED)
 
 
 @dataclass(frozen=True, eq=False)
@@ -465,11 +481,12 @@ class Log(Assumed):
         return 1.0 / z
 
     def _cuts(self, lower: Tensor, upper: Tensor) -> _Cuts:
-        return super()._cuts(*_unknown(lower, upper, lower <= 0.0))
+        # a number below may be flushed to zero, whose root is far from its own
+        return super()._cuts(*_unknown(lower, upper, ~(lower >= FLUSH)))
 
     def error(self, lower: Tensor, upper: Tensor) -> Tensor | float:
         lower, upper = self._inside(lower, upper)
-        return _ASSUMED * (1.0 + torch.maximum(lower.log().abs(), upper.log().abs()))
+        return LIBRARY * (1.0 + torch.maximum(lower.log().abs(), upper.log().abs()))
 
 
 @dataclass(frozen=True, eq=False)
@@ -487,7 +504,7 @@ class Softplus(Assumed):
         return torch.sigmoid(z)
 
     def error(self, lower: Tensor, upper: Tensor) -> Tensor | float:
-        return 2.0 * _ASSUMED * (1.0 + _size(lower, upper))
+        return 2.0 * LIBRARY * (1.0 + _size(lower, upper))
 
 
 @dataclass(frozen=True, eq=False)
@@ -514,7 +531,9 @@ class Elu(Assumed):
         return self.scale * self.alpha / self.width * torch.exp(z.clamp(max=0.0) / self.width)
 
     def error(self, lower: Tensor, upper: Tensor) -> Tensor | float:
-        return 2.0 * _ASSUMED * self.scale * (self.alpha + _size(lower, upper))
+        size = _size(lower, upper)
+        flushed = _FLUSHED * (1.0 + self.scale) * (1.0 + self.alpha) * (1.0 + size)
+        return 2.0 * LIBRARY * self.scale * (self.alpha + size) + flushed
 
 
 @dataclass(frozen=True, eq=False)
@@ -536,7 +555,7 @@ class Erf(Assumed):
         return 2.0 / math.sqrt(math.pi) * torch.exp(-z.square())
 
     def error(self, lower: Tensor, upper: Tensor) -> Tensor | float:
-        return 2.0 * _ASSUMED
+        return 2.0 * LIBRARY
 
 
 class _Gated(Assumed):
@@ -548,7 +567,7 @@ class _Gated(Assumed):
 
     def error(self, lower: Tensor, upper: Tensor) -> Tensor | float:
         # the gate may be made of two such functions, and of constants that are float32 numbers
-        return 4.0 * _ASSUMED * _size(lower, upper)
+        return 4.0 * LIBRARY * _size(lower, upper) + _FLUSHED
 
 
 @dataclass(frozen=True, eq=False)

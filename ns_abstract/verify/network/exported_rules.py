@@ -416,7 +416,7 @@ def _variance(root: bool) -> Rule:
             raise InputError(f"divides by {count} - {less}", fix="give it more numbers")
         middle = b.reduce(x, axes, True, True)
         squares = b.power(b.plus((x, b.spread(middle, shape)), (1, -1)), 2.0)
-        found = b.scale(b.reduce(squares, axes, False, keep), np.asarray(1.0 / (count - less)), None)
+        found = b.scale(b.reduce(squares, axes, True, keep), np.asarray(count / (count - less)), None)
         return Index(b.power(found, 0.5) if root else found)
 
     return rule

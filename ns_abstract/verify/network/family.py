@@ -11,6 +11,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from ns_abstract.arithmetic.network_charges import FLUSH, OWN_SUMS, gamma
 from ns_abstract.verify.network.bounds import _Cells, bound_outputs
 from ns_abstract.verify.network.forms import Form
 from ns_abstract.verify.network.graph import Network, NetworkArithmetic
@@ -18,7 +19,6 @@ from ns_abstract.verify.network.layers import Activation, LeakyRelu
 from ns_abstract.verify.network.maxima import MaxPool
 from ns_abstract.verify.network.products import Product
 from ns_abstract.verify.network.reached import Trace
-from ns_abstract.verify.network.rounding import FLUSH, gamma
 from ns_abstract.verify.network.rows import Float64, Int64, grid
 from ns_abstract.verify.network.sets import ImageSets, OutputBounds
 from ns_abstract.verify.network.sharing import Sharing
@@ -28,8 +28,6 @@ from ns_abstract.verify.network.sharing import Sharing
 _MOST_NUMBERS, _MOST_TRACED, _TOGETHER = 1 << 19, 1 << 16, 16 << 20
 #: Part of the memory that rows may take.
 _ROWS_SHARE = 0.25
-#: Room for rounding of a few sums in float64.
-_ROOM = 2.0**-46
 #: Rows that are multiplied at a time: their absolute values should stay in a processor's cache.
 _ROWS_AT_ONCE = 256
 #: Part of a number's width by which it may miss being open for the first cell to pass back a row for it.
@@ -252,9 +250,9 @@ class _Other(Sharing):
             if at == 0:
                 slopes, offsets = known.image.slopes.reshape(m, 2, -1, d), known.image.offsets.reshape(m, 2, -1)
                 half = 0.5 * (offsets[:, 1] - offsets[:, 0]) + 0.5 * np.abs(slopes[:, 1] - slopes[:, 0]).sum(-1)
-                half = np.maximum(half, 0.0) + _ROOM * (np.abs(offsets).max(1) + np.abs(slopes).max(1).sum(-1))
+                half = np.maximum(half, 0.0) + OWN_SUMS * (np.abs(offsets).max(1) + np.abs(slopes).max(1).sum(-1))
                 low, high = known.image.lower.reshape(m, -1), known.image.upper.reshape(m, -1)
-                box = 0.5 * (high - low) + _ROOM * (np.abs(low) + np.abs(high))
+                box = 0.5 * (high - low) + OWN_SUMS * (np.abs(low) + np.abs(high))
                 signed = [*np.moveaxis(slopes.mean(1), -1, 0), offsets.mean(1), 0.5 * (low + high)]
                 sized = [half, box]
             elif at in known.offered:
@@ -319,10 +317,10 @@ class _Other(Sharing):
         middle, moved = middle + 0.5 * (low + high), moved + 0.5 * (low + high)
         half, box = half[0] + spread, half[1] + spread + np.abs(tilts).sum(0)
         for width, center in ((half, middle), (box, moved)):
-            width += _ROOM * (np.abs(low) + np.abs(high) + np.abs(center) + np.abs(slopes).sum(0) + width + lost)
+            width += OWN_SUMS * (np.abs(low) + np.abs(high) + np.abs(center) + np.abs(slopes).sum(0) + width + lost)
         np.maximum(half, 0.0, out=half)
         reach = half + np.abs(slopes).sum(0)
-        reach += _ROOM * (reach + np.abs(middle))
+        reach += OWN_SUMS * (reach + np.abs(middle))
         lower, upper = np.maximum(middle - reach, moved - box), np.minimum(middle + reach, moved + box)
         turned = lent.sign < 0.0
         ends = np.where(turned, -upper, lower), np.where(turned, -lower, upper)
@@ -366,7 +364,7 @@ class _Other(Sharing):
             at, apart = flat[first], slopes[:, other] - slopes[:, first]
             center, tilt = 0.5 * (low[:, first] + high[:, other]), 0.5 * (slopes[:, first] + slopes[:, other])
             radius = 0.5 * (high[:, other] - low[:, first]) + 0.5 * np.abs(apart).sum(-1)
-            radius = np.maximum(radius, 0.0) + _ROOM * (
+            radius = np.maximum(radius, 0.0) + OWN_SUMS * (
                 np.abs(low[:, first]) + np.abs(high[:, other]) + np.abs(tilt).sum(-1)
             )
             for side in (first, other):

@@ -8,6 +8,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from ns_abstract.arithmetic.network_charges import OWN_FEW, UP
+
 
 class Interval(NamedTuple):
     """What a node's numbers are at least and at most, [m, *shape]."""
@@ -53,13 +55,13 @@ class Form:
     @property
     def interval(self) -> Interval:
         """What z is at least and at most."""
-        room = 2.0**-50 * self.reference.abs()
-        low = self.reference + self.lower - room - 2.0**-50 * self.lower.abs()
-        return Interval(low, self.reference + self.upper + room + 2.0**-50 * self.upper.abs())
+        room = OWN_FEW * self.reference.abs()
+        low = self.reference + self.lower - room - OWN_FEW * self.lower.abs()
+        return Interval(low, self.reference + self.upper + room + OWN_FEW * self.upper.abs())
 
     @staticmethod
     def ranged(reference: Tensor, c: Tensor, a: Tensor, r: Tensor, active: Tensor | None = None) -> Form:
         """With the range of the form itself."""
-        radius = (a.abs().sum(1) + r) * (1.0 + 2.0**-40) + c.abs() * 2.0**-50
+        radius = (a.abs().sum(1) + r) * UP + c.abs() * OWN_FEW
         active = torch.ones_like(c, dtype=torch.bool) if active is None else active
         return Form(reference, c, a, r, c - radius, c + radius, active)

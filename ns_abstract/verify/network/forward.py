@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import torch
 
+from ns_abstract.arithmetic.network_charges import SPARE, UNIT
 from ns_abstract.verify.network.forms import Form
 from ns_abstract.verify.network.known import Known
 from ns_abstract.verify.network.layers import Activation, LeakyRelu
@@ -14,7 +15,6 @@ from ns_abstract.verify.network.maxima import MaxPool
 from ns_abstract.verify.network.pooling import Pooling
 from ns_abstract.verify.network.products import Product
 from ns_abstract.verify.network.propagation import Propagation
-from ns_abstract.verify.network.rounding import SPARE, UNIT
 from ns_abstract.verify.network.schedule import Schedule
 from ns_abstract.verify.network.selection import Selection
 from ns_abstract.verify.network.slopes import Held

@@ -7,6 +7,7 @@ from typing import NamedTuple
 import numpy as np
 import torch
 
+from ns_abstract.arithmetic.network_charges import OVERFLOW, OWN_FEW, OWN_IMAGE
 from ns_abstract.verify.network.forms import Form
 from ns_abstract.verify.network.rows import Float64, grid
 from ns_abstract.verify.network.sets import ImageSets, Substitution
@@ -28,10 +29,15 @@ class ImagePlanes(NamedTuple):
 
 
 def finite(images: ImageSets) -> tuple[list[Float64], np.ndarray]:
-    """The fields of image sets without numbers that are not finite, and [m] which cells have no such numbers."""
+    """The fields of image sets without numbers that are not finite, and [m] which cells have no others to begin with.
+
+    Cells with numbers past the limit of N22 are not among these.
+    """
     fields = [np.asarray(getattr(images, name), np.float64) for name in images.__dataclass_fields__]
     good = np.logical_and.reduce([np.isfinite(f).reshape(images.count, -1).all(axis=1) for f in fields])
     good &= (fields[4] <= fields[5]).all(axis=1)
+    # what float32 programs may not be able to compute with (N22)
+    good &= (np.maximum(np.abs(fields[4]), np.abs(fields[5])) < OVERFLOW).all(axis=1)
     return [np.where(good.reshape(-1, *[1] * (f.ndim - 1)), f, 0.0) for f in fields], good
 
 
@@ -49,8 +55,8 @@ def planes_of(
     a_lower, b_lower, a_upper, b_upper, lower, upper = fields
     if substitution != "everywhere":
         a_lower, b_lower, a_upper, b_upper = np.zeros_like(a_lower), lower, np.zeros_like(a_upper), upper
-    b_lower, lower = (v - middle - 2.0**-51 * (np.abs(v) + np.abs(middle)) for v in (b_lower, lower))
-    b_upper, upper = (v - middle + 2.0**-51 * (np.abs(v) + np.abs(middle)) for v in (b_upper, upper))
+    b_lower, lower = (v - middle - OWN_IMAGE * (np.abs(v) + np.abs(middle)) for v in (b_lower, lower))
+    b_upper, upper = (v - middle + OWN_IMAGE * (np.abs(v) + np.abs(middle)) for v in (b_upper, upper))
     # numpy keeps the order of axes in memory that the images came with
     return ImagePlanes(
         np.ascontiguousarray(np.stack([a_lower, a_upper], 1)).reshape(m, 2, *shape, d),
@@ -67,7 +73,7 @@ def form_of(planes: ImagePlanes, middle: Float64, input_shape: tuple[int, ...]) 
     a = slopes.mean(1).movedim(-1, 1).reshape(m, d, *input_shape)
     c = offsets.mean(1)
     spread = 0.5 * (offsets[:, 1] - offsets[:, 0]) + 0.5 * (slopes[:, 1] - slopes[:, 0]).abs().sum(-1)
-    spread = spread.clamp(min=0.0) + 2.0**-50 * (offsets.abs().amax(1) + slopes.abs().amax(1).sum(-1))
+    spread = spread.clamp(min=0.0) + OWN_FEW * (offsets.abs().amax(1) + slopes.abs().amax(1).sum(-1))
     c, spread = c.reshape(-1, *input_shape), spread.reshape(-1, *input_shape)
     reference = torch.from_numpy(middle).reshape(-1, *input_shape)
     return Form.ranged(reference, c, a, spread)

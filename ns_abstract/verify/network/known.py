@@ -8,11 +8,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from ns_abstract.arithmetic.network_charges import DOUBLE_UNIT, OWN_LINE, UNIT
 from ns_abstract.verify.network.forms import Form
 from ns_abstract.verify.network.graph import Network, NetworkArithmetic
 from ns_abstract.verify.network.image import ImagePlanes, form_of
 from ns_abstract.verify.network.passages import Offered, Passage
-from ns_abstract.verify.network.rounding import DOUBLE_UNIT, UNIT
 from ns_abstract.verify.network.rows import Columns, Float64, columns_of, grid
 from ns_abstract.verify.network.schedule import Way
 from ns_abstract.verify.network.sets import Signs
@@ -115,7 +115,7 @@ class Known:
     def stop(self, index: int, form: Form) -> Columns:
         """What is known of node ``index``, for rows that arrive there."""
         m, d, shape = self.count, self.d, grid(self.network.shape(index))
-        room = 2.0**-48 * (form.c.abs() + form.r)
+        room = OWN_LINE * (form.c.abs() + form.r)
         slopes = form.a.movedim(1, -1).reshape(m, 1, *shape, d).expand(m, 2, *shape, d)
         offsets = torch.stack([form.c - form.r - room, form.c + form.r + room], 1)
         sizes = (m, 2, *shape, d), (m, 2, *shape), (m, *shape), (m, *shape)

@@ -21,11 +21,19 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
+from ns_abstract.arithmetic.network_charges import (
+    AFFINE,
+    FLUSH,
+    FUNCTION_FLUSHES,
+    LIBRARY,
+    OWN_FUNCTION,
+    OWN_LINE,
+    OWN_SUMS,
+    SLOPES_DOWN,
+)
 from ns_abstract.verify.network.rows import Rows, full, grid, interleave, unflatten
 
 Shape = tuple[int, ...]
-#: Room for rounding of the lines of an activation, computed with float64: a few operations.
-_LINE = 2.0**-48
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,6 +59,11 @@ class Linear:
     def bias(self) -> Tensor | None:
         """[*shape] or broadcastable to it; None: zero."""
         return None
+
+    @cached_property
+    def gain(self) -> float:
+        """The most that a number of the result may be of the largest input, in any grouping of the factors (N21)."""
+        return 1.0
 
     def roundings(self, active: Sequence[Tensor]) -> Tensor | int:
         """`terms` of sums in which inputs that are not ``active`` [B, *input_shapes[i]] are exactly zero (N2)."""
@@ -92,6 +105,10 @@ class Weighted(Linear):
     def weight_for(self, rows: Tensor) -> Tensor:
         """Weights in the rows' type."""
         return self._single if rows.dtype == torch.float32 else self.weight
+
+    @cached_property
+    def gain(self) -> float:
+        return max(1, self.terms) * (1.0 + float(self.weight.abs().max()))
 
     @property
     def squared(self) -> Weighted:
@@ -236,10 +253,20 @@ class Matrix(Weighted):
 
 @dataclass(frozen=True, eq=False)
 class Scale(Linear):
-    """``factor * x + offset`` with constants; both [*shape] float64 (batch normalisation, Mul, Add, ...)."""
+    """``factor * x + offset`` with constants; both [*shape] float64 (batch normalisation, Mul, Add, ...).
+
+    Attributes:
+        parts: The product of 1 + |f| over the largest constants that the factor and the offset are made of, if these
+            are others.
+    """
 
     factor: Tensor = field(default_factory=lambda: torch.zeros(0))
     offset: Tensor | None = None
+    parts: float = 0.0
+
+    @cached_property
+    def gain(self) -> float:
+        return max(self.parts, 1.0 + float(self.factor.abs().max()))
 
     @property
     def bias(self) -> Tensor | None:
@@ -426,8 +453,11 @@ class LeakyRelu(Activation):
         return torch.relu(z) if self.alpha == 0.0 else torch.where(z >= 0.0, z, z * self.alpha)
 
     def error(self, lower: Tensor, upper: Tensor) -> Tensor | float:
-        # the constant and the product are rounded
-        return 2.0**-22 * self.alpha * torch.maximum(lower.abs(), upper.abs()) if self.alpha else 0.0
+        # numbers that are flushed to zero are small and, but for a slope, positive
+        if not self.alpha:
+            return FUNCTION_FLUSHES * FLUSH * ((upper > 0.0) & (lower < FLUSH)).double()
+        size = torch.maximum(lower.abs(), upper.abs())
+        return AFFINE * self.alpha * size + FUNCTION_FLUSHES * FLUSH * (1.0 + size)
 
     def open(self, lower: Tensor, upper: Tensor) -> Tensor:
         return (lower < 0.0) & (upper > 0.0)
@@ -447,7 +477,7 @@ class LeakyRelu(Activation):
         # convex: above both ends is above everywhere between
         offset = torch.maximum(ends[0] - slope * lower, ends[1] - slope * upper)
         size = slope * torch.maximum(lower.abs(), upper.abs())
-        return slope, torch.where(self.open(lower, upper), offset + _LINE * size, torch.zeros_like(offset))
+        return slope, torch.where(self.open(lower, upper), offset + OWN_LINE * size, torch.zeros_like(offset))
 
     def lines(self, lower: Tensor, upper: Tensor) -> Lines:
         slope, offset = self._chord(lower, upper)
@@ -464,10 +494,10 @@ class LeakyRelu(Activation):
 class _Sigmoidal(Activation):
     """An increasing function that is convex below 0 and concave above, with a slope that falls away from 0."""
 
-    room: ClassVar[float] = 2.0**-46
+    room: ClassVar[float] = OWN_SUMS
 
     def error(self, lower: Tensor, upper: Tensor) -> Tensor | float:
-        return 2.0**-20
+        return LIBRARY
 
     def slope(self, z: Tensor) -> Tensor:
         raise AssertionError
@@ -477,8 +507,8 @@ class _Sigmoidal(Activation):
 
     def band(self, lower: Tensor, upper: Tensor) -> Lines:
         # with the least slope in the interval (at an end), f(z) - slope z does not decrease
-        slope = torch.minimum(self.slope(lower), self.slope(upper)) * (1.0 - 2.0**-30)
-        room = self.room + _LINE * slope * torch.maximum(lower.abs(), upper.abs())
+        slope = torch.minimum(self.slope(lower), self.slope(upper)) * SLOPES_DOWN
+        room = self.room + OWN_LINE * slope * torch.maximum(lower.abs(), upper.abs())
         low, high = self.function(lower) - slope * lower, self.function(upper) - slope * upper
         return Lines(slope, low - room, slope, high + room)
 
@@ -490,14 +520,14 @@ class _Sigmoidal(Activation):
         chord = torch.where(width > 0.0, (ends[1] - ends[0]) / width, torch.zeros_like(width))
         tangent = self.slope(middle)
         size = torch.maximum(lower.abs(), upper.abs())
-        room = self.room + _LINE * (chord.abs() + tangent) * size
+        room = self.room + OWN_LINE * (chord.abs() + tangent) * size
         # a chord is on the inner side of a curve and a tangent on the outer, whatever the rounding of
         # their slopes: offsets are taken from the ends and, for the tangent, from where it touches
         chord_low = torch.minimum(ends[0] - chord * lower, ends[1] - chord * upper) - room
         chord_high = torch.maximum(ends[0] - chord * lower, ends[1] - chord * upper) + room
         # a slope that is wrong by 2^-44 moves the tangent by that times the distance
         touch = self.function(middle) - tangent * middle
-        slack = room + 2.0**-44 * tangent * width
+        slack = room + OWN_FUNCTION * tangent * width
         convex, concave = upper <= 0.0, lower >= 0.0
         return Lines(
             torch.where(convex, tangent, torch.where(concave, chord, band.lower_slope)),

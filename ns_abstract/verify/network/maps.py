@@ -15,10 +15,19 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
+from ns_abstract.arithmetic.network_charges import (
+    FLUSH,
+    FLUSHES,
+    FOLDING,
+    MAGNITUDES_UP,
+    OWN_LINE,
+    UP,
+    VARIANCE_PASSES,
+    gamma,
+)
+from ns_abstract.verify.network.forms import Form
 from ns_abstract.verify.network.layers import Linear, Weighted
 from ns_abstract.verify.network.rows import Rows, full, grid
-
-_UNIT = 2.0**-24
 
 
 def _none() -> Tensor:
@@ -44,6 +53,10 @@ class Sparse(Linear):
     @property
     def bias(self) -> Tensor | None:
         return self.offset
+
+    @cached_property
+    def gain(self) -> float:
+        return max(1, self.terms) * (1.0 + float(self.weight.abs().max()))
 
     @cached_property
     def _sizes(self) -> tuple[int, int]:
@@ -92,14 +105,29 @@ class Variance(Sparse):
     """Means of squares of centred numbers, the first input; the second holds the numbers themselves.
 
     A program may work the variance out as mean of squares minus square of the mean: what that loses is
-    relative to the numbers and not to their spread.
+    relative to the numbers and not to their spread (N11).
     """
 
     def spare(self, sizes: Sequence[Tensor]) -> Tensor | float:
-        # n + 4 roundings of either term
-        squares = sizes[1].flatten(1).square()
-        mean = torch.sparse.mm(self._absolute, squares.T).T.reshape(-1, *self.shape)
-        return 2.0 * (self.terms + 4) * _UNIT * mean
+        return gamma(VARIANCE_PASSES * self.terms) * self._means(sizes[1].square()) * UP + FLUSHES * FLUSH
+
+    def least(self, squares: Form, x: Form, single: bool) -> Tensor:
+        """[m, *shape] what the variance is at least, with its rounding if ``single``, but for flushes (N11).
+
+        Squares are not negative, and one pass loses a part of the variance itself and of the square of the mean.
+        """
+        low = self._means(squares.interval.lower.clamp(min=0.0)) * (2.0 - MAGNITUDES_UP)
+        if not single:
+            return low
+        reach = self._means(x.reference + x.c).abs() + self._means(x.r)
+        reach = reach + self._means(x.a.flatten(0, 1)).unflatten(0, x.a.shape[:2]).abs().sum(1)
+        ends = torch.maximum(*(self._means(end).abs() for end in x.interval))
+        reach = torch.minimum(reach, ends) * MAGNITUDES_UP + OWN_LINE * self._means(x.interval.size)
+        relative = gamma((1 + VARIANCE_PASSES) * self.terms + FOLDING)
+        return low * (1.0 - relative) - gamma(VARIANCE_PASSES * self.terms) * reach.square() * UP
+
+    def _means(self, value: Tensor) -> Tensor:
+        return torch.sparse.mm(self._absolute, value.flatten(1).T).T.reshape(-1, *self.shape)
 
     def backward(self, rows: Rows) -> list[Rows]:
         found = super().backward(rows)
@@ -135,6 +163,10 @@ class Differences(Linear):
 
     axis: int = 0
     mixes: ClassVar[bool] = True
+
+    @cached_property
+    def gain(self) -> float:
+        return 2.0 * max(1, self.terms)
 
     @cached_property
     def _apart(self) -> Tensor:

@@ -12,14 +12,13 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
+from ns_abstract.arithmetic.network_charges import OWN_WINDOW
 from ns_abstract.verify.network.layers import Shape
 
 #: Steps towards the mixture of a window's numbers whose upper plane is lowest.
 _STEPS = 8
 #: What no number of a window is: stands for pairs that are left out.
 _LARGE = 1e300
-#: Room for rounding of what is computed here in float64: sums of at most 2^8 terms.
-_ROOM = 2.0**-42
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,7 +107,7 @@ class Candidates(NamedTuple):
             return v[:, :, None] - v[:, None, :]
 
         size = self.size
-        room = _ROOM * (size[:, :, None] + size[:, None, :])
+        room = OWN_WINDOW * (size[:, :, None] + size[:, None, :])
         form = less(self.reference) + less(self.middle) + (self.radius[:, :, None] + self.radius[:, None, :])
         for k in range(self.slopes.shape[2]):
             form = form + less(self.slopes[:, :, k]).abs()
@@ -168,7 +167,7 @@ def upper_planes(window: Candidates, apart: Tensor) -> Planes:
         best = torch.where(better[:, None], mixture, best)
         high = torch.where(better, new, high)
         height = torch.where(better, new + (mixture * middle).sum(1), height)
-    room = _ROOM * (best * size).sum(1)
+    room = OWN_WINDOW * (best * size).sum(1)
     low, high = low - room, high + room
     # over a box alone: level with the second or the third largest upper end
     none = torch.full_like(middle, -_LARGE)
@@ -186,7 +185,7 @@ def upper_planes(window: Candidates, apart: Tensor) -> Planes:
         rest = torch.where(window.inside, s * window.upper, torch.zeros_like(s)).sum(1)
         rest = rest - (s * window.upper)[at, winner]
         under = torch.minimum(first * window.lower[at, winner], first * window.upper[at, winner]) - rest
-        room = _ROOM * (base.abs() + (s * size).sum(1) + size[at, winner])
+        room = OWN_WINDOW * (base.abs() + (s * size).sum(1) + size[at, winner])
         best = torch.where(better[:, None], s, best)
         low, high = torch.where(better, under - room, low), torch.where(better, new + room, high)
         height = torch.where(better, new + (s * middle).sum(1), height)

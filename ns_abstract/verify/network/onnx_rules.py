@@ -122,7 +122,11 @@ def _gemm(r: Reader, node: onnx.NodeProto, a: Attributes) -> None:
     if weight.ndim != 2:
         raise InputError(f"weights {item(weight.shape)}", fix="a matrix expected")
     matrix = weight.astype(np.float64) if a.get("transB", 0) else weight.astype(np.float64).T
-    index = r.builder.matrix(x.index, alpha * matrix, None if bias is None else beta * bias.astype(np.float64))
+    bias = None if bias is None else beta * bias.astype(np.float64)
+    index = r.builder.matrix(x.index, matrix, bias if alpha == 1.0 else None)
+    if alpha != 1.0:
+        # programs multiply the sums, or the weights
+        index = r.builder.scale(index, np.asarray(alpha), bias)
     r.result(node, index, (*x.whole[:-1], matrix.shape[0]))
 
 

@@ -10,6 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from ns_abstract.arithmetic.network_charges import DOUBLE_UNIT, OWN_LINE
 from ns_abstract.verify.network.backward import ROWS_AT_ONCE, Backward, Batch
 from ns_abstract.verify.network.forms import Form
 from ns_abstract.verify.network.known import Known
@@ -48,7 +49,7 @@ class Outputs:
         size = last.width.reshape(m, -1).numpy()
         reference = last.reference.reshape(m, -1).numpy()
         missing = size @ np.abs(dense - stored).T
-        missing += 2.0**-52 * (dense.shape[1] + 2) * (np.abs(reference) @ np.abs(dense).T)
+        missing += 2.0 * DOUBLE_UNIT * (dense.shape[1] + 2) * (np.abs(reference) @ np.abs(dense).T)
         offset = reference @ dense.T + offset
         need = -offset + _SURE * (1.0 + np.abs(offset))
         for top, left, height, width, number in _windows(stored.reshape(k, *shape)):
@@ -60,7 +61,7 @@ class Outputs:
                 rows = Rows(np.ascontiguousarray(part[row]), np.full(len(which), top), np.full(len(which), left))
                 found, loosest[cell, row] = self._climb(index, rows, cell, need[cell, row])
                 plane[cell, row], lower[cell, row] = found.plane[:, 0], found.lower
-        room = 2.0**-48 * (np.abs(plane).sum(-1) + np.abs(offset) + missing) + missing
+        room = OWN_LINE * (np.abs(plane).sum(-1) + np.abs(offset) + missing) + missing
         lower, b = lower + offset - room, plane[..., -1] + offset - room
         a = plane[..., :-1]
         finite = self.known.good[:, None] & np.isfinite(lower)

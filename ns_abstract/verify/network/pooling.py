@@ -8,21 +8,19 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from ns_abstract.arithmetic.network_charges import FLUSH, FLUSHES, OWN_FEW, OWN_SUMS, SPARE, UP
 from ns_abstract.verify.network.backward import ROWS_AT_ONCE, Backward
 from ns_abstract.verify.network.forms import Form, Interval
 from ns_abstract.verify.network.known import Known
 from ns_abstract.verify.network.maxima import Candidates, MaxPool, Planes, upper_planes
 from ns_abstract.verify.network.passages import Maxima
 from ns_abstract.verify.network.reached import Enough, Goal
-from ns_abstract.verify.network.rounding import FLUSH, SPARE
 from ns_abstract.verify.network.rows import Int64, Rows
 from ns_abstract.verify.network.schedule import Schedule
 from ns_abstract.verify.network.sharing import Sharing
 
 #: Differences in windows are bounded by rows if so large a part of so many, which are tried first, is decided by it.
 _TRIED, _CLOSES = 64, 0.1
-#: Room for rounding of lines relative to references and sizes.
-_REFERENCES = 2.0**-46
 
 
 class _Exceeded(NamedTuple):
@@ -72,7 +70,9 @@ class Pooling:
         # sums of rows where windows overlap
         count = SPARE + layer.overlaps + self.network.readers[source]
         units = [count * passage.unit for passage in self.known.passages]
-        gives = [unit * width for unit in units]
+        # programs may flush what they compare
+        flushed = FLUSHES * FLUSH if self.known.single else 0.0
+        gives = [unit * width + flushed for unit in units]
         offsets = [torch.stack([-give, give, give, -give], 0) for give in gives]
         rivals = upper.scatter(2, winner, -torch.inf).amax(2)
         most, own_upper = upper.amax(2), chosen(interval.upper)
@@ -87,7 +87,7 @@ class Pooling:
             at, top, candidates, near, planes = exceeded
             which[at] = torch.arange(len(top)) + sum(map(len, slopes))
             base = (planes.slopes * candidates.reference).sum(1) - reference[at]
-            room = _REFERENCES * ((planes.slopes * candidates.reference.abs()).sum(1) + reference[at].abs())
+            room = OWN_SUMS * ((planes.slopes * candidates.reference.abs()).sum(1) + reference[at].abs()) + flushed
             for passage, unit, give, offset in zip(self.known.passages, units, gives, offsets, strict=True):
                 rounded = (planes.slopes.to(passage.dtype).double() - planes.slopes).abs()
                 lost = (rounded * near + unit * planes.slopes * near).sum(1) + room
@@ -99,12 +99,12 @@ class Pooling:
             low, high = planes.low + base - room, planes.high + base + room
             middle = (planes.slopes * candidates.middle).sum(1) + 0.5 * (low + high)
             radius = (planes.slopes * candidates.radius).sum(1) + 0.5 * (high - low)
-            radius = (radius + _REFERENCES * (planes.slopes * candidates.size).sum(1)) * (1.0 + 2.0**-40)
+            radius = (radius + OWN_SUMS * (planes.slopes * candidates.size).sum(1)) * UP
             own = r[at] + 0.5 * top
             better = radius < own
             rows = (planes.slopes[:, :, None] * candidates.slopes).sum(1)
             c[at] = torch.where(better, middle, c[at] + 0.5 * top)
-            r[at] = torch.where(better, radius, own * (1.0 + 2.0**-40) + _REFERENCES * c[at].abs())
+            r[at] = torch.where(better, radius, own * UP + OWN_SUMS * c[at].abs())
             cells, channels, windows = at
             a[cells, :, channels, windows] = torch.where(better[:, None], rows, a[cells, :, channels, windows])
             most[at] = torch.minimum(most[at], own_upper[at] + top)
@@ -123,10 +123,10 @@ class Pooling:
             )
         active = (layer.taps(x.active.double(), 0.0).amax(2) > 0.0).reshape(grown)
         reference, c, r = (v.reshape(grown) for v in (reference, c, r))
-        form = Form.ranged(reference, c, a.reshape(m, self.known.d, *shape), r, active)
+        form = Form.ranged(reference, c, a.reshape(m, self.known.d, *shape), r + flushed, active)
         lost = int(np.prod(shape)) * 2 * len(layer.steps) * FLUSH
         self.known.flush += lost * x.width.reshape(m, -1).amax(1).numpy()
-        room = 2.0**-50 * (reference.abs() + form.width)
+        room = OWN_FEW * (reference.abs() + form.width) + flushed
         least = lower.amax(2).reshape(grown)
         return self.known.within(form, least - reference - room, most.reshape(grown) - reference + room)
 
@@ -220,7 +220,7 @@ class Pooling:
                 value[row, channel, i, j] = sign
             near = candidates.reference[window, one], candidates.reference[window, other]
             ahead = (near[0] - near[1]).numpy()
-            room = 2.0**-50 * (near[0].abs() + near[1].abs()).numpy()
+            room = OWN_FEW * (near[0].abs() + near[1].abs()).numpy()
             rows = Rows(value, y * layer.stride[0] - layer.pads[0], x * layer.stride[1] - layer.pads[1])
             enough = Enough(Goal(), room - ahead, np.zeros(len(part), bool))
             found = self.backward.bound(source, rows, np.ascontiguousarray(cell), enough, None, cut)

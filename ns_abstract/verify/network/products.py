@@ -9,9 +9,10 @@ from typing import ClassVar, Protocol
 import torch
 from torch import Tensor
 
+from ns_abstract.arithmetic.network_charges import OWN_FUNCTION, OWN_LINE
 from ns_abstract.verify.network.layers import Shape
 
-#: Both factors must move by more than this of their sizes to be worth better bounds.
+#: A preference: both factors must move by more than this of their sizes to be worth better bounds.
 _MOVES = 2.0**-7
 
 
@@ -63,7 +64,7 @@ class Product:
         moves = plane.first.abs() * (x.upper - x.lower) + plane.second.abs() * (y.upper - y.lower)
         moves = moves.clamp(min=2.0**-1000)
         # rounding alone keeps the planes of points apart
-        return (plane.high - plane.low - 2.0**-44 * self._sizes(x, y)).clamp(min=0.0) / moves
+        return (plane.high - plane.low - OWN_FUNCTION * self._sizes(x, y)).clamp(min=0.0) / moves
 
     def _sizes(self, x: Interval, y: Interval) -> Tensor:
         return torch.maximum(x.lower.abs(), x.upper.abs()) * torch.maximum(y.lower.abs(), y.upper.abs())
@@ -75,5 +76,5 @@ class Product:
         corners = torch.stack([u * v - first * u - second * v for u in (x.lower, x.upper) for v in (y.lower, y.upper)])
         sizes = [torch.maximum(f.lower.abs(), f.upper.abs()) for f in (x, y)]
         # three products and two sums at each corner
-        room = 2.0**-48 * (sizes[0] * sizes[1] + first.abs() * sizes[0] + second.abs() * sizes[1])
+        room = OWN_LINE * (sizes[0] * sizes[1] + first.abs() * sizes[0] + second.abs() * sizes[1])
         return Plane(first, second, corners.amin(0) - room, corners.amax(0) + room)

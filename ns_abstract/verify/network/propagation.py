@@ -8,12 +8,27 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from ns_abstract.arithmetic.network_charges import (
+    DOUBLE_UNIT,
+    FLUSH,
+    FUNCTION_FLUSHES,
+    MAGNITUDES_UP,
+    OVERFLOW,
+    OWN_FEW,
+    OWN_FUNCTION,
+    OWN_LINE,
+    PRODUCT,
+    SPARE,
+    UP,
+    gamma,
+)
 from ns_abstract.verify.network.forms import Form
 from ns_abstract.verify.network.known import Known
-from ns_abstract.verify.network.layers import Activation, LeakyRelu, Linear, Sum
+from ns_abstract.verify.network.layers import Activation, LeakyRelu, Linear, Scale, Sum
+from ns_abstract.verify.network.maps import Variance
 from ns_abstract.verify.network.passages import Offered, Passage
 from ns_abstract.verify.network.products import Product
-from ns_abstract.verify.network.rounding import FLUSH, OVERFLOW, SPARE, UNIT, Rounding, gamma
+from ns_abstract.verify.network.rounding import Rounding
 from ns_abstract.verify.network.rows import grid
 from ns_abstract.verify.network.sharing import Sharing
 from ns_abstract.verify.network.slopes import OpenUnits
@@ -41,7 +56,7 @@ class Propagation:
         moved = layer.apply(stacks).reshape(m, 1 + d, *layer.shape)
         # float64's rounding is relative to forms and references, float32's of rows to distances from
         # references, that of the network to its values
-        own = (layer.terms + len(inputs) + 8) * 2.0**-52
+        own = 2.0 * (layer.terms + len(inputs) + 8) * DOUBLE_UNIT
         charged = [self.sharing.sized(f) for f in inputs]
         radii, sizes = [], []
         for f, sized in zip(inputs, charged, strict=True):
@@ -49,7 +64,7 @@ class Propagation:
             size = torch.maximum(sized.interval.spread, sized.reference.abs())
             sizes.append(size)
             radii.append(torch.cat([f.r + own * (f.c.abs() + f.a.abs().sum(1)), sized.width, size]))
-        found = layer.magnitude(radii) * (1.0 + 2.0**-28)
+        found = layer.magnitude(radii) * MAGNITUDES_UP
         radius, width, size = found.split([m, *[len(sizes[0])] * 2])
         if layer.bias is not None:
             size = size + layer.bias.abs()
@@ -64,24 +79,40 @@ class Propagation:
             def end(moves: Tensor = moves) -> Tensor:
                 return (reference + moved[:, 0]).abs() + moved[:, 1:].abs().sum(1) + radius + moves
 
-            moves = moves + self.rounding.charge(k, sources, layer, charged, size, end) + layer.spare(sizes)
+            moves = moves + self.rounding.charge(k, sources, layer, charged, size, end)
+            moves = moves + layer.spare([f.interval.size for f in charged])
+        extremes = self.rounding.groupings(k, sources, layer, sizes)
+        flushed = self.rounding.flushed(extremes, layer) if self.known.single else 0.0
+        moves = moves + flushed
         roundings = layer.row_terms + SPARE + max(self.network.readers[i] for i in sources)
         form = Form.ranged(reference, moved[:, 0], moved[:, 1:], radius + moves, active)
-        if float(size.amax()) >= OVERFLOW:
-            self.known.good &= (size.flatten(1).amax(1) < OVERFLOW).numpy()
+        self.known.good &= self.rounding.bounded(extremes).numpy()
+        tiny = torch.zeros((), dtype=torch.float64)
         for sized, shape in zip(charged, layer.input_shapes, strict=True):
             lost = int(np.prod(shape)) * (layer.row_terms + 2) * FLUSH
-            self.known.flush += lost * sized.width.flatten(1).amax(1).numpy()
+            most = sized.width.flatten(1).amax(1)
+            self.known.flush += lost * most.numpy()
+            # weights below that may be lost when rows store them in float32
+            tiny = tiny + max(1, layer.terms) * FLUSH * most.reshape(-1, *[1] * len(layer.shape))
         alone = [i for i in sources if self.known.rounds(i) and self.network.readers[i] == 1]
         folded = alone if isinstance(layer, Sum) else []
         self.known.folded.update(folded)
         for passage in self.known.passages:
             rows = gamma(roundings, passage.unit)
-            noise = ((moves + rows * width) * (1.0 + 2.0**-40)).expand(m, *layer.shape)
+            noise = ((moves + tiny + rows * width) * UP).expand(m, *layer.shape)
             for source in folded:
                 # one charge instead of several
                 noise = noise + passage.noise[source]
-            passage.noise[k] = noise * (1.0 + 2.0**-40 + passage.sums)
+            passage.noise[k] = noise * (UP + passage.sums)
+        if isinstance(layer, Variance):
+            least = layer.least(inputs[0], inputs[1], self.known.single)
+            least = least - flushed - own * size - FLUSH * (layer.terms + 1) - OWN_LINE * reference.abs()
+            return self.known.within(form, least - reference, form.upper)
+        if isinstance(layer, Scale):
+            # what is known of single numbers, beside their form
+            ends = torch.stack([layer.factor * inputs[0].lower, layer.factor * inputs[0].upper])
+            room = moves + OWN_FEW * ends.abs().amax(0)
+            return self.known.within(form, ends.amin(0) - room, ends.amax(0) + room)
         return self.known.within(form, form.lower, form.upper)
 
     def activation(self, k: int, source: int, layer: Activation, z: Form) -> Form:
@@ -89,17 +120,17 @@ class Propagation:
         lower, upper = z.interval
         size = z.interval.size
         reference = self.sharing.reference(k, lambda: layer.function(z.reference))
-        room = layer.missing(lower, upper) + 2.0**-48 * reference.abs()
+        room = layer.missing(lower, upper) + OWN_LINE * reference.abs()
         if self.known.single:
             room = room + layer.error(lower, upper)
         band = layer.band(lower, upper)
         s = band.lower_slope
         base = s * z.reference - reference
         middle = 0.5 * (band.lower_offset + band.upper_offset) + base
-        half = 0.5 * (band.upper_offset - band.lower_offset) + 2.0**-50 * middle.abs() + room
-        half = half + 2.0**-50 * (band.lower_offset.abs() + band.upper_offset.abs() + s.abs() * z.reference.abs())
-        half = half + 2.0**-48 * s.abs() * (z.c.abs() + z.a.abs().sum(1))
-        radius = s.abs() * z.r * (1.0 + 2.0**-40) + half
+        half = 0.5 * (band.upper_offset - band.lower_offset) + OWN_FEW * middle.abs() + room
+        half = half + OWN_FEW * (band.lower_offset.abs() + band.upper_offset.abs() + s.abs() * z.reference.abs())
+        half = half + OWN_LINE * s.abs() * (z.c.abs() + z.a.abs().sum(1))
+        radius = s.abs() * z.r * UP + half
         form = Form.ranged(reference, s * z.c + middle, s[:, None] * z.a, radius)
         if isinstance(layer, LeakyRelu) and layer.alpha == 0.0:
             form.active = upper > 0.0
@@ -113,8 +144,8 @@ class Propagation:
             for (slope, low, high), side in zip(chosen, (-1.0, 1.0), strict=True):
                 rounded = slope.to(passage.dtype).double()
                 base, apart = slope * z.reference - reference, band.lower_slope - slope
-                give = ((rounded - slope).abs() + unit * slope.abs()) * z.width + 2.0**-48 * apart.abs() * size + room
-                give = give + 2.0**-48 * (low.abs() + high.abs() + slope.abs() * z.reference.abs())
+                give = ((rounded - slope).abs() + unit * slope.abs()) * z.width + OWN_LINE * apart.abs() * size + room
+                give = give + OWN_LINE * (low.abs() + high.abs() + slope.abs() * z.reference.abs())
                 if fold:
                     give = give + rounded.abs() * passage.noise[source]
                 ends = (
@@ -154,8 +185,14 @@ class Propagation:
         lost = int(np.prod(layer.shape)) * 2 * FLUSH
         self.known.flush += lost * z.width.reshape(self.known.count, -1).amax(1).numpy()
         ends = layer.range(lower, upper)
-        room = room + 2.0**-48 * (ends[0].abs() + ends[1].abs())
+        room = room + OWN_LINE * (ends[0].abs() + ends[1].abs())
+        self._limit(torch.maximum(ends[0].abs(), ends[1].abs()))
         return self.known.within(form, ends[0] - reference - room, ends[1] - reference + room)
+
+    def _limit(self, size: Tensor) -> None:
+        """Give up cells in which numbers of at most ``size`` [m, ...] may overflow (N22)."""
+        if not float(size.amax()) < OVERFLOW:
+            self.known.good &= (size.flatten(1).amax(1) < OVERFLOW).numpy()
 
     def product(self, k: int, sources: tuple[int, ...], layer: Product, x: Form, y: Form) -> Form:
         """A product of two nodes (N9)."""
@@ -167,9 +204,9 @@ class Propagation:
         base = alpha * x.reference + beta * y.reference - reference
         # roundings of the plane relative to the references, and the network's
         own = alpha.abs() * x.reference.abs() + beta.abs() * y.reference.abs() + reference.abs()
-        room = 2.0**-48 * (own + plane.low.abs() + plane.high.abs()) + 2 * FLUSH
+        room = OWN_LINE * (own + plane.low.abs() + plane.high.abs()) + 2 * FLUSH
         if self.known.single:
-            room = room + 2 * UNIT * size
+            room = room + PRODUCT * size + FUNCTION_FLUSHES * FLUSH * (1.0 + first.size + second.size)
         shape = (6, m, *grid(layer.shape))
         for passage in self.known.passages:
             # rows' products with the slopes, which are float32 numbers, and sums where branches meet
@@ -184,17 +221,17 @@ class Propagation:
             )
         middle, half = 0.5 * (plane.low + plane.high) + base, 0.5 * (plane.high - plane.low)
         moved = alpha.abs() * (x.c.abs() + x.a.abs().sum(1)) + beta.abs() * (y.c.abs() + y.a.abs().sum(1))
-        half = half + room + 2.0**-50 * middle.abs() + 2.0**-44 * moved
-        radius = (alpha.abs() * x.r + beta.abs() * y.r) * (1.0 + 2.0**-40) + half
+        half = half + room + OWN_FEW * middle.abs() + OWN_FUNCTION * moved
+        radius = (alpha.abs() * x.r + beta.abs() * y.r) * UP + half
         c, a = alpha * x.c + beta * y.c + middle, alpha[:, None] * x.a + beta[:, None] * y.a
         form = Form.ranged(reference, c, a, radius, x.active & y.active)
         for f in (x, y):
             lost = int(np.prod(layer.shape)) * 2 * FLUSH
             self.known.flush += lost * f.width.reshape(m, -1).amax(1).numpy()
-        if float(size.amax()) >= OVERFLOW:
-            self.known.good &= (size.reshape(m, -1).amax(1) < OVERFLOW).numpy()
+        extremes = self.rounding.multiplied(k, sources, [first.size, second.size])
+        self.known.good &= self.rounding.bounded(extremes).numpy()
         ends = torch.stack([u * v for u in first for v in second]) - reference
-        room = room + 2.0**-50 * (size + reference.abs())
+        room = room + OWN_FEW * (size + reference.abs())
         return self.known.within(form, ends.amin(0) - room, ends.amax(0) + room)
 
 
@@ -206,7 +243,7 @@ def _tilted(slope: Tensor, z: Form, line: tuple[Tensor, Tensor, Tensor]) -> tupl
     own, below, above = line
     t = own - slope
     middle, size = t * (z.reference + z.c), z.reference.abs() + z.c.abs() + z.a.abs().sum(1)
-    half = t.abs() * (z.r * (1.0 + 2.0**-40) + 2.0**-48 * size)
+    half = t.abs() * (z.r * UP + OWN_LINE * size)
     return below + middle - half, above + middle + half, t[:, None] * z.a
 
 

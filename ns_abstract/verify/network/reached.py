@@ -10,6 +10,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from ns_abstract.arithmetic.network_charges import OWN_FEW, OWN_LINE
 from ns_abstract.verify.network.rows import Float64, Int64, Rows, full
 
 
@@ -54,13 +55,13 @@ class Reached:
         low, high = self.plane[:, 0], self.plane[:, 1]
         gap = high - low
         radius = 0.5 * (gap[:, -1] + np.abs(gap[:, :-1]).sum(1))
-        radius = np.maximum(radius, 0.0) + 2.0**-48 * (np.abs(low).sum(1) + np.abs(high).sum(1))
+        radius = np.maximum(radius, 0.0) + OWN_LINE * (np.abs(low).sum(1) + np.abs(high).sum(1))
         return torch.from_numpy(0.5 * (low + high)), torch.from_numpy(radius)
 
     def improve(self, number: Int64, plane: Float64, box: Float64) -> None:
         """Planes of the latest node; the best numbers of all: a plane's extremes or what the box says."""
         slopes = np.abs(plane[:, :, :-1]).sum(-1)
-        room = 2.0**-50 * (np.abs(plane[:, :, -1]) + slopes)
+        room = OWN_FEW * (np.abs(plane[:, :, -1]) + slopes)
         self.plane[number] = plane
         least = np.fmax(plane[:, 0, -1] - slopes[:, 0] - room[:, 0], box[:, 0])
         most = np.fmin(plane[:, 1, -1] + slopes[:, 1] + room[:, 1], box[:, 1])

@@ -1,46 +1,52 @@
-"""What float32 evaluations of a network and rows may be off (docs/design.md, N2, N20)."""
+"""What float32 evaluations of a network and rows may be off (docs/design.md, N2, N20-N22)."""
 
 from __future__ import annotations
 
 import functools
 from collections.abc import Callable
-from typing import Any
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
+from ns_abstract.arithmetic.network_charges import (
+    FLUSH,
+    FLUSHES,
+    FOLDED_SHIFT,
+    FOLDING,
+    MAGNITUDES_UP,
+    OVERFLOW,
+    PRODUCTS,
+    UP,
+    gamma,
+)
 from ns_abstract.verify.network.forms import Form
 from ns_abstract.verify.network.graph import Network
 from ns_abstract.verify.network.layers import Linear, Scale, Sum, Weighted
+from ns_abstract.verify.network.maps import Variance
+from ns_abstract.verify.network.maxima import MaxPool
 from ns_abstract.verify.network.sums import partial_sums
 
-#: Unit roundoff of float32: of the bounded evaluation, and of most rows.
-UNIT = 2.0**-24
-#: Unit roundoff of float64: of sums of offsets, and of rows of outputs in real arithmetic.
-DOUBLE_UNIT = 2.0**-53
-#: Roundings of rows beside those of their sums: stored weights and slopes, products with them.
-SPARE = 24
-#: Smallest normal number of float32: what a flush to zero may lose.
-FLUSH = 2.0**-126
-#: Past this a float32 evaluation may overflow.
-OVERFLOW = 2.0**126
-#: Roundings of the network beside those of a layer's sums: a batch normalisation's factor (sum, root, quotient),
-#: its product with a weight, and as many again.
-_FOLDING = 8
-#: Sums of fewer additions gain too little by their partial sums to pay for them.
+#: A preference: sums of fewer additions gain too little by their partial sums to pay for them.
 _LONG = 256
-
-
-def gamma(count: Any, unit: float | None = None) -> Any:
-    """What ``count`` roundings, in float32 unless said otherwise, may change, relatively."""
-    unit = UNIT if unit is None else unit
-    return count * unit / (1.0 - count * unit)
 
 
 def outward(value: Tensor, side: float) -> Tensor:
     """The float32 neighbour on one side, half a unit away at least; zero stays."""
     near = value.float()
     return torch.where(value == 0.0, near, torch.nextafter(near, torch.full_like(near, side * torch.inf)))
+
+
+class Extremes(NamedTuple):
+    """What numbers may grow to where a program groups the scales before a node in another way, [m] or [1] each (N21).
+
+    Attributes:
+        scales: Of products of scales alone, since the last layer of sums or activation.
+        sums: Of those with one layer of sums among them.
+    """
+
+    scales: Tensor
+    sums: Tensor
 
 
 class Rounding:
@@ -50,6 +56,79 @@ class Rounding:
         self.network = network
         #: by node: roundings of its sums
         self.terms: dict[int, Tensor | int] = {}
+        #: by linear node and product
+        self.extremes: dict[int, Extremes] = {}
+        #: by node, where a program may fold shifts into the next layer: their sizes together, one item (N21)
+        self.shifts: dict[int, Tensor] = {}
+
+    def groupings(self, k: int, sources: tuple[int, ...], layer: Linear, sizes: list[Tensor]) -> Extremes:
+        """`Extremes` of linear node k, for inputs of at most ``sizes`` [m or 1, *input_shapes[i]]; kept for readers."""
+        most = [size.flatten(1).amax(1) for size in sizes]
+        before = [self._before(i, size) for i, size in zip(sources, most, strict=True)]
+        scales = sum(e.scales + size + 1.0 for e, size in zip(before, most, strict=True))
+        sums = sum(e.sums for e in before)
+        assert isinstance(scales, Tensor) and isinstance(sums, Tensor)
+        if isinstance(layer, Variance):
+            # one pass sums the squares of the numbers themselves
+            scales = torch.maximum(most[0], most[1].square()) + 1.0
+        if layer.mixes and not isinstance(layer, Sum):
+            scales, sums = torch.zeros_like(scales), layer.gain * scales
+        else:
+            scales, sums = layer.gain * scales, layer.gain * sums
+        offset = 0.0 if layer.bias is None else float(layer.bias.abs().max())
+        found = self.extremes[k] = Extremes(scales + offset, sums + offset)
+        return found
+
+    def multiplied(self, k: int, sources: tuple[int, ...], sizes: list[Tensor]) -> Extremes:
+        """`Extremes` of product node k: either factor's scales may be the other's (N21)."""
+        most = [size.flatten(1).amax(1) for size in sizes]
+        one, two = (self._before(i, size) for i, size in zip(sources, most, strict=True))
+        scales = (one.scales + most[0] + 1.0) * (two.scales + most[1] + 1.0)
+        sums = one.sums * (two.scales + most[1] + 1.0) + two.sums * (one.scales + most[0] + 1.0)
+        found = self.extremes[k] = Extremes(scales, sums)
+        return found
+
+    def _before(self, index: int, like: Tensor) -> Extremes:
+        """`Extremes` of what a node reads; positive scales pass maxima."""
+        while index and isinstance(self.network.nodes[index - 1].layer, MaxPool):
+            index = self.network.nodes[index - 1].inputs[0]
+        zero = torch.zeros_like(like)
+        return self.extremes.get(index, Extremes(zero, zero))
+
+    @staticmethod
+    def bounded(extremes: Extremes) -> Tensor:
+        """[m or 1] whether no grouping overflows (N22)."""
+        return extremes.scales + extremes.sums < OVERFLOW
+
+    @staticmethod
+    def flushed(extremes: Extremes, layer: Linear) -> Tensor:
+        """[m or 1, 1, ...] what flushes to zero may cost in all groupings (N21)."""
+        lost = FLUSHES * FLUSH * (extremes.scales + extremes.sums + layer.gain + 1.0) * MAGNITUDES_UP
+        return lost.reshape(-1, *[1] * len(layer.shape))
+
+    def shifted(self, k: int, sources: tuple[int, ...], layer: Linear) -> Tensor | float:
+        """What folding shifts before node k into its sums costs besides, one item (N21)."""
+        given = [self.shifts.get(i) for i in sources]
+        if isinstance(layer, Scale):
+            carried = 0.0 if given[0] is None else given[0] * layer.factor.abs()
+            own = 0.0 if layer.offset is None else layer.offset.abs()
+            if given[0] is not None or layer.offset is not None:
+                self.shifts[k] = torch.as_tensor(carried + own).expand(layer.shape)
+            return 0.0
+        if all(shift is None for shift in given):
+            return 0.0
+        shapes = layer.input_shapes
+        parts = [
+            torch.zeros((1, *shape), dtype=torch.float64) if shift is None else shift[None].contiguous()
+            for shift, shape in zip(given, shapes, strict=True)
+        ]
+        moved = layer.magnitude(parts)[0] * MAGNITUDES_UP
+        if not isinstance(layer, Weighted):
+            if not layer.mixes or isinstance(layer, Sum):
+                self.shifts[k] = moved
+            return 0.0
+        bias = 0.0 if layer.bias is None else layer.bias.abs()
+        return gamma(layer.terms + FOLDING + 1) * (FOLDED_SHIFT * moved + bias)
 
     def charge(
         self,
@@ -65,35 +144,36 @@ class Rounding:
         ``size`` = |W| |x| + |bias|; ``end``: what its values are at most (N2, N20).
         """
         count = self.terms[k] = self._count(sources, layer, inputs)
-        folding = _FOLDING if k in self.network.scaled else 0
-        few = gamma(folding + 3 + len(inputs)) * size
+        folding = FOLDING if k in self.network.scaled else 0
+        few = gamma(folding + PRODUCTS + len(inputs)) * size
+        few = few + (shifts := self.shifted(k, sources, layer))
         if isinstance(layer, Scale):
             # sums before it may start with the offset
             first = torch.zeros(()) if layer.bias is None else layer.bias.abs()
-            return gamma(count) * first * (1.0 + gamma(count + _FOLDING)) + few
+            return gamma(count) * first * (1.0 + gamma(count + FOLDING)) + few
         if isinstance(layer, Sum):
             # the sum of one input may start with the others
             charges = []
             for i, f in zip(sources, inputs, strict=True):
-                others = size - f.interval.size * (1.0 - 2.0**-40)
+                others = size - f.interval.size * (2.0 - UP)
                 own = torch.as_tensor(self.terms.get(i, 0), dtype=torch.float64)
-                charges.append(gamma(own) * others * (1.0 + gamma(own + _FOLDING)))
+                charges.append(gamma(own) * others * (1.0 + gamma(own + FOLDING)))
             return few + (torch.maximum(*charges) if len(charges) == 2 else sum(charges))
         if not isinstance(layer, Weighted):
-            return gamma(count + _FOLDING) * size
+            return gamma(count + FOLDING) * size + shifts
         # partial sums are no larger than the positive products together, or the negative ones
         above, below = inputs[0].interval.upper.clamp(min=0.0), inputs[0].interval.lower.clamp(max=0.0)
         balance = layer([above + below])
-        peak = 0.5 * (size + balance.abs()) * (1.0 + 2.0**-40)
+        peak = 0.5 * (size + balance.abs()) * UP
         if float(torch.as_tensor(count).max()) < _LONG:
-            return gamma(count) * (peak + gamma(count + _FOLDING + 1) * size) + few
+            return gamma(count) * (peak + gamma(count + FOLDING + 1) * size) + few
         squared = layer.squared
         whole = squared.magnitude([above.square() + below.square()])
         if squared.bias is not None:
             whole = whole + squared.bias.abs()
-        squares = 0.5 * (whole + squared([above.square() - below.square()]).abs()) * (1.0 + 2.0**-36)
+        squares = 0.5 * (whole + squared([above.square() - below.square()]).abs()) * MAGNITUDES_UP
         together = partial_sums(count, peak, squares, end())
-        return gamma(1) * (together + count * gamma(count + _FOLDING + 1) * size) + few
+        return gamma(1) * (together + count * gamma(count + FOLDING + 1) * size) + few
 
     def _count(self, sources: tuple[int, ...], layer: Linear, inputs: list[Form]) -> Tensor | int:
         """Roundings that a layer's sums may suffer; what is added behind sums may be added within them (N2)."""

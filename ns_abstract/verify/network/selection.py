@@ -21,7 +21,8 @@ _MANY, _SOME, _GAIN = 1024, 64, 0.95
 _UNSURE = 0.25
 #: Numbers of a node that are probed by rows, and the part of widths past which forms are good enough.
 _PROBED, _HALF = 32, 0.5
-#: Lines that are apart by so small a part of a width are one line; by so large a part of what rows leave of it, open.
+#: Preferences: lines that are apart by so small a part of a width are one line; by so large a part of what rows leave
+#: of it, open.
 _STRAIGHT, _BENT = 2.0**-20, 2.0**-5
 
 

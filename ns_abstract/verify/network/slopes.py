@@ -11,6 +11,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from ns_abstract.arithmetic.network_charges import OWN_LINE, OWN_SUMS, UP
 from ns_abstract.verify.network.graph import Network
 from ns_abstract.verify.network.layers import Activation, Linear
 from ns_abstract.verify.network.maxima import MaxPool
@@ -22,8 +23,6 @@ Int64 = NDArray[np.int64]
 
 #: First step of slopes, what each is of the one before, and Adam's parts of what was known before.
 _STEP, _DECAY, _FIRST, _SECOND = 0.3, 0.88, 0.8, 0.95
-#: Room for rounding of what is computed here in float64: a few operations.
-_ROOM = 2.0**-46
 
 
 @dataclass(frozen=True)
@@ -66,7 +65,7 @@ class OpenUnits:
         s = slope.astype(np.float64)
         base = s * self.reference - self.image
         size = np.abs(self.reference) + np.abs(self.image) + np.abs(self.lower) + np.abs(self.upper)
-        give = s * self.loose + self.room + _ROOM * size
+        give = s * self.loose + self.room + OWN_SUMS * size
         # the function is convex: above a line by most at an end
         top = np.maximum(self.alpha * self.lower - s * self.lower, self.upper - s * self.upper)
         low, high = (base - give).astype(np.float32), (top + base + give).astype(np.float32)
@@ -96,7 +95,7 @@ class Held:
         """
         gained = -multiplier * self.side.astype(np.float32)
         size = np.abs(gained.astype(np.float64))
-        room = size @ (self.noise + 2.0**-48 * np.abs(self.reference)) * (1.0 + 2.0**-40)
+        room = size @ (self.noise + OWN_LINE * np.abs(self.reference)) * UP
         return gained, gained.astype(np.float64) @ self.reference - room
 
 

@@ -5,8 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-#: Room for float64's rounding of what is computed here.
-_ROOM = 1.0 + 2.0**-40
+from ns_abstract.arithmetic.network_charges import UP
 
 
 def partial_sums(count: Tensor | int, peak: Tensor, squares: Tensor, end: Tensor) -> Tensor:
@@ -19,7 +18,7 @@ def partial_sums(count: Tensor | int, peak: Tensor, squares: Tensor, end: Tensor
         end: The size of the whole sum, or more.
     """
     number = torch.as_tensor(count, dtype=torch.float64)
-    root = squares.sqrt() * _ROOM
+    root = squares.sqrt() * UP
 
     def ordered(leaves: Tensor) -> Tensor:
         """The sum of what one to ``leaves`` numbers of one sign may be together."""
@@ -29,4 +28,4 @@ def partial_sums(count: Tensor | int, peak: Tensor, squares: Tensor, end: Tensor
 
     half = (0.5 * (number + 1.0)).ceil()
     least = torch.minimum(ordered(number + 1.0), 2.0 * ordered(half) + peak + half * end)
-    return torch.minimum(number * peak, least * _ROOM)
+    return torch.minimum(number * peak, least * UP)

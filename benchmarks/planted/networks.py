@@ -1,0 +1,138 @@
+"""Faults in what float32 programs of networks are charged with: norms, folding, flushes to zero, overflow, counts."""
+
+from planted.fault import Fault
+
+_NETWORK = "verify/network/"
+_TESTS = "test_network_charges.py::"
+_FLUSHED = _TESTS + "test_flushed_numbers"
+
+NETWORKS = (
+    Fault(
+        "norm: variances of one pass are not negative",
+        _NETWORK + "maps.py",
+        "Variance.least",
+        "gamma(VARIANCE_PASSES * self.terms) * reach.square()",
+        "0.0 * reach.square()",
+        _TESTS + "test_norms_of_one_pass[15.1-0.001-True]",
+    ),
+    Fault(
+        "norm: one pass is not charged",
+        _NETWORK + "maps.py",
+        "Variance.spare",
+        "gamma(VARIANCE_PASSES * self.terms)",
+        "0.0",
+        _TESTS + "test_norms_of_one_pass[5.1-0.02-True]",
+    ),
+    Fault(
+        "norm: one made of several nodes is not seen",
+        _NETWORK + "compose.py",
+        "Composer.reduce",
+        "centred >= 0",
+        "centred > 1000",
+        _TESTS + "test_norms_of_one_pass[5.1-0.02-False]",
+    ),
+    Fault(
+        "norm: epsilon alone is below the root",
+        _NETWORK + "compose.py",
+        "Composer.normalise",
+        "self.curve(root, curves.Root, inverse=True)",
+        "self.curve(root, curves.Root, floor=epsilon * (1.0 - 2.0**-16), inverse=True)",
+        _TESTS + "test_norms_of_one_pass[15.1-0.001-True]",
+    ),
+    Fault(
+        "transposed convolution: dilated taps are taken to be side by side",
+        _NETWORK + "compose.py",
+        "Composer.transposed_convolution",
+        "s // math.gcd(s, d)",
+        "s",
+        _TESTS + "test_dilated_transposed_convolutions",
+    ),
+    Fault(
+        "convolution: rows' dilated taps are taken to be side by side",
+        _NETWORK + "build.py",
+        "Builder.convolution",
+        "s // math.gcd(s, d)",
+        "s",
+        _TESTS + "test_counts_of_dilated_sums[5-4-4]",
+    ),
+    Fault(
+        "sums of which no digit is left are charged by negative numbers",
+        "arithmetic/network_charges.py",
+        "gamma",
+        "largest < 0.5",
+        "largest < 1e9",
+        _TESTS + "test_sums_without_a_digit_are_refused",
+    ),
+    Fault(
+        "layers: flushed factors and numbers are not charged",
+        _NETWORK + "rounding.py",
+        "Rounding.flushed",
+        "extremes.scales + extremes.sums + layer.gain + 1.0",
+        "0.0 * extremes.scales",
+        _FLUSHED + "[weights]",
+    ),
+    Fault(
+        "layers: a flush behind folded scales is charged as one before them",
+        _NETWORK + "rounding.py",
+        "Rounding.groupings",
+        "layer.gain * scales, layer.gain * sums",
+        "layer.gain * scales, 0.0 * sums",
+        _FLUSHED + "[product of weights]",
+    ),
+    Fault(
+        "batch norm: its factors are taken for their product",
+        _NETWORK + "build.py",
+        "Builder.batch_norm",
+        "self.scale(x, factor, -mean * factor, grown)",
+        "self.scale(x, factor, -mean * factor)",
+        _FLUSHED + "[batch norm]",
+    ),
+    Fault(
+        "leaky ReLU: flushes are not charged",
+        _NETWORK + "layers.py",
+        "LeakyRelu.error",
+        "AFFINE * self.alpha * size + FUNCTION_FLUSHES * FLUSH * (1.0 + size)",
+        "AFFINE * self.alpha * size",
+        _FLUSHED + "[leaky]",
+    ),
+    Fault(
+        "root: small numbers are never flushed",
+        _NETWORK + "curves.py",
+        "Root._cuts",
+        "lower >= FLUSH",
+        "lower > 0.0",
+        _FLUSHED + "[root]",
+    ),
+    Fault(
+        "clip: limits of 2^100 are taken for none",
+        _NETWORK + "compose.py",
+        "Composer.clip",
+        "least <= -OVERFLOW, most >= OVERFLOW",
+        "least <= -(2.0**100), most >= 2.0**100",
+        _TESTS + "test_limits_of_clips_count_however_large",
+    ),
+    Fault(
+        "activations: results past float32 are bounded",
+        _NETWORK + "propagation.py",
+        "Propagation._limit",
+        "float(size.amax()) < OVERFLOW",
+        "True",
+        _TESTS + "test_overflow_between[power]",
+    ),
+    Fault(
+        "layers: what overflows between folded scales is bounded",
+        _NETWORK + "rounding.py",
+        "Rounding.bounded",
+        "extremes.scales + extremes.sums",
+        "0.0 * extremes.scales",
+        _TESTS + "test_overflow_between[folded weights]",
+    ),
+    Fault(
+        "layers: shifts folded into the next sums are not charged",
+        _NETWORK + "rounding.py",
+        "Rounding.shifted",
+        "FOLDED_SHIFT * moved + bias",
+        "0.0 * moved",
+        _TESTS + "test_shifts_that_are_folded_forwards[scale]",
+    ),
+)
