@@ -21,8 +21,8 @@ _COPIES = 6
 Run = Callable[[np.ndarray], np.ndarray]
 
 
-def read_exported(path: Path) -> tuple[Network, Run]:
-    """The network in a .pt2 file, and the same graph run with torch's own operators on one image [1, ...].
+def read_exported(path: Path, output: str | None = None) -> tuple[Network, Run]:
+    """The network in a .pt2 file up to ``output``, which may be left out where there is one, and the same graph run with torch's own operators on one image [1, ...].
 
     Raises:
         InputError: The file cannot be read, or uses what is not supported; names node, operator and argument.
@@ -31,7 +31,7 @@ def read_exported(path: Path) -> tuple[Network, Run]:
         check_memory(_COPIES * file_size(path, "network"), path, "the network")
         with zipfile.ZipFile(path) as archive:
             graph, weights = contents(path, archive)
-        reader = Reader(path, graph, weights, OPERATORS)
+        reader = Reader(path, graph, weights, OPERATORS, output)
         return reader.network(), reader.run
     except (InputError, MemoryError):
         raise

@@ -105,7 +105,7 @@ def _average_pool(r: Reader, node: onnx.NodeProto, a: Attributes) -> None:
 
 def _max_pool(r: Reader, node: onnx.NodeProto, a: Attributes) -> None:
     x, kernel, stride, dilation, pads, more, line = _pool_window(r, node, a)
-    a.ignore("storage_order")  # of the second output, which is refused
+    a.ignore("storage_order")  # of the second output, which is refused where it is read
     pads = (*pads[:2], pads[2] + more[0], pads[3] + more[1])
     _mapped(r, node, r.builder.max_pool(x, kernel, stride, dilation, pads), line)
 
@@ -213,7 +213,7 @@ def _dropout(r: Reader, node: onnx.NodeProto, a: Attributes) -> None:
     if training is not None and bool(np.any(training)):
         raise InputError("is in training mode", fix="export the network in evaluation mode")
     if any(node.output[1:]):
-        raise InputError("has a mask as second output", fix="export the network in evaluation mode")
+        raise InputError("gives its mask to other nodes", fix="export the network in evaluation mode")
     r.values[node.output[0]] = r.value(node)
 
 
@@ -393,6 +393,8 @@ def _given(operand: Value | np.ndarray) -> Operand:
 
 
 def _matmul(r: Reader, node: onnx.NodeProto, a: Attributes) -> None:
+    if r.batch > 1 and (r.moves(node, 1) or r.weight(node, 1).ndim > 2):
+        raise InputError(f"multiplies within a batch of {r.batch} items", fix="export with a batch of 1")
     r.result(node, *matmul(r.builder, *(_given(_operand(r, node, k)) for k in range(2))))
 
 
@@ -424,6 +426,8 @@ def _flatten(r: Reader, node: onnx.NodeProto, a: Attributes) -> None:
     if not -len(x.whole) <= axis <= len(x.whole):
         raise InputError(f"attribute axis = {axis} of {item(x.whole)}", fix="use 1")
     axis = axis + len(x.whole) if axis < 0 else axis
+    if r.batch > 1 and axis != 1:
+        raise InputError(f"attribute axis = {axis} on a batch of {r.batch} items", fix="use 1")
     r.result(node, x.index, (math.prod(x.whole[:axis]), math.prod(x.whole[axis:])))
 
 
@@ -439,6 +443,10 @@ def _reshape(r: Reader, node: onnx.NodeProto, a: Attributes) -> None:
             if k >= len(x.whole):
                 raise InputError(f"shape {target} copies a size that is not there", fix="check the shape")
             target[k] = x.whole[k]
+    if r.batch > 1:
+        if not x.batched or not target or target[0] not in (r.batch, -1):
+            raise InputError(f"shape {target} mixes the {r.batch} items of a batch", fix="export with a batch of 1")
+        target[0] = 1 if target[0] == r.batch else -1
     total, rest = math.prod(x.whole), math.prod(v for v in target if v != -1)
     if target.count(-1) > 1 or rest <= 0 or total % rest or (-1 not in target and rest != total):
         raise InputError(f"shape {target} of {total} numbers", fix="export with a batch of 1")
