@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -13,6 +14,7 @@ import torch
 from ns_abstract.io.errors import InputError
 from ns_abstract.verify.network import curves
 from ns_abstract.verify.network.build import Builder
+from ns_abstract.verify.network.doubtful import Doubtful, Doubts, doubtful
 from ns_abstract.verify.network.graph import as_double, item
 from ns_abstract.verify.network.layers import (
     Activation,
@@ -29,10 +31,11 @@ from ns_abstract.verify.network.layers import (
 from ns_abstract.verify.network.maps import Differences, Resized, Sparse, TransposedConvolution, Variance
 from ns_abstract.verify.network.maxima import MaxPool
 from ns_abstract.verify.network.products import Product
+from ns_abstract.verify.network.recognised import GatedClip, ScaledGelu, SwitchedSoftplus
 
 #: Sums of exponentials one of which is exp(0) are no less than this, rounding included.
 _ONE_AND_MORE = 1.0 - 2.0**-10
-#: How far a float32 constant may be from the number that it stands for, relative.
+#: How far constants may be from those of a known function, relative, for its charges of rounding to hold.
 _NEAR = 2.0**-22
 _ONES = (1, 1)
 #: Entries of a matrix that takes means away; where it would have more, the mean is a layer of its own.
@@ -54,7 +57,8 @@ class Composer(Builder):
     def _affine(self, index: int) -> tuple[int, float, float]:
         """(root, factor, offset): node ``index`` is ``factor * root + offset`` with plain numbers."""
         factor, offset = 1.0, 0.0
-        while index and isinstance(self._node(index).layer, Scale):
+        # constants that are known within bounds alone are no plain numbers
+        while index and type(self._node(index).layer) is Scale:
             layer = self._node(index).layer
             f = layer.factor.reshape(-1)
             o = torch.zeros(1, dtype=torch.float64) if layer.offset is None else layer.offset.reshape(-1)
@@ -83,14 +87,14 @@ class Composer(Builder):
             return 0.0 if (min(least) >= 0.0 or isinstance(layer, Variance)) else -math.inf
         if min(least) == -math.inf or isinstance(layer, Activation):
             return -math.inf
-        if isinstance(layer, Scale) and bool((layer.factor >= 0.0).all()):
+        if type(layer) is Scale and bool((layer.factor >= 0.0).all()):
             low = layer.factor * least[0] + (0.0 if layer.offset is None else layer.offset)
             return self._rounded(float(low.min()), layer.offset is None or bool((layer.offset >= 0.0).all()))
         if type(layer) is Linear or isinstance(layer, MaxPool):
             return least[0]
         positive = (
             (isinstance(layer, Sum) and min(layer.signs) > 0)
-            or (isinstance(layer, (Sparse, Convolution)) and bool((layer.weight >= 0.0).all()))
+            or (isinstance(layer, (Sparse, Convolution)) and not isinstance(layer, Doubtful) and bool((layer.weight >= 0.0).all()))
             or isinstance(layer, Gather)
         )
         return 0.0 if positive and min(least) >= 0.0 and layer.bias is None else -math.inf
@@ -105,6 +109,14 @@ class Composer(Builder):
     def curve(self, x: int, make: Callable[..., curves.Curve], **settings: Any) -> int:
         """A layer of `ns_abstract.verify.network.curves`."""
         return self._add(make(self.shape(x), **settings), x)
+
+    def doubt(self, index: int, weight: Doubts | None, offset: Doubts | None) -> int:
+        """The last layer again, whose constants are known within bounds alone (N21)."""
+        if weight is None and offset is None:
+            return index
+        node = self.nodes[index - 1]
+        self.nodes[index - 1] = replace(node, layer=doubtful(node.layer, weight, offset))
+        return index
 
     def clip(self, x: int, least: float, most: float) -> int:
         """``min(max(x, least), most)``, with infinite limits, too."""
@@ -163,16 +175,19 @@ class Composer(Builder):
         """The natural logarithm."""
         return self.curve(x, curves.Log, floor=self._above(x))
 
-    def is_softplus(self, compared: int, limit: float, straight: int, curved: int) -> bool:
-        """Whether ``straight`` where ``compared`` is above the limit is what ``curved`` is there, rounding aside."""
+    def switched_softplus(self, compared: int, limit: float, straight: int, curved: int) -> int:
+        """``straight`` where ``compared`` is above the limit, else the softplus ``curved``; 0 if it is none."""
         (root, s, o), (behind, t, p) = self._affine(straight), self._affine(curved)
         node = self._node(behind)
-        if node is None or not isinstance(node.layer, curves.Softplus) or limit < 16.0 or o != 0.0 or p != 0.0:
-            return False
-        # softplus is less than 2^-23 from its argument there
+        if node is None or type(node.layer) is not curves.Softplus or limit < 16.0 or o != 0.0 or p != 0.0:
+            return 0
         argument, other = self._affine(node.inputs[0]), self._affine(compared)
         same = argument[0] == other[0] == root and argument[2] == other[2] == 0.0 and argument[1] == other[1]
-        return same and abs(t * argument[1] - s) <= _NEAR * abs(s)
+        if not same or not abs(t * argument[1] - s) <= _NEAR * abs(s):
+            return 0
+        # of the argument a x: the line is s x = s / (t a) of it, times t
+        excess = abs(1.0 - s / (t * argument[1]))
+        return self._times(self.curve(node.inputs[0], SwitchedSoftplus, limit=limit, excess=excess), t)
 
     # ------------------------------------------------------------ two values that depend on the image
 
@@ -237,12 +252,13 @@ class Composer(Builder):
         if isinstance(layer, Sigmoid) and c == 0.0 and shift == 0.0 and t != 0.0:
             return self._times(self.curve(self._times(root, t), curves.Silu), s * factor / t)
         if isinstance(layer, curves.Erf) and c == 0.0 and abs(t * math.sqrt(2.0) - 1.0) < _NEAR and shift == factor:
-            return self._times(self.curve(root, curves.Gelu), 2.0 * s * factor)
-        if isinstance(layer, curves.Clip) and shift == 0.0 and layer.least == 0.0:
+            return self._times(self.curve(root, ScaledGelu, rate=t * math.sqrt(2.0)), 2.0 * s * factor)
+        if isinstance(layer, curves.Clip) and shift == 0.0 and layer.least == 0.0 and 0.0 in (c, layer.offset):
             # clip(a x + b, 0, m) of the root
             a, b = layer.factor * t / layer.most, (layer.factor * c + layer.offset) / layer.most
             if abs(6.0 * a - 1.0) < _NEAR and abs(2.0 * b - 1.0) < _NEAR:
-                return self._times(self.curve(root, curves.HardSwish), s * factor * layer.most)
+                gate = self.curve(root, GatedClip, factor=a, offset=b)
+                return self._times(gate, s * factor * layer.most)
         return 0
 
     def extreme(self, inputs: Sequence[int], most: bool) -> int:

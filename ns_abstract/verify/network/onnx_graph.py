@@ -13,6 +13,7 @@ import onnx
 from ns_abstract.io.errors import InputError
 from ns_abstract.verify.network.chosen import chosen_output
 from ns_abstract.verify.network.compose import Composer
+from ns_abstract.verify.network.enclosed import Enclosed, arithmetic, fold_enclosed
 from ns_abstract.verify.network.graph import Network
 from ns_abstract.verify.network.layers import Shape
 from ns_abstract.verify.network.onnx_fold import FOLDED, fold
@@ -129,6 +130,8 @@ class Reader:
         self.path, self.graph, self.opset, self.rules = path, graph, opset, rules
         self.stored = StoredTensors(path)
         self.constants: dict[str, np.ndarray] = {}
+        #: constants that evaluations may round differently; `constants` holds numbers within
+        self.enclosed: dict[str, Enclosed] = {}
         for tensor in graph.initializer:
             self.constants[tensor.name] = self.stored.array(tensor, f"initializer {tensor.name}")
         if graph.sparse_initializer:
@@ -227,7 +230,15 @@ class Reader:
         inputs = [name for name in node.input if name]
         if kind in FOLDED and inputs and all(name in self.constants for name in inputs):
             values = [self.constants[name] if name else None for name in node.input]
-            self.fold(node, *fold(node, values, self.opset))
+            if not arithmetic(node, values, any(name in self.enclosed for name in inputs)):
+                self.fold(node, *fold(node, values, self.opset))
+                return
+            with np.errstate(all="ignore"):
+                within = [self.enclosed.get(n, v) for n, v in zip(node.input, values, strict=True)]
+                found = fold_enclosed(node, within, self.opset)
+            names = [name for name in node.output if name]
+            self.enclosed |= {n: v for n, v in zip(names, found, strict=False) if isinstance(v, Enclosed)}
+            self.fold(node, *(v.value if isinstance(v, Enclosed) else v for v in found))
             return
         rule = self.rules.get(kind)
         if rule is None:
@@ -262,20 +273,27 @@ class Reader:
             raise InputError(f"input of shape {list(value.whole)} mixes the batch", fix="keep the batch first")
         return value.index
 
-    def constant(self, node: onnx.NodeProto, position: int, default: Any = None) -> Any:
-        """Constant input ``position``; ``default`` if it is absent."""
+    def constant(self, node: onnx.NodeProto, position: int, default: Any = None, doubtful: bool = False) -> Any:
+        """Constant input ``position``; ``default`` if it is absent. ``doubtful``: the caller charges `doubts`."""
         name = node.input[position] if position < len(node.input) else ""
         if not name:
             return default
         if name not in self.constants:
             raise InputError(f"input {position} ({name}) is not a constant", fix="fold constants when exporting")
+        if name in self.enclosed and not doubtful:
+            problem = f"input {position} ({name}) is a constant that rounding changes"
+            raise InputError(problem, fix="fold constants when exporting, in float64")
         found = self.constants[name]
         if found.dtype.kind == "f" and node.op_type != "Add" and np.isneginf(found).any():
             raise InputError(f"input {position} ({name}) holds minus infinity", fix="mask right before a Softmax")
         return found
 
-    def weight(self, node: onnx.NodeProto, position: int) -> np.ndarray:
-        found = self.constant(node, position)
+    def doubts(self, node: onnx.NodeProto, position: int) -> Enclosed | None:
+        """Enclosures of a constant input that rounding changes."""
+        return self.enclosed.get(node.input[position]) if position < len(node.input) else None
+
+    def weight(self, node: onnx.NodeProto, position: int, doubtful: bool = False) -> np.ndarray:
+        found = self.constant(node, position, None, doubtful)
         if found is None:
             raise InputError(f"input {position} is missing", fix="export the network again")
         return found

@@ -12,6 +12,8 @@ import onnx
 from ns_abstract.io.errors import InputError
 from ns_abstract.verify.network import curves
 from ns_abstract.verify.network.compose import Composer, interpolation
+from ns_abstract.verify.network.doubtful import Doubts
+from ns_abstract.verify.network.enclosed import Enclosed
 from ns_abstract.verify.network.graph import item
 from ns_abstract.verify.network.layers import Shape
 from ns_abstract.verify.network.onnx_graph import Attributes, Reader, Rule, Value
@@ -65,7 +67,7 @@ def _mapped(r: Reader, node: onnx.NodeProto, index: int, line: bool) -> None:
 
 
 def _conv(r: Reader, node: onnx.NodeProto, a: Attributes) -> None:
-    x, weight, bias = r.source(node), r.weight(node, 1), r.constant(node, 2)
+    x, weight, bias = r.source(node), r.weight(node, 1, True), r.constant(node, 2, None, True)
     shape = r.builder.shape(x)
     if (weight.ndim, len(shape)) not in ((4, 3), (3, 2)):
         problem = f"weights {item(weight.shape)} on {item(shape)}"
@@ -78,6 +80,7 @@ def _conv(r: Reader, node: onnx.NodeProto, a: Attributes) -> None:
     stride, dilation = _ints(a, "strides", line, 1), _ints(a, "dilations", line, 1)
     pads = _pads(a, r.builder.shape(x)[1:], kernel, stride, dilation, line)
     index = r.builder.convolution(x, weight, bias, stride, dilation, pads, int(a.get("group", 1)))
+    r.builder.doubt(index, _doubts(r.doubts(node, 1), weight.shape), _doubts(r.doubts(node, 2)))
     _mapped(r, node, index, line)
 
 
@@ -116,13 +119,17 @@ def _global_average(r: Reader, node: onnx.NodeProto, a: Attributes) -> None:
 
 
 def _gemm(r: Reader, node: onnx.NodeProto, a: Attributes) -> None:
-    x, weight, bias = r.value(node), r.weight(node, 1), r.constant(node, 2)
+    x, weight, bias = r.value(node), r.weight(node, 1, True), r.constant(node, 2, None, True)
     a.only("transA", 0)
     alpha, beta = float(a.get("alpha", 1.0)), float(a.get("beta", 1.0))
     if weight.ndim != 2:
         raise InputError(f"weights {item(weight.shape)}", fix="a matrix expected")
     matrix = weight.astype(np.float64) if a.get("transB", 0) else weight.astype(np.float64).T
     index = r.builder.matrix(x.index, alpha * matrix, None if bias is None else beta * bias.astype(np.float64))
+    own, shift = r.doubts(node, 1), r.doubts(node, 2)
+    if own is not None:
+        own = own.times(alpha) if a.get("transB", 0) else own.times(alpha).turned()
+    r.builder.doubt(index, _doubts(own), _doubts(None if shift is None else shift.times(beta)))
     r.result(node, index, (*x.whole[:-1], matrix.shape[0]))
 
 
@@ -251,10 +258,11 @@ def _number(r: Reader, node: onnx.NodeProto, a: Attributes) -> None:
 def _binary(r: Reader, node: onnx.NodeProto, a: Attributes) -> None:
     kind = node.op_type
     a.ignore("axis", "broadcast")
-    one, two = (_operand(r, node, k) for k in range(2))
+    one, two = (_operand(r, node, k, True) for k in range(2))
     if isinstance(one, Value) and isinstance(two, Value):
         r.result(node, *_both(r.builder, kind, one, two))
         return
+    own = r.doubts(node, 1 if isinstance(one, Value) else 0)
     if isinstance(one, Value):
         value, constant = one, np.asarray(two, np.float64)
     else:
@@ -269,7 +277,8 @@ def _binary(r: Reader, node: onnx.NodeProto, a: Attributes) -> None:
     elif kind == "Div":
         if not constant.all():
             raise InputError("divides by zero", fix="check the constant")
-        factor = 1.0 / constant
+        own = None if own is None else own.inverse()
+        factor = 1.0 / constant if own is None else own.value
     elif kind == "Add":
         dropped = constant <= _DROPPED
         if dropped.any():
@@ -278,11 +287,28 @@ def _binary(r: Reader, node: onnx.NodeProto, a: Attributes) -> None:
     else:
         factor = np.ones(()) if isinstance(one, Value) else -np.ones(())
         offset = -constant if isinstance(one, Value) else constant
-    r.result(node, r.builder.scale(x, factor, offset), whole)
+    index = r.builder.scale(x, factor, offset)
+    if own is not None:
+        off = _doubts(own, r.builder.shape(x))
+        index = r.builder.doubt(index, *((off, None) if kind in ("Mul", "Div") else (None, off)))
+    r.result(node, index, whole)
 
 
-def _operand(r: Reader, node: onnx.NodeProto, position: int) -> Value | np.ndarray:
-    return r.value(node, position) if r.moves(node, position) else r.weight(node, position)
+def _doubts(constant: Enclosed | None, shape: Shape | None = None) -> Doubts | None:
+    """Doubts of a constant, spread to an item or given the shape of weights."""
+    if constant is None:
+        return None
+    found = constant.doubts
+    if shape is None:
+        return found
+    if found[0].size == math.prod(shape):
+        return found[0].reshape(shape), found[1].reshape(shape)
+    real, single = (np.broadcast_to(part, (1, *shape))[0] for part in found)
+    return real, single
+
+
+def _operand(r: Reader, node: onnx.NodeProto, position: int, doubtful: bool = False) -> Value | np.ndarray:
+    return r.value(node, position) if r.moves(node, position) else r.weight(node, position, doubtful)
 
 
 def _spread(b: Composer, value: Value, shape: Sequence[int]) -> tuple[int, Shape]:
@@ -370,9 +396,10 @@ def _where(r: Reader, node: onnx.NodeProto, a: Attributes) -> None:
     if node.input[0] in r.above:
         value, limit = r.above[node.input[0]]
         straight, curved = r.value(node, 1), r.value(node, 2)
-        if not r.builder.is_softplus(value.index, limit, straight.index, curved.index):
+        index = r.builder.switched_softplus(value.index, limit, straight.index, curved.index)
+        if not index:
             raise InputError("chooses by a value that depends on the image", fix="only torch's softplus is read")
-        r.values[node.output[0]] = curved
+        r.result(node, index, curved.whole)
         return
     chosen = np.asarray(r.weight(node, 0), bool)
     parts = [_operand(r, node, k) for k in (1, 2)]
@@ -395,7 +422,12 @@ def _given(operand: Value | np.ndarray) -> Operand:
 def _matmul(r: Reader, node: onnx.NodeProto, a: Attributes) -> None:
     if r.batch > 1 and (r.moves(node, 1) or r.weight(node, 1).ndim > 2):
         raise InputError(f"multiplies within a batch of {r.batch} items", fix="export with a batch of 1")
-    r.result(node, *matmul(r.builder, *(_given(_operand(r, node, k)) for k in range(2))))
+    own = r.doubts(node, 1)
+    flat = own is not None and own.value.ndim == 2
+    result = matmul(r.builder, *(_given(_operand(r, node, k, k == 1 and flat)) for k in range(2)))
+    if own is not None:
+        r.builder.doubt(result[0], _doubts(own.turned()), None)
+    r.result(node, *result)
 
 
 def _einsum(r: Reader, node: onnx.NodeProto, a: Attributes) -> None:
@@ -706,7 +738,7 @@ def _resize(r: Reader, node: onnx.NodeProto, a: Attributes) -> None:
 
 
 def _conv_transpose(r: Reader, node: onnx.NodeProto, a: Attributes) -> None:
-    (x, line), weight, bias = _map(r, r.source(node)), r.weight(node, 1), r.constant(node, 2)
+    (x, line), weight, bias = _map(r, r.source(node)), r.weight(node, 1, True), r.constant(node, 2, None, True)
     weight = weight.reshape(*weight.shape, *[1] * line)
     a.only("auto_pad", "NOTSET", "VALID")
     _ints(a, "kernel_shape", line)
@@ -718,6 +750,7 @@ def _conv_transpose(r: Reader, node: onnx.NodeProto, a: Attributes) -> None:
         raise InputError("attribute output_shape is not supported", fix="use pads and output_padding")
     groups = int(a.get("group", 1))
     index = r.builder.transposed_convolution(x, weight, bias, stride, dilation, pads, more, groups)
+    r.builder.doubt(index, _doubts(r.doubts(node, 1), weight.shape), _doubts(r.doubts(node, 2)))
     _mapped(r, node, index, line)
 
 
