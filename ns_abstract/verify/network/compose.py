@@ -37,6 +37,8 @@ from ns_abstract.verify.network.recognised import GatedClip, ScaledGelu, Switche
 _ONE_AND_MORE = 1.0 - 2.0**-10
 #: How far constants may be from those of a known function, relative, for its charges of rounding to hold.
 _NEAR = 2.0**-22
+#: The same for curves that take the file's own numbers.
+_ALIKE = 2.0**-10
 _ONES = (1, 1)
 #: Entries of a matrix that takes means away; where it would have more, the mean is a layer of its own.
 _CENTRED_AT_ONCE = 1 << 16
@@ -251,12 +253,12 @@ class Composer(Builder):
             return 0
         if isinstance(layer, Sigmoid) and c == 0.0 and shift == 0.0 and t != 0.0:
             return self._times(self.curve(self._times(root, t), curves.Silu), s * factor / t)
-        if isinstance(layer, curves.Erf) and c == 0.0 and abs(t * math.sqrt(2.0) - 1.0) < _NEAR and shift == factor:
+        if isinstance(layer, curves.Erf) and c == 0.0 and abs(t * math.sqrt(2.0) - 1.0) < _ALIKE and shift == factor:
             return self._times(self.curve(root, ScaledGelu, rate=t * math.sqrt(2.0)), 2.0 * s * factor)
         if isinstance(layer, curves.Clip) and shift == 0.0 and layer.least == 0.0 and 0.0 in (c, layer.offset):
             # clip(a x + b, 0, m) of the root
             a, b = layer.factor * t / layer.most, (layer.factor * c + layer.offset) / layer.most
-            if abs(6.0 * a - 1.0) < _NEAR and abs(2.0 * b - 1.0) < _NEAR:
+            if abs(6.0 * a - 1.0) < _ALIKE and abs(2.0 * b - 1.0) < _ALIKE:
                 gate = self.curve(root, GatedClip, factor=a, offset=b)
                 return self._times(gate, s * factor * layer.most)
         return 0

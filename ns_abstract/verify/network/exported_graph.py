@@ -384,7 +384,21 @@ class Reader:
         found = self.by_torch(node, {})
         parts = found if isinstance(found, (list, tuple)) else [found]
         made = [part.contiguous().numpy() if isinstance(part, torch.Tensor) else part for part in parts]
+        if any(isinstance(v, np.ndarray) and v.dtype == np.float32 for v in made):
+            self._check_exact(node, made)
         return made if isinstance(found, (list, tuple)) else made[0]
+
+
+    def _check_exact(self, node: dict[str, Any], made: list[Any]) -> None:
+        """Refuse results that float32 rounds: another order of the same sums gives others (N21)."""
+        wide = {k: v.astype(np.float64) for k, v in self.constants.items() if getattr(v, "dtype", None) == np.float32}
+        again = self.by_torch(node, wide)
+        parts = again if isinstance(again, (list, tuple)) else [again]
+        for one, two in zip(made, parts, strict=True):
+            if not isinstance(one, np.ndarray) or one.dtype != np.float32:
+                continue
+            if not np.array_equal(one.astype(np.float64), two.double().numpy()):
+                raise InputError("computes a constant that float32 rounds", fix="register the result as a buffer")
 
 
 def _floats(content: Any) -> Any:

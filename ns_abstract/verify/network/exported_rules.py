@@ -14,6 +14,7 @@ from ns_abstract.verify.network.compose import Axis, Composer, interpolation
 from ns_abstract.verify.network.exported_graph import Arguments, Index, Operators, Reader, Rule, named_values
 from ns_abstract.verify.network.graph import item
 from ns_abstract.verify.network.operands import einsum, joined, matmul
+from ns_abstract.verify.network.recognised import SwitchedSoftplus
 
 _ONES = (1, 1)
 
@@ -97,9 +98,10 @@ def _gelu(b: Composer, x: int, a: Arguments) -> int:
 
 def _softplus(b: Composer, x: int, a: Arguments) -> int:
     a.only("beta", 1, 1.0)
-    if _number(a, "threshold", 20.0) < 16.0:
+    limit = _number(a, "threshold", 20.0)
+    if limit < 16.0:
         raise InputError("argument threshold is not supported", fix="at least 16")
-    return b.curve(x, curves.Softplus)
+    return b.curve(x, SwitchedSoftplus, limit=limit)
 
 
 def _clamp(b: Composer, x: int, a: Arguments) -> int:
