@@ -21,7 +21,9 @@ from ns_abstract.io.errors import InputError
 from ns_abstract.io.jsonio import show
 from ns_abstract.verify.network.chosen import chosen_output
 from ns_abstract.verify.network.compose import Composer
+from ns_abstract.verify.network.doubtful import Doubts
 from ns_abstract.verify.network.graph import Network, item
+from ns_abstract.verify.network.rounding import gamma
 
 _LARGEST_GRAPH = 64 << 20
 _LARGEST_WEIGHTS = 4 << 30
@@ -235,6 +237,8 @@ class Reader:
         self.stored = dict(self.constants)
         self.builder = Composer(path, tuple(sizes[1:]))
         self.values: dict[str, Any] = {self.image: Index(0)}
+        #: how far computed weights may be from what `constants` holds
+        self.doubted: dict[str, Doubts] = {}
 
     def value(self, argument: dict[str, Any]) -> Any:
         """An argument: a node, a constant, a number or a list of them; the batch counts as 1."""
@@ -293,6 +297,7 @@ class Reader:
                         raise InputError("works on a value with the batch inside its shape", fix="move the batch first")
                     found = rule(self, arguments)
                     arguments.done()
+                    self._charge(node, short, found)
             except InputError as error:
                 if error.file is not None:
                     raise
@@ -381,13 +386,31 @@ class Reader:
         target = str(node["target"])
         if target.split(".")[-2].endswith("_") and target not in _KEPT:
             raise InputError("changes a constant in place", fix="write the network without that")
+        self._charge(node, "", None)
         found = self.by_torch(node, {})
         parts = found if isinstance(found, (list, tuple)) else [found]
         made = [part.contiguous().numpy() if isinstance(part, torch.Tensor) else part for part in parts]
-        if any(isinstance(v, np.ndarray) and v.dtype == np.float32 for v in made):
+        if ".aten._weight_norm." in target:
+            # a sum of squares, its root, a quotient and a product: nothing cancels
+            direction, size = (self._named(entry["arg"]["as_tensor"]["name"]) for entry in node["inputs"][:2])
+            wide = self.by_torch(node, {k: np.asarray(v, np.float64) for k, v in self.constants.items()})
+            made = [wide.numpy()]
+            count = np.size(direction) / max(1, np.size(size)) + 16
+            single = gamma(count) * (1.0 + 2.0**-4) * np.abs(made[0]) + 2.0**-100
+            self.doubted[_output(node)] = (2.0**-44 * np.abs(made[0]), single)
+        elif any(isinstance(v, np.ndarray) and v.dtype == np.float32 for v in made):
             self._check_exact(node, made)
         return made if isinstance(found, (list, tuple)) else made[0]
 
+
+    def _charge(self, node: dict[str, Any], short: str, found: Any) -> None:
+        """Charge what a layer's weights may be off, where they are computed."""
+        names = [name for entry in node["inputs"] for name in named_values(entry["arg"]) if name in self.doubted]
+        if not names:
+            return
+        if short not in ("conv2d.default", "linear.default") or len(names) > 1:
+            raise InputError("reads a constant that float32 rounds", fix="register it as a buffer")
+        self.builder.doubt(found.number, self.doubted[names[0]], None)
 
     def _check_exact(self, node: dict[str, Any], made: list[Any]) -> None:
         """Refuse results that float32 rounds: another order of the same sums gives others (N21)."""
