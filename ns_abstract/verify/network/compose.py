@@ -579,6 +579,34 @@ class Axis(NamedTuple):
     doubt: np.ndarray
 
 
+def nearest_pixels(size: int, out: int, coordinates: str, nearest: str, ratio: float) -> np.ndarray:
+    """[out] the pixel that onnxruntime takes along one axis: places are computed in float32, one operation a time.
+
+    Exact places differ from these by up to a pixel where they lie half way or on a number.
+    """
+    half = np.float32(0.5)
+    k, scale = np.arange(out, dtype=np.float32), np.float32(ratio)
+    if coordinates == "align_corners":
+        place = k * np.float32(size - 1) / np.float32(out - 1) if out > 1 else 0.0 * k
+    elif coordinates == "asymmetric":
+        place = k / scale
+    elif coordinates == "pytorch_half_pixel" and out == 1:
+        place = 0.0 * k
+    else:
+        place = (k + half) / scale - half
+    # half way from zero, as C rounds
+    rounded = np.trunc(place) + np.sign(place) * (np.abs(place - np.trunc(place)) >= half)
+    found = {
+        "floor": np.floor(place),
+        "ceil": np.ceil(place),
+        "round_prefer_floor": np.where(place == np.trunc(place) + half, np.floor(place), rounded),
+        "round_prefer_ceil": rounded,
+    }
+    if nearest not in found:
+        raise InputError(f"attribute nearest_mode = {nearest} is not supported", fix="use floor")
+    return np.clip(found[nearest], 0, size - 1).astype(np.int64)
+
+
 def interpolation(
     size: int, out: int, mode: str, coordinates: str, nearest: str, scale: float | None, bend: float = -0.75
 ) -> Axis:
@@ -602,15 +630,7 @@ def interpolation(
     matrix, doubt = np.zeros((out, size)), np.zeros((out, size))
     rows = np.arange(out)
     if mode == "nearest":
-        rounded = {
-            "floor": np.floor(place),
-            "ceil": np.ceil(place),
-            "round_prefer_floor": np.ceil(place - 0.5),
-            "round_prefer_ceil": np.floor(place + 0.5),
-        }
-        if nearest not in rounded:
-            raise InputError(f"attribute nearest_mode = {nearest} is not supported", fix="use floor")
-        matrix[rows, np.clip(rounded[nearest], 0, size - 1).astype(np.int64)] = 1.0
+        matrix[rows, nearest_pixels(size, out, coordinates, nearest, ratio)] = 1.0
         return Axis(matrix, doubt)
     cubic = mode == "cubic"
     if cubic and not abs(bend) <= 1.0:

@@ -724,7 +724,7 @@ def _resize(r: Reader, node: onnx.NodeProto, a: Attributes) -> None:
         for axis, scale in zip(axes, np.atleast_1d(scales), strict=True):
             if not 0.0 < float(scale) < 1024.0:
                 raise InputError(f"scales {list(np.atleast_1d(scales))}", fix="positive numbers expected")
-            out[axis], ratio[axis] = math.floor(whole[axis] * float(scale)), float(scale)
+            out[axis], ratio[axis] = int(np.float32(whole[axis]) * np.float32(scale)), float(scale)
     else:
         raise InputError("neither scales nor sizes are given", fix="export with fixed sizes")
     if out[:2] != whole[:2] or min(out) < 1:
