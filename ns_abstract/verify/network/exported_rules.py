@@ -7,6 +7,7 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
+import torch
 
 from ns_abstract.io.errors import InputError
 from ns_abstract.verify.network import curves
@@ -506,12 +507,21 @@ def _upsample(mode: str) -> Rule:
         r.builder.reserve(4.0 * shape[0] * found[0] * found[1])
         coordinates = "asymmetric" if mode == "nearest" else "align_corners" if align else "half_pixel"
         maps = [
-            interpolation(n, m, mode, coordinates, "floor", ratio)
+            _nearest(n, m, ratio) if mode == "nearest" else interpolation(n, m, mode, coordinates, "floor", ratio)
             for n, m, ratio in zip(shape[1:], found, ratios, strict=True)
         ]
         return Index(r.builder.resize(x, maps))
 
     return rule
+
+
+def _nearest(size: int, out: int, ratio: float | None) -> Axis:
+    """The pixels that torch takes along one axis, which it is asked for: it computes their places in float32."""
+    column = torch.arange(size, dtype=torch.float32).reshape(1, 1, size, 1)
+    taken = torch.ops.aten.upsample_nearest2d(column, [out, 1], ratio, None).reshape(-1).long().numpy()
+    matrix = np.zeros((out, size))
+    matrix[np.arange(out), taken] = 1.0
+    return Axis(matrix, np.zeros((out, size)))
 
 
 def _moves(r: Reader, a: Arguments) -> Any:
