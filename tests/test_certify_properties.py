@@ -180,8 +180,8 @@ def test_classification(tmp_path: Path) -> None:
 
 
 VNNLIB = """
-; outputs
-(declare-const X_0 Real)
+; inputs and outputs
+""" + "\n".join(f"(declare-const X_{k} Real)" for k in range(3 * 16 * 16)) + """
 (declare-const Y_0 Real)
 (declare-const Y_1 Real)
 (declare-const Y_2 Real)

@@ -18,6 +18,7 @@ from ns_abstract.io.jsonio import file_beside, read_text
 from ns_abstract.io.packed import unpacked
 from ns_abstract.verify.boxes import Answer, decide
 from ns_abstract.verify.network import Network, NetworkArithmetic, load_network
+from ns_abstract.verify.network.comparison import compare
 from ns_abstract.verify.network.explain import check_cell
 from ns_abstract.verify.network.load import onnx_runner
 from ns_abstract.verify.vnnlib import load_regions
@@ -27,6 +28,8 @@ _INSTANCES = 100_000
 #: Bytes that a packed network may grow to.
 _NETWORK_LIMIT = 1 << 30
 _LONGEST = 1e6
+#: Boxes at whose corners the reading of a network is compared.
+_COMPARED = 4
 
 
 @dataclass(frozen=True)
@@ -151,6 +154,9 @@ def run_folder(
                 network, run = networks.load(_stored(folder, one.network))
                 check_cell(network, 1, memory)
                 regions = load_regions(_stored(folder, one.property), network.input_size, network.output_size)
+                ends = [image[None] for r in regions[:_COMPARED] for image in (r.lower, r.upper, 0.5 * (r.lower + r.upper))]
+                shape = (1, *network.input_shape)
+                compare(network, run, [image.reshape(shape) for image in ends], usual=False)
                 ready = time.perf_counter()
                 end = ready + limit
 

@@ -181,9 +181,8 @@ class Loop:
 
     @property
     def loading(self) -> dict[str, Any]:
-        """Keywords of `load_network`: the output, and the size of pictures where the file leaves it free."""
-        preprocess = self.preprocess
-        return {"output": self.value.get("output"), "picture": preprocess.resize, "layout": preprocess.layout}
+        """Keywords of `load_network`."""
+        return self.preprocess.loading(self.value.get("output"))
 
     @property
     def box(self) -> ParameterBox:

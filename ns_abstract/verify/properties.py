@@ -511,8 +511,7 @@ def loading(root: Any) -> dict[str, Any]:
     output = root.get("output")
     if "output" in root and not (isinstance(output, str) and output):
         raise _fail("output", output, "write the name of one of the network's outputs")
-    preprocess = parse_preprocess(root.get("preprocess", {}))
-    return {"output": output, "picture": preprocess.resize, "layout": preprocess.layout}
+    return parse_preprocess(root.get("preprocess", {})).loading(output)
 
 
 def parse_property(root: Any, folder: Path, input_shape: tuple[int, ...], output_shape: tuple[int, ...]) -> Property:

@@ -269,11 +269,11 @@ def _parse(expressions: list[Any], output_size: int, input_size: int | None) -> 
         if len(unsafe) * len(ways) > _CONJUNCTIONS:
             raise InputError(f"more than {_CONJUNCTIONS} combinations of cases", fix="use fewer assertions of (or")
         unsafe = [[*old, *new] for old in unsafe for new in ways]
+    if not any(unsafe):
+        raise InputError("no assertion on an output", fix="assert which outputs are unsafe")
     _check_declared(declared, "Y", output_size)
     if input_size is not None and any(name[0] == "X" for name in declared):
         _check_declared(declared, "X", input_size)
-    if not any(unsafe):
-        raise InputError("no assertion on an output", fix="assert which outputs are unsafe")
     return _unsafe(unsafe, output_size, inputs)
 
 

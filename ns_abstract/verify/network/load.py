@@ -2,24 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import itertools
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 
 import numpy as np
 import onnxruntime
-import torch
 
 from ns_abstract.io.errors import InputError
 from ns_abstract.io.jsonio import file_size
+from ns_abstract.verify.network.comparison import Run, compare, probes
 from ns_abstract.verify.network.exported import read_exported
 from ns_abstract.verify.network.graph import Network
 from ns_abstract.verify.network.onnx_file import read_onnx
 from ns_abstract.verify.network.onnx_graph import Asked
 from ns_abstract.verify.network.onnx_tensors import PACKED, unpacked_model
-
-#: A reading that differs more than this, relative to the largest output, is wrong and not rounded.
-_DIFFERENCE = 2.0**-10
-
 
 
 
@@ -30,6 +27,7 @@ def load_network(
     output: str | None = None,
     picture: tuple[int, int] | None = None,
     layout: str = "NCHW",
+    shown: Callable[[tuple[int, ...]], Iterable[np.ndarray]] | None = None,
 ) -> Network:
     """The network in an .onnx, .onnx.gz or .pt2 file, compared with the program that usually runs such a file.
 
@@ -39,6 +37,7 @@ def load_network(
         output: Name of the output that is read; None: the only one.
         picture: Height and width of pictures, used where the file leaves them free.
         layout: "NCHW" or "NHWC", of such pictures.
+        shown: Inputs [1, *input_shape] to compare besides, for an input shape: what the network will be given.
 
     Raises:
         InputError: The file cannot be read, uses what is not supported, or computes something else elsewhere.
@@ -55,7 +54,9 @@ def load_network(
         raise InputError(
             f"has the ending {path.suffix!r}", file=path, fix="give an .onnx file or a .pt2 file of torch.export"
         )
-    compare(network, run)
+    usual, strange = probes(network)
+    compare(network, run, usual if shown is None else itertools.chain(usual, shown(network.input_shape)))
+    compare(network, run, strange, usual=False)
     return network
 
 
@@ -76,7 +77,7 @@ def onnx_session(path: Path) -> onnxruntime.InferenceSession:
         raise InputError(f"onnxruntime refuses it: {error}", file=path, fix="export the network again") from None
 
 
-def onnx_runner(path: Path, output: str = "", shape: Sequence[int] | None = None) -> Callable[[np.ndarray], np.ndarray]:
+def onnx_runner(path: Path, output: str = "", shape: Sequence[int] | None = None) -> Run:
     """Runs the model in onnxruntime on one image [1, ...] in the type that it wants; returns one output, flattened.
 
     A model without a batch is given the image alone; one of a fixed batch, as many copies.
@@ -103,31 +104,3 @@ def onnx_runner(path: Path, output: str = "", shape: Sequence[int] | None = None
         return (found[0] if copies > 1 else found).reshape(-1)
 
     return run
-
-
-def compare(network: Network, run: Callable[[np.ndarray], np.ndarray]) -> None:
-    """Refuse a network whose reading gives other numbers than the program that runs the file.
-
-    Raises:
-        InputError: They differ by more than rounding.
-    """
-    path = network.source
-    generator = np.random.default_rng(0)
-    for k in range(3):
-        image = generator.uniform(0.0, 1.0 + k, (1, *network.input_shape)).astype(np.float32)
-        try:
-            expected = run(image).reshape(-1).astype(np.float64)
-        except Exception as error:  # the other program's own
-            raise InputError(f"cannot be run: {error}", file=path, fix="export the network again") from None
-        found = network(torch.from_numpy(image).double())[0].numpy()
-        if expected.shape != found.shape:
-            raise InputError(f"has {expected.size} outputs when run, {found.size} when read", file=path)
-        if not np.isfinite(expected).all():
-            raise InputError("computes numbers that are not finite", file=path, fix="train the network again")
-        difference = float(np.abs(expected - found).max())
-        if not difference <= _DIFFERENCE * max(1.0, float(np.abs(expected).max())):
-            raise InputError(
-                f"computes something else when run: outputs differ by {difference:.3g}",
-                file=path,
-                fix="export the network again in evaluation mode, or report the file",
-            )

@@ -729,6 +729,9 @@ def _resize(r: Reader, node: onnx.NodeProto, a: Attributes) -> None:
         raise InputError("neither scales nor sizes are given", fix="export with fixed sizes")
     if out[:2] != whole[:2] or min(out) < 1:
         raise InputError(f"resizes {item(whole)} to {item(out)}", fix="only rows and columns may change")
+    if out == whole and any(v not in (None, 1.0) for v in ratio):
+        # onnxruntime copies, the operator's definition does not
+        raise InputError(f"scales of {item(whole)} that keep its size", fix="export with sizes, or without the node")
     r.builder.reserve(float(math.prod(out)) * 4.0)
     maps = [interpolation(whole[k], out[k], mode, coordinates, nearest, ratio[k], bend) for k in (2, 3)]
     r.result(node, r.builder.resize(x, maps))
