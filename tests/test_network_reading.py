@@ -63,7 +63,7 @@ def test_several_outputs_are_refused_and_one_is_picked(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=f"has 2 outputs: {scores} .*, {other} ") as caught:
         load_network(file)
     assert '"output"' in (caught.value.fix or "")
-    with pytest.raises(InputError, match="has no output nothing"):
+    with pytest.raises(InputError, match="has no output 'nothing'"):
         load_network(file, output="nothing")
     x = np.random.default_rng(0).normal(size=(2, 3, 3)).astype(np.float32)
     for name in (scores, other):
@@ -272,16 +272,6 @@ def test_folded_functions_hold_their_exact_value(op: str, tmp_path: Path) -> Non
 
 def test_exact_constants_stay_exact(tmp_path: Path) -> None:
     """Sizes that go through floats decide shapes; a constant that may fall either way does not."""
-    f = OnnxFile((1, 2, 2))
-    x = f.last
-    f.node("Mul", f.constant([2.0, 3.0]), f.constant([2.0, 1.0]))
-    f.node("Div", f.last, f.constant([2.0]))
-    f.node("Floor")
-    f.node("Cast", to=TensorProto.INT64)
-    f.node("Concat", f.constant([1, 1], np.int64), f.last, axis=0)
-    f.node("Resize", x, "", "", f.last, mode="nearest")
-    with pytest.raises(InputError, match="only rows|resizes|neither"):
-        load_network(f.write(tmp_path / "net.onnx"))
     f = OnnxFile((1, 2, 2))
     x = f.last
     f.node("Mul", f.constant([2.0, 2.0]), f.constant([3.0, 2.5]))

@@ -42,8 +42,6 @@ def operator_set(model: onnx.ModelProto, path: Path) -> int:
 
 #: What people do instead of an operator that has no bounds here.
 _INSTEAD = {
-    "ArgMax": "leave it out: properties compare the scores themselves",
-    "ArgMin": "leave it out: properties compare the scores themselves",
     "Atan": "use Tanh",
     "Ceil": "leave rounding out",
     "Col2Im": "use ConvTranspose, or DepthToSpace where blocks do not overlap",
@@ -73,7 +71,6 @@ _INSTEAD = {
     "ScatterND": "use Concat of slices",
     "Sign": "use Clip or Tanh",
     "Sin": "only constants may pass it",
-    "TopK": "export without post-processing",
 }
 
 
@@ -102,6 +99,10 @@ class Asked(NamedTuple):
     vector: bool = False
     picture: tuple[int, int] | None = None
     last: bool = False
+
+
+#: What picks among scores, at the end of many networks.
+_PICKS = frozenset(("ArgMax", "ArgMin", "TopK"))
 
 
 class Value(NamedTuple):
@@ -244,6 +245,8 @@ class Reader:
         if rule is None:
             near = difflib.get_close_matches(kind, self.rules, 5, 0.0)
             known = f"{len(self.rules)} operators are, the nearest by name {', '.join(near)}"
+            if kind in _PICKS:
+                known = f"make its input {node.input[0]!r} the network's output: properties compare the scores themselves"
             raise InputError("operator is not supported", fix=_INSTEAD.get(kind, known))
         attributes = Attributes(self, node)
         rule(self, node, attributes)
