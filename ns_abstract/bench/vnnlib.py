@@ -154,7 +154,9 @@ def run_folder(
                 network, run = networks.load(_stored(folder, one.network))
                 check_cell(network, 1, memory)
                 regions = load_regions(_stored(folder, one.property), network.input_size, network.output_size)
-                ends = [image[None] for r in regions[:_COMPARED] for image in (r.lower, r.upper, 0.5 * (r.lower + r.upper))]
+                ends = [
+                    image[None] for r in regions[:_COMPARED] for image in (r.lower, r.upper, 0.5 * (r.lower + r.upper))
+                ]
                 shape = (1, *network.input_shape)
                 compare(network, run, [image.reshape(shape) for image in ends], usual=False)
                 ready = time.perf_counter()

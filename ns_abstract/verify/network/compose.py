@@ -96,7 +96,11 @@ class Composer(Builder):
             return least[0]
         positive = (
             (isinstance(layer, Sum) and min(layer.signs) > 0)
-            or (isinstance(layer, (Sparse, Convolution)) and not isinstance(layer, Doubtful) and bool((layer.weight >= 0.0).all()))
+            or (
+                isinstance(layer, (Sparse, Convolution))
+                and not isinstance(layer, Doubtful)
+                and bool((layer.weight >= 0.0).all())
+            )
             or isinstance(layer, Gather)
         )
         return 0.0 if positive and min(least) >= 0.0 and layer.bias is None else -math.inf
@@ -117,6 +121,7 @@ class Composer(Builder):
         if weight is None and offset is None:
             return index
         node = self.nodes[index - 1]
+        assert isinstance(node.layer, Linear)
         self.nodes[index - 1] = replace(node, layer=doubtful(node.layer, weight, offset))
         return index
 

@@ -96,6 +96,17 @@ class Enclosed(NamedTuple):
         return Enclosed(self.kind, wide[0], wide[1])
 
 
+def scaled_integers(number: np.ndarray, scale: Enclosed) -> np.ndarray | Enclosed:
+    """Integers times floats, rounded once."""
+    whole = number.astype(np.float64)
+    ends = [
+        _elementary("Mul", [(whole, whole), part], rounds)
+        for part, rounds in ((scale.real, (_OWN, 0.0)), (scale.single, _UNITS[scale.kind.itemsize]))
+    ]
+    found = Enclosed(scale.kind, ends[0], ends[1])
+    return found.value.astype(scale.kind) if found.exact else found
+
+
 def enclosed(value: np.ndarray) -> Enclosed:
     """A stored constant, which is exact."""
     number = value.astype(np.float64)
@@ -331,7 +342,12 @@ def _matmul(first: Ends, second: Ends, rounds: Rounds) -> Ends:
     count = float(a.shape[-1])
     value, size = a @ b, (np.abs(a) + r) @ (np.abs(b) + q)
     still = not r.any() and not q.any()
-    if still and bool((size <= 2.0 ** _held(unit) * _grain(a) * _grain(b)).all()) and _plain(a, tiny) and _plain(b, tiny):
+    if (
+        still
+        and bool((size <= 2.0 ** _held(unit) * _grain(a) * _grain(b)).all())
+        and _plain(a, tiny)
+        and _plain(b, tiny)
+    ):
         return value, value
     # flushed operands lose a product with what is beside them
     lost = tiny * (np.abs(a).max(initial=0.0) + np.abs(b).max(initial=0.0) + 2.0) * count

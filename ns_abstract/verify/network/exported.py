@@ -22,7 +22,9 @@ Run = Callable[[np.ndarray], np.ndarray]
 
 
 def read_exported(path: Path, output: str | None = None) -> tuple[Network, Run]:
-    """The network in a .pt2 file up to ``output``, which may be left out where there is one, and the same graph run with torch's own operators on one image [1, ...].
+    """The network in a .pt2 file, and the same graph run with torch's own operators on one image [1, ...].
+
+    ``output``: the output that is read; None: the only one.
 
     Raises:
         InputError: The file cannot be read, or uses what is not supported; names node, operator and argument.

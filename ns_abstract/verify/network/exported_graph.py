@@ -402,7 +402,6 @@ class Reader:
             self._check_exact(node, made)
         return made if isinstance(found, (list, tuple)) else made[0]
 
-
     def _charge(self, node: dict[str, Any], short: str, found: Any) -> None:
         """Charge what a layer's weights may be off, where they are computed."""
         names = [name for entry in node["inputs"] for name in named_values(entry["arg"]) if name in self.doubted]

@@ -19,7 +19,6 @@ from ns_abstract.verify.network.onnx_graph import Asked
 from ns_abstract.verify.network.onnx_tensors import PACKED, unpacked_model
 
 
-
 def load_network(
     path: Path,
     *,
@@ -55,8 +54,10 @@ def load_network(
             f"has the ending {path.suffix!r}", file=path, fix="give an .onnx file or a .pt2 file of torch.export"
         )
     usual, strange = probes(network)
-    compare(network, run, usual if shown is None else itertools.chain(usual, shown(network.input_shape)))
-    compare(network, run, strange, usual=False)
+    compare(network, run, usual)
+    compare(
+        network, run, strange if shown is None else itertools.chain(shown(network.input_shape), strange), usual=False
+    )
     return network
 
 

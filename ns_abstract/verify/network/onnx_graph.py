@@ -61,8 +61,6 @@ _INSTEAD = {
     "MaxRoiPool": "export without post-processing",
     "NonMaxSuppression": "export without post-processing",
     "NonZero": "export without post-processing",
-    "QuantizeLinear": "export before quantisation",
-    "DequantizeLinear": "export before quantisation",
     "RNN": "use convolutions or attention",
     "ReduceProd": "use ReduceSum of logarithms",
     "RoiAlign": "export without post-processing",
@@ -79,7 +77,19 @@ _BY_ITEM = frozenset(
     (
         *("Abs", "Add", "AveragePool", "BatchNormalization", "Cast", "Celu", "Clip", "Concat", "Conv", "ConvTranspose"),
         *("Div", "Dropout", "Elu", "Erf", "Exp", "Flatten", "Gelu", "Gemm", "GlobalAveragePool", "GlobalMaxPool"),
-        *("HardSigmoid", "HardSwish", "Identity", "LeakyRelu", "MatMul", "MaxPool", "Mish", "Mul", "PRelu", "Pad", "Relu"),
+        *(
+            "HardSigmoid",
+            "HardSwish",
+            "Identity",
+            "LeakyRelu",
+            "MatMul",
+            "MaxPool",
+            "Mish",
+            "Mul",
+            "PRelu",
+            "Pad",
+            "Relu",
+        ),
         *("Reshape", "Resize", "Selu", "Sigmoid", "Softmax", "Softplus", "Sub", "Tanh", "Upsample"),
     )
 )
@@ -125,9 +135,7 @@ class Value(NamedTuple):
 class Reader:
     """Turns one graph's nodes into layers."""
 
-    def __init__(
-        self, path: Path, graph: onnx.GraphProto, opset: int, rules: dict[str, Rule], asked: Asked
-    ) -> None:
+    def __init__(self, path: Path, graph: onnx.GraphProto, opset: int, rules: dict[str, Rule], asked: Asked) -> None:
         self.path, self.graph, self.opset, self.rules = path, graph, opset, rules
         self.stored = StoredTensors(path)
         self.constants: dict[str, np.ndarray] = {}
@@ -145,6 +153,8 @@ class Reader:
         self.values: dict[str, Value] = {self.input_name: image}
         #: whether a value is above a number: what the exporter makes of softplus
         self.above: dict[str, tuple[Value, float]] = {}
+        #: scale and zero of values that are rounded to steps, until they are dequantised
+        self.quantised: dict[str, tuple[float, int]] = {}
         #: numbers of a value that a mask has set to minus infinity, in its whole shape; they stand as they were before
         self.dropped: dict[str, np.ndarray] = {}
 
@@ -208,6 +218,8 @@ class Reader:
         name = self.output
         if name not in self.values:
             raise InputError(f"output {name!r} does not depend on the image", file=self.path, field="graph.output")
+        if name in self.quantised:
+            raise InputError(f"output {name!r} holds integers", file=self.path, field="graph.output")
         if name in self.dropped:
             raise InputError(f"output {name!r} holds minus infinity", file=self.path, field="graph.output")
         return self.builder.network(self.values[name].index, name)
@@ -217,7 +229,9 @@ class Reader:
         shapes, beside = {}, []
         for value in self.graph.output:
             kind = value.type.tensor_type
-            shapes[value.name] = [d.dim_value if d.HasField("dim_value") else d.dim_param or "?" for d in kind.shape.dim]
+            shapes[value.name] = [
+                d.dim_value if d.HasField("dim_value") else d.dim_param or "?" for d in kind.shape.dim
+            ]
             if kind.elem_type not in (0, onnx.TensorProto.FLOAT, onnx.TensorProto.DOUBLE, onnx.TensorProto.FLOAT16):
                 beside.append(value.name)
         return chosen_output(self.path, shapes, asked, beside)
@@ -246,7 +260,9 @@ class Reader:
             near = difflib.get_close_matches(kind, self.rules, 5, 0.0)
             known = f"{len(self.rules)} operators are, the nearest by name {', '.join(near)}"
             if kind in _PICKS:
-                known = f"make its input {node.input[0]!r} the network's output: properties compare the scores themselves"
+                known = (
+                    f"make its input {node.input[0]!r} the network's output: properties compare the scores themselves"
+                )
             raise InputError("operator is not supported", fix=_INSTEAD.get(kind, known))
         attributes = Attributes(self, node)
         rule(self, node, attributes)
@@ -259,6 +275,8 @@ class Reader:
         name = node.input[position] if position < len(node.input) else ""
         if name in self.dropped and node.op_type != "Softmax":
             raise InputError("reads what a mask has set to minus infinity", fix="mask right before a Softmax")
+        if name in self.quantised and node.op_type != "DequantizeLinear":
+            raise InputError("reads integers", fix="put a DequantizeLinear between")
         if name in self.values:
             return self.values[name]
         if name in self.constants:

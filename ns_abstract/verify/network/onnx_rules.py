@@ -17,6 +17,7 @@ from ns_abstract.verify.network.enclosed import Enclosed
 from ns_abstract.verify.network.graph import item
 from ns_abstract.verify.network.layers import Shape
 from ns_abstract.verify.network.onnx_graph import Attributes, Reader, Rule, Value
+from ns_abstract.verify.network.onnx_quantised import dequantize, quantize
 from ns_abstract.verify.network.operands import Operand, einsum, joined, matmul
 
 #: A mask that adds less than this takes a number out of a softmax: in float32 its exponential is zero.
@@ -205,7 +206,8 @@ def _cast(r: Reader, node: onnx.NodeProto, a: Attributes) -> None:
     a.ignore("saturate")
     if a.get("to") not in (onnx.TensorProto.FLOAT, onnx.TensorProto.DOUBLE):
         name = onnx.TensorProto.DataType.Name(int(a.get("to", 0)))
-        raise InputError(f"attribute to = {name} is not supported", fix="export the network in float32")
+        fix = "write model.float() before the export" if "FLOAT16" in name else "export the network in float32"
+        raise InputError(f"attribute to = {name} is not supported", fix=fix)
     r.values[node.output[0]] = x
 
 
@@ -864,6 +866,7 @@ RULES: dict[str, Rule] = {
     "Conv": _conv,
     "ConvTranspose": _conv_transpose,
     "DepthToSpace": _depth_to_space,
+    "DequantizeLinear": dequantize,
     "Div": _binary,
     "Dropout": _dropout,
     "Einsum": _einsum,
@@ -899,6 +902,7 @@ RULES: dict[str, Rule] = {
     "PRelu": _prelu,
     "Pad": _pad,
     "Pow": _pow,
+    "QuantizeLinear": quantize,
     "Reciprocal": _unary(lambda b, x, a: b.reciprocal(x)),
     "ReduceL1": _reduce,
     "ReduceL2": _reduce,

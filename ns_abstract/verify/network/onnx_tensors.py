@@ -93,7 +93,9 @@ def _inlined(model: onnx.ModelProto, path: Path) -> onnx.ModelProto:
     try:
         return onnx.inliner.inline_local_functions(model)
     except Exception as error:  # the inliner raises whatever it meets
-        raise InputError(f"has functions that cannot be read ({error})", file=path, field="functions", fix=_FIX) from None
+        raise InputError(
+            f"has functions that cannot be read ({error})", file=path, field="functions", fix=_FIX
+        ) from None
 
 
 class StoredTensors:

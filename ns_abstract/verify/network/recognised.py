@@ -7,6 +7,7 @@ curves here take the file's numbers (docs/design.md, N22).
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -74,3 +75,25 @@ class SwitchedSoftplus(curves.Softplus):
         # softplus is less than exp(-z) above its argument
         gap = math.exp(-self.limit) * (1.0 + 2.0**-20) + (self.excess + _QUOTIENTS) * _far(lower, upper)
         return torch.where(upper >= self.limit * (1.0 - 2.0**-20), gap, torch.zeros_like(gap))
+
+
+@dataclass(frozen=True, eq=False)
+class Quantised(curves.Clip):
+    """``step * min(max(round(z / step), low), high)``, enclosed by the clipped z and half a step (N23).
+
+    `function` is the clipped z; a call gives the steps, whose gradient is that of the clipped z.
+    ``least`` and ``most`` are ``step * low`` and ``step * high``.
+    """
+
+    step: float = 1.0
+
+    def missing(self, lower: Tensor, upper: Tensor) -> Tensor | float:
+        # places, quotients and products of float32 move a number by less than the second part
+        largest = max(abs(self.least), abs(self.most))
+        return 0.5 * self.step * (1.0 + 2.0**-20) + 2.0**-21 * largest
+
+    def __call__(self, inputs: Sequence[Tensor]) -> Tensor:
+        z = inputs[0]
+        plain = self.function(z)
+        stepped = (torch.round(z / self.step) * self.step).clamp(self.least, self.most)
+        return plain + (stepped - plain).detach()
