@@ -63,7 +63,7 @@ class Builder:
             self.nodes[k - 1] = replace(self.nodes[k - 1], name=name, op=op)
 
     def network(self, output: int, name: str = "") -> Network:
-        """The network whose output is node ``output``, called ``name`` in the file, without nodes that it does not need."""
+        """The network whose output is node ``output``, called ``name``, without nodes that it does not need."""
         needed = {output}
         for k in range(output, 0, -1):
             if k in needed:
