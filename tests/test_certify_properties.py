@@ -179,9 +179,12 @@ def test_classification(tmp_path: Path) -> None:
     assert boxed(claim, low, high, poses(), low) == -np.inf
 
 
-VNNLIB = """
-; outputs
-(declare-const X_0 Real)
+VNNLIB = (
+    """
+; inputs and outputs
+"""
+    + "\n".join(f"(declare-const X_{k} Real)" for k in range(3 * 16 * 16))
+    + """
 (declare-const Y_0 Real)
 (declare-const Y_1 Real)
 (declare-const Y_2 Real)
@@ -192,6 +195,7 @@ VNNLIB = """
   (and (>= (- Y_2 1e-1) Y_0))
 ))
 """
+)
 
 
 def test_vnnlib(tmp_path: Path) -> None:

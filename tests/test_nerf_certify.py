@@ -247,8 +247,7 @@ def differences(scene: nsa.Scene, poses: nsa.PoseSet, angles: np.ndarray) -> np.
 def claim_above(level: float, folder: Path) -> Path:
     """A property that holds where the difference of the two outputs is above ``level``."""
     (folder / "unsafe.vnnlib").write_text(
-        "(declare-const X_0 Real)\n(declare-const Y_0 Real)\n(declare-const Y_1 Real)\n"
-        f"(assert (<= (- Y_0 Y_1) {level:.6f}))\n"
+        f"(declare-const Y_0 Real)\n(declare-const Y_1 Real)\n(assert (<= (- Y_0 Y_1) {level:.6f}))\n"
     )
     file = folder / "prop.json"
     file.write_text(json.dumps({"type": "vnnlib", "file": "unsafe.vnnlib"}))

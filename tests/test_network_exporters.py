@@ -6,11 +6,13 @@ import warnings
 from pathlib import Path
 
 import numpy as np
+import onnx
 import pytest
 import torch
 from onnx_files import attack, image_sets, session
 from torch import nn
 
+from ns_abstract.io.errors import InputError
 from ns_abstract.verify.network import bound_outputs, load_network
 
 SHAPE = (3, 8, 8)
@@ -58,8 +60,9 @@ def exported(module: nn.Module, file: Path, dynamo: bool) -> Path:
     return file
 
 
+@pytest.mark.parametrize("which", [0, 1])
 @pytest.mark.parametrize("kind", ["pt2", "onnx"])
-def test_pieces_are_bounded(kind: str, tmp_path: Path) -> None:
+def test_pieces_are_bounded(kind: str, which: int, tmp_path: Path) -> None:
     torch.manual_seed(0)
     module = Pieces().eval()
     if kind == "pt2":
@@ -67,11 +70,17 @@ def test_pieces_are_bounded(kind: str, tmp_path: Path) -> None:
         torch.export.save(torch.export.export(module, (torch.randn(1, *SHAPE),)), file)
     else:
         file = exported(module, tmp_path / "net.onnx", False)
-    network = load_network(file)
+    if kind == "pt2":
+        names = ["flatten", "log_sigmoid"]
+    else:
+        names = [value.name for value in onnx.load(file).graph.output]
+    with pytest.raises(InputError, match=f"has 2 outputs: {names[0]} .*, {names[1]} "):
+        load_network(file)
+    network = load_network(file, output=names[which])
 
     def run(images: np.ndarray) -> np.ndarray:
         with torch.no_grad():
-            return np.concatenate([y.numpy().reshape(len(images), -1) for y in module(torch.from_numpy(images))], 1)
+            return module(torch.from_numpy(images))[which].numpy().reshape(len(images), -1)
 
     x = np.random.default_rng(0).normal(size=(2, *SHAPE)).astype(np.float32)
     np.testing.assert_allclose(network(torch.from_numpy(x)).numpy(), run(x), rtol=1e-4, atol=1e-5)

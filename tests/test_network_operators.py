@@ -484,17 +484,6 @@ def test_positions_of_resized_maps_are_charged(tmp_path: Path) -> None:
     assert (-found[10:] - found[:10]).max() < 1e-5
 
 
-def test_two_outputs_stand_one_after_the_other(tmp_path: Path) -> None:
-    f = OnnxFile(SHAPE)
-    x = f.conv(3, 2)
-    f.node("Flatten")
-    f.gemm(32, 3)
-    model = f.model()
-    model.graph.output.append(helper.make_tensor_value_info(x, 1, None))
-    (tmp_path / "net.onnx").write_bytes(model.SerializeToString())
-    assert load_network(tmp_path / "net.onnx").output_size == 3 + 32
-
-
 def test_a_domain_that_is_left_is_unknown(tmp_path: Path) -> None:
     f = OnnxFile(SHAPE)
     f.node("Flatten")

@@ -40,7 +40,7 @@ from ns_abstract.verify.eight_bit import Picture, rounded, rounded_sets
 from ns_abstract.verify.model import NetworkModel, parametric
 from ns_abstract.verify.network import NetworkArithmetic, load_network
 from ns_abstract.verify.pixel_costs import pixel_costs
-from ns_abstract.verify.properties import Claim, LinearClaim, Property, parse_property
+from ns_abstract.verify.properties import Claim, LinearClaim, Property, loading, parse_property
 from ns_abstract.verify.protocol import Model as SearchedModel
 from ns_abstract.verify.protocol import Scene as SearchedScene
 from ns_abstract.verify.registration import RegisteredModel, RegisteredScene
@@ -52,7 +52,7 @@ if TYPE_CHECKING:
     from ns_abstract.verify.interop import Form
 
 #: Of the search's rules: results of different ones are not mixed.
-_RULES = 4
+_RULES = 5
 #: Pixels that the picture moves by over a first cell: with one parameter, and with more.
 _MOTION_LINE, _MOTION = 0.08, 0.5
 #: Numbers that a network's layers may have together in a block's cells.
@@ -196,7 +196,11 @@ class Question:
 
     def __init__(self, model: Path, source: PropertySource) -> None:
         self.model, self.source = model, source
-        self.network = load_network(model)
+        try:
+            given = loading(source.value)
+        except InputError as error:
+            raise source.within(error) from None
+        self.network = load_network(model, **given)
         shapes = self.network.input_shape, self.network.output_shape
         try:
             self.property: Property = parse_property(source.value, source.folder, *shapes)
@@ -534,7 +538,8 @@ class Certification:
             )
         linear, lower, upper, _ = pictures.sets(box)
         images = parametric(self.model.input_sets(tuple(part[None] for part in linear), lower[None], upper[None]))
-        return write_vnnlib(self.question.model, images, claim.rows, claim.offset, target, form, claim.groups)
+        network = self.question.network
+        return write_vnnlib(network, images, claim.rows, claim.offset, target, form, claim.groups)
 
     def partitions(self, grid: Grid) -> int | None:
         """Number of parts of the fixed partition, if there is one."""

@@ -62,7 +62,7 @@ from ns_abstract.verify.search import Verdict
 from ns_abstract.verify.store import Block, Store, Tally, fractions
 
 #: Of the search's rules: results of different ones are not mixed.
-_RULES = 1
+_RULES = 2
 #: Random runs for the report, and part of the time for them; runs from a cell whose tube is shown; cells shown, and
 #: part of the time for them.
 _RUNS, _RUNS_SHARE, _CELL_RUNS, _SHOWN, _SHOWN_SHARE = 200, 0.1, 20, 2, 0.1
@@ -113,7 +113,7 @@ class LoopJob:
     ) -> None:
         require_sound_platform()
         self.loop = loop
-        self.network = load_network(loop.network)
+        self.network = load_network(loop.network, **loop.loading)
         self.model = NetworkModel(self.network, loop.preprocess, MEMORY, network_arithmetic)
         size = loop.preprocess.size(self.network.input_shape)
         outputs = loop.control.gain.shape[1]
@@ -223,7 +223,7 @@ def _open(open_job: Callable[[], Job], value: dict[str, Any], folder: Path, arit
     require_sound_platform()
     job = LoopJob.__new__(LoopJob)
     job.loop, job.job = parse_loop(value, folder), open_job()
-    job.network = load_network(job.loop.network)
+    job.network = load_network(job.loop.network, **job.loop.loading)
     job.model = NetworkModel(job.network, job.loop.preprocess, MEMORY, arithmetic)
     return job
 

@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-import contextlib
 import csv
-import gzip
 import io
 import tempfile
 import time
-import zlib
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,19 +14,22 @@ from typing import Any
 import numpy as np
 
 from ns_abstract.io.errors import InputError
-from ns_abstract.io.jsonio import file_beside, file_size, read_text
+from ns_abstract.io.jsonio import file_beside, read_text
+from ns_abstract.io.packed import unpacked
 from ns_abstract.verify.boxes import Answer, decide
 from ns_abstract.verify.network import Network, NetworkArithmetic, load_network
+from ns_abstract.verify.network.comparison import compare
 from ns_abstract.verify.network.explain import check_cell
 from ns_abstract.verify.network.load import onnx_runner
 from ns_abstract.verify.vnnlib import load_regions
 
 _LIST_LIMIT = 16 << 20
 _INSTANCES = 100_000
-#: Bytes that a packed network and a packed property may grow to.
-_NETWORK_LIMIT, _PROPERTY_LIMIT = 1 << 30, 64 << 20
-_CHUNK = 1 << 20
+#: Bytes that a packed network may grow to.
+_NETWORK_LIMIT = 1 << 30
 _LONGEST = 1e6
+#: Boxes at whose corners the reading of a network is compared.
+_COMPARED = 4
 
 
 @dataclass(frozen=True)
@@ -85,45 +85,26 @@ def _stored(folder: Path, name: str) -> Path:
     return path
 
 
-def unpacked(path: Path, limit: int) -> Iterator[bytes]:
-    """Contents of a .gz file in parts.
-
-    Raises:
-        InputError: It is damaged, or grows past ``limit`` bytes.
-    """
-    total = 0
-    file_size(path, "file")
-    try:
-        with gzip.open(path) as stream:
-            while part := stream.read(_CHUNK):
-                total += len(part)
-                if total > limit:
-                    problem = f"unpacks to more than {limit:,} bytes"
-                    raise InputError(problem, file=path, fix="check that this is the file meant")
-                yield part
-    except (OSError, EOFError, zlib.error) as error:
-        raise InputError(f"cannot be unpacked: {error}", file=path, fix="copy it again") from None
-
-
 class _Networks:
     """Loads networks; the latest is kept, since neighbouring lines name the same."""
 
-    def __init__(self, scratch: Path) -> None:
-        self.scratch = scratch
+    def __init__(self, scratch: Path, output: str | None) -> None:
+        self.scratch, self.output = scratch, output
         self.latest: tuple[Path, Network, Any] | None = None
 
     def load(self, path: Path) -> tuple[Network, Any]:
         if self.latest is None or self.latest[0] != path:
             self.latest = None
             file = path
-            if path.suffix == ".gz":
+            if path.suffix.lower() == ".gz":
                 file = self.scratch / "network.onnx"
                 with open(file, "wb") as stream:
                     for part in unpacked(path, _NETWORK_LIMIT):
                         stream.write(part)
-            if file.suffix != ".onnx":
+            if file.suffix.lower() != ".onnx":
                 raise InputError("is no .onnx file", file=path, fix="name an .onnx or .onnx.gz file")
-            self.latest = path, load_network(file), onnx_runner(file)
+            network = load_network(file, output=self.output)
+            self.latest = path, network, onnx_runner(file, network.output, network.input_shape)
         return self.latest[1:]
 
 
@@ -135,6 +116,7 @@ def run_folder(
     seconds: float | None = None,
     memory: int = 2 << 30,
     arithmetic: NetworkArithmetic = "float32",
+    output: str | None = None,
 ) -> Iterator[dict[str, Any]]:
     """Decide the instances of ``folder``; a row for each, as soon as it is known.
 
@@ -148,6 +130,7 @@ def run_folder(
         seconds: Limit beside those of the list.
         memory: Bytes that bounds may take.
         arithmetic: What "unsat" covers.
+        output: Name of the networks' output; None: the only one.
 
     Raises:
         InputError: The list cannot be read. A network or a property that cannot is a row with "error" and a reason.
@@ -161,7 +144,7 @@ def run_folder(
         raise InputError("no instance is chosen", file=folder / "instances.csv", fix="check --only")
     output_dir.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory() as scratch, open(output_dir / "results.csv", "w", newline="") as stream:
-        networks = _Networks(Path(scratch))
+        networks = _Networks(Path(scratch), output)
         writer = csv.writer(stream)
         for one in chosen:
             limit = one.seconds if seconds is None else min(one.seconds, seconds)
@@ -170,7 +153,12 @@ def run_folder(
             try:
                 network, run = networks.load(_stored(folder, one.network))
                 check_cell(network, 1, memory)
-                regions = load_regions(*_property(folder, one.property, network))
+                regions = load_regions(_stored(folder, one.property), network.input_size, network.output_size)
+                ends = [
+                    image[None] for r in regions[:_COMPARED] for image in (r.lower, r.upper, 0.5 * (r.lower + r.upper))
+                ]
+                shape = (1, *network.input_shape)
+                compare(network, run, [image.reshape(shape) for image in ends], usual=False)
                 ready = time.perf_counter()
                 end = ready + limit
 
@@ -196,23 +184,11 @@ def run_folder(
             }
 
 
-def _property(folder: Path, name: str, network: Network) -> tuple[Path, int, int, str | None]:
-    """Arguments of `load_regions`."""
-    path, text = _stored(folder, name), None
-    if path.suffix == ".gz":
-        data = b"".join(unpacked(path, _PROPERTY_LIMIT))
-        with contextlib.suppress(UnicodeDecodeError):
-            text = data.decode("utf-8")
-        if text is None:
-            raise InputError("VNN-LIB file is not UTF-8 text", file=path, fix="save it as UTF-8")
-    return path, network.input_size, network.output_size, text
-
-
 def _stem(name: str) -> str:
     """A file's name without its endings."""
     last = Path(name).name
     for ending in (".gz", ".onnx", ".vnnlib"):
-        last = last.removesuffix(ending)
+        last = last[: -len(ending)] if last.lower().endswith(ending) else last
     return last
 
 

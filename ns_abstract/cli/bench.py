@@ -246,6 +246,8 @@ class Vnnlib:
     """GiB that bounds may take."""
     network_arithmetic: Literal["float32", "real"] = "float32"
     """What "unsat" covers: every float32 evaluation and the exact network, or the exact network alone."""
+    output: str | None = None
+    """Name of the networks' output. Default: the only one."""
 
 
 def _said(text: str) -> None:
@@ -268,6 +270,7 @@ def vnnlib(options: Vnnlib) -> int:
         seconds=options.seconds,
         memory=int(options.memory_limit * 2**30),
         arithmetic=options.network_arithmetic,
+        output=options.output,
     ):
         words[row["verdict"]] = words.get(row["verdict"], 0) + 1
         names = visible(f"{row['network']} {row['property']}")

@@ -137,6 +137,8 @@ class Explain:
     """Only this."""
     parameters: int = 2
     """How many parameters the poses will have."""
+    output: str | None = None
+    """Name of the network's output. Default: the only one."""
 
 
 def explain(options: Explain) -> int:
@@ -150,7 +152,7 @@ def explain(options: Explain) -> int:
 
     if not 0 <= options.parameters <= 64:
         raise InputError(f"found {options.parameters}", field="--parameters", fix="give a number from 0 to 64")
-    print("\n".join(explained(load_network(options.model), options.parameters)))
+    print("\n".join(explained(load_network(options.model, output=options.output), options.parameters)))
     return DONE
 
 

@@ -37,7 +37,7 @@ class LearnedDynamics:
     name = "onnx"
 
     def __init__(self, file: Path, states: int) -> None:
-        if file.suffix != ".onnx":
+        if file.suffix.lower() != ".onnx":
             raise InputError(f"has the ending {file.suffix!r}", file=file, fix="give an .onnx file")
         self.file, self.states = file, states
         self.network = load_network(file, vector=True)
@@ -56,7 +56,7 @@ class LearnedDynamics:
             )
         self.controls = shape[0] - states
         self.about = f"x' = {file.name}(x, u), evaluated in float32"
-        self._run = onnx_runner(file)
+        self._run = onnx_runner(file, self.network.output, self.network.input_shape)
 
     def step(self, x: Float64, u: Float64) -> Float64:
         """[n] the next state as onnxruntime computes it, from a state [n] and a control [m]."""

@@ -39,7 +39,7 @@ MOST_STEPS, _MOST_SETS, _MOST_OUTPUTS = 1000, 64, 64
 FARTHEST, _TURN = 1e4, 10.0
 _KEYS = (
     "version", "state", "units", "initial", "steps", "sampling_time", "dynamics", "disturbance", "camera", "network",
-    "preprocess", "control", "unsafe", "goal",
+    "preprocess", "control", "unsafe", "goal", "output",
 )  # fmt: skip
 
 
@@ -180,6 +180,11 @@ class Loop:
     value: Mapping[str, Any]
 
     @property
+    def loading(self) -> dict[str, Any]:
+        """Keywords of `load_network`."""
+        return self.preprocess.loading(self.value.get("output"))
+
+    @property
     def box(self) -> ParameterBox:
         """The initial states that differ, as the box that cells are cut from."""
         free = [k for k in range(len(self.names)) if self.lower[k] < self.upper[k]]
@@ -251,6 +256,8 @@ def parse_loop(value: Any, folder: Path) -> Loop:
     dynamics = parse_dynamics(value.get("dynamics"), n, dt, folder, fail)
     disturbance = np.stack(_ranges(value.get("disturbance", {}), "disturbance", names, fail))
     network = named_file(value.get("network"), "network", folder, "an .onnx or .pt2", fail)
+    if "output" in value and not (isinstance(output := value["output"], str) and output):
+        raise fail("output", f"found {show(output)}", "write the name of one of the network's outputs")
     unsafe = value.get("unsafe", [])
     if not isinstance(unsafe, list) or len(unsafe) > _MOST_SETS:
         raise fail("unsafe", f"found {show(unsafe)}", f"write a list of at most {_MOST_SETS} sets")

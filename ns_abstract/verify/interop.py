@@ -21,7 +21,7 @@ from onnx import TensorProto, helper, numpy_helper
 from ns_abstract.arithmetic.network_charges import UNIT, WRITTEN_FLUSH, WRITTEN_TERMS
 from ns_abstract.io.atomic import write_atomic
 from ns_abstract.io.errors import InputError
-from ns_abstract.verify.network import ImageSets, load_network
+from ns_abstract.verify.network import ImageSets, Network, load_network
 from ns_abstract.verify.network.onnx_tensors import parse_model
 
 Form = Literal["slice", "gemm"]
@@ -30,7 +30,7 @@ Form = Literal["slice", "gemm"]
 
 
 def write_vnnlib(
-    model: Path,
+    model: Path | Network,
     images: ImageSets,
     rows: Any,
     offset: np.ndarray,
@@ -44,7 +44,7 @@ def write_vnnlib(
     float32 constants are rounded outward. It leaves out the box ``images.lower``, ``images.upper``.
 
     Args:
-        model: The network's .onnx file, with its weights inside.
+        model: The network, or its .onnx file, with its weights inside.
         images: One cell.
         rows, offset: [k, output_size] and [k], both rounded to float32; the property is that in every group
             some row of ``rows @ y + offset`` is above 0.
@@ -56,8 +56,9 @@ def write_vnnlib(
     Raises:
         InputError: The network cannot be extended.
     """
-    network = load_network(model)
-    if model.suffix != ".onnx":
+    network = load_network(model) if isinstance(model, Path) else model
+    model = network.source
+    if model.suffix.lower() != ".onnx":
         raise InputError("only .onnx networks can be extended", file=model, fix="export the network to ONNX")
     if images.count != 1 or images.a_lower.shape[1] != network.input_size:
         raise ValueError(f"one cell of {network.input_size} numbers expected")
@@ -69,7 +70,12 @@ def write_vnnlib(
         raise InputError("keeps its weights in another file", file=model, fix="save it as a single file")
     if proto.ir_version < 4:
         raise InputError(f"has IR version {proto.ir_version}", file=model, fix="export with IR version 4 or later")
-    _extend(proto, _parallel(images), network.input_shape, matrix, np.asarray(offset, np.float64), form)
+    stored = {tensor.name for tensor in proto.graph.initializer}
+    image = next(value for value in proto.graph.input if value.name not in stored)
+    sizes = image.type.tensor_type.shape.dim
+    if len(sizes) != len(network.input_shape) + 1 or sizes[0].dim_value > 1:
+        raise InputError("takes other inputs than a batch of 1", file=model, fix="export it with a free batch")
+    _extend(proto, _parallel(images), network, matrix, np.asarray(offset, np.float64), form)
     d, n = images.dimensions, network.input_size
     network_file, property_file = target.with_name(target.name + ".onnx"), target.with_name(target.name + ".vnnlib")
     text = _vnnlib(d, n, [(k,) for k in range(len(matrix))] if groups is None else groups, len(matrix)).encode("ascii")
@@ -95,7 +101,7 @@ def _parallel(images: ImageSets) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 def _extend(
     proto: onnx.ModelProto,
     planes: tuple[np.ndarray, np.ndarray, np.ndarray],
-    shape: tuple[int, ...],
+    network: Network,
     rows: np.ndarray,
     offset: np.ndarray,
     form: Form,
@@ -106,7 +112,7 @@ def _extend(
     n, d = A.shape
     stored = {tensor.name for tensor in graph.initializer}
     image = next(value for value in graph.input if value.name not in stored)
-    output = graph.output[0].name
+    output, shape = network.output, network.input_shape
     used = {name for node in graph.node for name in (*node.input, *node.output)} | stored
 
     def name(text: str) -> str:

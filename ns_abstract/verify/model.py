@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 import torch
@@ -21,6 +20,7 @@ from ns_abstract.verify.network import (
     lends_anywhere,
 )
 from ns_abstract.verify.network.branching import branch
+from ns_abstract.verify.network.load import onnx_runner
 from ns_abstract.verify.preprocess import Preprocess
 from ns_abstract.verify.properties import Query
 
@@ -42,15 +42,12 @@ class NetworkModel:
         self.arithmetic: NetworkArithmetic = arithmetic
 
     @cached_property
-    def _session(self) -> Any:
-        """onnxruntime's session, or None for other files than ONNX."""
-        if self.network.source.suffix.lower() != ".onnx":
+    def _run(self) -> Callable[[np.ndarray], np.ndarray] | None:
+        """Runs the file in onnxruntime; None for other files than ONNX."""
+        network = self.network
+        if network.source.suffix.lower() == ".pt2":
             return None
-        import onnxruntime
-
-        options = onnxruntime.SessionOptions()
-        options.intra_op_num_threads = options.inter_op_num_threads = 1
-        return onnxruntime.InferenceSession(str(self.network.source), options, providers=["CPUExecutionProvider"])
+        return onnx_runner(network.source, network.output, network.input_shape)
 
     def outputs(self, images: np.ndarray) -> np.ndarray:
         """[B, n] of onnxruntime (torch for .pt2 files) in float32, picture by picture.
@@ -61,12 +58,10 @@ class NetworkModel:
             inputs = self.preprocess.apply(torch.from_numpy(np.asarray(images, np.float32)))
             if self.arithmetic == "real":
                 return np.concatenate([self.network(x[None].double()).numpy() for x in inputs])
-            if self._session is None:
+            if self._run is None:
                 return np.concatenate([self.network(x[None]).numpy() for x in inputs])
-        name = self._session.get_inputs()[0].name
         # one at a time: the same picture gives the same bits whatever stands beside it
-        found = [self._session.run(None, {name: x[None].numpy()}) for x in inputs]
-        return np.stack([np.concatenate([np.asarray(y).reshape(-1) for y in outputs]) for outputs in found])
+        return np.stack([self._run(x[None].numpy()) for x in inputs])
 
     def differentiable(self, images: torch.Tensor) -> torch.Tensor:
         return self.network(self.preprocess.apply(images))

@@ -6,6 +6,7 @@ Resizing is done by the renderer, which draws at the network's resolution (docs/
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -65,6 +66,20 @@ class Preprocess:
                 fix=f"write [{size[0]}, {size[1]}]",
             )
         return size
+
+    def loading(self, output: str | None) -> dict[str, Any]:
+        """Keywords of `load_network`: the output, the size of pictures where it is free, and what they look like."""
+        return {"output": output, "picture": self.resize, "layout": self.layout, "shown": self._samples}
+
+    def _samples(self, input_shape: tuple[int, ...]) -> Iterator[np.ndarray]:
+        """Inputs [1, *input_shape] of dark, bright and random pictures; none if the network takes no pictures."""
+        try:
+            height, width = self.size(input_shape)
+        except InputError:
+            return
+        random = torch.rand((2, height, width, 3), generator=torch.Generator().manual_seed(0), dtype=torch.float32)
+        for picture in (torch.zeros_like(random[0]), torch.ones_like(random[0]), *random):
+            yield self.apply(picture[None]).numpy()
 
     def _constants(self) -> tuple[np.ndarray, np.ndarray, float, float]:
         low, high = self.range

@@ -487,7 +487,7 @@ class Detection(Property):
 
 # ---------------------------------------------------------------- the file
 
-_COMMON = ("type", "preprocess", "partitions")
+_COMMON = ("type", "preprocess", "partitions", "output")
 _KEYS = {
     "classification": ("label",),
     "regression": ("target", "tolerance", "origin", "scale"),
@@ -498,6 +498,20 @@ _KEYS = {
 
 def _fail(name: str, found: Any, fix: str) -> InputError:
     return InputError(f"found {show(found)}", field=name, fix=fix)
+
+
+def loading(root: Any) -> dict[str, Any]:
+    """Keywords of `load_network` that a parsed PROP.json says: the output, and the size of the pictures.
+
+    Raises:
+        InputError: A field cannot be used.
+    """
+    if not isinstance(root, dict):
+        return {}
+    output = root.get("output")
+    if "output" in root and not (isinstance(output, str) and output):
+        raise _fail("output", output, "write the name of one of the network's outputs")
+    return parse_preprocess(root.get("preprocess", {})).loading(output)
 
 
 def parse_property(root: Any, folder: Path, input_shape: tuple[int, ...], output_shape: tuple[int, ...]) -> Property:
@@ -531,7 +545,7 @@ def parse_property(root: Any, folder: Path, input_shape: tuple[int, ...], output
         file = file_beside(folder, name)
     except InputError as error:
         raise InputError(error.problem, field="file", fix=error.fix) from None
-    return VnnLib(file=file, unsafe=load_vnnlib(file, outputs), **common)
+    return VnnLib(file=file, unsafe=load_vnnlib(file, outputs, math.prod(input_shape)), **common)
 
 
 def _partitions(root: dict[str, Any]) -> tuple[int, ...] | None:

@@ -19,6 +19,7 @@ import numpy as np
 
 from ns_abstract.io.errors import InputError
 from ns_abstract.io.jsonio import read_text
+from ns_abstract.io.packed import unpacked
 
 _LIMIT = 64 << 20
 _TOKEN = re.compile(r'\s+|;[^\n]*|(?P<text>[()]|"[^"]*"|[^\s();"]+)|(?P<bad>.)', re.DOTALL)
@@ -86,21 +87,44 @@ class _Sizes(NamedTuple):
     outputs: int
 
 
-def load_vnnlib(path: Path, output_size: int) -> UnsafeSet:
-    """Read a VNN-LIB file.
+def load_vnnlib(path: Path, output_size: int, input_size: int | None = None) -> UnsafeSet:
+    """Read a VNN-LIB file, packed (.gz) or not.
 
     Args:
         path: The file.
-        output_size: Number of the network's outputs.
+        output_size: Number of the network's outputs; as many must be declared.
+        input_size: Number of its inputs; as many must be declared, or none. None: not compared.
 
     Raises:
         InputError: The file cannot be read or says something that is not understood.
     """
-    text = read_text(path, "VNN-LIB file", _LIMIT)
+    text = _text(path)
     try:
-        return _parse(_expressions(text), output_size)
+        return _parse(_expressions(text), output_size, input_size)
     except InputError as error:
         raise error.within(path) from None
+
+
+def _text(path: Path) -> str:
+    if not path.name.lower().endswith(".gz"):
+        return read_text(path, "VNN-LIB file", _LIMIT)
+    data = b"".join(unpacked(path, _LIMIT))
+    try:
+        return data.decode("utf-8-sig")
+    except UnicodeDecodeError:
+        raise InputError("VNN-LIB file is not UTF-8 text", file=path, fix="save it as UTF-8") from None
+
+
+def _check_declared(declared: set[str], kind: str, count: int) -> None:
+    """Refuse a file that was written for a network of another size."""
+    names = {name for name in declared if name[0] == kind}
+    if names != {f"{kind}_{k}" for k in range(count)}:
+        what = "inputs" if kind == "X" else "outputs"
+        raise InputError(
+            f"declares {len(names)} variables {kind}_, the network has {count} {what}",
+            field=f"declare-const {kind}_",
+            fix=f"{_OTHER}, or declare {kind}_0 to {kind}_{count - 1}",
+        )
 
 
 def load_regions(path: Path, input_size: int, output_size: int, text: str | None = None) -> tuple[Region, ...]:
@@ -114,7 +138,7 @@ def load_regions(path: Path, input_size: int, output_size: int, text: str | None
     Raises:
         InputError: As `load_vnnlib`, or an input has no bounds.
     """
-    text = read_text(path, "VNN-LIB file", _LIMIT) if text is None else text
+    text = _text(path) if text is None else text
     try:
         return _regions(_expressions(text), _Sizes(input_size, output_size))
     except InputError as error:
@@ -137,6 +161,8 @@ def _regions(expressions: list[Any], sizes: _Sizes) -> tuple[Region, ...]:
         if len(cases) * len(ways) > _CONJUNCTIONS or len(cases) * sum(map(len, ways)) > _BOXES:
             raise InputError(f"more than {_CONJUNCTIONS} combinations of cases", fix="use fewer assertions of (or")
         cases = [[*old, *new] for old in cases for new in ways]
+    _check_declared(declared, "X", sizes.inputs)
+    _check_declared(declared, "Y", sizes.outputs)
     boxes: dict[bytes, tuple[np.ndarray, list[_Conjunction]]] = {}
     for case in cases:
         own = ends.copy()
@@ -228,7 +254,7 @@ def _fail(expression: Any, fix: str) -> InputError:
     return InputError(f"not understood: {_show(expression)}", fix=fix)
 
 
-def _parse(expressions: list[Any], output_size: int) -> UnsafeSet:
+def _parse(expressions: list[Any], output_size: int, input_size: int | None) -> UnsafeSet:
     declared: set[str] = set()
     unsafe: list[_Conjunction] = [[]]
     inputs = 0
@@ -245,6 +271,9 @@ def _parse(expressions: list[Any], output_size: int) -> UnsafeSet:
         unsafe = [[*old, *new] for old in unsafe for new in ways]
     if not any(unsafe):
         raise InputError("no assertion on an output", fix="assert which outputs are unsafe")
+    _check_declared(declared, "Y", output_size)
+    if input_size is not None and any(name[0] == "X" for name in declared):
+        _check_declared(declared, "X", input_size)
     return _unsafe(unsafe, output_size, inputs)
 
 

@@ -64,8 +64,8 @@ class Builder:
                 break
             self.nodes[k - 1] = replace(self.nodes[k - 1], name=name, op=op)
 
-    def network(self, output: int) -> Network:
-        """The network whose output is node ``output``; nodes that it does not need are left out."""
+    def network(self, output: int, name: str = "") -> Network:
+        """The network whose output is node ``output``, called ``name``, without nodes that it does not need."""
         needed = {output}
         for k in range(output, 0, -1):
             if k in needed:
@@ -83,7 +83,7 @@ class Builder:
             kept.pop()
             if len(shape) == 1 and len(before) == 3:
                 shape = before
-        return Network(self.path, self.input_shape, kept, shape)
+        return Network(self.path, self.input_shape, kept, shape, name)
 
     def _check_size(self, shape: Sequence[int]) -> None:
         if any(v < 1 for v in shape) or int(np.prod([float(v) for v in shape])) > _LARGEST:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -23,6 +24,7 @@ from ns_abstract.arithmetic.network_charges import (
 from ns_abstract.io.errors import InputError
 from ns_abstract.verify.network import curves
 from ns_abstract.verify.network.build import Builder
+from ns_abstract.verify.network.doubtful import Doubtful, Doubts, doubtful
 from ns_abstract.verify.network.graph import as_double, item
 from ns_abstract.verify.network.layers import (
     Activation,
@@ -39,7 +41,10 @@ from ns_abstract.verify.network.layers import (
 from ns_abstract.verify.network.maps import Differences, Resized, Sparse, TransposedConvolution, Variance
 from ns_abstract.verify.network.maxima import MaxPool
 from ns_abstract.verify.network.products import Product
+from ns_abstract.verify.network.recognised import GatedClip, ScaledGelu, SwitchedSoftplus
 
+#: The same for curves that take the file's own numbers.
+_ALIKE = 2.0**-10
 _ONES = (1, 1)
 #: A preference: limits of one side up to this are those of a ReLU, whose slopes are chosen (N14).
 _NEAR_ZERO = 2.0**16
@@ -58,7 +63,8 @@ class Composer(Builder):
     def _affine(self, index: int) -> tuple[int, float, float]:
         """(root, factor, offset): node ``index`` is ``factor * root + offset`` with plain numbers."""
         factor, offset = 1.0, 0.0
-        while index and isinstance(self._node(index).layer, Scale):
+        # constants that are known within bounds alone are no plain numbers
+        while index and type(self._node(index).layer) is Scale:
             layer = self._node(index).layer
             f = layer.factor.reshape(-1)
             o = torch.zeros(1, dtype=torch.float64) if layer.offset is None else layer.offset.reshape(-1)
@@ -90,7 +96,7 @@ class Composer(Builder):
             return -math.inf
         if min(least) == -math.inf or isinstance(layer, Activation):
             return -math.inf
-        if isinstance(layer, Scale) and bool((layer.factor >= 0.0).all()):
+        if type(layer) is Scale and bool((layer.factor >= 0.0).all()):
             low = layer.factor * least[0] + (0.0 if layer.offset is None else layer.offset)
             positive = layer.offset is None or bool((layer.offset >= 0.0).all())
             return self._rounded(float(low.min()), positive, layer.terms)
@@ -98,7 +104,11 @@ class Composer(Builder):
             return least[0]
         positive = (
             (isinstance(layer, Sum) and min(layer.signs) > 0)
-            or (isinstance(layer, (Sparse, Convolution)) and bool((layer.weight >= 0.0).all()))
+            or (
+                isinstance(layer, (Sparse, Convolution))
+                and not isinstance(layer, Doubtful)
+                and bool((layer.weight >= 0.0).all())
+            )
             or isinstance(layer, Gather)
         )
         return 0.0 if positive and min(least) >= 0.0 and layer.bias is None else -math.inf
@@ -113,6 +123,15 @@ class Composer(Builder):
     def curve(self, x: int, make: Callable[..., curves.Curve], **settings: Any) -> int:
         """A layer of `ns_abstract.verify.network.curves`."""
         return self._add(make(self.shape(x), **settings), x)
+
+    def doubt(self, index: int, weight: Doubts | None, offset: Doubts | None) -> int:
+        """The last layer again, whose constants are known within bounds alone (N24)."""
+        if weight is None and offset is None:
+            return index
+        node = self.nodes[index - 1]
+        assert isinstance(node.layer, Linear)
+        self.nodes[index - 1] = replace(node, layer=doubtful(node.layer, weight, offset))
+        return index
 
     def clip(self, x: int, least: float, most: float) -> int:
         """``min(max(x, least), most)``, with infinite limits, too."""
@@ -177,16 +196,19 @@ class Composer(Builder):
         """The natural logarithm."""
         return self.curve(x, curves.Log, floor=self._above(x))
 
-    def is_softplus(self, compared: int, limit: float, straight: int, curved: int) -> bool:
-        """Whether ``straight`` where ``compared`` is above the limit is what ``curved`` is there, rounding aside."""
+    def switched_softplus(self, compared: int, limit: float, straight: int, curved: int) -> int:
+        """``straight`` where ``compared`` is above the limit, else the softplus ``curved``; 0 if it is none."""
         (root, s, o), (behind, t, p) = self._affine(straight), self._affine(curved)
         node = self._node(behind)
-        if node is None or not isinstance(node.layer, curves.Softplus) or limit < 16.0 or o != 0.0 or p != 0.0:
-            return False
-        # softplus is less than 2^-23 from its argument there
+        if node is None or type(node.layer) is not curves.Softplus or limit < 16.0 or o != 0.0 or p != 0.0:
+            return 0
         argument, other = self._affine(node.inputs[0]), self._affine(compared)
         same = argument[0] == other[0] == root and argument[2] == other[2] == 0.0 and argument[1] == other[1]
-        return same and abs(t * argument[1] - s) <= NEAR * abs(s)
+        if not same or not abs(t * argument[1] - s) <= NEAR * abs(s):
+            return 0
+        # of the argument a x: the line is s x = s / (t a) of it, times t
+        excess = abs(1.0 - s / (t * argument[1]))
+        return self._times(self.curve(node.inputs[0], SwitchedSoftplus, limit=limit, excess=excess), t)
 
     # ------------------------------------------------------------ two values that depend on the image
 
@@ -250,13 +272,14 @@ class Composer(Builder):
             return 0
         if isinstance(layer, Sigmoid) and c == 0.0 and shift == 0.0 and t != 0.0:
             return self._times(self.curve(self._times(root, t), curves.Silu), s * factor / t)
-        if isinstance(layer, curves.Erf) and c == 0.0 and abs(t * math.sqrt(2.0) - 1.0) < NEAR and shift == factor:
-            return self._times(self.curve(root, curves.Gelu), 2.0 * s * factor)
-        if isinstance(layer, curves.Clip) and shift == 0.0 and layer.least == 0.0:
+        if isinstance(layer, curves.Erf) and c == 0.0 and abs(t * math.sqrt(2.0) - 1.0) < _ALIKE and shift == factor:
+            return self._times(self.curve(root, ScaledGelu, rate=t * math.sqrt(2.0)), 2.0 * s * factor)
+        if isinstance(layer, curves.Clip) and shift == 0.0 and layer.least == 0.0 and 0.0 in (c, layer.offset):
             # clip(a x + b, 0, m) of the root
             a, b = layer.factor * t / layer.most, (layer.factor * c + layer.offset) / layer.most
-            if abs(6.0 * a - 1.0) < NEAR and abs(2.0 * b - 1.0) < NEAR:
-                return self._times(self.curve(root, curves.HardSwish), s * factor * layer.most)
+            if abs(6.0 * a - 1.0) < _ALIKE and abs(2.0 * b - 1.0) < _ALIKE:
+                gate = self.curve(root, GatedClip, factor=a, offset=b)
+                return self._times(gate, s * factor * layer.most)
         return 0
 
     def extreme(self, inputs: Sequence[int], most: bool) -> int:
@@ -606,6 +629,34 @@ class Axis(NamedTuple):
     doubt: np.ndarray
 
 
+def nearest_pixels(size: int, out: int, coordinates: str, nearest: str, ratio: float) -> np.ndarray:
+    """[out] the pixel that onnxruntime takes along one axis: places are computed in float32, one operation a time.
+
+    Exact places differ from these by up to a pixel where they lie half way or on a number.
+    """
+    half = np.float32(0.5)
+    k, scale = np.arange(out, dtype=np.float32), np.float32(ratio)
+    if coordinates == "align_corners":
+        place = k * np.float32(size - 1) / np.float32(out - 1) if out > 1 else 0.0 * k
+    elif coordinates == "asymmetric":
+        place = k / scale
+    elif coordinates == "pytorch_half_pixel" and out == 1:
+        place = 0.0 * k
+    else:
+        place = (k + half) / scale - half
+    # half way from zero, as C rounds
+    rounded = np.trunc(place) + np.sign(place) * (np.abs(place - np.trunc(place)) >= half)
+    found = {
+        "floor": np.floor(place),
+        "ceil": np.ceil(place),
+        "round_prefer_floor": np.where(place == np.trunc(place) + half, np.floor(place), rounded),
+        "round_prefer_ceil": rounded,
+    }
+    if nearest not in found:
+        raise InputError(f"attribute nearest_mode = {nearest} is not supported", fix="use floor")
+    return np.clip(found[nearest], 0, size - 1).astype(np.int64)
+
+
 def interpolation(
     size: int, out: int, mode: str, coordinates: str, nearest: str, scale: float | None, bend: float = -0.75
 ) -> Axis:
@@ -629,15 +680,7 @@ def interpolation(
     matrix, doubt = np.zeros((out, size)), np.zeros((out, size))
     rows = np.arange(out)
     if mode == "nearest":
-        rounded = {
-            "floor": np.floor(place),
-            "ceil": np.ceil(place),
-            "round_prefer_floor": np.ceil(place - 0.5),
-            "round_prefer_ceil": np.floor(place + 0.5),
-        }
-        if nearest not in rounded:
-            raise InputError(f"attribute nearest_mode = {nearest} is not supported", fix="use floor")
-        matrix[rows, np.clip(rounded[nearest], 0, size - 1).astype(np.int64)] = 1.0
+        matrix[rows, nearest_pixels(size, out, coordinates, nearest, ratio)] = 1.0
         return Axis(matrix, doubt)
     cubic = mode == "cubic"
     if cubic and not abs(bend) <= 1.0:

@@ -21,8 +21,10 @@ _COPIES = 6
 Run = Callable[[np.ndarray], np.ndarray]
 
 
-def read_exported(path: Path) -> tuple[Network, Run]:
+def read_exported(path: Path, output: str | None = None) -> tuple[Network, Run]:
     """The network in a .pt2 file, and the same graph run with torch's own operators on one image [1, ...].
+
+    ``output``: the output that is read; None: the only one.
 
     Raises:
         InputError: The file cannot be read, or uses what is not supported; names node, operator and argument.
@@ -31,7 +33,7 @@ def read_exported(path: Path) -> tuple[Network, Run]:
         check_memory(_COPIES * file_size(path, "network"), path, "the network")
         with zipfile.ZipFile(path) as archive:
             graph, weights = contents(path, archive)
-        reader = Reader(path, graph, weights, OPERATORS)
+        reader = Reader(path, graph, weights, OPERATORS, output)
         return reader.network(), reader.run
     except (InputError, MemoryError):
         raise

@@ -19,8 +19,11 @@ import torch
 
 from ns_abstract.io.errors import InputError
 from ns_abstract.io.jsonio import show
+from ns_abstract.verify.network.chosen import chosen_output
 from ns_abstract.verify.network.compose import Composer
+from ns_abstract.verify.network.doubtful import Doubts
 from ns_abstract.verify.network.graph import Network, item
+from ns_abstract.verify.network.rounding import gamma
 
 _LARGEST_GRAPH = 64 << 20
 _LARGEST_WEIGHTS = 4 << 30
@@ -194,7 +197,12 @@ class Reader:
     """Turns one graph's nodes into layers."""
 
     def __init__(
-        self, path: Path, module: dict[str, Any], weights: dict[str, np.ndarray], operators: Operators
+        self,
+        path: Path,
+        module: dict[str, Any],
+        weights: dict[str, np.ndarray],
+        operators: Operators,
+        output: str | None = None,
     ) -> None:
         self.path, self.graph, self.operators = path, module["graph"], operators
         self.constants: dict[str, np.ndarray] = {}
@@ -218,8 +226,9 @@ class Reader:
         if not all("as_tensor" in result for result in results):
             raise InputError("has outputs that are no tensors", file=path, fix="return tensors alone")
         self.image = images[0]
-        #: all outputs, bounded one after another
-        self.outputs = [str(result["as_tensor"]["name"]) for result in results]
+        names = [str(result["as_tensor"]["name"]) for result in results]
+        shapes = [[size.get("as_int", "?") for size in self.graph["tensor_values"][name]["sizes"]] for name in names]
+        self.output = chosen_output(path, dict(zip(names, shapes, strict=True)), output)
         sizes = [size.get("as_int", 0) for size in self.graph["tensor_values"][self.image]["sizes"]]
         if len(sizes) < 2 or min(sizes[1:]) < 1:
             raise InputError(f"input has sizes {sizes}", file=path, fix="only the batch may be free")
@@ -228,6 +237,8 @@ class Reader:
         self.stored = dict(self.constants)
         self.builder = Composer(path, tuple(sizes[1:]))
         self.values: dict[str, Any] = {self.image: Index(0)}
+        #: how far computed weights may be from what `constants` holds
+        self.doubted: dict[str, Doubts] = {}
 
     def value(self, argument: dict[str, Any]) -> Any:
         """An argument: a node, a constant, a number or a list of them; the batch counts as 1."""
@@ -261,9 +272,10 @@ class Reader:
         return int(entry["as_int"]) if "as_int" in entry else int(self._named(entry["as_name"]))
 
     def network(self) -> Network:
+        needed = self._ancestors()
         for node in self.graph["nodes"]:
             target = str(node["target"])
-            if target in _CHECKS:
+            if target in _CHECKS or not needed.intersection(_outputs(node)):
                 continue
             name = _output(node)
             try:
@@ -285,6 +297,7 @@ class Reader:
                         raise InputError("works on a value with the batch inside its shape", fix="move the batch first")
                     found = rule(self, arguments)
                     arguments.done()
+                    self._charge(node, short, found)
             except InputError as error:
                 if error.file is not None:
                     raise
@@ -299,16 +312,19 @@ class Reader:
                     self.values[output] = value
                 else:
                     self.constants[output] = value
-        found = []
-        for name in self.outputs:
-            result = self.values.get(name)
-            if not isinstance(result, Index):
-                raise InputError(f"output {name} does not depend on the image", file=self.path)
-            found.append(result.number)
-        if len(found) > 1:
-            flat = [self.builder.reshape(k, (math.prod(self.builder.shape(k)),)) for k in found]
-            found = [self.builder.concat(flat, 0)]
-        return self.builder.network(found[0])
+        result = self.values.get(self.output)
+        if not isinstance(result, Index):
+            raise InputError(f"output {self.output} does not depend on the image", file=self.path)
+        return self.builder.network(result.number, self.output)
+
+    def _ancestors(self) -> set[str]:
+        """Names that the output depends on; what is changed in place may be shared by any of them."""
+        needed = {self.output}
+        for node in reversed(self.graph["nodes"]):
+            changes = str(node["target"]).rpartition(".")[0].endswith("_")
+            if changes or needed.intersection(_outputs(node)):
+                needed.update(_outputs(node), _read(node["inputs"]))
+        return needed
 
     def _made(self, name: str) -> dict[str, Any] | None:
         """The node that makes a value."""
@@ -343,7 +359,7 @@ class Reader:
                 found = _applied(node, values)
                 names = _outputs(node)
                 values.update(zip(names, found if len(names) > 1 else [found], strict=True))
-        return np.concatenate([values[name][0].reshape(-1).numpy() for name in self.outputs])
+        return values[self.output][0].reshape(-1).numpy()
 
     def by_torch(self, node: dict[str, Any], values: dict[str, np.ndarray]) -> Any:
         """What torch's operator of a node makes of its constants and of ``values`` by name, once there is room for it.
@@ -370,10 +386,41 @@ class Reader:
         target = str(node["target"])
         if target.split(".")[-2].endswith("_") and target not in _KEPT:
             raise InputError("changes a constant in place", fix="write the network without that")
+        self._charge(node, "", None)
         found = self.by_torch(node, {})
         parts = found if isinstance(found, (list, tuple)) else [found]
         made = [part.contiguous().numpy() if isinstance(part, torch.Tensor) else part for part in parts]
+        if ".aten._weight_norm." in target:
+            # a sum of squares, its root, a quotient and a product: nothing cancels
+            direction, size = (self._named(entry["arg"]["as_tensor"]["name"]) for entry in node["inputs"][:2])
+            wide = self.by_torch(node, {k: np.asarray(v, np.float64) for k, v in self.constants.items()})
+            made = [wide.numpy()]
+            count = np.size(direction) / max(1, np.size(size)) + 16
+            single = gamma(count) * (1.0 + 2.0**-4) * np.abs(made[0]) + 2.0**-100
+            self.doubted[_output(node)] = (2.0**-44 * np.abs(made[0]), single)
+        elif any(isinstance(v, np.ndarray) and v.dtype == np.float32 for v in made):
+            self._check_exact(node, made)
         return made if isinstance(found, (list, tuple)) else made[0]
+
+    def _charge(self, node: dict[str, Any], short: str, found: Any) -> None:
+        """Charge what a layer's weights may be off, where they are computed."""
+        names = [name for entry in node["inputs"] for name in named_values(entry["arg"]) if name in self.doubted]
+        if not names:
+            return
+        if short not in ("conv2d.default", "linear.default") or len(names) > 1:
+            raise InputError("reads a constant that float32 rounds", fix="register it as a buffer")
+        self.builder.doubt(found.number, self.doubted[names[0]], None)
+
+    def _check_exact(self, node: dict[str, Any], made: list[Any]) -> None:
+        """Refuse results that float32 rounds: another order of the same sums gives others (N24)."""
+        wide = {k: v.astype(np.float64) for k, v in self.constants.items() if getattr(v, "dtype", None) == np.float32}
+        again = self.by_torch(node, wide)
+        parts = again if isinstance(again, (list, tuple)) else [again]
+        for one, two in zip(made, parts, strict=True):
+            if not isinstance(one, np.ndarray) or one.dtype != np.float32:
+                continue
+            if not np.array_equal(one.astype(np.float64), two.double().numpy()):
+                raise InputError("computes a constant that float32 rounds", fix="register the result as a buffer")
 
 
 def _floats(content: Any) -> Any:
@@ -422,6 +469,16 @@ def _applied(node: dict[str, Any], values: dict[str, Any], device: str = "cpu") 
     positional = [take(e["arg"]) for e in node["inputs"] if e.get("kind", 1) == 1]
     named = {e["name"]: take(e["arg"]) for e in node["inputs"] if e.get("kind", 1) != 1}
     return getattr(getattr(torch.ops.aten, operator), overload)(*positional, **named)
+
+
+def _read(inputs: Any) -> set[str]:
+    """Names of tensors and numbers in the arguments of a node."""
+    if isinstance(inputs, list):
+        return {name for part in inputs for name in _read(part)}
+    if not isinstance(inputs, dict):
+        return set()
+    own = {inputs[key] for key in ("name", "as_name") if isinstance(inputs.get(key), str)}
+    return own.union(*(_read(part) for part in inputs.values()))
 
 
 def _output(node: dict[str, Any]) -> str:

@@ -7,6 +7,7 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
+import torch
 
 from ns_abstract.io.errors import InputError
 from ns_abstract.verify.network import curves
@@ -14,6 +15,7 @@ from ns_abstract.verify.network.compose import Axis, Composer, interpolation
 from ns_abstract.verify.network.exported_graph import Arguments, Index, Operators, Reader, Rule, named_values
 from ns_abstract.verify.network.graph import item
 from ns_abstract.verify.network.operands import einsum, joined, matmul
+from ns_abstract.verify.network.recognised import SwitchedSoftplus
 
 _ONES = (1, 1)
 
@@ -97,9 +99,10 @@ def _gelu(b: Composer, x: int, a: Arguments) -> int:
 
 def _softplus(b: Composer, x: int, a: Arguments) -> int:
     a.only("beta", 1, 1.0)
-    if _number(a, "threshold", 20.0) < 16.0:
+    limit = _number(a, "threshold", 20.0)
+    if limit < 16.0:
         raise InputError("argument threshold is not supported", fix="at least 16")
-    return b.curve(x, curves.Softplus)
+    return b.curve(x, SwitchedSoftplus, limit=limit)
 
 
 def _clamp(b: Composer, x: int, a: Arguments) -> int:
@@ -504,12 +507,21 @@ def _upsample(mode: str) -> Rule:
         r.builder.reserve(4.0 * shape[0] * found[0] * found[1])
         coordinates = "asymmetric" if mode == "nearest" else "align_corners" if align else "half_pixel"
         maps = [
-            interpolation(n, m, mode, coordinates, "floor", ratio)
+            _nearest(n, m, ratio) if mode == "nearest" else interpolation(n, m, mode, coordinates, "floor", ratio)
             for n, m, ratio in zip(shape[1:], found, ratios, strict=True)
         ]
         return Index(r.builder.resize(x, maps))
 
     return rule
+
+
+def _nearest(size: int, out: int, ratio: float | None) -> Axis:
+    """The pixels that torch takes along one axis, which it is asked for: it computes their places in float32."""
+    column = torch.arange(size, dtype=torch.float32).reshape(1, 1, size, 1)
+    taken = torch.ops.aten.upsample_nearest2d(column, [out, 1], ratio, None).reshape(-1).long().numpy()
+    matrix = np.zeros((out, size))
+    matrix[np.arange(out), taken] = 1.0
+    return Axis(matrix, np.zeros((out, size)))
 
 
 def _moves(r: Reader, a: Arguments) -> Any:

@@ -65,16 +65,20 @@ class Network:
         input_shape: One item, without the batch.
         nodes: In an order in which every node's inputs come before it; node k is ``nodes[k - 1]``.
         output_shape: One item of the last node, as the file says it.
+        output: The output's name in the file.
     """
 
-    def __init__(self, source: Path, input_shape: Shape, nodes: Sequence[Node], output_shape: Shape) -> None:
+    def __init__(
+        self, source: Path, input_shape: Shape, nodes: Sequence[Node], output_shape: Shape, output: str = ""
+    ) -> None:
         self.source = source
         self.input_shape = tuple(input_shape)
         self.nodes = tuple(nodes)
         self.output_shape = tuple(output_shape)
+        self.output = output
 
     def __getstate__(self) -> dict[str, Any]:
-        kept = ("source", "input_shape", "nodes", "output_shape")
+        kept = ("source", "input_shape", "nodes", "output_shape", "output")
         return {name: self.__dict__[name] for name in kept}
 
     @property

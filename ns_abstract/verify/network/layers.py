@@ -81,6 +81,10 @@ class Linear:
         """What a float32 evaluation may be off besides, for inputs of at most ``sizes`` [m, *input_shapes[i]]."""
         return 0.0
 
+    def inexact(self, sizes: Sequence[Tensor]) -> Tensor | float:
+        """What the network is off the layer's numbers in real arithmetic, too, for inputs of at most ``sizes``."""
+        return 0.0
+
     def backward(self, rows: Rows) -> list[Rows]:
         """Rows on every input for rows on the output; may reuse their memory."""
         return [unflatten(rows, self.shape, self.input_shapes[0])]

@@ -11,7 +11,9 @@ import numpy as np
 import onnx
 
 from ns_abstract.io.errors import InputError
+from ns_abstract.verify.network.chosen import chosen_output
 from ns_abstract.verify.network.compose import Composer
+from ns_abstract.verify.network.enclosed import Enclosed, arithmetic, fold_enclosed
 from ns_abstract.verify.network.graph import Network
 from ns_abstract.verify.network.layers import Shape
 from ns_abstract.verify.network.onnx_fold import FOLDED, fold
@@ -40,8 +42,6 @@ def operator_set(model: onnx.ModelProto, path: Path) -> int:
 
 #: What people do instead of an operator that has no bounds here.
 _INSTEAD = {
-    "ArgMax": "leave it out: properties compare the scores themselves",
-    "ArgMin": "leave it out: properties compare the scores themselves",
     "Atan": "use Tanh",
     "Ceil": "leave rounding out",
     "Col2Im": "use ConvTranspose, or DepthToSpace where blocks do not overlap",
@@ -61,8 +61,6 @@ _INSTEAD = {
     "MaxRoiPool": "export without post-processing",
     "NonMaxSuppression": "export without post-processing",
     "NonZero": "export without post-processing",
-    "QuantizeLinear": "export before quantisation",
-    "DequantizeLinear": "export before quantisation",
     "RNN": "use convolutions or attention",
     "ReduceProd": "use ReduceSum of logarithms",
     "RoiAlign": "export without post-processing",
@@ -71,8 +69,50 @@ _INSTEAD = {
     "ScatterND": "use Concat of slices",
     "Sign": "use Clip or Tanh",
     "Sin": "only constants may pass it",
-    "TopK": "export without post-processing",
 }
+
+
+#: Operators that work on every item of a batch by itself, and rules that refuse where they do not.
+_BY_ITEM = frozenset(
+    (
+        *("Abs", "Add", "AveragePool", "BatchNormalization", "Cast", "Celu", "Clip", "Concat", "Conv", "ConvTranspose"),
+        *("Div", "Dropout", "Elu", "Erf", "Exp", "Flatten", "Gelu", "Gemm", "GlobalAveragePool", "GlobalMaxPool"),
+        *(
+            "HardSigmoid",
+            "HardSwish",
+            "Identity",
+            "LeakyRelu",
+            "MatMul",
+            "MaxPool",
+            "Mish",
+            "Mul",
+            "PRelu",
+            "Pad",
+            "Relu",
+        ),
+        *("Reshape", "Resize", "Selu", "Sigmoid", "Softmax", "Softplus", "Sub", "Tanh", "Upsample"),
+    )
+)
+
+
+class Asked(NamedTuple):
+    """What of a file is read.
+
+    Attributes:
+        output: Name of the output; None: the only one.
+        vector: Whether the input may be a vector [n], without a batch.
+        picture: Height and width where the file leaves them free.
+        last: Whether channels come last in such a picture.
+    """
+
+    output: str | None = None
+    vector: bool = False
+    picture: tuple[int, int] | None = None
+    last: bool = False
+
+
+#: What picks among scores, at the end of many networks.
+_PICKS = frozenset(("ArgMax", "ArgMin", "TopK"))
 
 
 class Value(NamedTuple):
@@ -95,21 +135,26 @@ class Value(NamedTuple):
 class Reader:
     """Turns one graph's nodes into layers."""
 
-    def __init__(
-        self, path: Path, graph: onnx.GraphProto, opset: int, rules: dict[str, Rule], vector: bool = False
-    ) -> None:
+    def __init__(self, path: Path, graph: onnx.GraphProto, opset: int, rules: dict[str, Rule], asked: Asked) -> None:
         self.path, self.graph, self.opset, self.rules = path, graph, opset, rules
         self.stored = StoredTensors(path)
         self.constants: dict[str, np.ndarray] = {}
+        #: constants that evaluations may round differently; `constants` holds numbers within
+        self.enclosed: dict[str, Enclosed] = {}
         for tensor in graph.initializer:
             self.constants[tensor.name] = self.stored.array(tensor, f"initializer {tensor.name}")
         if graph.sparse_initializer:
             raise InputError("sparse constants are not supported", file=path, fix="store them as dense tensors")
-        self.input_name, image = self._input(vector)
+        #: items that the file's batch always holds; all are the same picture
+        self.batch = 1
+        self.input_name, image = self._input(asked)
+        self.output = self._chosen(asked.output)
         self.builder = Composer(path, image.item)
         self.values: dict[str, Value] = {self.input_name: image}
         #: whether a value is above a number: what the exporter makes of softplus
         self.above: dict[str, tuple[Value, float]] = {}
+        #: scale and zero of values that are rounded to steps, until they are dequantised
+        self.quantised: dict[str, tuple[float, int]] = {}
         #: numbers of a value that a mask has set to minus infinity, in its whole shape; they stand as they were before
         self.dropped: dict[str, np.ndarray] = {}
 
@@ -117,7 +162,7 @@ class Reader:
         name = node.name or (node.output[0] if node.output else "")
         return InputError(problem, file=self.path, field=f"node {name} ({node.op_type})", fix=fix)
 
-    def _input(self, vector: bool) -> tuple[str, Value]:
+    def _input(self, asked: Asked) -> tuple[str, Value]:
         inputs = [value for value in self.graph.input if value.name not in self.constants]
         if len(inputs) != 1:
             raise InputError(f"has {len(inputs)} inputs", file=self.path, field="graph.input", fix="one image expected")
@@ -126,8 +171,18 @@ class Reader:
         kind = value.type.tensor_type
         if kind.elem_type not in (onnx.TensorProto.FLOAT, onnx.TensorProto.DOUBLE):
             raise InputError("is not a float32 tensor", file=self.path, field=field, fix="export with a float input")
-        sizes = [d.dim_value if d.HasField("dim_value") else 0 for d in kind.shape.dim]
-        if vector and len(sizes) == 1 and sizes[0] > 0:
+        # some exporters write -1 for what is free
+        sizes = [max(0, d.dim_value) if d.HasField("dim_value") else 0 for d in kind.shape.dim]
+        if len(sizes) == 4 and asked.picture is not None:
+            places = (1, 2) if asked.last else (2, 3)
+            for place, size in zip(places, asked.picture, strict=True):
+                sizes[place] = sizes[place] or size
+        if asked.vector and len(sizes) == 1 and sizes[0] > 0:
+            return value.name, Value(0, tuple(sizes))
+        if len(sizes) == 4 and sizes[0] > 1:
+            self.batch, sizes[0] = sizes[0], 1
+        if len(sizes) > 1 and sizes[0] > 1 and min(sizes) > 0:
+            # no batch of pictures: the whole tensor is the item
             return value.name, Value(0, tuple(sizes))
         if len(sizes) < 2 or sizes[0] not in (0, 1) or min(sizes[1:]) < 1:
             shown = [d.dim_value if d.HasField("dim_value") else d.dim_param or "?" for d in kind.shape.dim]
@@ -135,42 +190,79 @@ class Reader:
                 f"has shape {shown}",
                 file=self.path,
                 field=field,
-                fix="export with a free batch or a batch of 1 and all other sizes fixed",
+                fix="export with all sizes but the batch fixed, or say height and width in preprocess.resize",
             )
         return value.name, Value(0, (1, *sizes[1:]))
 
     def network(self) -> Network:
-        """All outputs that depend on the image, one after the other if they are several."""
+        """The network up to the chosen output; nodes that it does not depend on are not read."""
+        needed = {self.output}
+        for node in reversed(self.graph.node):
+            if needed.intersection(node.output):
+                needed.update(node.input, _outer_names(node))
+        needed.discard("")
         for node in self.graph.node:
+            wanted = [name if name in needed else "" for name in node.output]
+            if not any(wanted):
+                continue
+            read = onnx.NodeProto()
+            read.CopyFrom(node)
+            del read.output[:]
+            read.output.extend(wanted)
             try:
-                self._read(node)
+                self._read(read)
             except InputError as error:
                 if error.field is not None:
                     raise
                 raise self._fail(node, error.problem, error.fix) from None
-        names = [value.name for value in self.graph.output]
-        for name in names:
-            if name not in self.values:
-                raise InputError(f"output {name!r} does not depend on the image", file=self.path, field="graph.output")
-        found = [self.values[name].index for name in names]
-        if len(found) > 1:
-            flat = [self.builder.reshape(k, (int(np.prod(self.builder.shape(k))),)) for k in found]
-            found = [self.builder.concat(flat, 0)]
-        return self.builder.network(found[0])
+        name = self.output
+        if name not in self.values:
+            raise InputError(f"output {name!r} does not depend on the image", file=self.path, field="graph.output")
+        if name in self.quantised:
+            raise InputError(f"output {name!r} holds integers", file=self.path, field="graph.output")
+        if name in self.dropped:
+            raise InputError(f"output {name!r} holds minus infinity", file=self.path, field="graph.output")
+        return self.builder.network(self.values[name].index, name)
+
+    def _chosen(self, asked: str | None) -> str:
+        """The name of the output that is read."""
+        shapes, beside = {}, []
+        for value in self.graph.output:
+            kind = value.type.tensor_type
+            shapes[value.name] = [
+                d.dim_value if d.HasField("dim_value") else d.dim_param or "?" for d in kind.shape.dim
+            ]
+            if kind.elem_type not in (0, onnx.TensorProto.FLOAT, onnx.TensorProto.DOUBLE, onnx.TensorProto.FLOAT16):
+                beside.append(value.name)
+        return chosen_output(self.path, shapes, asked, beside)
 
     def _read(self, node: onnx.NodeProto) -> None:
         kind = node.op_type
+        if self.batch > 1 and kind not in _BY_ITEM and any(name in self.values for name in node.input):
+            raise InputError(f"works on a batch of {self.batch} items", fix="export with a free batch or a batch of 1")
         if node.domain not in ("", "ai.onnx"):
             raise InputError(f"operator of domain {node.domain} is not supported", fix="export without it")
         inputs = [name for name in node.input if name]
         if kind in FOLDED and inputs and all(name in self.constants for name in inputs):
             values = [self.constants[name] if name else None for name in node.input]
-            self.fold(node, *fold(node, values, self.opset))
+            if not arithmetic(node, values, any(name in self.enclosed for name in inputs)):
+                self.fold(node, *fold(node, values, self.opset))
+                return
+            with np.errstate(all="ignore"):
+                within = [self.enclosed.get(n, v) for n, v in zip(node.input, values, strict=True)]
+                found = fold_enclosed(node, within, self.opset)
+            names = [name for name in node.output if name]
+            self.enclosed |= {n: v for n, v in zip(names, found, strict=False) if isinstance(v, Enclosed)}
+            self.fold(node, *(v.value if isinstance(v, Enclosed) else v for v in found))
             return
         rule = self.rules.get(kind)
         if rule is None:
             near = difflib.get_close_matches(kind, self.rules, 5, 0.0)
             known = f"{len(self.rules)} operators are, the nearest by name {', '.join(near)}"
+            if kind in _PICKS:
+                known = (
+                    f"make its input {node.input[0]!r} the network's output: properties compare the scores themselves"
+                )
             raise InputError("operator is not supported", fix=_INSTEAD.get(kind, known))
         attributes = Attributes(self, node)
         rule(self, node, attributes)
@@ -183,6 +275,8 @@ class Reader:
         name = node.input[position] if position < len(node.input) else ""
         if name in self.dropped and node.op_type != "Softmax":
             raise InputError("reads what a mask has set to minus infinity", fix="mask right before a Softmax")
+        if name in self.quantised and node.op_type != "DequantizeLinear":
+            raise InputError("reads integers", fix="put a DequantizeLinear between")
         if name in self.values:
             return self.values[name]
         if name in self.constants:
@@ -200,20 +294,27 @@ class Reader:
             raise InputError(f"input of shape {list(value.whole)} mixes the batch", fix="keep the batch first")
         return value.index
 
-    def constant(self, node: onnx.NodeProto, position: int, default: Any = None) -> Any:
-        """Constant input ``position``; ``default`` if it is absent."""
+    def constant(self, node: onnx.NodeProto, position: int, default: Any = None, doubtful: bool = False) -> Any:
+        """Constant input ``position``; ``default`` if it is absent. ``doubtful``: the caller charges `doubts`."""
         name = node.input[position] if position < len(node.input) else ""
         if not name:
             return default
         if name not in self.constants:
             raise InputError(f"input {position} ({name}) is not a constant", fix="fold constants when exporting")
+        if name in self.enclosed and not doubtful:
+            problem = f"input {position} ({name}) is a constant that rounding changes"
+            raise InputError(problem, fix="fold constants when exporting, in float64")
         found = self.constants[name]
         if found.dtype.kind == "f" and node.op_type != "Add" and np.isneginf(found).any():
             raise InputError(f"input {position} ({name}) holds minus infinity", fix="mask right before a Softmax")
         return found
 
-    def weight(self, node: onnx.NodeProto, position: int) -> np.ndarray:
-        found = self.constant(node, position)
+    def doubts(self, node: onnx.NodeProto, position: int) -> Enclosed | None:
+        """Enclosures of a constant input that rounding changes."""
+        return self.enclosed.get(node.input[position]) if position < len(node.input) else None
+
+    def weight(self, node: onnx.NodeProto, position: int, doubtful: bool = False) -> np.ndarray:
+        found = self.constant(node, position, None, doubtful)
         if found is None:
             raise InputError(f"input {position} is missing", fix="export the network again")
         return found
@@ -225,6 +326,8 @@ class Reader:
                 raise InputError("has several outputs", fix="only the first is supported")
             whole = (1, *self.builder.shape(index))
         value = Value(index, tuple(whole))
+        if self.batch > 1 and not value.batched:
+            raise InputError(f"mixes the {self.batch} items of a batch", fix="export with a batch of 1")
         value = Value(self.builder.reshape(index, value.item), value.whole)
         self.builder.name(value.index, node.name or node.output[0], node.op_type)
         self.values[node.output[output]] = value
@@ -272,3 +375,13 @@ class Attributes:
         for name in self.found:
             if name not in self.asked:
                 raise InputError(f"attribute {name} is not supported", fix="export without it")
+
+
+def _outer_names(node: onnx.NodeProto) -> set[str]:
+    """Names that the graphs inside a node may read from around it."""
+    found: set[str] = set()
+    for attribute in node.attribute:
+        for graph in (*attribute.graphs, *([attribute.g] if attribute.HasField("g") else [])):
+            for inner in graph.node:
+                found.update(inner.input, _outer_names(inner))
+    return found

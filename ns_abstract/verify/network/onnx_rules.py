@@ -12,9 +12,12 @@ import onnx
 from ns_abstract.io.errors import InputError
 from ns_abstract.verify.network import curves
 from ns_abstract.verify.network.compose import Composer, interpolation
+from ns_abstract.verify.network.doubtful import Doubts
+from ns_abstract.verify.network.enclosed import Enclosed
 from ns_abstract.verify.network.graph import item
 from ns_abstract.verify.network.layers import Shape
 from ns_abstract.verify.network.onnx_graph import Attributes, Reader, Rule, Value
+from ns_abstract.verify.network.onnx_quantised import dequantize, quantize
 from ns_abstract.verify.network.operands import Operand, einsum, joined, matmul
 
 #: A mask that adds less than this takes a number out of a softmax: in float32 its exponential is zero.
@@ -65,7 +68,7 @@ def _mapped(r: Reader, node: onnx.NodeProto, index: int, line: bool) -> None:
 
 
 def _conv(r: Reader, node: onnx.NodeProto, a: Attributes) -> None:
-    x, weight, bias = r.source(node), r.weight(node, 1), r.constant(node, 2)
+    x, weight, bias = r.source(node), r.weight(node, 1, True), r.constant(node, 2, None, True)
     shape = r.builder.shape(x)
     if (weight.ndim, len(shape)) not in ((4, 3), (3, 2)):
         problem = f"weights {item(weight.shape)} on {item(shape)}"
@@ -78,6 +81,7 @@ def _conv(r: Reader, node: onnx.NodeProto, a: Attributes) -> None:
     stride, dilation = _ints(a, "strides", line, 1), _ints(a, "dilations", line, 1)
     pads = _pads(a, r.builder.shape(x)[1:], kernel, stride, dilation, line)
     index = r.builder.convolution(x, weight, bias, stride, dilation, pads, int(a.get("group", 1)))
+    r.builder.doubt(index, _doubts(r.doubts(node, 1), weight.shape), _doubts(r.doubts(node, 2)))
     _mapped(r, node, index, line)
 
 
@@ -105,7 +109,7 @@ def _average_pool(r: Reader, node: onnx.NodeProto, a: Attributes) -> None:
 
 def _max_pool(r: Reader, node: onnx.NodeProto, a: Attributes) -> None:
     x, kernel, stride, dilation, pads, more, line = _pool_window(r, node, a)
-    a.ignore("storage_order")  # of the second output, which is refused
+    a.ignore("storage_order")  # of the second output, which is refused where it is read
     pads = (*pads[:2], pads[2] + more[0], pads[3] + more[1])
     _mapped(r, node, r.builder.max_pool(x, kernel, stride, dilation, pads), line)
 
@@ -116,17 +120,22 @@ def _global_average(r: Reader, node: onnx.NodeProto, a: Attributes) -> None:
 
 
 def _gemm(r: Reader, node: onnx.NodeProto, a: Attributes) -> None:
-    x, weight, bias = r.value(node), r.weight(node, 1), r.constant(node, 2)
+    x, weight, bias = r.value(node), r.weight(node, 1, True), r.constant(node, 2, None, True)
     a.only("transA", 0)
     alpha, beta = float(a.get("alpha", 1.0)), float(a.get("beta", 1.0))
     if weight.ndim != 2:
         raise InputError(f"weights {item(weight.shape)}", fix="a matrix expected")
     matrix = weight.astype(np.float64) if a.get("transB", 0) else weight.astype(np.float64).T
+    own, shift = r.doubts(node, 1), r.doubts(node, 2)
+    own = own if own is None or a.get("transB", 0) else own.turned()
     bias = None if bias is None else beta * bias.astype(np.float64)
-    index = r.builder.matrix(x.index, matrix, bias if alpha == 1.0 else None)
-    if alpha != 1.0:
+    added = _doubts(None if shift is None else shift.times(beta))
+    if alpha == 1.0:
+        index = r.builder.doubt(r.builder.matrix(x.index, matrix, bias), _doubts(own), added)
+    else:
         # programs multiply the sums, or the weights
-        index = r.builder.scale(index, np.asarray(alpha), bias)
+        index = r.builder.doubt(r.builder.matrix(x.index, matrix, None), _doubts(own), None)
+        index = r.builder.doubt(r.builder.scale(index, np.asarray(alpha), bias), None, added)
     r.result(node, index, (*x.whole[:-1], matrix.shape[0]))
 
 
@@ -202,7 +211,8 @@ def _cast(r: Reader, node: onnx.NodeProto, a: Attributes) -> None:
     a.ignore("saturate")
     if a.get("to") not in (onnx.TensorProto.FLOAT, onnx.TensorProto.DOUBLE):
         name = onnx.TensorProto.DataType.Name(int(a.get("to", 0)))
-        raise InputError(f"attribute to = {name} is not supported", fix="export the network in float32")
+        fix = "write model.float() before the export" if "FLOAT16" in name else "export the network in float32"
+        raise InputError(f"attribute to = {name} is not supported", fix=fix)
     r.values[node.output[0]] = x
 
 
@@ -217,7 +227,7 @@ def _dropout(r: Reader, node: onnx.NodeProto, a: Attributes) -> None:
     if training is not None and bool(np.any(training)):
         raise InputError("is in training mode", fix="export the network in evaluation mode")
     if any(node.output[1:]):
-        raise InputError("has a mask as second output", fix="export the network in evaluation mode")
+        raise InputError("gives its mask to other nodes", fix="export the network in evaluation mode")
     r.values[node.output[0]] = r.value(node)
 
 
@@ -255,10 +265,11 @@ def _number(r: Reader, node: onnx.NodeProto, a: Attributes) -> None:
 def _binary(r: Reader, node: onnx.NodeProto, a: Attributes) -> None:
     kind = node.op_type
     a.ignore("axis", "broadcast")
-    one, two = (_operand(r, node, k) for k in range(2))
+    one, two = (_operand(r, node, k, True) for k in range(2))
     if isinstance(one, Value) and isinstance(two, Value):
         r.result(node, *_both(r.builder, kind, one, two))
         return
+    own = r.doubts(node, 1 if isinstance(one, Value) else 0)
     if isinstance(one, Value):
         value, constant = one, np.asarray(two, np.float64)
     else:
@@ -273,7 +284,8 @@ def _binary(r: Reader, node: onnx.NodeProto, a: Attributes) -> None:
     elif kind == "Div":
         if not constant.all():
             raise InputError("divides by zero", fix="check the constant")
-        factor = 1.0 / constant
+        own = None if own is None else own.inverse()
+        factor = 1.0 / constant if own is None else own.value
     elif kind == "Add":
         dropped = constant <= _DROPPED
         if dropped.any():
@@ -282,11 +294,28 @@ def _binary(r: Reader, node: onnx.NodeProto, a: Attributes) -> None:
     else:
         factor = np.ones(()) if isinstance(one, Value) else -np.ones(())
         offset = -constant if isinstance(one, Value) else constant
-    r.result(node, r.builder.scale(x, factor, offset), whole)
+    index = r.builder.scale(x, factor, offset)
+    if own is not None:
+        off = _doubts(own, r.builder.shape(x))
+        index = r.builder.doubt(index, *((off, None) if kind in ("Mul", "Div") else (None, off)))
+    r.result(node, index, whole)
 
 
-def _operand(r: Reader, node: onnx.NodeProto, position: int) -> Value | np.ndarray:
-    return r.value(node, position) if r.moves(node, position) else r.weight(node, position)
+def _doubts(constant: Enclosed | None, shape: Shape | None = None) -> Doubts | None:
+    """Doubts of a constant, spread to an item or given the shape of weights."""
+    if constant is None:
+        return None
+    found = constant.doubts
+    if shape is None:
+        return found
+    if found[0].size == math.prod(shape):
+        return found[0].reshape(shape), found[1].reshape(shape)
+    real, single = (np.broadcast_to(part, (1, *shape))[0] for part in found)
+    return real, single
+
+
+def _operand(r: Reader, node: onnx.NodeProto, position: int, doubtful: bool = False) -> Value | np.ndarray:
+    return r.value(node, position) if r.moves(node, position) else r.weight(node, position, doubtful)
 
 
 def _spread(b: Composer, value: Value, shape: Sequence[int]) -> tuple[int, Shape]:
@@ -374,9 +403,10 @@ def _where(r: Reader, node: onnx.NodeProto, a: Attributes) -> None:
     if node.input[0] in r.above:
         value, limit = r.above[node.input[0]]
         straight, curved = r.value(node, 1), r.value(node, 2)
-        if not r.builder.is_softplus(value.index, limit, straight.index, curved.index):
+        index = r.builder.switched_softplus(value.index, limit, straight.index, curved.index)
+        if not index:
             raise InputError("chooses by a value that depends on the image", fix="only torch's softplus is read")
-        r.values[node.output[0]] = curved
+        r.result(node, index, curved.whole)
         return
     chosen = np.asarray(r.weight(node, 0), bool)
     parts = [_operand(r, node, k) for k in (1, 2)]
@@ -397,7 +427,14 @@ def _given(operand: Value | np.ndarray) -> Operand:
 
 
 def _matmul(r: Reader, node: onnx.NodeProto, a: Attributes) -> None:
-    r.result(node, *matmul(r.builder, *(_given(_operand(r, node, k)) for k in range(2))))
+    if r.batch > 1 and (r.moves(node, 1) or r.weight(node, 1).ndim > 2):
+        raise InputError(f"multiplies within a batch of {r.batch} items", fix="export with a batch of 1")
+    own = r.doubts(node, 1)
+    flat = own is not None and own.value.ndim == 2
+    result = matmul(r.builder, *(_given(_operand(r, node, k, k == 1 and flat)) for k in range(2)))
+    if own is not None:
+        r.builder.doubt(result[0], _doubts(own.turned()), None)
+    r.result(node, *result)
 
 
 def _einsum(r: Reader, node: onnx.NodeProto, a: Attributes) -> None:
@@ -428,6 +465,8 @@ def _flatten(r: Reader, node: onnx.NodeProto, a: Attributes) -> None:
     if not -len(x.whole) <= axis <= len(x.whole):
         raise InputError(f"attribute axis = {axis} of {item(x.whole)}", fix="use 1")
     axis = axis + len(x.whole) if axis < 0 else axis
+    if r.batch > 1 and axis != 1:
+        raise InputError(f"attribute axis = {axis} on a batch of {r.batch} items", fix="use 1")
     r.result(node, x.index, (math.prod(x.whole[:axis]), math.prod(x.whole[axis:])))
 
 
@@ -443,6 +482,10 @@ def _reshape(r: Reader, node: onnx.NodeProto, a: Attributes) -> None:
             if k >= len(x.whole):
                 raise InputError(f"shape {target} copies a size that is not there", fix="check the shape")
             target[k] = x.whole[k]
+    if r.batch > 1:
+        if not x.batched or not target or target[0] not in (r.batch, -1):
+            raise InputError(f"shape {target} mixes the {r.batch} items of a batch", fix="export with a batch of 1")
+        target[0] = 1 if target[0] == r.batch else -1
     total, rest = math.prod(x.whole), math.prod(v for v in target if v != -1)
     if target.count(-1) > 1 or rest <= 0 or total % rest or (-1 not in target and rest != total):
         raise InputError(f"shape {target} of {total} numbers", fix="export with a batch of 1")
@@ -688,11 +731,14 @@ def _resize(r: Reader, node: onnx.NodeProto, a: Attributes) -> None:
         for axis, scale in zip(axes, np.atleast_1d(scales), strict=True):
             if not 0.0 < float(scale) < 1024.0:
                 raise InputError(f"scales {list(np.atleast_1d(scales))}", fix="positive numbers expected")
-            out[axis], ratio[axis] = math.floor(whole[axis] * float(scale)), float(scale)
+            out[axis], ratio[axis] = int(np.float32(whole[axis]) * np.float32(scale)), float(scale)
     else:
         raise InputError("neither scales nor sizes are given", fix="export with fixed sizes")
     if out[:2] != whole[:2] or min(out) < 1:
         raise InputError(f"resizes {item(whole)} to {item(out)}", fix="only rows and columns may change")
+    if out == whole and any(v not in (None, 1.0) for v in ratio):
+        # onnxruntime copies, the operator's definition does not
+        raise InputError(f"scales of {item(whole)} that keep its size", fix="export with sizes, or without the node")
     r.builder.reserve(float(math.prod(out)) * 4.0)
     maps = [interpolation(whole[k], out[k], mode, coordinates, nearest, ratio[k], bend) for k in (2, 3)]
     r.result(node, r.builder.resize(x, maps))
@@ -702,7 +748,7 @@ def _resize(r: Reader, node: onnx.NodeProto, a: Attributes) -> None:
 
 
 def _conv_transpose(r: Reader, node: onnx.NodeProto, a: Attributes) -> None:
-    (x, line), weight, bias = _map(r, r.source(node)), r.weight(node, 1), r.constant(node, 2)
+    (x, line), weight, bias = _map(r, r.source(node)), r.weight(node, 1, True), r.constant(node, 2, None, True)
     weight = weight.reshape(*weight.shape, *[1] * line)
     a.only("auto_pad", "NOTSET", "VALID")
     _ints(a, "kernel_shape", line)
@@ -714,6 +760,7 @@ def _conv_transpose(r: Reader, node: onnx.NodeProto, a: Attributes) -> None:
         raise InputError("attribute output_shape is not supported", fix="use pads and output_padding")
     groups = int(a.get("group", 1))
     index = r.builder.transposed_convolution(x, weight, bias, stride, dilation, pads, more, groups)
+    r.builder.doubt(index, _doubts(r.doubts(node, 1), weight.shape), _doubts(r.doubts(node, 2)))
     _mapped(r, node, index, line)
 
 
@@ -824,6 +871,7 @@ RULES: dict[str, Rule] = {
     "Conv": _conv,
     "ConvTranspose": _conv_transpose,
     "DepthToSpace": _depth_to_space,
+    "DequantizeLinear": dequantize,
     "Div": _binary,
     "Dropout": _dropout,
     "Einsum": _einsum,
@@ -859,6 +907,7 @@ RULES: dict[str, Rule] = {
     "PRelu": _prelu,
     "Pad": _pad,
     "Pow": _pow,
+    "QuantizeLinear": quantize,
     "Reciprocal": _unary(lambda b, x, a: b.reciprocal(x)),
     "ReduceL1": _reduce,
     "ReduceL2": _reduce,

@@ -6,12 +6,14 @@ from pathlib import Path
 
 import numpy as np
 import onnx
+import onnx.inliner
 from google.protobuf.message import DecodeError
 from onnx import numpy_helper
 
 from ns_abstract.io.errors import InputError
 from ns_abstract.io.jsonio import file_size, show
 from ns_abstract.io.memory import check_memory
+from ns_abstract.io.packed import unpacked
 
 #: Numbers that one stored tensor may have.
 _LARGEST = 1 << 28
@@ -23,6 +25,10 @@ _COPIES = 6
 _HOLES, _LARGE = 16, 16 << 20
 #: How often tensors may share the bytes of files beside the model.
 _SHARED = 4
+#: Nodes that a graph may have with its local functions written out.
+_MOST_NODES = 1 << 18
+#: Ending of packed models.
+PACKED = ".onnx.gz"
 _FIX = "export the network again"
 
 
@@ -37,15 +43,59 @@ def parse_model(path: Path) -> onnx.ModelProto:
         problem = f"claims {size:,} bytes, {path.stat().st_blocks * 512:,} of them are stored"
         raise InputError(problem, file=path, fix="copy it again whole, or export with external data")
     check_memory(_COPIES * size, path, "the network")
+    packed = path.name.lower().endswith(PACKED)
     try:
-        model = onnx.load(str(path), load_external_data=False)
+        if packed:
+            model = onnx.load_model_from_string(unpacked_model(path))
+        else:
+            model = onnx.load(str(path), load_external_data=False)
     except OSError as error:
         raise InputError(f"cannot be read: {error.strerror or error}", file=path, fix="check the path") from None
     except (DecodeError, ValueError, TypeError) as error:
         raise InputError(f"is not an ONNX model ({str(error) or type(error).__name__})", file=path, fix=_FIX) from None
     if not model.graph.node or not model.graph.output:
         raise InputError("holds no network", file=path, field="graph", fix=_FIX)
-    return model
+    return _inlined(model, path) if model.functions else model
+
+
+def unpacked_model(path: Path) -> bytes:
+    """The contents of an .onnx.gz file.
+
+    Raises:
+        InputError: It is damaged, or unpacks to more than the format's limit or the memory that is free.
+    """
+    parts, total = [], 0
+    for part in unpacked(path, _LARGEST_FILE):
+        parts.append(part)
+        total += len(part)
+        check_memory(_COPIES * total, path, "the network")
+    return b"".join(parts)
+
+
+def _inlined(model: onnx.ModelProto, path: Path) -> onnx.ModelProto:
+    """The model with the nodes of its local functions in place of their calls."""
+    bodies = {(f.domain, f.name): [(n.domain, n.op_type) for n in f.node] for f in model.functions}
+    counts: dict[tuple[str, str], float] = {}
+
+    def count(key: tuple[str, str], within: tuple[tuple[str, str], ...]) -> float:
+        if key not in bodies:
+            return 1.0
+        if key in within:
+            raise InputError(f"function {key[1]} calls itself", file=path, field="functions", fix=_FIX)
+        if key not in counts:
+            counts[key] = sum(count(inner, (*within, key)) for inner in bodies[key])
+        return counts[key]
+
+    total = sum(count((node.domain, node.op_type), ()) for node in model.graph.node)
+    if total > _MOST_NODES:
+        problem = f"has functions of {total:,.0f} nodes together"
+        raise InputError(problem, file=path, field="functions", fix=f"at most {_MOST_NODES:,} are read")
+    try:
+        return onnx.inliner.inline_local_functions(model)
+    except Exception as error:  # the inliner raises whatever it meets
+        raise InputError(
+            f"has functions that cannot be read ({error})", file=path, field="functions", fix=_FIX
+        ) from None
 
 
 class StoredTensors:

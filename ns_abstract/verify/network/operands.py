@@ -63,7 +63,10 @@ def _axes_of(
     order = [rest.index(v) for v in (*lead, *own, *inner)]
     shape = tuple(math.prod(sizes[v] for v in part) for part in (lead, own, inner))
     if not isinstance(value, int):
-        return np.asarray(value, np.float64).sum(tuple(alone)).transpose(order).reshape(shape)
+        if alone:
+            # another order of the sum gives another constant
+            raise InputError("sums up a constant", fix="fold constants when exporting, in float64")
+        return np.asarray(value, np.float64).transpose(order).reshape(shape)
     index = b.reduce(b.reshape(value, whole), alone, False, False)
     return b.reshape(b.transpose(index, order) if rest else index, shape)
 

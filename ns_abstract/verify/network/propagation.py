@@ -69,6 +69,7 @@ class Propagation:
         if layer.bias is not None:
             size = size + layer.bias.abs()
         moves = own * size + (layer.terms + 1) * FLUSH
+        moves = moves + layer.inexact(sizes)
         active = None
         if not layer.terms:
             active = layer.magnitude([f.active.double() for f in inputs]) != 0.0

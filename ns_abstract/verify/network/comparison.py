@@ -1,0 +1,182 @@
+"""Whether a network's reading computes what the program that runs its file computes."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterable, Iterator
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ns_abstract.io.errors import InputError
+from ns_abstract.verify.network.bounds import bound_outputs
+from ns_abstract.verify.network.curves import Curve
+from ns_abstract.verify.network.graph import Network
+from ns_abstract.verify.network.layers import Activation
+from ns_abstract.verify.network.maps import Variance
+from ns_abstract.verify.network.recognised import Quantised
+from ns_abstract.verify.network.sets import ImageSets
+
+#: One output, flattened, for one image [1, ...].
+Run = Callable[[np.ndarray], np.ndarray]
+#: A reading that differs more than this, relative to the largest output, is wrong and not rounded,
+_DIFFERENCE = 2.0**-10
+#: unless float32 itself differs from float64 by so much: more than this part of it.
+_ROUNDED = 64.0
+#: times this where values are rounded to steps.
+_STEPPED = 2.0**6
+#: Seconds and steps of the search for inputs that reach other sides of units; steps without a new one.
+_SECONDS, _STEPS, _PATIENCE = 1.0, 24, 8
+#: Outputs and units of networks whose bounds are worked out where numbers differ.
+_BOUNDED, _UNITS = 32, 1 << 16
+
+
+def compare(network: Network, run: Run, images: Iterable[np.ndarray], *, usual: bool = True) -> None:
+    """Refuse a network whose reading gives other numbers than the program that runs the file.
+
+    Args:
+        network: As it is read.
+        run: The program.
+        images: [1, *input_shape] each.
+        usual: Whether these are inputs for which the outputs must be finite.
+
+    Raises:
+        InputError: Outputs differ by more than rounding.
+    """
+    path = network.source
+    for image in images:
+        image = image.astype(np.float32)
+        try:
+            expected = run(image).reshape(-1).astype(np.float64)
+        except Exception as error:  # the other program's own
+            raise InputError(f"cannot be run: {error}", file=path, fix="export the network again") from None
+        with torch.no_grad():
+            found = network(torch.from_numpy(image).double())[0].numpy()
+        if expected.shape != found.shape:
+            raise InputError(f"has {expected.size} outputs when run, {found.size} when read", file=path)
+        if not np.isfinite(expected).all() or not np.isfinite(found).all():
+            if not usual:
+                continue
+            raise InputError("computes numbers that are not finite", file=path, fix="train the network again")
+        allowed = _DIFFERENCE * max(1.0 if usual else 0.0, float(np.abs(expected).max()), float(np.abs(found).max()))
+        if any(isinstance(node.layer, Quantised) for node in network.nodes):
+            # a rounding that falls the other way moves a value by a step
+            allowed = _STEPPED * allowed
+        difference = float(np.abs(expected - found).max())
+        if difference <= allowed:
+            continue
+        with torch.no_grad():
+            single = network(torch.from_numpy(image))[0].double().numpy()
+        rounded = float(np.abs(single - found).max())
+        if not usual and any(isinstance(node.layer, Variance) for node in network.nodes):
+            # of features that are all alike programs find variances that differ by much, and bounds charge that
+            continue
+        if _within(network, image, expected):
+            continue
+        if not difference <= _ROUNDED * rounded + (0.0 if usual else 2.0**-16) and np.isfinite(rounded):
+            raise InputError(
+                f"computes something else when run: outputs differ by {difference:.3g}",
+                file=path,
+                fix="export the network again in evaluation mode, or report the file",
+            )
+
+
+def _within(network: Network, image: np.ndarray, expected: np.ndarray) -> bool:
+    """Whether outputs of a small network lie within the bounds of float32 evaluations.
+
+    Sums of computed constants may cancel, and then two programs differ by much.
+    """
+    units = sum(int(np.prod(node.layer.shape)) for node in network.nodes)
+    if expected.size > _BOUNDED or units > _UNITS:
+        return False
+    flat = image.astype(np.float64).reshape(1, -1)
+    still = np.zeros((1, flat.shape[1], 1))
+    rows = np.concatenate([np.eye(expected.size), -np.eye(expected.size)])
+    found = bound_outputs(network, ImageSets(still, flat, still, flat, flat, flat), rows, np.zeros(len(rows))).lower[0]
+    low, high = found[: expected.size], -found[expected.size :]
+    return bool(np.isfinite(found).all() and (low <= expected).all() and (expected <= high).all())
+
+
+def probes(network: Network) -> tuple[Iterator[np.ndarray], Iterator[np.ndarray]]:
+    """Usual inputs, and others: corners, large and tiny numbers, and inputs that bring units to their other sides."""
+    return _usual(network), _strange(network)
+
+
+def _usual(network: Network) -> Iterator[np.ndarray]:
+    generator = np.random.default_rng(0)
+    for k in range(3):
+        yield generator.uniform(0.0, 1.0 + k, (1, *network.input_shape))
+
+
+def _strange(network: Network) -> Iterator[np.ndarray]:
+    generator = np.random.default_rng(1)
+    shape, end = (1, *network.input_shape), time.monotonic() + _SECONDS
+    sides = _Sides(network)
+    fixed = [np.zeros(shape), np.ones(shape), -np.ones(shape)]
+    fixed += [generator.normal(size=shape) * size for size in (1.0, 2.0**-60, 16.0, 256.0)]
+    for image in fixed:
+        if time.monotonic() > end:
+            return
+        sides.visit(torch.from_numpy(image))
+        yield image
+    image, step, idle = torch.from_numpy(generator.uniform(size=shape)), 0.5, 0
+    for _ in range(_STEPS):
+        if time.monotonic() > end or idle >= _PATIENCE:
+            return
+        moved = sides.gradient(image)
+        if moved is None:
+            return
+        image = image + step * torch.sign(moved)
+        new = sides.visit(image)
+        idle, step = (0, step) if new else (idle + 1, 4.0 * step)
+        yield image.numpy()
+
+
+class _Sides:
+    """Which sides of their kinks the units of a network have been on."""
+
+    def __init__(self, network: Network) -> None:
+        self.network = network
+        #: by node and kink: units that have been below and above
+        self.seen: dict[tuple[int, float], tuple[Tensor, Tensor]] = {}
+
+    def _inputs(self, image: Tensor) -> Iterator[tuple[tuple[int, float], Tensor]]:
+        """What enters each activation, less each of its kinks."""
+        values: list[Tensor] = [image]
+        for k, node in enumerate(self.network.nodes, 1):
+            inputs = [values[index] for index in node.inputs]
+            values.append(node.layer(inputs))
+            if isinstance(node.layer, Activation):
+                kinks = node.layer.breaks if isinstance(node.layer, Curve) else (0.0,)
+                for kink in kinks:
+                    if np.isfinite(kink):
+                        yield (k, kink), inputs[0] - kink
+
+    def visit(self, image: Tensor) -> bool:
+        """Note the sides at an image; whether a unit is on one for the first time."""
+        new = False
+        with torch.no_grad():
+            for key, z in self._inputs(image):
+                below, above = self.seen.get(key, (torch.zeros_like(z, dtype=torch.bool),) * 2)
+                now = below | (z < 0.0), above | (z > 0.0)
+                new |= bool((now[0] ^ below).any()) or bool((now[1] ^ above).any())
+                self.seen[key] = now
+        return new
+
+    def gradient(self, image: Tensor) -> Tensor | None:
+        """How the image changes towards the sides that units have not been on; None if all have been on both."""
+        image = image.clone().requires_grad_(True)
+        wanted: list[Tensor] = []
+        for key, z in self._inputs(image):
+            below, above = self.seen[key]
+            missing = (~above).to(z.dtype) - (~below).to(z.dtype)
+            if bool((missing != 0.0).any()):
+                wanted.append((missing * z / (1.0 + z.detach().abs())).sum())
+        if not wanted:
+            return None
+        total = torch.stack(wanted).sum()
+        if not total.requires_grad:
+            return None
+        (found,) = torch.autograd.grad(total, image)
+        return torch.nan_to_num(found)

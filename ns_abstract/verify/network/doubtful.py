@@ -1,0 +1,79 @@
+"""Layers whose constants are known within bounds only: what programs compute of stored constants (N24)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, replace
+
+import numpy as np
+from torch import Tensor
+
+from ns_abstract.verify.network.graph import as_double
+from ns_abstract.verify.network.layers import Convolution, Linear, Matrix, Scale
+from ns_abstract.verify.network.maps import TransposedConvolution
+
+#: (exact value, float32 evaluations): how far either may be from the number that the layer holds.
+Doubts = tuple[np.ndarray, np.ndarray]
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Doubtful(Linear):
+    """Adds what constants that are off change, for inputs of at most some sizes.
+
+    Attributes:
+        real, single: The layer with the doubts as weights and offset: of the exact value, and of float32 evaluations.
+    """
+
+    real: Linear
+    single: Linear
+
+    def inexact(self, sizes: Sequence[Tensor]) -> Tensor | float:
+        return self.real(sizes)
+
+    def spare(self, sizes: Sequence[Tensor]) -> Tensor | float:
+        return super().spare(sizes) + self.single(sizes)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class DoubtfulConvolution(Doubtful, Convolution):
+    """A convolution."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class DoubtfulMatrix(Doubtful, Matrix):
+    """A fully connected layer."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class DoubtfulScale(Doubtful, Scale):
+    """A factor and an offset."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class DoubtfulTransposed(Doubtful, TransposedConvolution):
+    """A transposed convolution."""
+
+
+_KINDS = {
+    Convolution: DoubtfulConvolution,
+    Matrix: DoubtfulMatrix,
+    Scale: DoubtfulScale,
+    TransposedConvolution: DoubtfulTransposed,
+}
+
+
+def doubtful(layer: Linear, weight: Doubts | None, offset: Doubts | None) -> Linear:
+    """The layer with doubts of its weights (a scale's factor) and of its offset, in their shapes; None: exact."""
+    name = "factor" if isinstance(layer, Scale) else "weight"
+    sides = []
+    for side in range(2):
+        parts = {}
+        for key, doubts in ((name, weight), ("offset", offset)):
+            own = getattr(layer, key)
+            if own is None:
+                continue
+            given = np.zeros(()) if doubts is None else doubts[side]
+            parts[key] = as_double(np.broadcast_to(np.abs(given), tuple(own.shape)))
+        sides.append(replace(layer, **parts))
+    given = {f.name: getattr(layer, f.name) for f in fields(layer)}
+    return _KINDS[type(layer)](**given, real=sides[0], single=sides[1])

@@ -1,0 +1,69 @@
+"""Quantised ONNX files: weights stored as integers, and values that are rounded to steps on the way (N26)."""
+
+from __future__ import annotations
+
+import numpy as np
+import onnx
+
+from ns_abstract.io.errors import InputError
+from ns_abstract.verify.network.enclosed import Enclosed, enclosed, scaled_integers
+from ns_abstract.verify.network.onnx_graph import Attributes, Reader
+from ns_abstract.verify.network.recognised import Quantised
+
+_RANGES = {
+    np.dtype(kind): (np.iinfo(kind).min, np.iinfo(kind).max) for kind in (np.int8, np.uint8, np.int16, np.uint16)
+}
+
+
+def dequantize(r: Reader, node: onnx.NodeProto, a: Attributes) -> None:
+    """``(q - zero) scale``: of constants a constant, of values what their `quantize` has left."""
+    axis = int(a.get("axis", 1))
+    a.only("block_size", 0)
+    a.ignore("output_dtype")
+    scale, zero = r.weight(node, 1), r.constant(node, 2)
+    if node.input[0] in r.constants:
+        q = r.weight(node, 0)
+        if q.dtype.kind not in "iu":
+            raise InputError(f"reads type {q.dtype}", fix="store integers")
+        number = q.astype(np.int64) - (0 if zero is None else _along(zero.astype(np.int64), q.ndim, axis))
+        found = scaled_integers(number, enclosed(_along(scale, q.ndim, axis)))
+        if isinstance(found, Enclosed):
+            r.enclosed[node.output[0]] = found
+        r.fold(node, found.value if isinstance(found, Enclosed) else found)
+        return
+    given = r.quantised.get(node.input[0])
+    own = _scalar(scale), 0 if zero is None else int(np.reshape(zero, -1)[0])
+    if given is None or given != own:
+        raise InputError("has another scale than the QuantizeLinear before it", fix="quantise with one scale a value")
+    r.values[node.output[0]] = r.values[node.input[0]]
+
+
+def quantize(r: Reader, node: onnx.NodeProto, a: Attributes) -> None:
+    """A value rounded to steps; what reads it must dequantise it."""
+    a.ignore("axis", "saturate", "output_dtype")
+    a.only("block_size", 0)
+    x, scale, zero = r.value(node), r.weight(node, 1), r.constant(node, 2)
+    step = _scalar(scale)
+    kind = np.dtype(np.uint8) if zero is None else zero.dtype
+    if kind not in _RANGES or not 0.0 < step < 2.0**60 or (zero is not None and zero.size != 1):
+        raise InputError(f"scale {step:g} of type {kind}", fix="use 8 or 16 bits and one positive scale")
+    offset = 0 if zero is None else int(np.reshape(zero, -1)[0])
+    low, high = (step * (end - offset) for end in _RANGES[kind])
+    index = r.builder.curve(x.index, Quantised, least=low, most=high, step=step)
+    r.result(node, index, x.whole)
+    r.quantised[node.output[0]] = step, offset
+
+
+def _scalar(scale: np.ndarray) -> float:
+    if scale.size != 1 or scale.dtype.kind != "f":
+        raise InputError(f"scales of shape {list(scale.shape)}", fix="quantise values with one scale")
+    return float(scale.reshape(-1)[0])
+
+
+def _along(value: np.ndarray, rank: int, axis: int) -> np.ndarray:
+    """A number for each place along an axis, spread to ``rank`` axes; a single one as it is."""
+    if value.size == 1:
+        return value.reshape(())
+    if value.ndim != 1 or not -rank <= axis < rank:
+        raise InputError(f"scales of shape {list(value.shape)}", fix="give one, or one for each place along an axis")
+    return value.reshape([-1 if k == axis % rank else 1 for k in range(rank)])
