@@ -7,9 +7,10 @@ from planted.fields import FIELDS
 from planted.forms import FORMS
 from planted.loops import LOOPS
 from planted.polynomials import POLYNOMIALS
+from planted.results import RESULTS
 from planted.splats import SPLATS
 from planted.verdicts import VERDICTS
 
-FAULTS = (*FORMS, *POLYNOMIALS, *FIELDS, *VERDICTS, *CERTIFICATES, *SPLATS, *DEPTHS, *LOOPS)
+FAULTS = (*FORMS, *POLYNOMIALS, *FIELDS, *VERDICTS, *CERTIFICATES, *SPLATS, *DEPTHS, *LOOPS, *RESULTS)
 
 __all__ = ["FAULTS", "Fault", "apply"]

@@ -423,7 +423,12 @@ def bound(
         if stop():
             raise KeyboardInterrupt
         raise InputError("over before one picture was rendered", field="time_budget", fix="give more")
-    about = {"guarantee": guarantee, "renderer": job.method.program, "scene": job.describe()}
+    about = {
+        "guarantee": guarantee,
+        "renderer": job.method.program,
+        "scene": job.describe(),
+        "fingerprint": job.fingerprint,
+    }
     return BoundResult.of(frames[0], guarantee=guarantee, interrupted=stop(), target_ratio=target_ratio, about=about)
 
 

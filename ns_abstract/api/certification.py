@@ -52,7 +52,7 @@ if TYPE_CHECKING:
     from ns_abstract.verify.interop import Form
 
 #: Of the search's rules: results of different ones are not mixed.
-_RULES = 4
+_RULES = 5
 #: Pixels that the picture moves by over a first cell: with one parameter, and with more.
 _MOTION_LINE, _MOTION = 0.08, 0.5
 #: Numbers that a network's layers may have together in a block's cells.

@@ -62,7 +62,7 @@ from ns_abstract.verify.search import Verdict
 from ns_abstract.verify.store import Block, Store, Tally, fractions
 
 #: Of the search's rules: results of different ones are not mixed.
-_RULES = 1
+_RULES = 2
 #: Random runs for the report, and part of the time for them; runs from a cell whose tube is shown; cells shown, and
 #: part of the time for them.
 _RUNS, _RUNS_SHARE, _CELL_RUNS, _SHOWN, _SHOWN_SHARE = 200, 0.1, 20, 2, 0.1
