@@ -7,6 +7,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from ns_abstract.io import version as _version
+
 if TYPE_CHECKING:
     from ns_abstract.api.bounding import BoundResult, Progress, bound
     from ns_abstract.api.certifying import Certificate, CertifiedCell, CertifyProgress, certify
@@ -16,7 +18,7 @@ if TYPE_CHECKING:
     from ns_abstract.geometry.camera_path import CameraPath, load_camera_path
     from ns_abstract.io.errors import InputError
 
-__version__ = "0.1.0"
+__version__ = _version.VERSION
 
 _HOMES = {
     "api.bounding": ("BoundResult", "Progress", "bound"),

@@ -24,6 +24,7 @@ from ns_abstract.cli import export as export_command
 from ns_abstract.cli import render as render_command
 from ns_abstract.io.atomic import write_json
 from ns_abstract.io.errors import InputError
+from ns_abstract.io.version import computed_by
 from ns_abstract.methods.splat.load import load_scene
 from ns_abstract.methods.splat.ply import write_ply
 from ns_abstract.methods.splat.scene import SplatScene
@@ -34,6 +35,8 @@ from ns_abstract.verify.properties import LinearClaim
 from ns_abstract.verify.vnnlib import load_vnnlib
 
 Call = Callable[..., tuple[int, str]]
+#: Of frames that are written here.
+ABOUT = {"fingerprint": computed_by()}
 ARRAYS = ("means", "log_scales", "quats", "opacity_logits", "sh")
 
 
@@ -127,7 +130,12 @@ def test_odd_sizes_and_missing_bounds(bounded: Path, tmp_path: Path, call: Call)
     result = frames(bounded)[0]
     cut = {name: np.ascontiguousarray(getattr(result, name)[:31, :29]) for name in IMAGES}
     cut["lower"], cut["upper"] = np.zeros_like(cut["lower"]), np.ones_like(cut["upper"])
-    save_frame(tmp_path / "frame_00000.npz", dataclasses.replace(result, **cut, bounded=False), status="missing")
+    save_frame(
+        tmp_path / "frame_00000.npz",
+        dataclasses.replace(result, **cut, bounded=False),
+        status="missing",
+        about=ABOUT,
+    )
     code, said = run(call, "mp4", "--input-dir", tmp_path, "--output-filename", tmp_path / "a.mp4")
     assert code == 0 and "no bounds but [0, 1] in frames 0" in said
 
@@ -178,8 +186,8 @@ def test_mistakes(call: Call, bounded: Path, tmp_path: Path) -> None:  # noqa: F
 def test_sizes_must_agree(bounded: Path, tmp_path: Path) -> None:
     first, second = frames(bounded)[:2]
     cut = {name: np.ascontiguousarray(getattr(second, name)[:16]) for name in IMAGES}
-    save_frame(tmp_path / "frame_00000.npz", first)
-    save_frame(tmp_path / "frame_00001.npz", dataclasses.replace(second, **cut))
+    save_frame(tmp_path / "frame_00000.npz", first, about=ABOUT)
+    save_frame(tmp_path / "frame_00001.npz", dataclasses.replace(second, **cut), about=ABOUT)
     with pytest.raises(InputError, match="one size"):
         Results(tmp_path)
 

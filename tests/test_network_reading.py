@@ -466,7 +466,8 @@ def test_stored_integers_are_weights(axis: int | None, tmp_path: Path) -> None:
     file, point = f.write(tmp_path / "net.onnx"), rng.normal(size=4).astype(np.float32)
     exact = [
         sum((int(q[i, j]) - int(np.reshape(zero, -1)[i if axis == 0 else 0]))
-            * Fraction(float(np.reshape(scale, -1)[i if axis == 0 else 0])) * Fraction(float(point[j])) for j in range(4))
+            * Fraction(float(np.reshape(scale, -1)[i if axis == 0 else 0])) * Fraction(float(point[j]))
+            for j in range(4))
         for i in range(3)
     ]  # fmt: skip
     for arithmetic in ("real", "float32"):

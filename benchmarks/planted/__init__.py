@@ -10,12 +10,14 @@ from planted.loops import LOOPS
 from planted.networks import NETWORKS
 from planted.polynomials import POLYNOMIALS
 from planted.processes import PROCESSES
+from planted.results import RESULTS
 from planted.scenes import SCENES
 from planted.splats import SPLATS
 from planted.verdicts import VERDICTS
 
 FAULTS = (
-    *FORMS, *POLYNOMIALS, *FIELDS, *VERDICTS, *CERTIFICATES, *SPLATS, *DEPTHS, *LOOPS, *INPUTS, *NETWORKS, *PROCESSES, *SCENES,
+    *FORMS, *POLYNOMIALS, *FIELDS, *VERDICTS, *CERTIFICATES, *SPLATS, *DEPTHS, *LOOPS, *INPUTS,
+    *NETWORKS, *PROCESSES, *RESULTS, *SCENES,
 )  # fmt: skip
 
 __all__ = ["FAULTS", "Fault", "apply"]

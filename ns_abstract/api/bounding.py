@@ -423,7 +423,12 @@ def bound(
             raise KeyboardInterrupt
         raise InputError("over before one picture was rendered", field="time_budget", fix="give more")
     guarantee = "sampled" if frames[0].problems else job.method.guarantee
-    about = {"guarantee": guarantee, "renderer": job.method.program, "scene": job.describe()}
+    about = {
+        "guarantee": guarantee,
+        "renderer": job.method.program,
+        "scene": job.describe(),
+        "fingerprint": job.fingerprint,
+    }
     return BoundResult.of(frames[0], guarantee=guarantee, interrupted=stop(), target_ratio=target_ratio, about=about)
 
 

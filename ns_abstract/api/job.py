@@ -23,6 +23,7 @@ from ns_abstract.execution.threads import most_threads
 from ns_abstract.geometry.poses import PoseSet
 from ns_abstract.io.errors import InputError
 from ns_abstract.io.memory import allowed_memory
+from ns_abstract.io.version import computed_by
 from ns_abstract.perturbation.variations import SceneVariation
 from ns_abstract.refine.engine import Goal, Refinement
 from ns_abstract.refine.protocol import Frame, Method
@@ -263,7 +264,7 @@ class Job:
             if poses.perturbation.scene:
                 sets.update(repr(poses.perturbation.scene).encode())
         more = {"outputs": list(self.layers)} if self.layers else {}
-        return {**self.method.fingerprint, **more, "poses": sets.hexdigest()}
+        return {**computed_by(), **self.method.fingerprint, **more, "poses": sets.hexdigest()}
 
     def describe(self) -> dict[str, Any]:
         """The scene for reports."""

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any, Generic, Protocol, TypeVar
 
 from ns_abstract.io.errors import InputError
+from ns_abstract.io.version import VERSION, stale
 
 
 class Fingerprinted(Protocol):
@@ -75,11 +76,26 @@ def opened(recipe: Recipe[F]) -> F:
     """What the recipe describes, opened once in this process.
 
     Raises:
-        InputError: This process reads other files under the same names than the one that asks.
+        InputError: This process runs another version of the package than the one that asks, or reads other files
+            under the same names.
     """
 
     def make() -> F:
+        asked = recipe.fingerprint.get("ns_abstract", VERSION)
+        if asked != VERSION:
+            # before the files: another version may not even open them
+            raise InputError(
+                f"a worker runs ns-abstract {VERSION}, the command that asks it {asked}",
+                field="--engine",
+                fix="install the same version on all machines",
+            )
         found = recipe.open()
+        if problem := stale(found.fingerprint, recipe.fingerprint):
+            raise InputError(
+                f"a worker's results would be {problem}",
+                field="--engine",
+                fix="install the same version on all machines",
+            )
         if found.fingerprint != recipe.fingerprint:
             raise InputError(
                 "the worker finds other content than this machine",

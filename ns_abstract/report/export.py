@@ -17,6 +17,7 @@ import numpy as np
 from ns_abstract.io.atomic import write_atomic
 from ns_abstract.io.errors import InputError
 from ns_abstract.io.jsonio import load_json
+from ns_abstract.io.version import ADVISORY, computed_by, stale
 from ns_abstract.refine.result import FrameResult, gap
 from ns_abstract.report.figures import metrics, number
 from ns_abstract.report.files import IMAGES, frame_index, load_frame
@@ -74,6 +75,11 @@ class Results:
         self.parameters: list[list[dict[str, Any]]] = []
         for index, file in self.files.items():
             stored = load_frame(file, leaves=False)
+            prints = stored.about.get("fingerprint")
+            if problem := stale(prints if isinstance(prints, dict) else {}, computed_by()):
+                raise InputError(
+                    problem, file=file, fix=f"bound it again with ns-abstract-render, without --resume; {ADVISORY}"
+                )
             result, size = stored.result, stored.result.lower.shape[:2]
             if self.size not in ((0, 0), size):
                 raise InputError(

@@ -324,7 +324,7 @@ def _parse(archive: Archive, has_leaves: bool, read_leaves: bool) -> StoredFrame
     result = FrameResult(
         index=_integer(record["index"]),
         box=box,
-        **{name: archive.read(name) for name in IMAGES},
+        **{name: archive.read(name) for name in IMAGES},  # type: ignore[arg-type]
         seconds=float(record["seconds"]),
         cells=_integer(record["cells"]),
         # files of earlier versions say nothing of what was covered: all of it

@@ -20,6 +20,8 @@ from ns_abstract.io.atomic import write_atomic
 from ns_abstract.io.errors import InputError
 from ns_abstract.io.folder import remove_parts, unwritable
 from ns_abstract.io.jsonio import file_size, is_number, load_json
+from ns_abstract.io.version import ADVISORY, stale
+from ns_abstract.io.version import VERSION as PACKAGE
 from ns_abstract.refine.result import FrameResult, Layer, TracePoint
 from ns_abstract.report.figures import layer_metrics, metrics, seconds_to
 from ns_abstract.report.files import (
@@ -158,7 +160,8 @@ def explanations(document: Any) -> dict[int, tuple[str, ...]]:
 def versions() -> dict[str, str | None]:
     """Versions of what computed the bounds; None where a package has no metadata."""
     found: dict[str, str | None] = {"python": platform.python_version(), "machine": platform.machine()}
-    for name in ("ns-abstract", "numpy", "numba"):
+    found["ns-abstract"] = PACKAGE
+    for name in ("numpy", "numba"):
         try:
             found[name] = importlib.metadata.version(name)
         except importlib.metadata.PackageNotFoundError:
@@ -361,6 +364,13 @@ class Report:
             explained = explanations(old)
             prints = old.get("fingerprint") if isinstance(old, dict) else None
             if isinstance(prints, dict):
+                if problem := stale(prints, run.fingerprint):
+                    raise InputError(
+                        f"the results in this folder were {problem}",
+                        file=path,
+                        field="--resume",
+                        fix=f"leave it out to bound all frames again; {ADVISORY}",
+                    )
                 changed = differences(prints, run.fingerprint)
                 if changed:
                     raise InputError(
@@ -381,7 +391,11 @@ class Report:
                 continue
             if digest == digests.get(path.name):
                 self._digests[path.name] = digest
-            if differences(stored.about.get("fingerprint") or {}, run.fingerprint):
+            prints = stored.about.get("fingerprint")
+            prints = prints if isinstance(prints, dict) else {}
+            if problem := stale(prints, run.fingerprint):
+                self.ignored.append(f"{path.name}: {problem}")
+            elif differences(prints, run.fingerprint):
                 self.ignored.append(f"{path.name}: computed with other settings")
             elif stored.about.get("guarantee") != run.guarantee:
                 # the settings say which guarantee is meant: this one lost it on a machine that failed the self-check

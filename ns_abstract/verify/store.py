@@ -32,6 +32,7 @@ from ns_abstract.io.atomic import write_atomic
 from ns_abstract.io.errors import InputError, first_line
 from ns_abstract.io.folder import claim, remove_parts, unwritable
 from ns_abstract.io.jsonio import load_json
+from ns_abstract.io.version import ADVISORY, stale
 from ns_abstract.verify.cells import Cell, Grid
 from ns_abstract.verify.scene_margin import Settled
 from ns_abstract.verify.search import RANK_FIRST, Findings, Leaf, Verdict
@@ -381,8 +382,20 @@ class Store:
 
     def _check(self, fingerprint: Mapping[str, Any]) -> None:
         if self._get("version") != VERSION:
-            raise InputError("written by another version", file=self.file, fix="run without --resume")
+            raise InputError(
+                "written by another version of ns-abstract",
+                file=self.file,
+                field="--resume",
+                fix=f"leave it out to search again; {ADVISORY}",
+            )
         stored, asked = self._get("fingerprint"), json.loads(json.dumps(dict(fingerprint)))
+        if problem := stale(stored, asked):
+            raise InputError(
+                f"holds a search {problem}",
+                file=self.file,
+                field="--resume",
+                fix=f"leave it out to search again; {ADVISORY}",
+            )
         different = [key for key in {**stored, **asked} if stored.get(key) != asked.get(key)]
         if different:
             raise InputError(
