@@ -6,7 +6,6 @@ own rounding to ``r``: an operation in float64 errs by at most ``U`` times the s
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -155,9 +154,9 @@ class Form:
         met = ~((least >= low) & (most <= high))
         return self.boxed(met, np.clip(least, low, high), np.clip(most, low, high))
 
-    def pick(self, index: Any) -> Form:
-        """Some of the functions, by an index of the trailing axes."""
-        return Form(self.c[index], self.g[(slice(None), *index)] if isinstance(index, tuple) else self.g[:, index], self.r[index])
+    def among(self, index: Array) -> Form:
+        """Some of the n functions of every row [B, n]."""
+        return Form(self.c[:, index], self.g[:, :, index], self.r[:, index])
 
     def take(self, order: Array) -> Form:
         """The functions of every row in another order: ``order`` [B, n]."""
@@ -203,5 +202,3 @@ def fixed(matrix: Array, like: Form, r: float = 0.0) -> list[list[Form]]:
     """A matrix of numbers as forms."""
     return [[Form.constant(v, like, r) for v in row] for row in np.atleast_2d(matrix)]
 
-
-Function = Callable[[Form], Form]

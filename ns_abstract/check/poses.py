@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from ns_abstract.check.forms import Form, U, fixed, parameters, product, rotation, total
+from ns_abstract.check.forms import Form, U, fixed, parameters, product, rotation
 
 Array = Any
 
@@ -125,7 +125,3 @@ def _axis_angle(turn: Array) -> tuple[Array, float]:
         return np.array([0.0, 0.0, 1.0]), 0.0
     return vector / length, 2.0 * float(np.arctan2(length, abs(w)))
 
-
-def summed(items: Any) -> Form:
-    """Sum of forms."""
-    return total(items)

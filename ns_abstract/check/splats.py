@@ -99,8 +99,8 @@ def candidates(splats: Splats, poses: Poses, low: Array, high: Array, pixel: tup
     cam, found = poses.camera, (zh >= NEAR * (1.0 - ROOM)) & ~(zl > FAR * (1.0 + ROOM))
     with np.errstate(all="ignore"):
         reach = np.sqrt(2.0 * np.log(np.maximum(splats.opacity * (1.0 + ROOM) * 255.0, 1.0))) * (1.0 + ROOM)
-        size = np.abs(splats.axes).sum(axis=(1, 2)) * (1.0 + ROOM)
-        # rows of the rotation are about unit vectors; entries of world-to-camera are at most 1.01
+        # keyframes' rotations stretch by a hundredth at most
+        size = np.sqrt((splats.axes**2).sum(axis=1).max(axis=1))
         for t, f, centre, place, side in (
             (x, cam.fx, cam.cx, pixel[1], cam.width), (y, cam.fy, cam.cy, pixel[0], cam.height)
         ):  # fmt: skip
@@ -109,7 +109,7 @@ def candidates(splats: Splats, poses: Poses, low: Array, high: Array, pixel: tup
             most = f * np.maximum(b / zl, b / zh) + centre - (place + 0.5)
             away = np.maximum(np.maximum(least, -most), 0.0) * (1.0 - ROOM) - 1e-9
             limit = (max(centre, side - centre) + 0.15 * side) / f * (1.0 + ROOM)
-            spread = 1.05 * f / zl * size * (1.0 + limit)
+            spread = 1.05 * f / zl * size * np.sqrt(1.0 + limit * limit)
             found &= open_ | ~(away > reach * np.sqrt(spread * spread + BLUR) * (1.0 + ROOM))
     found &= splats.opacity * (1.0 + ROOM) >= LEAST_ALPHA
     return np.flatnonzero(found)
@@ -143,6 +143,7 @@ class _Fragments(NamedTuple):
     color: Form
     depth: Form
     shows: Array
+    motion: Array
 
 
 def _fragments(
@@ -202,7 +203,9 @@ def _fragments(
     alpha = alpha.boxed(rough, bottom, np.maximum(top, bottom))
     gone = np.where(shows, 1.0, 0.0)
     alpha = Form(alpha.c * gone, alpha.g * gone, alpha.r * gone)
-    return _Fragments(alpha, _colors(splats, poses, view, low, high, index, channel, dx), z, shows)
+    motion = np.where(shows[None], np.abs(mx.g) + np.abs(my.g), 0.0).max(axis=2, initial=0.0)
+    color = _colors(splats, poses, view, low, high, index, channel, dx)
+    return _Fragments(alpha, color, z, shows, motion)
 
 
 def _factor(flat: Form, det: Form, least: float) -> Form:
@@ -291,8 +294,10 @@ def _directions(splats: Splats, poses: Poses, low: Array, high: Array, index: Ar
 
 def pixel_form(
     splats: Splats, poses: Poses, low: Array, high: Array, index: Array, pixel: tuple[int, int], channel: int
-) -> tuple[Form, Array]:
-    """The pixel's channel before the clamp over every box, a form [B], and which Gaussians may matter [B, n].
+) -> tuple[Form, Array, Array]:
+    """The pixel's channel before the clamp over every box, a form [B]; which Gaussians may matter [B, n]; their motion.
+
+    The motion [d, B], in pixels, is what each parameter moves a Gaussian by at most, about.
 
     Args:
         low, high: [B, d] ends of the boxes.
@@ -303,13 +308,10 @@ def pixel_form(
     with np.errstate(all="ignore"):
         f = _fragments(splats, poses, low, high, index, pixel, channel)
         used = np.flatnonzero(f.shows.any(axis=0))
-        every = np.arange(len(low))
         if not len(used):
             zero = np.zeros(len(low))
-            return Form(zero + background, np.zeros((low.shape[1], len(low))), zero), f.shows
-        alpha, color, depth, shows = f.alpha.pick((every[:, None], used)), f.color.pick((every[:, None], used)), f.depth.pick(
-            (every[:, None], used)
-        ), f.shows[:, used]
+            return Form(zero + background, np.zeros((low.shape[1], len(low))), zero), f.shows, f.motion
+        alpha, color, depth, shows = f.alpha.among(used), f.color.among(used), f.depth.among(used), f.shows[:, used]
         # those that do not show stand behind all others
         key = np.where(shows, depth.c, np.inf)
         order = np.argsort(key, axis=1, kind="stable")
@@ -318,7 +320,7 @@ def pixel_form(
         form, matters = _blended(alpha, color, depth, shows, background)
         keep = np.zeros(f.shows.shape, bool)
         np.put_along_axis(keep, used[order], matters & shows, 1)
-        return form, keep
+        return form, keep, f.motion
 
 
 def _groups(depth: Form, shows: Array) -> Array:
