@@ -128,7 +128,9 @@ def run(
             cells, poses = frames[claim.frame]
             start = time.monotonic()
             share = max(4.0 * left / max(claims - audit.claims, 1), 0.0)
-            verdict, detail = settle(splats, poses, cells, claim, start + min(share, left)) if left > 0.0 else (None, {})
+            verdict, detail = (
+                settle(splats, poses, cells, claim, start + min(share, left)) if left > 0.0 else (None, {})
+            )
             spent.append(time.monotonic() - start)
             _count(audit, claim, cells, verdict, detail)
             if not claim.hunted:
@@ -138,7 +140,9 @@ def run(
                 break
     audit.uniform = {"claims": uniform[0], "proved": uniform[1], "holds_at_least": least_part(uniform[1], uniform[0])}
     audit.seconds, audit.median_seconds = time.monotonic() - begin, statistics.median(spent) if spent else 0.0
-    (folder / "check.json").write_text(json.dumps({"version": 1, "seed": seed, **vars(audit)}, indent=1, allow_nan=False))
+    (folder / "check.json").write_text(
+        json.dumps({"version": 1, "seed": seed, **vars(audit)}, indent=1, allow_nan=False)
+    )
     return audit
 
 
@@ -185,7 +189,9 @@ def draw(frames: list[Cells], count: int, seed: int) -> list[Claim]:
         a = frames[claim.frame].arrays
         row, column = claim.row - a["tile"][claim.cell][0], claim.column - a["tile"][claim.cell][1]
         slope = np.abs(a["A_upper"][claim.cell, row, column, claim.channel]).sum()
-        gap = a["b_upper"][claim.cell, row, column, claim.channel] - a["b_lower"][claim.cell, row, column, claim.channel]
+        gap = (
+            a["b_upper"][claim.cell, row, column, claim.channel] - a["b_lower"][claim.cell, row, column, claim.channel]
+        )
         return float((slope + 1e-4) / max(gap, 1e-7)) if slope > 0.0 else 0.0
 
     return [max((one(True) for _ in range(8)), key=interest) if k % 2 else one(False) for k in range(count)]
@@ -234,7 +240,9 @@ def _bounds(cells: Cells, claim: Claim) -> _Bounds:
     return _Bounds(*ends, a["box_lower"][k], a["box_upper"][k], planes)  # pyright: ignore[reportArgumentType]
 
 
-def settle(splats: Splats, poses: Poses, cells: Cells, claim: Claim, deadline: float) -> tuple[bool | None, dict[str, Any]]:
+def settle(
+    splats: Splats, poses: Poses, cells: Cells, claim: Claim, deadline: float
+) -> tuple[bool | None, dict[str, Any]]:
     """True: proved; False: refuted, with the pose; None: open when the time was over."""
     bounds = _bounds(cells, claim)
     pixel = (claim.row, claim.column)
@@ -309,7 +317,13 @@ def _refuted(
         k = int(np.argmax(np.where(np.isfinite(out) & np.isfinite(error), out, -1.0)))
         if np.isfinite(out[k]) and out[k] > 0.0 and np.isfinite(error[k]):
             value = float(np.clip(form.c[k], 0.0, 1.0))
-            return {"pose": points[k].tolist(), "value": value, "error": float(error[k]), "bound": side, "excess": float(out[k])}
+            return {
+                "pose": points[k].tolist(),
+                "value": value,
+                "error": float(error[k]),
+                "bound": side,
+                "excess": float(out[k]),
+            }
     return {}
 
 

@@ -201,4 +201,3 @@ def rotation(axis: Array, angle: Form) -> list[list[Form]]:
 def fixed(matrix: Array, like: Form, r: float = 0.0) -> list[list[Form]]:
     """A matrix of numbers as forms."""
     return [[Form.constant(v, like, r) for v in row] for row in np.atleast_2d(matrix)]
-

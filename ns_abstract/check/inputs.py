@@ -101,7 +101,12 @@ def read_scene(file: Path, settings: dict[str, Any], about: dict[str, Any], vers
         digest.update(np.ascontiguousarray(array, np.float32).tobytes())
     digest.update(repr(("sigmoid" if sigmoid else "sh", degree, mode)).encode())
     found = activated(
-        *stored, sigmoid=sigmoid, degree=degree, antialiased=mode == "antialiased", background=background, version=version
+        *stored,
+        sigmoid=sigmoid,
+        degree=degree,
+        antialiased=mode == "antialiased",
+        background=background,
+        version=version,
     )
     return found, digest.hexdigest()
 
@@ -121,7 +126,9 @@ def _read_run(file: Path, settings: dict[str, Any]) -> tuple[list[Array], str, A
         background = _COLORS[color.lower()] if isinstance(color, str) else [float(v) for v in color]
     except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError, yaml.YAMLError):
         raise BadInput("cannot be read as a Splatfacto run's configuration", file) from None
-    names = {int(m[1]): p for p in sorted(folder.glob("step-*.ckpt")) if (m := re.fullmatch(r"step-(\d+)\.ckpt", p.name))}
+    names = {
+        int(m[1]): p for p in sorted(folder.glob("step-*.ckpt")) if (m := re.fullmatch(r"step-(\d+)\.ckpt", p.name))
+    }
     if not names or (step is not None and int(step) not in names):
         raise BadInput("no such checkpoint" if names else "no checkpoints", folder, fix="give the whole run folder")
     checkpoint = names[max(names) if step is None else int(step)]
@@ -151,7 +158,9 @@ def _state(checkpoint: Path) -> dict[str, Any]:
         names = {key.removeprefix("module."): value for key, value in pipeline.items()}
     except Exception:  # torch raises whatever a damaged file makes it run into
         raise BadInput("cannot be read as a checkpoint", checkpoint) from None
-    return {key.removeprefix("_model.").removeprefix("module."): v for key, v in names.items() if key.startswith("_model.")}
+    return {
+        key.removeprefix("_model.").removeprefix("module."): v for key, v in names.items() if key.startswith("_model.")
+    }
 
 
 def _read_ply(file: Path, settings: dict[str, Any]) -> tuple[list[Array], str, Any, bool, int]:
@@ -189,7 +198,9 @@ def dataset_scale(config: Path) -> float:
     return float(read_json(file, "dataparser transform")["scale"]) if file.is_file() else 1.0
 
 
-def read_poses(path: Path, given: dict[str, Any] | None, frame: int, settings: dict[str, Any], scale: float) -> tuple[Poses, Any]:
+def read_poses(
+    path: Path, given: dict[str, Any] | None, frame: int, settings: dict[str, Any], scale: float
+) -> tuple[Poses, Any]:
     """The poses of a frame, and its box of parameters as [(name, lower, upper)].
 
     Args:
@@ -232,7 +243,11 @@ def read_poses(path: Path, given: dict[str, Any] | None, frame: int, settings: d
     poses = Poses(
         camera,
         tuple(name for name, _, _ in free),
-        {name: low for name, (low, high) in ranges.items() if low == high and (low != 0.0 or name in ("segment", "azimuth"))},
+        {
+            name: low
+            for name, (low, high) in ranges.items()
+            if low == high and (low != 0.0 or name in ("segment", "azimuth"))
+        },
         spec.get("frame", "camera") == "world",
         orbit,
         following if "segment" in ranges else None,

@@ -54,7 +54,11 @@ class Poses:
         middle = 0.5 * (low + high)
         half = np.maximum(high - middle, middle - low) * (1.0 + 4.0 * U)
         # a set of one pose has no parameters; one that nothing depends on stands in
-        given = parameters(middle, half) if low.shape[1] else [Form(np.zeros(len(low)), np.zeros((0, len(low))), np.zeros(len(low)))]
+        given = (
+            parameters(middle, half)
+            if low.shape[1]
+            else [Form(np.zeros(len(low)), np.zeros((0, len(low))), np.zeros(len(low)))]
+        )
         like = given[0]
         p = dict(zip(self.names, given, strict=False))
         p |= {name: Form.constant(v, like) for name, v in self.values.items()}
@@ -98,8 +102,17 @@ class Poses:
         return back, [row[0] for row in product(back, rest)], origin
 
     def position(self, low: Array, high: Array) -> list[Form]:
-        """The camera's position relative to the origin of `view`."""
-        return [e - e.c for e in self._posed(low, high)[1]]
+        """The camera's position relative to the origin of `view`, for all versions of gsplat.
+
+        Version 1.6.0 takes -R^T t with the view matrix, which differs where a keyframe's rotation R is not orthonormal.
+        """
+        place, r = self._posed(low, high)[1], self.camera.pose[:, :3]
+        stretch = float(np.linalg.norm(r @ r.T - np.eye(3))) + _BASE
+        far = sum(np.abs(e.c) + e.width for e in place)
+        found = [e - e.c for e in place]
+        for entry in found:
+            entry.r = entry.r + stretch * far
+        return found
 
 
 def _nearest_rotation(matrix: Array) -> Array:
@@ -111,7 +124,12 @@ def _axis_angle(turn: Array) -> tuple[Array, float]:
     """Axis and angle of a rotation, by way of the quaternion's largest component."""
     k = np.array(
         [
-            [turn[0, 0] - turn[1, 1] - turn[2, 2], turn[1, 0] + turn[0, 1], turn[2, 0] + turn[0, 2], turn[2, 1] - turn[1, 2]],
+            [
+                turn[0, 0] - turn[1, 1] - turn[2, 2],
+                turn[1, 0] + turn[0, 1],
+                turn[2, 0] + turn[0, 2],
+                turn[2, 1] - turn[1, 2],
+            ],
             [0.0, turn[1, 1] - turn[0, 0] - turn[2, 2], turn[2, 1] + turn[1, 2], turn[0, 2] - turn[2, 0]],
             [0.0, 0.0, turn[2, 2] - turn[0, 0] - turn[1, 1], turn[1, 0] - turn[0, 1]],
             [0.0, 0.0, 0.0, np.trace(turn)],
@@ -124,4 +142,3 @@ def _axis_angle(turn: Array) -> tuple[Array, float]:
     if length == 0.0:
         return np.array([0.0, 0.0, 1.0]), 0.0
     return vector / length, 2.0 * float(np.arctan2(length, abs(w)))
-

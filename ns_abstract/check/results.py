@@ -44,7 +44,9 @@ def read_report(folder: Path) -> dict[str, Any]:
         raise BadInput("no such folder", folder, fix="give the output folder of ns-abstract-render")
     report = read_json(folder / "report.json", "report", "give the output folder of ns-abstract-render")
     if report.get("version") != 1:
-        raise BadInput(f"found {report.get('version')!r}", folder / "report.json", "version", "this program reads version 1")
+        raise BadInput(
+            f"found {report.get('version')!r}", folder / "report.json", "version", "this program reads version 1"
+        )
     for name, kind in (("settings", dict), ("sha256", dict), ("fingerprint", dict), ("frames", list), ("scene", dict)):
         if not isinstance(report.get(name), kind):
             raise BadInput("missing", folder / "report.json", name, "give the output folder of ns-abstract-render")
@@ -146,5 +148,8 @@ def partition(low: Array, high: Array, first: Array, last: Array) -> bool:
         if not apart.all():
             return False
     # a float64 is a rational number
-    volume = sum(math.prod(Fraction(b) - Fraction(a) for a, b in zip(*ends, strict=True)) for ends in zip(low.tolist(), high.tolist(), strict=True))
+    volume = sum(
+        math.prod(Fraction(b) - Fraction(a) for a, b in zip(*ends, strict=True))
+        for ends in zip(low.tolist(), high.tolist(), strict=True)
+    )
     return volume == math.prod(Fraction(b) - Fraction(a) for a, b in zip(first.tolist(), last.tolist(), strict=True))

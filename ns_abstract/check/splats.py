@@ -329,7 +329,9 @@ def _groups(depth: Form, shows: Array) -> Array:
     weight = shows / np.maximum(shows.sum(axis=1, keepdims=True), 1)
     # a slope that all share changes no order
     common = (depth.g * weight).sum(axis=2, keepdims=True)
-    room = (np.abs(depth.g - common).sum(axis=0) + depth.r) * (1.0 + 64.0 * U) + 64.0 * U * (np.abs(depth.c) + depth.slope)
+    room = (np.abs(depth.g - common).sum(axis=0) + depth.r) * (1.0 + 64.0 * U) + 64.0 * U * (
+        np.abs(depth.c) + depth.slope
+    )
     low = np.where(shows, depth.c - room, np.inf)
     high = np.where(shows, depth.c + room, -np.inf)
     low, high = np.where(np.isnan(low), -np.inf, low), np.where(np.isnan(high), np.inf, high)
@@ -349,7 +351,8 @@ def _blended(alpha: Form, color: Form, depth: Form, shows: Array, background: fl
     clean, dlow, dhigh = _groups(depth, shows)
     step = 1.0 + 8.0 * n * U
     most, least = (
-        np.concatenate([np.ones((count, 1)), np.cumprod(1.0 - a, axis=1)], axis=1) * s for a, s in ((al, step), (ah, 1 / step))
+        np.concatenate([np.ones((count, 1)), np.cumprod(1.0 - a, axis=1)], axis=1) * s
+        for a, s in ((al, step), (ah, 1 / step))
     )
     most[:, 0] = least[:, 0] = 1.0
     place = np.arange(n + 1)[None]
@@ -373,7 +376,9 @@ def _blended(alpha: Form, color: Form, depth: Form, shows: Array, background: fl
             a, b = s[:, k + 1], c[:, k]
             s[:, k] = pick(a + al[:, k] * (b - a), a + ah[:, k] * (b - a))
         centre[:, k] = centre[:, k + 1] + ac[:, k] * (color.c[:, k] - centre[:, k + 1])
-    span = np.maximum(np.abs(low), np.abs(high)).max(axis=1) + np.where(inside, np.maximum(np.abs(cl), np.abs(ch)), 0.0).max(axis=1)
+    span = np.maximum(np.abs(low), np.abs(high)).max(axis=1) + np.where(
+        inside, np.maximum(np.abs(cl), np.abs(ch)), 0.0
+    ).max(axis=1)
     slack = 8.0 * (n + 2) * U * span
     low, high = low - slack[:, None], high + slack[:, None]
     total_form = _mean_value(alpha, color, blank, (most, least), (al, ah), (cl, ch), (low, high))
@@ -392,7 +397,9 @@ def _blended(alpha: Form, color: Form, depth: Form, shows: Array, background: fl
     rise = np.where(stops, light * (background - darkest), 0.0) * (1.0 + ROOM)
     lower, upper = swap[0] - fall, swap[1] + rise
     form = Form(
-        form.c + 0.5 * (lower + upper), form.g, form.r + 0.5 * (upper - lower) * (1.0 + ROOM) + 8.0 * U * (np.abs(form.c) + 1.0)
+        form.c + 0.5 * (lower + upper),
+        form.g,
+        form.r + 0.5 * (upper - lower) * (1.0 + ROOM) + 8.0 * U * (np.abs(form.c) + 1.0),
     )
     return form, inside | (np.arange(n)[None] < end + 1)
 
