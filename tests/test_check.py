@@ -17,9 +17,9 @@ import mpmath
 import numpy as np
 import pytest
 import torch
+from conftest import InProcess, Inputs, blob_scene, environment, ring
 
 import ns_abstract as nsa
-from conftest import InProcess, Inputs, blob_scene, environment, ring
 from ns_abstract.api.checking import check
 from ns_abstract.check import audit
 from ns_abstract.check.forms import Form, parameters
@@ -81,8 +81,10 @@ def test_forms_contain_exact_values(name: str) -> None:
             found = enclose(a + b * 0.125)
             for k in range(20):
                 for s in rng.uniform(-1.0, 1.0, (8, 2)):
-                    p = [mpmath.mpf(float(m)) + mpmath.mpf(half) * mpmath.mpf(float(e)) for m, e in zip(middle[k], s, strict=True)]
-                    true = exact(p[0] + p[1] / 8)
+                    x, y = (
+                        mpmath.mpf(float(m)) + mpmath.mpf(half) * float(e) for m, e in zip(middle[k], s, strict=True)
+                    )
+                    true = exact(x + y / 8)
                     plane = mpmath.mpf(float(found.c[k])) + sum(
                         mpmath.mpf(float(g)) * mpmath.mpf(float(e)) for g, e in zip(found.g[:, k], s, strict=True)
                     )
@@ -286,7 +288,7 @@ BAD: dict[str, tuple[Callable[[Path], object], str]] = {
     "another scene": (lambda f: report(f, lambda d: d["fingerprint"].update(scene="0")), "not the scene"),
     "another mode": (lambda f: report(f, lambda d: d["scene"].update(rasterize_mode="antialiased")), "another mode"),
     "another program": (lambda f: report(f, lambda d: d["renderer"].update(name="paper")), "gsplat alone"),
-    "moved run": (lambda f: report(f, lambda d: d["settings"].update(load_config="/nowhere/config.yml")), "--load-config"),
+    "moved run": (lambda f: report(f, lambda d: d["settings"].update(load_config="/nowhere")), "--load-config"),
     "moved path": (
         lambda f: report(f, lambda d: d["settings"].update(camera_path_filename="/nowhere.json")),
         "--camera-path-filename",
@@ -335,7 +337,11 @@ def test_another_set_of_poses_is_refused(copy: Path, blobs: Inputs, tmp_path: Pa
     [
         {"translation": {"x": 0.1}, "frame": "world", "rotation": {"roll": [0, 0.02], "pitch": 0.01}},
         {"sweep": "segments", "translation": {"z": [0.01, 0.01]}, "rotation": {"yaw": 1.0}, "angle_units": "degrees"},
-        {"orbit": {"target": [0, 0, 0], "axis": [1, 2, 3], "azimuth": [0.5, 1.0]}, "units": "dataset", "translation": {"y": 1}},
+        {
+            "orbit": {"target": [0, 0, 0], "axis": [1, 2, 3], "azimuth": [0.5, 1.0]},
+            "units": "dataset",
+            "translation": {"y": 1},
+        },
     ],
 )
 def test_poses_are_those_of_the_perturbation_file(blobs: Inputs, spec: dict[str, Any]) -> None:

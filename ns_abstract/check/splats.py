@@ -323,8 +323,8 @@ def pixel_form(
         return form, keep, f.motion
 
 
-def _groups(depth: Form, shows: Array) -> Array:
-    """[B, n + 1] whether everything in front of a place in the order is surely in front of everything behind it."""
+def _groups(depth: Form, shows: Array) -> tuple[Array, Array, Array]:
+    """[B, n + 1] whether all in front of a place in the order is surely in front of all behind it; ranges of depth."""
     n = shows.shape[1]
     weight = shows / np.maximum(shows.sum(axis=1, keepdims=True), 1)
     # a slope that all share changes no order
