@@ -73,7 +73,8 @@ class Audit:
 
 def run(
     folder: Path, *, claims: int, seconds: float, seed: int, load_config: Path | None = None,
-    camera_path: Path | None = None, perturbation: Path | None = None, on_claim: Callable[[Audit], object] | None = None,
+    camera_path: Path | None = None, perturbation: Path | None = None,
+    on_claim: Callable[[Audit], object] | None = None,
 ) -> Audit:  # fmt: skip
     """Audit the result in ``folder`` and write ``check.json`` there.
 
@@ -105,7 +106,12 @@ def run(
     frames: list[tuple[Cells, Poses]] = []
     for entry in report["frames"]:
         index, name = entry.get("index"), (entry.get("files") or {}).get("npz")
-        if name is None or entry.get("status") == "missing":
+        # where the cells do not cover the set yet nothing is claimed
+        if (
+            name is None
+            or entry.get("status") == "missing"
+            or (entry.get("trace") or [{}])[-1].get("covered", 1.0) < 1.0
+        ):
             continue
         if not isinstance(index, int) or name != f"frame_{index:05d}.npz":
             raise BadInput(f"found {name!r}", folder / "report.json", "frames.files.npz")

@@ -122,7 +122,7 @@ class Form:
 
     def exp(self) -> Form:
         """The exponential."""
-        low, high = self.range()
+        high = self.range()[1]
         f = np.exp(np.minimum(self.c, 700.0))
         top = 0.5 * np.exp(np.minimum(high, 700.0)) * (1.0 + 16.0 * FUNCTION * U)
         return self.composed(f, f, 0.0 * f, top).unless(high > 690.0)

@@ -73,7 +73,7 @@ def read_cells(folder: Path, name: str, index: int, digest: object) -> Cells:
         raise BadInput("keeps no cells", file, fix=_KEEP)
     try:
         n, d = declared["box_lower"][0]
-        (h, w, three), side = declared["lower"][0], declared["b_lower"][0][1]
+        (h, w, _), side = declared["lower"][0], declared["b_lower"][0][1]
     except (KeyError, ValueError, IndexError):
         raise BadInput("is not a frame file", file, fix="render the frame again") from None
     tiles, single, double = (n, side, side, 3), np.dtype("<f4"), np.dtype("<f8")

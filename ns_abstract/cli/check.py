@@ -58,8 +58,8 @@ def check(options: Check) -> int:
     for entry in found.refutations[:10]:
         row, column = entry["pixel"]
         print(
-            f"refuted: frame {entry['frame']}, pixel ({row}, {column}), channel {entry['channel']}: {entry['value']:.6f} "
-            f"is beyond the {entry['bound']} bound by {entry['excess']:.2g} at {entry['pose']}"
+            f"refuted: frame {entry['frame']}, pixel ({row}, {column}), channel {entry['channel']}: "
+            f"{entry['value']:.6f} is beyond the {entry['bound']} bound by {entry['excess']:.2g} at {entry['pose']}"
         )
     print(
         f"{found.claims} claims about the picture in {found.picture}: {found.proved} proved, {found.refuted} refuted, "
