@@ -42,6 +42,9 @@ def read_report(folder: Path) -> dict[str, Any]:
     """The report of a finished result."""
     if not folder.is_dir():
         raise BadInput("no such folder", folder, fix="give the output folder of ns-abstract-render")
+    if (folder / "cells.sqlite").exists():
+        problem = "holds the cells of a certificate, and this program checks results of ns-abstract-render"
+        raise BadInput(problem, folder, fix="render the set with --save-cells and check that")
     report = read_json(folder / "report.json", "report", "give the output folder of ns-abstract-render")
     if report.get("version") != 1:
         raise BadInput(
