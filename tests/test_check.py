@@ -196,7 +196,8 @@ def test_a_capped_alpha_lets_light_through() -> None:
     """One opaque Gaussian in front of the background: 0.999 of its colour and a thousandth of the background's."""
     scene = dataclasses.replace(
         blob_scene(1, degree=0),
-        means=np.zeros((1, 3), np.float32),
+        # in the middle of a pixel
+        means=np.array([[0.025, -0.025, 0.0]], np.float32),
         log_scales=np.full((1, 3), -1.0, np.float32),
         opacity_logits=np.full(1, 12.0, np.float32),
         sh=np.zeros((1, 1, 3), np.float32),

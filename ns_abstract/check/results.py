@@ -151,8 +151,7 @@ def partition(low: Array, high: Array, first: Array, last: Array) -> bool:
         if not apart.all():
             return False
     # a float64 is a rational number
-    volume = sum(
-        math.prod(Fraction(b) - Fraction(a) for a, b in zip(*ends, strict=True))
-        for ends in zip(low.tolist(), high.tolist(), strict=True)
-    )
-    return volume == math.prod(Fraction(b) - Fraction(a) for a, b in zip(first.tolist(), last.tolist(), strict=True))
+    rows = (zip(a, b, strict=True) for a, b in zip(low.tolist(), high.tolist(), strict=True))
+    volume = sum(math.prod(Fraction(b) - Fraction(a) for a, b in row) for row in rows)
+    whole = math.prod(Fraction(b) - Fraction(a) for a, b in zip(first.tolist(), last.tolist(), strict=True))
+    return volume == whole
