@@ -209,6 +209,34 @@ def test_a_capped_alpha_lets_light_through() -> None:
     assert abs(form.c[0] - (0.999 * 0.5 + 0.001)) <= form.r[0] < 1e-12
 
 
+def test_a_stop_that_is_open_is_enclosed() -> None:
+    """Behind 0.999 the rasteriser stops at an alpha of 0.9, which a second Gaussian has for some poses of a box only."""
+    scene = dataclasses.replace(
+        blob_scene(2, degree=0),
+        means=np.array([[0.0, 0.0, 0.0], [0.0, 0.0, -0.5]], np.float32),
+        log_scales=np.array([[-1.0] * 3, [-2.0] * 3], np.float32),
+        opacity_logits=np.array([12.0, 2.9], np.float32),
+        sh=np.array([[[0.0] * 3], [[-1.7] * 3]], np.float32),
+        background=np.ones(3, np.float32),
+    )
+    ours, theirs = cameras(np.array([[1.0, 0, 0, -0.0125], [0, 1, 0, 0.0125], [0, 0, 1, 2.0]]), 40.0)
+    pose_set = PoseSet.around(theirs, parse_perturbation({"version": 1, "translation": {"x": 0.06}}))
+    poses, splats, reference = Poses(ours, ("x",)), splats_of(scene), Reference(scene)
+    low, high = np.array([[-0.06]]), np.array([[0.06]])
+    seen = [
+        float(reference.image(theirs, torch.from_numpy(pose_set.pose(np.array([x]))))[16, 16, 0])
+        for x in np.linspace(-0.06, 0.06, 61)
+    ]
+    assert max(np.abs(np.diff(seen))) > 5e-4
+    form, _, _ = pixel_form(splats, poses, low, high, np.arange(2), (16, 16), 0)
+    values = form.c[0] + form.g[0, 0] * np.linspace(-1.0, 1.0, 61)
+    assert (np.abs(values - seen) <= form.r[0] + 1e-12).all()
+    # the enclosure knows where it stops
+    parts = np.linspace(-0.06, 0.06, 2001)[:, None]
+    form, _, _ = pixel_form(splats, poses, parts[:-1], parts[1:], np.arange(2), (16, 16), 0)
+    assert np.median(form.r) < 1e-6 < 5e-4 < form.r.max()
+
+
 def test_a_claim_is_about_both_bounds() -> None:
     def excess(most: float, plane: float) -> tuple[float, float]:
         slope, low, high = np.zeros(1), np.zeros(1), np.ones(1)
@@ -250,13 +278,16 @@ def test_the_least_part_is_that_of_clopper_and_pearson() -> None:
 @pytest.fixture(scope="module")
 def result(blobs: Inputs, tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("checked") / "out"
-    options = blobs.options(folder, frames=[0], time_budget=15, save_cells=True)
+    rendered(blobs.options(folder, frames=[0], time_budget=15, save_cells=True))
+    return folder
+
+
+def rendered(options: list[str]) -> None:
     done = subprocess.run(
         [sys.executable, "-m", "ns_abstract.cli.render", *options],
         capture_output=True, text=True, timeout=600, check=False, env=environment(),
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
-    return folder
 
 
 @pytest.fixture
@@ -290,6 +321,19 @@ def test_a_sound_result_is_proved(copy: Path) -> None:
     assert [stored[name] for name in ("claims", "proved", "refuted", "unsettled", "refutations")] == [
         found.claims, found.proved, found.refuted, found.unsettled, [],
     ]  # fmt: skip
+
+
+@pytest.mark.parametrize("version", ["1.4.0", "1.5.3", "1.6.0"])
+def test_antialiased_results_of_every_version_are_proved(
+    version: str, make_blobs: Callable[..., Inputs], tmp_path: Path
+) -> None:
+    scene = dataclasses.replace(opaque(blob_scene()), rasterize_mode="antialiased")
+    spec = {"version": 1, "translation": {"x": 0.01}, "rotation": {"yaw": 0.005, "roll": [0, 0.01]}}
+    inputs = make_blobs(scene=scene, spec=spec)
+    more = {"time_budget": 4, "save_cells": True, "gsplat_version": version, "arithmetic": "real"}
+    rendered(inputs.options(tmp_path / "out", frames=[1], **more))
+    found = check(tmp_path / "out", claims=20, seconds=100)
+    assert found.refuted == 0 and found.proved >= 16 and found.exit_code == 0
 
 
 def test_bounds_moved_inward_are_refuted(copy: Path) -> None:

@@ -31,12 +31,12 @@ CHECKS = (
         "test_check.py::test_a_change_of_order_is_enclosed",
     ),
     Fault(
-        "checker: the rasteriser never stops",
+        "checker: a stop that is open is none",
         _SPLATS,
         "_blended",
-        "np.where(sure.any(axis=1), sure.argmax(axis=1), n)[:, None]",
-        "np.full((count, 1), n)",
-        _PIXELS,
+        "np.where(may.any(axis=1), may.argmax(axis=1), n)",
+        "np.full(count, n)",
+        "test_check.py::test_a_stop_that_is_open_is_enclosed",
     ),
     Fault(
         "checker: an alpha that may be skipped is never skipped",
