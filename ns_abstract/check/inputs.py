@@ -282,9 +282,9 @@ def _camera(root: dict[str, Any], entry: dict[str, Any], down: float) -> Camera:
         return Camera(pose, focal, focal, width / 2.0, height / 2.0, width, height)
     # nerfstudio holds the factor and the centre in float32
     scale = np.float32(1.0 / down)
-    centre = [float(np.float32(side / 2.0) * scale) for side in (width, height)]
+    cx, cy = (float(np.float32(side / 2.0) * scale) for side in (width, height))
     wide, tall = (int(np.float32(side) * scale) for side in (width, height))
-    return Camera(pose, focal * float(scale), focal * float(scale), *centre, wide, tall)
+    return Camera(pose, focal * float(scale), focal * float(scale), cx, cy, wide, tall)
 
 
 __all__ = ["RULES", "BadInput", "dataset_scale", "given_set", "read_json", "read_poses", "read_scene"]
