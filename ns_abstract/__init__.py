@@ -12,6 +12,7 @@ from ns_abstract.io import version as _version
 if TYPE_CHECKING:
     from ns_abstract.api.bounding import BoundResult, Progress, bound
     from ns_abstract.api.certifying import Certificate, CertifiedCell, CertifyProgress, certify
+    from ns_abstract.api.checking import Audit, check
     from ns_abstract.api.poses import Camera, PoseSet
     from ns_abstract.api.reaching import ReachCell, ReachProgress, ReachResult, reach
     from ns_abstract.api.scenes import Scene, load_scene, render
@@ -23,6 +24,7 @@ __version__ = _version.VERSION
 _HOMES = {
     "api.bounding": ("BoundResult", "Progress", "bound"),
     "api.certifying": ("Certificate", "CertifiedCell", "CertifyProgress", "certify"),
+    "api.checking": ("Audit", "check"),
     "api.poses": ("Camera", "PoseSet"),
     "api.reaching": ("ReachCell", "ReachProgress", "ReachResult", "reach"),
     "api.scenes": ("Scene", "load_scene", "render"),
@@ -32,6 +34,7 @@ _HOMES = {
 _HOME = {name: home for home, names in _HOMES.items() for name in names}
 
 __all__ = [
+    "Audit",
     "BoundResult",
     "Camera",
     "CameraPath",
@@ -48,6 +51,7 @@ __all__ = [
     "__version__",
     "bound",
     "certify",
+    "check",
     "load_camera_path",
     "load_scene",
     "reach",

@@ -29,6 +29,7 @@ LEVELS = (
     "report",
     "verify",
     "reach",
+    "check",
     "api",
     "viewer",
     "nerfstudio",

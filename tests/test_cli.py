@@ -100,6 +100,7 @@ def check_samples(inputs: Inputs, folder: Path, index: int, **settings: Any) -> 
         ("ns_abstract.cli.demo", "--output-dir"),
         ("ns_abstract.cli.viewer", "--viewer.websocket-port"),
         ("ns_abstract.cli.export", "mp4"),
+        ("ns_abstract.cli.check", "--claims"),
     ],
 )
 def test_help_is_quick_and_light(module: str, option: str) -> None:

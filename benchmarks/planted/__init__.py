@@ -1,6 +1,7 @@
 """Planted faults, by the part of the package that they lie in."""
 
 from planted.certificates import CERTIFICATES
+from planted.checks import CHECKS
 from planted.depths import DEPTHS
 from planted.fault import Fault, apply
 from planted.fields import FIELDS
@@ -16,8 +17,8 @@ from planted.splats import SPLATS
 from planted.verdicts import VERDICTS
 
 FAULTS = (
-    *FORMS, *POLYNOMIALS, *FIELDS, *VERDICTS, *CERTIFICATES, *SPLATS, *DEPTHS, *LOOPS, *INPUTS,
-    *NETWORKS, *PROCESSES, *RESULTS, *SCENES,
+    *FORMS, *POLYNOMIALS, *FIELDS, *VERDICTS, *CERTIFICATES, *SPLATS, *DEPTHS, *LOOPS, *CHECKS,
+    *INPUTS, *NETWORKS, *PROCESSES, *RESULTS, *SCENES,
 )  # fmt: skip
 
 __all__ = ["FAULTS", "Fault", "apply"]

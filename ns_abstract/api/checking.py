@@ -1,0 +1,53 @@
+"""An audit of a stored result by `ns_abstract.check`, which shares no code with the bounds."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from pathlib import Path
+
+from ns_abstract.check.audit import Audit, run
+from ns_abstract.check.inputs import BadInput
+from ns_abstract.io.errors import InputError
+
+
+def check(
+    output_dir: str | os.PathLike[str],
+    *,
+    claims: int = 200,
+    seconds: float = 600.0,
+    seed: int = 0,
+    load_config: str | os.PathLike[str] | None = None,
+    camera_path: str | os.PathLike[str] | None = None,
+    perturbation: str | os.PathLike[str] | None = None,
+    on_progress: Callable[[Audit], object] | None = None,
+) -> Audit:
+    """Numbers of claims of a result that were proved, refuted and left open by a second program.
+
+    Args:
+        output_dir: Output folder of ``ns-abstract-render --save-cells``; ``check.json`` is written there.
+        claims: Number of claims to draw; a claim is one channel of a pixel over one cell.
+        seconds: Time for all of them.
+        seed: Of the draws.
+        load_config, camera_path, perturbation: Where files lie that have been moved since; None: where the report says.
+        on_progress: Called after every claim; returning False ends the audit.
+
+    Raises:
+        InputError: A file or a field in it cannot be used.
+    """
+    if claims < 1:
+        raise InputError(f"found {claims}", field="claims", fix="give a number of at least 1")
+    if not 0.0 < seconds < float("inf"):
+        raise InputError(f"found {seconds}", field="seconds", fix="give a positive number")
+    if not 0 <= seed < 2**63:
+        raise InputError(f"found {seed}", field="seed", fix="give a number from 0 on")
+    moved = {
+        "load_config": load_config,
+        "camera_path": camera_path,
+        "perturbation": perturbation,
+    }
+    files = {name: None if file is None else Path(file) for name, file in moved.items()}
+    try:
+        return run(Path(output_dir), claims=claims, seconds=seconds, seed=seed, on_claim=on_progress, **files)
+    except BadInput as error:
+        raise InputError(error.problem, fix=error.fix, file=error.file, field=error.field) from None

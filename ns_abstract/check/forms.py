@@ -1,0 +1,203 @@
+"""First-order forms with a remainder, in float64: the checker's own arithmetic.
+
+A form encloses a function of ``s`` in [-1, 1]^d: ``c + g . s`` with an error of at most ``r``. Every operation adds its
+own rounding to ``r``: an operation in float64 errs by at most ``U`` times the size of its result.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+#: Unit roundoff of float64.
+U = 2.0**-53
+#: What underflow may add.
+TINY = 1e-290
+#: Relative error, in units, of numpy's exponential, sine and cosine; the libraries' own figure is 4 at most.
+FUNCTION = 8.0
+
+Array = Any
+
+
+class Form:
+    """Arrays ``c`` [...], ``g`` [d, ...] and ``r`` [...] of equal trailing shape; several functions side by side."""
+
+    __slots__ = ("c", "g", "r")
+
+    def __init__(self, c: Array, g: Array, r: Array) -> None:
+        self.c, self.g, self.r = c, g, r
+
+    @classmethod
+    def constant(cls, c: Array, like: Form, r: Array = 0.0) -> Form:
+        """``c`` within ``r``, of the shape of ``like``."""
+        c = np.broadcast_to(np.asarray(c, np.float64), like.c.shape)
+        return cls(c, np.zeros_like(like.g), np.broadcast_to(np.asarray(r, np.float64), like.c.shape))
+
+    @property
+    def slope(self) -> Array:
+        """Sum of the sizes of the linear coefficients."""
+        return np.abs(self.g).sum(axis=0)
+
+    @property
+    def width(self) -> Array:
+        """Largest distance of the function from its centre."""
+        return (self.slope + self.r) * (1.0 + 16.0 * U)
+
+    def range(self) -> tuple[Array, Array]:
+        """Lower and upper bounds."""
+        w = self.width + 2.0 * U * np.abs(self.c)
+        return self.c - w, self.c + w
+
+    def __neg__(self) -> Form:
+        return Form(-self.c, -self.g, self.r)
+
+    def __add__(self, other: Form | float | Array) -> Form:
+        if not isinstance(other, Form):
+            c = self.c + other
+            return Form(c, self.g, self.r + (2.0 * U * np.abs(c) + TINY))
+        c, g = self.c + other.c, self.g + other.g
+        size = np.abs(c) + np.abs(g).sum(axis=0)
+        return Form(c, g, (self.r + other.r + 4.0 * U * size) * (1.0 + 4.0 * U) + TINY)
+
+    def __sub__(self, other: Form | float | Array) -> Form:
+        return self + (-other)
+
+    def __mul__(self, other: Form | float | Array) -> Form:
+        if not isinstance(other, Form):
+            c, g = self.c * other, self.g * other
+            size = np.abs(c) + np.abs(g).sum(axis=0)
+            return Form(c, g, (self.r * np.abs(other) + 4.0 * U * size) * (1.0 + 4.0 * U) + TINY)
+        # (g . s)(h . s) has g_k h_k s_k^2 with s_k^2 in [0, 1]
+        half = 0.5 * self.g * other.g
+        a, b = self.slope, other.slope
+        p, q = np.abs(self.c) + a, np.abs(other.c) + b
+        c = self.c * other.c + half.sum(axis=0)
+        g = self.c * other.g + other.c * self.g
+        # sum |half| is at most half of a b, so that the difference keeps half of it
+        r = (a * b - np.abs(half).sum(axis=0)) + p * other.r + q * self.r + self.r * other.r + 32.0 * U * p * q
+        return Form(c, g, r * (1.0 + 32.0 * U) + TINY)
+
+    __radd__, __rmul__ = __add__, __mul__
+
+    def square(self) -> Form:
+        """The form of the square."""
+        a = self.slope
+        p = np.abs(self.c) + a
+        half = 0.5 * a * a
+        # (g . s)^2 lies in [0, a^2]
+        r = half + self.r * (2.0 * p + self.r) + 32.0 * U * p * p
+        return Form(self.c * self.c + half, 2.0 * self.c * self.g, r * (1.0 + 32.0 * U) + TINY)
+
+    def composed(self, f: Array, slope: Array, low: Array, high: Array) -> Form:
+        """The form of a function with value ``f`` and slope at the centre, half its second derivative in [low, high].
+
+        The remainder of Taylor's formula is ``t^2`` times half the second derivative, ``t^2`` in [0, width^2].
+        """
+        w = self.width
+        square = w * w
+        low, high = np.minimum(low, 0.0) * square, np.maximum(high, 0.0) * square
+        r = np.abs(slope) * self.r + 0.5 * (high - low)
+        size = np.abs(f) + np.abs(slope) * w + high - low
+        r = (r + 4.0 * FUNCTION * U * size) * (1.0 + 32.0 * U) + TINY
+        good = np.isfinite(r) & np.isfinite(f)
+        return Form(f + 0.5 * (high + low), slope * self.g, np.where(good, r, np.inf))
+
+    def reciprocal(self) -> Form:
+        """1 / x; unbounded where the form is not surely above 0."""
+        low, high = self.range()
+        good = low > 0.0
+        low, high, c = (np.where(good, v, 1.0) for v in (low, high, self.c))
+        found = self.composed(1.0 / c, -1.0 / (c * c), high**-3.0, low**-3.0 * (1.0 + 16.0 * U))
+        return found.unless(~good)
+
+    def root(self) -> Form:
+        """The square root; unbounded where the form is not surely above 0."""
+        low, _ = self.range()
+        good = low > 0.0
+        low, c = np.where(good, low, 1.0), np.where(good, self.c, 1.0)
+        f = np.sqrt(c)
+        found = self.composed(f, 0.5 / f, -0.125 * low**-1.5 * (1.0 + 32.0 * U), 0.0 * f)
+        return found.unless(~good)
+
+    def exp(self) -> Form:
+        """The exponential."""
+        high = self.range()[1]
+        f = np.exp(np.minimum(self.c, 700.0))
+        top = 0.5 * np.exp(np.minimum(high, 700.0)) * (1.0 + 16.0 * FUNCTION * U)
+        return self.composed(f, f, 0.0 * f, top).unless(high > 690.0)
+
+    def sine(self) -> tuple[Form, Form]:
+        """Sine and cosine."""
+        s, c = np.sin(self.c), np.cos(self.c)
+        half = np.full(np.shape(s), 0.5 * (1.0 + 8.0 * U))
+        # the second derivative moves by no more than the angle
+        found = []
+        for f, slope in ((s, c), (c, -s)):
+            middle, room = -0.5 * f, 0.5 * self.width + 1e-15
+            found.append(self.composed(f, slope, np.maximum(middle - room, -half), np.minimum(middle + room, half)))
+        return found[0], found[1]
+
+    def unless(self, bad: Array) -> Form:
+        """The form, unbounded where ``bad``."""
+        return Form(np.where(bad, 0.0, self.c), np.where(bad, 0.0, self.g), np.where(bad, np.inf, self.r))
+
+    def boxed(self, where: Array, low: Array, high: Array) -> Form:
+        """The form, but the interval [low, high] ``where`` that is asked for."""
+        middle = 0.5 * (low + high)
+        radius = np.maximum(high - middle, middle - low) * (1.0 + 4.0 * U) + TINY
+        return Form(np.where(where, middle, self.c), np.where(where, 0.0, self.g), np.where(where, radius, self.r))
+
+    def clamped(self, low: float | Array, high: float | Array) -> Form:
+        """The form of the value limited to [low, high]: itself where no limit is met, else an interval."""
+        least, most = self.range()
+        met = ~((least >= low) & (most <= high))
+        return self.boxed(met, np.clip(least, low, high), np.clip(most, low, high))
+
+    def among(self, index: Array) -> Form:
+        """Some of the n functions of every row [B, n]."""
+        return Form(self.c[:, index], self.g[:, :, index], self.r[:, index])
+
+    def take(self, order: Array) -> Form:
+        """The functions of every row in another order: ``order`` [B, n]."""
+        along = np.take_along_axis
+        return Form(along(self.c, order, 1), along(self.g, order[None], 2), along(self.r, order, 1))
+
+
+def parameters(middle: Array, half: Array) -> list[Form]:
+    """The d parameters over the boxes ``middle`` +- ``half`` [B, d], as forms [B]."""
+    d = middle.shape[1]
+    found = []
+    for k in range(d):
+        g = np.zeros((d, len(middle)))
+        g[k] = half[:, k]
+        found.append(Form(middle[:, k], g, 4.0 * U * (np.abs(middle[:, k]) + half[:, k])))
+    return found
+
+
+def product(a: list[list[Form]], b: list[list[Form]]) -> list[list[Form]]:
+    """Matrix product of forms."""
+    return [[total(row[k] * b[k][j] for k in range(len(b))) for j in range(len(b[0]))] for row in a]
+
+
+def total(items: Any) -> Form:
+    """Sum of forms."""
+    first, *rest = items
+    for item in rest:
+        first = first + item
+    return first
+
+
+def rotation(axis: Array, angle: Form) -> list[list[Form]]:
+    """Right-handed rotation about the unit vector ``axis``: I + sin K + (1 - cos) K^2."""
+    x, y, z = (float(v) for v in axis)
+    k = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    kk, (s, c) = k @ k, angle.sine()
+    rest = -c + 1.0
+    one = np.eye(3)
+    return [[s * k[i, j] + rest * kk[i, j] + one[i, j] for j in range(3)] for i in range(3)]
+
+
+def fixed(matrix: Array, like: Form, r: float = 0.0) -> list[list[Form]]:
+    """A matrix of numbers as forms."""
+    return [[Form.constant(v, like, r) for v in row] for row in np.atleast_2d(matrix)]

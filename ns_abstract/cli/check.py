@@ -1,0 +1,80 @@
+"""``ns-abstract-check``: audits a result with a program that shares no code with the bounds."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from ns_abstract.cli.common import run
+
+
+@dataclass
+class Check:
+    """Prove claims of a stored result again, drawn at random, with a second and much smaller program.
+
+    A claim says that one channel of a pixel stays between its bounds for every pose of one cell. Each is proved,
+    refuted by a pose, or left open when its time is over. Writes check.json into the folder. Exit codes: 0 nothing is
+    refuted; 1 a claim is refuted; 2 bad input; 3 fewer than 80 % of the claims were settled, or interrupted.
+    """
+
+    output_dir: Annotated[Path, tyro.conf.Positional]
+    """Output folder of ns-abstract-render --save-cells."""
+    claims: int = 200
+    """Number of claims to draw."""
+    seconds: float = 600.0
+    """Time for all of them."""
+    seed: int = 0
+    """Of the draws."""
+    load_config: Path | None = None
+    """config.yml or .ply, if it has been moved since."""
+    camera_path_filename: Path | None = None
+    """The camera path, if it has been moved since."""
+    perturbation_filename: Path | None = None
+    """The perturbation file, if it has been moved since."""
+
+
+def check(options: Check) -> int:
+    """Run the command; returns the exit code.
+
+    Raises:
+        InputError: A file, a field or an option cannot be used.
+    """
+    from ns_abstract.api.checking import check as audited
+
+    found = audited(
+        options.output_dir,
+        claims=options.claims,
+        seconds=options.seconds,
+        seed=options.seed,
+        load_config=options.load_config,
+        camera_path=options.camera_path_filename,
+        perturbation=options.perturbation_filename,
+    )
+    for text in found.structure:
+        print(f"refuted: {text}")
+    for entry in found.refutations[:10]:
+        row, column = entry["pixel"]
+        print(
+            f"refuted: frame {entry['frame']}, pixel ({row}, {column}), channel {entry['channel']}: "
+            f"{entry['value']:.6f} is beyond the {entry['bound']} bound by {entry['excess']:.2g} at {entry['pose']}"
+        )
+    print(
+        f"{found.claims} claims about the picture in {found.picture}: {found.proved} proved, {found.refuted} refuted, "
+        f"{found.unsettled} not settled; {found.median_seconds:.2g} s a claim"
+    )
+    share, count = found.uniform["holds_at_least"], found.uniform["claims"]
+    print(f"at least {100.0 * share:.1f} % of all claims hold (95 % confidence, {count} drawn uniformly)")
+    print(f"details: {options.output_dir / 'check.json'}")
+    return found.exit_code
+
+
+def main() -> None:
+    """Entry point of the console script."""
+    run(check, lambda: tyro.cli(Check, prog="ns-abstract-check"), "close other programs")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,464 @@
+"""The program that checks results: it is independent, its enclosures hold, and false results do not pass."""
+
+from __future__ import annotations
+
+import ast
+import dataclasses
+import hashlib
+import io
+import json
+import shutil
+import subprocess
+import sys
+import tokenize
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import mpmath
+import numpy as np
+import pytest
+import torch
+from conftest import InProcess, Inputs, blob_scene, environment, ring
+
+import ns_abstract as nsa
+from ns_abstract.api.checking import check
+from ns_abstract.check import audit
+from ns_abstract.check.forms import Form, parameters
+from ns_abstract.check.inputs import BadInput, read_poses
+from ns_abstract.check.poses import Camera, Poses
+from ns_abstract.check.results import partition, read_cells
+from ns_abstract.check.splats import Splats, activated, candidates, pixel_form
+from ns_abstract.cli import check as check_command
+from ns_abstract.geometry.camera_path import Camera as PathCamera
+from ns_abstract.geometry.poses import PoseSet
+from ns_abstract.methods.splat.constants import VERSIONS
+from ns_abstract.methods.splat.reference import Reference
+from ns_abstract.methods.splat.scene import SplatScene
+from ns_abstract.perturbation.specification import parse_perturbation
+
+FOLDER = Path(nsa.__file__).parent / "check"
+PLANT = Path(__file__).resolve().parents[1].parent / "shared" / "runs" / "plant"
+
+# ---------------------------------------------------------------- independence
+
+
+def lines_of_code(text: str) -> int:
+    """Lines that are no blank lines, comments or docstrings."""
+    silent = {tokenize.COMMENT, tokenize.NL, tokenize.NEWLINE, tokenize.INDENT, tokenize.DEDENT, tokenize.ENDMARKER}
+    tokens = [t for t in tokenize.generate_tokens(io.StringIO(text).readline) if t.type not in silent]
+    lines = {n for t in tokens for n in range(t.start[0], t.end[0] + 1)}
+    for node in ast.walk(ast.parse(text)):
+        if isinstance(node, (ast.Module, ast.ClassDef, ast.FunctionDef)) and ast.get_docstring(node) is not None:
+            lines -= set(range(node.body[0].lineno, (node.body[0].end_lineno or 0) + 1))
+    return len(lines)
+
+
+def test_it_shares_no_code_and_stays_small() -> None:
+    lines = 0
+    for file in FOLDER.glob("*.py"):
+        text = file.read_text(encoding="utf-8")
+        lines += lines_of_code(text)
+        for node in ast.walk(ast.parse(text)):
+            names = [a.name for a in node.names] if isinstance(node, ast.Import) else []
+            names += [node.module or ""] if isinstance(node, ast.ImportFrom) else []
+            for name in names:
+                assert not name.startswith("ns_abstract") or name.startswith("ns_abstract.check."), (file, name)
+    assert 0 < lines <= 1200
+
+
+# ---------------------------------------------------------------- enclosures
+
+OPERATIONS: dict[str, tuple[Callable[[Form], Form], Callable[[Any], Any]]] = {
+    "square": (lambda f: f.square(), lambda x: x * x),
+    "product": (lambda f: f * (f + 1.5), lambda x: x * (x + mpmath.mpf(1.5))),
+    "reciprocal": (lambda f: f.reciprocal(), lambda x: 1 / x),
+    "root": (lambda f: f.root(), mpmath.sqrt),
+    "exponential": (lambda f: f.exp(), mpmath.exp),
+    "sine": (lambda f: f.sine()[0], mpmath.sin),
+    "cosine": (lambda f: f.sine()[1], mpmath.cos),
+    "clamp": (lambda f: f.clamped(0.7, 1.9), lambda x: min(max(x, mpmath.mpf(0.7)), mpmath.mpf(1.9))),
+}
+
+
+@pytest.mark.parametrize("name", OPERATIONS)
+def test_forms_contain_exact_values(name: str) -> None:
+    enclose, exact = OPERATIONS[name]
+    rng = np.random.default_rng(5)
+    with mpmath.workprec(200):
+        for half in (0.0, 1e-9, 1e-3, 0.2):
+            middle = rng.uniform(0.5, 2.0, (20, 2))
+            radius = np.full((20, 2), half)
+            a, b = parameters(middle, radius)
+            # a + b / 8, which is exact enough in 200 bits
+            found = enclose(a + b * 0.125)
+            for k in range(20):
+                for s in rng.uniform(-1.0, 1.0, (8, 2)):
+                    x, y = (mpmath.mpf(m) + mpmath.mpf(half) * e for m, e in zip(middle[k], s.tolist(), strict=True))
+                    true = exact(x + y / 8)
+                    plane = mpmath.mpf(float(found.c[k])) + sum(
+                        mpmath.mpf(float(g)) * mpmath.mpf(float(e)) for g, e in zip(found.g[:, k], s, strict=True)
+                    )
+                    assert abs(true - plane) <= mpmath.mpf(float(found.r[k]))
+
+
+def test_what_is_not_defined_is_not_bounded() -> None:
+    form = Form(np.array([0.1, -1.0]), np.array([[0.2, 0.1]]), np.array([0.0, 0.0]))
+    assert np.isinf(form.reciprocal().r).all() and np.isinf(form.root().r).all()
+
+
+SPEC = {
+    "version": 1, "translation": {"x": 0.05, "y": 0.02}, "rotation": {"yaw": 0.03},
+    "orbit": {"target": [0, 0, 0.1], "axis": [0, 0.2, 1], "azimuth": [-0.3, 0.3]},
+}  # fmt: skip
+
+
+def splats_of(scene: SplatScene, version: str = "1.4.0") -> Splats:
+    return activated(
+        scene.means, scene.log_scales, scene.quats, scene.opacity_logits, scene.sh, sigmoid=False,
+        degree=scene.sh_degree, antialiased=scene.rasterize_mode == "antialiased", background=scene.background,
+        version=version,
+    )  # fmt: skip
+
+
+def cameras(pose: np.ndarray, focal: float) -> tuple[Camera, PathCamera]:
+    """One camera of 32 x 32 pixels, for both programs."""
+    values = (pose, focal, focal, 16.0, 16.0, 32, 32)
+    return Camera(*values), PathCamera(*values)
+
+
+def opaque(scene: SplatScene) -> SplatScene:
+    """The scene with opacities at which the rasteriser caps alphas and stops."""
+    return dataclasses.replace(scene, opacity_logits=3.0 * scene.opacity_logits)
+
+
+@pytest.mark.parametrize("version", VERSIONS)
+@pytest.mark.parametrize("mode", ["classic", "antialiased"])
+def test_pixels_contain_pictures_of_another_renderer(mode: str, version: str) -> None:
+    scene = dataclasses.replace(opaque(blob_scene(120, degree=3)), rasterize_mode=mode)
+    pose = np.asarray(ring()[1].camera_to_world, np.float64)[:3]
+    focal = 16.0 / np.tan(np.radians(45.0) / 2.0)
+    ours, theirs = cameras(pose, focal)
+    pose_set = PoseSet.around(theirs, parse_perturbation(SPEC))
+    poses = Poses(ours, pose_set.box.names, {}, False, (np.array([0, 0, 0.1]), np.array([0, 0.2, 1.0])))
+    splats, reference, rng = splats_of(scene, version), Reference(scene, VERSIONS[version]), np.random.default_rng(3)
+    narrow = 0
+    for half in (0.0, 1e-5, 1e-3, 0.01):
+        middle = rng.uniform(-0.9, 0.9, 4) * np.array([0.05, 0.02, 0.03, 0.3])
+        low, high = (middle - half)[None], (middle + half)[None]
+        places = [np.clip(middle + half * s, low[0], high[0]) for s in rng.uniform(-1.0, 1.0, (4, 4))]
+        pictures = [reference.image(theirs, torch.from_numpy(pose_set.pose(p))).numpy() for p in places]
+        for _ in range(40):
+            pixel, channel = tuple(int(v) for v in rng.integers(0, 32, 2)), int(rng.integers(3))
+            index = candidates(splats, poses, low[0], high[0], pixel)  # pyright: ignore[reportArgumentType]
+            form, kept, _ = pixel_form(splats, poses, low, high, index, pixel, channel)  # pyright: ignore[reportArgumentType]
+            again, _, _ = pixel_form(splats, poses, low, high, index[kept[0]], pixel, channel)  # pyright: ignore[reportArgumentType]
+            narrow += bool(form.r[0] < 1e-2)
+            for found in (form, again):
+                for p, picture in zip(places, pictures, strict=True):
+                    s = (p - middle) / half if half else np.zeros(4)
+                    value = found.c[0] + found.g[:, 0] @ s
+                    # what the other renderer's float64 errs by
+                    room = found.r[0] + 1e-10
+                    assert np.clip(value - room, 0, 1) <= picture[pixel][channel] + 1e-12
+                    assert np.clip(value + room, 0, 1) >= picture[pixel][channel] - 1e-12
+    assert narrow > 80
+
+
+def test_a_change_of_order_is_enclosed() -> None:
+    """Two Gaussians at nearly one depth, of other colours, seen from both sides of the tie."""
+    scene = blob_scene(2, degree=0)
+    scene = dataclasses.replace(
+        scene,
+        means=np.array([[-0.02, 0.0, 0.0], [0.02, 0.0, 0.0]], np.float32),
+        log_scales=np.full((2, 3), -2.0, np.float32),
+        opacity_logits=np.full(2, 2.0, np.float32),
+        sh=np.array([[[1.5, -1.5, 0.0]], [[-1.5, 1.5, 0.0]]], np.float32),
+    )
+    pose = np.array([[1.0, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 2.0]])
+    ours, theirs = cameras(pose, 40.0)
+    # far enough off the axis for the order to change by a small turn
+    pose_set = PoseSet.around(theirs, parse_perturbation({"version": 1, "rotation": {"yaw": 0.01}}))
+    poses, splats, reference = Poses(ours, ("yaw",)), splats_of(scene), Reference(scene)
+    low, high = np.array([[-0.01]]), np.array([[0.01]])
+    index = candidates(splats, poses, low[0], high[0], (16, 16))
+    form, _, _ = pixel_form(splats, poses, low, high, index, (16, 16), 0)
+    least, most = (float(v[0]) for v in form.range())
+    seen = [
+        float(reference.image(theirs, torch.from_numpy(pose_set.pose(np.array([yaw]))))[16, 16, 0])
+        for yaw in (-0.01, -1e-6, 1e-6, 0.01)
+    ]
+    assert max(seen) - min(seen) > 0.1
+    assert least <= min(seen) and max(seen) <= most
+
+
+def test_a_capped_alpha_lets_light_through() -> None:
+    """One opaque Gaussian in front of the background: 0.999 of its colour and a thousandth of the background's."""
+    scene = dataclasses.replace(
+        blob_scene(1, degree=0),
+        # in the middle of a pixel
+        means=np.array([[0.025, -0.025, 0.0]], np.float32),
+        log_scales=np.full((1, 3), -1.0, np.float32),
+        opacity_logits=np.full(1, 12.0, np.float32),
+        sh=np.zeros((1, 1, 3), np.float32),
+        background=np.ones(3, np.float32),
+    )
+    ours, _ = cameras(np.array([[1.0, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 2.0]]), 40.0)
+    poses, splats, box = Poses(ours, ("x",)), splats_of(scene), np.array([[0.0]])
+    form, _, _ = pixel_form(splats, poses, box, box, np.arange(1), (16, 16), 0)
+    assert abs(form.c[0] - (0.999 * 0.5 + 0.001)) <= form.r[0] < 1e-12
+
+
+def test_a_stop_that_is_open_is_enclosed() -> None:
+    """Behind 0.999 the rasteriser stops at an alpha of 0.9, which a second Gaussian has for some poses of a box."""
+    scene = dataclasses.replace(
+        blob_scene(2, degree=0),
+        means=np.array([[0.0, 0.0, 0.0], [0.0, 0.0, -0.5]], np.float32),
+        log_scales=np.array([[-1.0] * 3, [-2.0] * 3], np.float32),
+        opacity_logits=np.array([12.0, 2.9], np.float32),
+        sh=np.array([[[0.0] * 3], [[-1.7] * 3]], np.float32),
+        background=np.ones(3, np.float32),
+    )
+    ours, theirs = cameras(np.array([[1.0, 0, 0, -0.0125], [0, 1, 0, 0.0125], [0, 0, 1, 2.0]]), 40.0)
+    pose_set = PoseSet.around(theirs, parse_perturbation({"version": 1, "translation": {"x": 0.06}}))
+    poses, splats, reference = Poses(ours, ("x",)), splats_of(scene), Reference(scene)
+    low, high = np.array([[-0.06]]), np.array([[0.06]])
+    seen = [
+        float(reference.image(theirs, torch.from_numpy(pose_set.pose(np.array([x]))))[16, 16, 0])
+        for x in np.linspace(-0.06, 0.06, 61)
+    ]
+    assert max(np.abs(np.diff(seen))) > 5e-4
+    form, _, _ = pixel_form(splats, poses, low, high, np.arange(2), (16, 16), 0)
+    values = form.c[0] + form.g[0, 0] * np.linspace(-1.0, 1.0, 61)
+    assert (np.abs(values - seen) <= form.r[0] + 1e-12).all()
+    # the enclosure knows where it stops
+    parts = np.linspace(-0.06, 0.06, 2001)[:, None]
+    form, _, _ = pixel_form(splats, poses, parts[:-1], parts[1:], np.arange(2), (16, 16), 0)
+    assert np.median(form.r) < 1e-6 and form.r.max() > 4e-4
+
+
+def test_a_claim_is_about_both_bounds() -> None:
+    def excess(most: float, plane: float) -> tuple[float, float]:
+        slope, low, high = np.zeros(1), np.zeros(1), np.ones(1)
+        bounds = audit._Bounds(0.2, most, low, high, ((slope, 0.3), (slope, plane)))
+        half, c, g, r = np.full((1, 1), 0.5), np.full(1, 0.5), np.full((1, 1), 0.01), np.zeros(1)
+        below, above = bounds.excess(half, half, c, g, r)
+        return float(below[0]), float(above[0])
+
+    assert max(excess(0.8, 0.7)) <= 0.0
+    assert excess(0.505, 0.7)[1] > 0.0 and excess(0.8, 0.505)[1] > 0.0
+
+
+def test_a_file_with_another_digest_is_refused(tmp_path: Path) -> None:
+    np.savez(tmp_path / "frame_00000.npz", lower=np.zeros(3))
+    with pytest.raises(BadInput, match="sha256"):
+        read_cells(tmp_path, "frame_00000.npz", 0, "0" * 64)
+
+
+def test_partitions_are_exact() -> None:
+    low, high = np.array([[0.0], [0.1]]), np.array([[0.1], [0.3]])
+    first, last = np.array([0.0]), np.array([0.3])
+    assert partition(low, high, first, last)
+    assert not partition(low, np.array([[np.nextafter(0.1, 0)], [0.3]]), first, last)
+    assert not partition(low, np.array([[np.nextafter(0.1, 1)], [0.3]]), first, last)
+    assert not partition(low[:1], high[:1], first, last)
+
+
+def test_the_least_part_is_that_of_clopper_and_pearson() -> None:
+    # all of n: 0.05^(1/n)
+    assert audit.least_part(59, 59) == pytest.approx(0.05 ** (1 / 59), rel=1e-9)
+    assert audit.least_part(0, 10) == 0.0
+    # tables: 8 of 10, one-sided 95 %
+    assert audit.least_part(8, 10) == pytest.approx(0.4931, abs=1e-4)
+
+
+# ---------------------------------------------------------------- results
+
+
+@pytest.fixture(scope="module")
+def result(blobs: Inputs, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("checked") / "out"
+    rendered(blobs.options(folder, frames=[0], time_budget=15, save_cells=True))
+    return folder
+
+
+def rendered(options: list[str]) -> None:
+    done = subprocess.run(
+        [sys.executable, "-m", "ns_abstract.cli.render", *options],
+        capture_output=True, text=True, timeout=600, check=False, env=environment(),
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+
+
+@pytest.fixture
+def copy(result: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(result, tmp_path / "copy"))
+
+
+def rewrite(folder: Path, change: Callable[[dict[str, np.ndarray]], object], frame: int = 0) -> None:
+    """Change a frame file's arrays, and its digest, as who forges a result would."""
+    file = folder / f"frame_{frame:05d}.npz"
+    with np.load(file, allow_pickle=False) as archive:
+        arrays = {name: archive[name] for name in archive.files}
+    change(arrays)
+    np.savez(file, **arrays)  # pyright: ignore[reportArgumentType]
+    report(folder, lambda d: d["sha256"].update({file.name: hashlib.sha256(file.read_bytes()).hexdigest()}))
+
+
+def report(folder: Path, change: Callable[[dict[str, Any]], object]) -> None:
+    file = folder / "report.json"
+    document = json.loads(file.read_text())
+    change(document)
+    file.write_text(json.dumps(document))
+
+
+def test_a_sound_result_is_proved(copy: Path) -> None:
+    found = check(copy, claims=30, seconds=200)
+    assert (found.claims, found.refuted, found.structure) == (30, 0, [])
+    assert found.proved >= 27 and found.exit_code == 0
+    assert found.uniform["claims"] == 15 and found.uniform["holds_at_least"] > 0.5
+    stored = json.loads((copy / "check.json").read_text())
+    assert [stored[name] for name in ("claims", "proved", "refuted", "unsettled", "refutations")] == [
+        found.claims, found.proved, found.refuted, found.unsettled, [],
+    ]  # fmt: skip
+
+
+@pytest.mark.parametrize("version", ["1.4.0", "1.5.3", "1.6.0"])
+def test_antialiased_results_of_every_version_are_proved(
+    version: str, make_blobs: Callable[..., Inputs], tmp_path: Path
+) -> None:
+    scene = dataclasses.replace(opaque(blob_scene()), rasterize_mode="antialiased")
+    spec = {"version": 1, "translation": {"x": 0.01}, "rotation": {"yaw": 0.005, "roll": [0, 0.01]}}
+    inputs = make_blobs(scene=scene, spec=spec)
+    more = {"time_budget": 4, "save_cells": True, "gsplat_version": version, "arithmetic": "real"}
+    rendered(inputs.options(tmp_path / "out", frames=[1], **more))
+    found = check(tmp_path / "out", claims=20, seconds=100)
+    assert found.refuted == 0 and found.proved >= 16 and found.exit_code == 0
+
+
+def test_bounds_moved_inward_are_refuted(copy: Path) -> None:
+    def inward(a: dict[str, np.ndarray]) -> None:
+        # where renders come: beyond them by 2e-3
+        wide = a["witness_upper"] - a["witness_lower"] > 0.05
+        a["upper"] = np.where(wide, a["witness_upper"] - np.float32(2e-3), a["upper"])
+
+    rewrite(copy, inward)
+    found = check(copy, claims=30, seconds=60)
+    assert found.refuted > 0 and found.exit_code == 1
+    worst = found.refutations[0]
+    assert worst["bound"] == "upper" and worst["error"] < 1e-6 and worst["excess"] > worst["error"]
+
+
+@pytest.mark.parametrize("side", ["lower", "upper"])
+def test_linear_sets_moved_inward_are_never_proved(copy: Path, side: str) -> None:
+    def inward(a: dict[str, np.ndarray]) -> None:
+        middle = 0.5 * (a["b_lower"] + a["b_upper"])
+        a[f"b_{side}"] = middle + (np.float32(0.003) if side == "lower" else np.float32(-0.003))
+
+    rewrite(copy, inward)
+    found = check(copy, claims=20, seconds=40)
+    # a picture of the middle of [0, 1] cannot keep to a set without width
+    assert found.refuted >= 8
+    assert all(entry["bound"] in ("lower", "upper") for entry in found.refutations)
+
+
+def test_cells_that_leave_a_gap_are_refuted(copy: Path, in_process: InProcess) -> None:
+    rewrite(copy, lambda a: a["box_lower"].__setitem__((0, 0), np.nextafter(a["box_lower"][0, 0], 1.0)))
+    code, out, _ = in_process(check_command.main, [str(copy), "--claims", "4"])
+    assert code == 1 and "no partition of the set" in out
+
+
+def test_too_little_time_is_no_success(copy: Path, in_process: InProcess) -> None:
+    code, out, _ = in_process(check_command.main, [str(copy), "--claims", "50", "--seconds", "0.001"])
+    assert code == 3 and "50 not settled" in out
+
+
+BAD: dict[str, tuple[Callable[[Path], object], str]] = {
+    "another file": (lambda f: (f / "frame_00000.npz").write_bytes(b"PK"), "sha256"),
+    "forged": (lambda f: report(f, lambda d: d["sha256"].update({"frame_00000.npz": "0" * 64})), "sha256"),
+    "no cells": (lambda f: rewrite(f, lambda a: a.pop("box_lower")), "--save-cells"),
+    "another type": (lambda f: rewrite(f, lambda a: a.update(lower=a["lower"].astype("f8"))), "lower is not float32"),
+    "another shape": (lambda f: rewrite(f, lambda a: a.update(b_lower=a["b_lower"][:-1])), "b_lower is not float32"),
+    "not finite": (lambda f: rewrite(f, lambda a: a["A_lower"].fill(np.nan)), "not finite"),
+    "another version": (lambda f: report(f, lambda d: d.update(version=2)), "version"),
+    "another scene": (lambda f: report(f, lambda d: d["fingerprint"].update(scene="0")), "not the scene"),
+    "another mode": (lambda f: report(f, lambda d: d["scene"].update(rasterize_mode="antialiased")), "another mode"),
+    "another program": (lambda f: report(f, lambda d: d["renderer"].update(name="paper")), "gsplat alone"),
+    "moved run": (lambda f: report(f, lambda d: d["settings"].update(load_config="/nowhere")), "--load-config"),
+    "moved path": (
+        lambda f: report(f, lambda d: d["settings"].update(camera_path_filename="/nowhere.json")),
+        "--camera-path-filename",
+    ),
+    "a certificate": (lambda f: (f / "cells.sqlite").touch(), "holds the cells of a certificate"),
+    "no report": (lambda f: (f / "report.json").unlink(), "ns-abstract-render"),
+    "damaged report": (lambda f: (f / "report.json").write_text("{"), "cannot be read"),
+    "a report of something else": (lambda f: (f / "report.json").write_text('{"version": 1}'), "settings"),
+}
+
+
+@pytest.mark.parametrize("name", BAD)
+def test_bad_input_is_one_line(name: str, copy: Path, in_process: InProcess) -> None:
+    damage, words = BAD[name]
+    damage(copy)
+    code, out, err = in_process(check_command.main, [str(copy), "--claims", "2"])
+    assert (code, out, len(err.splitlines())) == (2, "", 1)
+    assert words in err and err.startswith("error: ")
+    assert not (copy / "check.json").exists()
+
+
+def test_a_pickle_in_a_frame_file_is_not_run(copy: Path, in_process: InProcess, tmp_path: Path) -> None:
+    class Evil:
+        def __reduce__(self) -> Any:
+            return (Path.touch, (tmp_path / "ran",))
+
+    file = copy / "frame_00000.npz"
+    with np.load(file, allow_pickle=False) as archive:
+        arrays = {name: archive[name] for name in archive.files}
+    np.savez(file, **(arrays | {"tile": np.array([Evil()], object)}), allow_pickle=True)  # pyright: ignore[reportArgumentType]
+    report(copy, lambda d: d["sha256"].update({file.name: hashlib.sha256(file.read_bytes()).hexdigest()}))
+    code, _, _ = in_process(check_command.main, [str(copy)])
+    assert code == 2 and not (tmp_path / "ran").exists()
+
+
+def test_another_set_of_poses_is_refused(copy: Path, blobs: Inputs, tmp_path: Path) -> None:
+    other = tmp_path / "spec.json"
+    other.write_text(json.dumps({"version": 1, "translation": {"x": 0.02}}))
+    with pytest.raises(nsa.InputError, match="another set of poses"):
+        check(copy, perturbation=other)
+    other.write_text(blobs.spec.read_text())
+    assert check(copy, claims=2, perturbation=other, camera_path=blobs.path, load_config=blobs.config).refuted == 0
+
+
+@pytest.mark.parametrize(
+    "spec",
+    [
+        {"translation": {"x": 0.1}, "frame": "world", "rotation": {"roll": [0, 0.02], "pitch": 0.01}},
+        {"sweep": "segments", "translation": {"z": [0.01, 0.01]}, "rotation": {"yaw": 1.0}, "angle_units": "degrees"},
+        {
+            "orbit": {"target": [0, 0, 0], "axis": [1, 2, 3], "azimuth": [0.5, 1.0]},
+            "units": "dataset",
+            "translation": {"y": 1},
+        },
+    ],
+)
+def test_poses_are_those_of_the_perturbation_file(blobs: Inputs, spec: dict[str, Any]) -> None:
+    poses, free = read_poses(blobs.path, spec, 0, {}, 0.25)
+    path = nsa.load_camera_path(blobs.path)
+    theirs = PoseSet.around(path.cameras[0], parse_perturbation(spec, dataset_scale=0.25), path.cameras[1])
+    assert free == list(zip(theirs.box.names, theirs.box.lower, theirs.box.upper, strict=True))
+    rng = np.random.default_rng(1)
+    low, high = (np.array([[e[k] for e in free]]) for k in (1, 2))
+    for _ in range(20):
+        p = rng.uniform(low, high)
+        back, _, origin = poses.view(p, p)
+        expected = theirs.pose(p[0])
+        found = np.array([[float(e.c[0]) for e in row] for row in back])
+        assert np.abs(found - (expected[:, :3] * [1.0, -1.0, -1.0]).T).max() < 1e-13
+        assert np.abs(origin[0] - expected[:, 3]).max() < 1e-13
+
+
+def test_a_keyframes_camera_is_that_of_the_path(blobs: Inputs) -> None:
+    poses, _ = read_poses(blobs.path, {}, 1, {"downscale_factor": 3.0}, 1.0)
+    theirs = nsa.load_camera_path(blobs.path, 3.0).cameras[1]
+    for name in ("fx", "fy", "cx", "cy", "width", "height"):
+        assert getattr(poses.camera, name) == getattr(theirs, name)
