@@ -369,6 +369,8 @@ class Composer(Builder):
     def _centred(self, squares: int) -> int:
         """The node whose numbers less a mean of them are squared in node ``squares``; -1: none."""
         node = self._node(squares)
+        while node is not None and type(node.layer) is Linear:
+            node = self._node(node.inputs[0])
         if node is None or not isinstance(node.layer, curves.Power) or node.layer.exponent != 2:
             return -1
         apart = self._node(node.inputs[0])

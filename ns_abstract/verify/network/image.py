@@ -1,4 +1,4 @@
-"""Sets of images as rows and forms want them, relative to a reference (docs/design.md, N, N0)."""
+"""Sets of images as rows and forms want them, relative to a reference (docs/design.md, N, N0, N22)."""
 
 from __future__ import annotations
 

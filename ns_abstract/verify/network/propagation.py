@@ -1,4 +1,4 @@
-"""How forms pass linear layers, activations and products, and what rows take there (docs/design.md, N1-N4, N9)."""
+"""How forms pass linear layers, activations and products (docs/design.md, N1-N4, N9, N21, N22)."""
 
 from __future__ import annotations
 
