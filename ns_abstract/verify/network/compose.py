@@ -125,7 +125,7 @@ class Composer(Builder):
         return self._add(make(self.shape(x), **settings), x)
 
     def doubt(self, index: int, weight: Doubts | None, offset: Doubts | None) -> int:
-        """The last layer again, whose constants are known within bounds alone (N24)."""
+        """The last layer again, whose constants are known within bounds alone (N23)."""
         if weight is None and offset is None:
             return index
         node = self.nodes[index - 1]

@@ -1,4 +1,4 @@
-"""Layers whose constants are known within bounds only: what programs compute of stored constants (N24)."""
+"""Layers whose constants are known within bounds only: what programs compute of stored constants (N23)."""
 
 from __future__ import annotations
 

@@ -412,7 +412,7 @@ class Reader:
         self.builder.doubt(found.number, self.doubted[names[0]], None)
 
     def _check_exact(self, node: dict[str, Any], made: list[Any]) -> None:
-        """Refuse results that float32 rounds: another order of the same sums gives others (N24)."""
+        """Refuse results that float32 rounds: another order of the same sums gives others (N23)."""
         wide = {k: v.astype(np.float64) for k, v in self.constants.items() if getattr(v, "dtype", None) == np.float32}
         again = self.by_torch(node, wide)
         parts = again if isinstance(again, (list, tuple)) else [again]

@@ -1,4 +1,4 @@
-"""Quantised ONNX files: weights stored as integers, and values that are rounded to steps on the way (N26)."""
+"""Quantised ONNX files: weights stored as integers, and values that are rounded to steps on the way (N25)."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
 """Functions that a graph spells out with constants of its own: bounded as they stand, not as what they resemble.
 
 A file's 0.70710677 is not ``1 / sqrt(2)``. In exact arithmetic the difference may decide a verdict, so that the
-curves here take the file's numbers (docs/design.md, N25).
+curves here take the file's numbers (docs/design.md, N24).
 """
 
 from __future__ import annotations
@@ -79,7 +79,7 @@ class SwitchedSoftplus(curves.Softplus):
 
 @dataclass(frozen=True, eq=False)
 class Quantised(curves.Clip):
-    """``step * min(max(round(z / step), low), high)``, enclosed by the clipped z and half a step (N26).
+    """``step * min(max(round(z / step), low), high)``, enclosed by the clipped z and half a step (N25).
 
     `function` is the clipped z; a call gives the steps, whose gradient is that of the clipped z.
     ``least`` and ``most`` are ``step * low`` and ``step * high``.
