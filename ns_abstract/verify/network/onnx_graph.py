@@ -176,7 +176,9 @@ class Reader:
         if len(sizes) == 4 and asked.picture is not None:
             places = (1, 2) if asked.last else (2, 3)
             for place, size in zip(places, asked.picture, strict=True):
-                sizes[place] = sizes[place] or size
+                side = kind.shape.dim[place]
+                if not side.HasField("dim_value") or side.dim_value < 0:
+                    sizes[place] = size
         if asked.vector and len(sizes) == 1 and sizes[0] > 0:
             return value.name, Value(0, tuple(sizes))
         if len(sizes) == 4 and sizes[0] > 1:

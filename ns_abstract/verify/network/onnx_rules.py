@@ -211,7 +211,7 @@ def _cast(r: Reader, node: onnx.NodeProto, a: Attributes) -> None:
     a.ignore("saturate")
     if a.get("to") not in (onnx.TensorProto.FLOAT, onnx.TensorProto.DOUBLE):
         name = onnx.TensorProto.DataType.Name(int(a.get("to", 0)))
-        fix = "write model.float() before the export" if "FLOAT16" in name else "export the network in float32"
+        fix = "export the network in float32" + (": write model.float() before it" if "FLOAT16" in name else "")
         raise InputError(f"attribute to = {name} is not supported", fix=fix)
     r.values[node.output[0]] = x
 
