@@ -141,7 +141,7 @@ def _refuse_other_class(run: runs.RunConfig) -> None:
 def _background(run: runs.RunConfig, overrides: Overrides) -> tuple[Assumption, NDArray[np.float32]]:
     """The record of the background's choice, and its colour."""
     named, origin = "background_color" in run.model, "config.yml: pipeline.model.background_color"
-    if run.model.get("background_color") == "last_sample":
+    if str(run.model.get("background_color")).lower() == "last_sample":
         if overrides.background is None:
             raise InputError(
                 "last_sample, which continues the colour of a ray's last sample, is not supported",
