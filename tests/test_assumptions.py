@@ -7,9 +7,11 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from certifying import classifier
 from conftest import InProcess, Inputs, blob_scene
+from nerfs import tiny_scene, view
 
 import ns_abstract as nsa
 from ns_abstract.api.certification import CertifySettings, open_certification
@@ -18,10 +20,12 @@ from ns_abstract.api.files import Settings, open_job
 from ns_abstract.api.reaching import open_loop
 from ns_abstract.cli import render as render_command
 from ns_abstract.demo.writing import write_loop_demo
+from ns_abstract.geometry.views import View, path_json
 from ns_abstract.io.assumptions import Assumption
 from ns_abstract.io.atomic import write_json
+from ns_abstract.methods.nerf.write import write_nerf_run
 from ns_abstract.methods.overrides import Overrides
-from ns_abstract.methods.splat.write import write_ply
+from ns_abstract.methods.splat.ply import write_ply
 from ns_abstract.report.page import reproduce
 from ns_abstract.report.record import Report, Run
 
@@ -43,7 +47,8 @@ def test_defaults_and_options_of_a_run(blobs: Inputs) -> None:
     assert found["varied"][1] == "spec.json" and {"rasterize_mode", "background", "load_step", "units"} <= set(found)
     assert found["rasterize_mode"] == ("classic", "config.yml: pipeline.model.rasterize_mode")
     given = Settings(
-        blobs.config, blobs.path, None, 2.0, "gsplat", "1.5.3", "real", given_set={"version": 1, "rotation": {"yaw": 0.1}},
+        blobs.config, blobs.path, None, 2.0, "gsplat", "1.5.3", "real",
+        given_set={"version": 1, "rotation": {"yaw": 0.1}},
         overrides=Overrides("antialiased", (0.0, 0.5, 1.0)),
     )  # fmt: skip
     found = table(open_job(given).assumptions)
@@ -135,9 +140,15 @@ def test_page_escapes(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("sampling", [None, "hierarchical"])
 def test_nerf(sampling: str | None, tmp_path: Path) -> None:
-    from nerfs import write_run
-
-    config, path = write_run(tmp_path)
-    found = table(open_job(Settings(config, path, sampling=sampling, num_samples=None)).assumptions)
+    config = write_nerf_run(tiny_scene(1), tmp_path / "runs", timestamp="t", experiment_name="tiny")
+    pose = np.eye(4)
+    pose[:3] = view().camera_to_world
+    path = write_json(tmp_path / "path.json", path_json([View(pose, 40.0, 3, 4)]))
+    spec = write_json(tmp_path / "spec.json", {"version": 1, "rotation": {"yaw": 0.002}})
+    found = table(open_job(Settings(config, path, spec, sampling=sampling)).assumptions)
+    samples = ("num_samples", "default") if sampling is None else (
+        "num_coarse_samples", "the run: pipeline.model.num_coarse_samples"
+    )  # fmt: skip
+    assert found[samples[0]] == ("64", samples[1]) and found["near_plane"] == ("0", "default")
     assert found["arithmetic"] == ("real", "default") and found["device"] == ("cpu", "default")
     assert found["renderer"] == (f"nerf-{sampling or 'uniform'}", "default" if sampling is None else "--sampling")
