@@ -205,7 +205,7 @@ def _weights(change: Callable[[dict[str, Any]], None]) -> Change:
 
 
 def _nan(pipeline: dict[str, Any]) -> None:
-    pipeline["_model.gauss_params.means"][3, 1] = float("nan")
+    pipeline["_model.gauss_params.opacities"][3, 0] = float("nan")
 
 
 def _matrix(x: float, y: float, z: float) -> list[float]:
@@ -230,7 +230,7 @@ MISTAKES: dict[str, tuple[Change, tuple[str, ...]]] = {
     "half a checkpoint": (_half_checkpoint, ("step-000029999.ckpt",)),
     "checkpoint is text": (text("checkpoint", "weights"), ("step-000029999.ckpt", "not a PyTorch checkpoint")),
     "no Gaussians": (_weights(lambda p: p.pop("_model.gauss_params.means")), ("gauss_params.means",)),
-    "NaN among the means": (_weights(_nan), ("gauss_params.means", "not finite", "row 3")),
+    "NaN among the opacities": (_weights(_nan), ("gauss_params.opacities", "row 3")),
     "transform is no JSON": (text("transforms", "{"), ("dataparser_transforms.json", "JSON")),
     "a checkpoint as scene": (lambda i: {"load_config": i.checkpoint}, (".ckpt", "config.yml")),
     # the camera path

@@ -18,6 +18,7 @@ from extreme_networks import (
     convolution,
     gemm,
     layer_norm,
+    one_pass,
     plain,
     power,
     random_maps,
@@ -86,6 +87,17 @@ def test_norms_of_one_pass(op: bool, mean: float, spread: float, tmp_path: Path)
     # two passes would do: the exact network's bounds are close
     low, high = bounds(read_onnx(tmp_path / "net.onnx"), x, x, "real")
     assert (low <= exact + 1e-6).all() and (high - low < 1e-6).all()
+
+
+@pytest.mark.parametrize("op", [True, False])
+def test_variances_below_zero(op: bool, tmp_path: Path) -> None:
+    """Where one pass has no root, or one of next to nothing, nothing is known."""
+    net, lost = Extreme((64,), [layer_norm(64, op=op)]), 0
+    for seed in range(12):
+        x = (15.103 + 1e-3 * np.random.default_rng(seed).normal(size=64)).astype(np.float32)
+        within(net, tmp_path, x, x)
+        lost += not bool(torch.isfinite(one_pass(torch.from_numpy(x[None]), 1e-5)).all())
+    assert lost > 0
 
 
 @pytest.mark.parametrize("op", ["InstanceNormalization", "GroupNorm"])
@@ -169,25 +181,33 @@ ONE = np.ones(1)
 
 
 def tiny_factors() -> dict[str, list[Layer]]:
-    """Layers whose constants, or products of them, are subnormal, with a factor behind that makes them count."""
+    """Layers whose constants, or products of them, are subnormal, with factors behind that make them count."""
+
+    def times(power: int) -> Layer:
+        return scale(2.0**power * ONE, 0.0 * ONE)
+
+    def loud(power: int) -> list[Layer]:
+        # an activation between, so that no grouping overflows, nor do rows
+        return [times(110), plain("Abs", torch.abs), times(power - 110)]
+
     half = gemm(np.full((1, 1), 2.0**-64), np.zeros(1))
-    loud = scale(2.0**120 * ONE, 0.0 * ONE)
-    weights = gemm(np.full((1, 1), 2.0**-130), np.zeros(1))
+    tiny = scale(-(2.0**-127) * ONE, 0.0 * ONE)
     return {
-        "weights": [weights, loud, scale(2.0**10 * ONE, 0.0 * ONE)],
-        "scale": [scale(2.0**-130 * ONE, 0.0 * ONE), loud, scale(2.0**10 * ONE, 0.0 * ONE)],
-        "product of weights": [half, scale(2.0**-64 * ONE, 0.0 * ONE), loud, scale(2.0**8 * ONE, 0.0 * ONE)],
-        "folded forwards": [scale(2.0**-64 * ONE, 0.0 * ONE), half, loud, scale(2.0**8 * ONE, 0.0 * ONE)],
-        "batch norm": [batch_norm(2.0**-128 * ONE, 0.0 * ONE, 0.0 * ONE, 2.0**-40 * ONE, 2.0**-60), loud],
-        "leaky": [scale(-(2.0**-120) * ONE, 0.0 * ONE), leaky(2.0**-7), loud, scale(2.0**7 * ONE, 0.0 * ONE)],
-        "slope": [scale(-ONE, 0.0 * ONE), leaky(2.0**-130), loud, scale(2.0**10 * ONE, 0.0 * ONE)],
-        "relu": [scale(2.0**-127 * ONE, 0.0 * ONE), plain("Relu", torch.relu), loud, scale(2.0**7 * ONE, 0.0 * ONE)],
-        "abs": [scale(-(2.0**-127) * ONE, 0.0 * ONE), plain("Abs", torch.abs), loud, scale(2.0**7 * ONE, 0.0 * ONE)],
-        "clip": [scale(2.0**-127 * ONE, 0.0 * ONE), clip(-1.0, 1.0), loud, scale(2.0**7 * ONE, 0.0 * ONE)],
-        "square": [scale(2.0**-64 * ONE, 0.0 * ONE), power(2.0), loud, scale(2.0**8 * ONE, 0.0 * ONE)],
-        "root": [scale(2.0**-130 * ONE, 0.0 * ONE), power(0.5), scale(2.0**64 * ONE, 0.0 * ONE)],
-        "exponential": [scale(-70.0 * ONE, 0.0 * ONE), plain("Exp", torch.exp), loud, scale(2.0**-20 * ONE, 0.0 * ONE)],
-        "limit": [clip(2.0**-128, 1.0), loud, scale(2.0**8 * ONE, 0.0 * ONE)],
+        "weights": [gemm(np.full((1, 1), 2.0**-130), np.zeros(1)), *loud(120)],
+        "scale": [times(-130), *loud(120)],
+        "product of weights": [half, times(-64), *loud(120)],
+        "folded forwards": [times(-64), half, *loud(120)],
+        "batch norm": [batch_norm(2.0**-128 * ONE, 0.0 * ONE, 0.0 * ONE, 2.0**-40 * ONE, 2.0**-60), *loud(108)],
+        "leaky": [scale(-(2.0**-120) * ONE, 0.0 * ONE), leaky(2.0**-7)],
+        "leaky, loud": [scale(-(2.0**-120) * ONE, 0.0 * ONE), leaky(2.0**-7), *loud(120)],
+        "slope": [scale(-ONE, 0.0 * ONE), leaky(2.0**-130), *loud(120)],
+        "relu": [times(-127), plain("Relu", torch.relu), *loud(120)],
+        "abs": [tiny, plain("Abs", torch.abs), *loud(120)],
+        "clip": [tiny, clip(-1.0, 1.0), *loud(120)],
+        "square": [times(-64), power(2.0), *loud(120)],
+        "root": [times(-130), power(0.5), times(64)],
+        "exponential": [scale(-70.0 * ONE, 0.0 * ONE), plain("Exp", torch.exp), *loud(100)],
+        "limit": [clip(2.0**-128, 1.0), *loud(120)],
     }
 
 
@@ -199,12 +219,14 @@ def leaky(alpha: float) -> Layer:
 def test_flushed_numbers(name: str, tmp_path: Path) -> None:
     """Subnormal numbers that are kept or flushed to zero, before and behind every kind of layer."""
     net = Extreme((1,), tiny_factors()[name])
-    for low, high in ((1.25, 1.25), (1.25, 1.5), (-1.5, 1.25), (300.0, 300.0)):
+    for low, high in ((1.25, 1.25), (1.25, 1.5), (-1.5, 1.25), (3000.0, 3000.0)):
         within(net, tmp_path, low * ONE, high * ONE)
 
 
 def test_flushed_images(tmp_path: Path) -> None:
     """Images of subnormal numbers."""
+    root = Extreme((1,), [power(0.5), scale(2.0**63 * ONE, 0.0 * ONE)])
+    within(root, tmp_path, 2.0**-127 * ONE, 2.0**-127 * ONE)
     for layer in (scale(HUGE * ONE, 0.0 * ONE), gemm(np.full((1, 1), HUGE), np.zeros(1))):
         within(Extreme((1,), [layer, scale(2.0**27 * ONE, 0.0 * ONE)]), tmp_path, 2.0**-127 * ONE, 2.0**-126 * ONE)
 
@@ -222,6 +244,7 @@ def overflowing() -> dict[str, tuple[list[Layer], float]]:
     )
     return {
         "power": ([steep, power(8.0), shrink], 1.0),
+        "power at the end": ([power(8.0)], 1e5),
         "reciprocal": ([scale(2.0**-120 * ONE, 0.0 * ONE), power(-1.0), power(-1.0)], 2.0**-9),
         "exponential": ([plain("Exp", torch.exp), shrink], 89.0),
         "square": ([scale(HUGE * ONE, 0.0 * ONE), power(2.0), power(-0.5)], 1.0),
@@ -294,6 +317,22 @@ def test_shifts_that_are_folded_forwards(kind: str, tmp_path: Path) -> None:
     # a folded program is off by far more than sums of the differences
     assert max(abs(float(Fraction(float(v)) - e)) for v, e in zip(y, exact, strict=True)) > 1e-3
     assert not outside(y[None].astype(np.float64), low, high).any()
+
+
+def test_folded_biases_lose_sums(tmp_path: Path) -> None:
+    """A folded program may lose all products but the first, and its bias none."""
+    n = 4000
+    weight = np.full((1, n), np.float32(0.99 * 2.0**-15 / 1000.0))
+    weight[0, 0] = 1.0
+    x = np.full(n, 1000.0, np.float32)
+    net = Extreme((n,), [scale(np.ones(n), np.full(n, -1000.0)), gemm(weight, np.zeros(1))])
+    low, high, _ = within(net, tmp_path, x, x)
+    total, bias = np.float32(0.0), np.float32(0.0)
+    for w in weight[0]:
+        total = total + w * np.float32(1000.0)
+    for w in weight[0, ::-1]:
+        bias = bias - w * np.float32(1000.0)
+    assert abs(float(total + bias)) > 0.1 and low[0] <= total + bias <= high[0]
 
 
 # ---------------------------------------------------------------- networks at random
