@@ -32,7 +32,7 @@ def scene_choices(scene: Scene, method: Method, arithmetic: str | None) -> tuple
         ]
     renderer = "--sampling" if options.renderer is None and options.sampling is not None else "--renderer"
     found.append(choice("renderer", program["name"], options.renderer or options.sampling, renderer))
-    if not scene.rays:
+    if "sampling" not in program:
         default = "--renderer" if options.renderer == "paper" else DEFAULT
         found.append(
             choice("renderer version", program["version"], options.gsplat_version, "--gsplat-version", default)
