@@ -659,6 +659,7 @@ def test_report(planted: Case, finished: Path) -> None:
     for key in (
         "version", "verdict", "guarantee", "guarantee_text", "network_guarantee", "renderer", "scene", "model",
         "property", "coverage", "sampled", "frames", "trace", "seconds", "plan", "settings", "fingerprint", "command",
+        "assumptions",
     ):  # fmt: skip
         assert key in document, key
     assert document["guarantee"] == "float32-sound" and document["model"]["input"] == [3, SIZE, SIZE]

@@ -23,6 +23,7 @@ from test_report import frame, read, run
 import ns_abstract
 from ns_abstract.io.errors import InputError
 from ns_abstract.io.folder import MARK, claim, remove_parts, unwritable
+from ns_abstract.io.version import computed_by
 from ns_abstract.report.export import Results
 from ns_abstract.report.files import load_frame, save_frame
 from ns_abstract.report.record import Report
@@ -357,7 +358,7 @@ def test_seals_know_rows_and_no_order() -> None:
 
 
 def test_an_edited_frame_is_computed_again(tmp_path: Path) -> None:
-    report = Report(tmp_path, run(frames=(0, 1)))
+    report = Report(tmp_path, run(frames=(0, 1), fingerprint=computed_by()))
     for index in (0, 1):
         report.add(frame(index, witness=0.97), picture=False)
     file = tmp_path / "frame_00000.npz"
@@ -366,7 +367,7 @@ def test_an_edited_frame_is_computed_again(tmp_path: Path) -> None:
     save_frame(file, dataclasses.replace(stored.result, lower=middle), about=stored.about)
     with pytest.raises(InputError, match=r"frame_00000\.npz: not as report\.json knows it"):
         Results(tmp_path)
-    again = Report.resume(tmp_path, run(frames=(0, 1)))
+    again = Report.resume(tmp_path, run(frames=(0, 1), fingerprint=computed_by()))
     assert again.kept == [1] and again.pending == [0] and "frame_00000.npz" in again.ignored[0]
     again.add(frame(0, witness=0.97), picture=False)
     np.testing.assert_array_equal(load_frame(file).result.lower, frame(0).lower)
@@ -381,7 +382,7 @@ def test_an_edited_frame_is_computed_again(tmp_path: Path) -> None:
     # without its report nothing is believed, and exports say so
     (tmp_path / "report.json").unlink()
     assert not Results(tmp_path).checked
-    assert Report.resume(tmp_path, run(frames=(0, 1))).kept == []
+    assert Report.resume(tmp_path, run(frames=(0, 1), fingerprint=computed_by())).kept == []
 
 
 def test_stored_frames_are_read_where_their_digests_are_known() -> None:

@@ -79,11 +79,18 @@ def test_fingerprints_name_version_and_rules(blobs: Inputs, tmp_path: Path) -> N
     certified = open_certification(CertifySettings(blobs.config, blobs.path, net, prop, blobs.spec)).fingerprint
     config, loop = write_loop_demo(tmp_path / "loop")
     reached = open_loop(nsa.load_scene(config), loop).fingerprint
+    assert rendered["ns_abstract"] == nsa.__version__
     for found in (rendered, certified, reached):
         assert found["ns_abstract"] == nsa.__version__ and found["render_rules"] == version.RENDER_RULES >= 1
     assert "rules" not in rendered
     # 4 and 1 are those of searches that 0.1.0 left
     assert certified["rules"] == certification._RULES > 4 and reached["rules"] == reaching._RULES > 1
+
+
+def test_fingerprint_of_images_and_numbers_of_rules(blobs: Inputs) -> None:
+    found = open_job(Settings(blobs.config, blobs.path, blobs.spec)).fingerprint
+    assert {key: found.get(key) for key in computed_by()} == computed_by()
+    assert certification._RULES > 4 and reaching._RULES > 1
 
 
 @others
@@ -166,8 +173,12 @@ def test_worker_of_another_version_is_refused(blobs: Inputs, monkeypatch: pytest
     opened = open_job(Settings(blobs.config, blobs.path, blobs.spec))
     recipe, goal = opened.recipe, opened.goal(1.5, 1.0, 2)
     opening.forget()
+
+    def opens(*arguments: Any) -> None:
+        raise AssertionError("files are opened")
+
     monkeypatch.setattr(opening, "VERSION", "9.0.0")
-    monkeypatch.setattr(job.Scene, "__init__", lambda *arguments: pytest.fail("files are opened"))
+    monkeypatch.setattr(job.Scene, "__init__", opens)
     with pytest.raises(InputError, match=rf"runs ns-abstract 9\.0\.0.*{re.escape(nsa.__version__)}.*same version"):
         bound_part(recipe, Part(0, None), goal, False)
 

@@ -17,7 +17,9 @@ import torch
 from ns_abstract.arithmetic.outward import outward
 from ns_abstract.geometry.box import ParameterBox
 from ns_abstract.geometry.poses import PoseSet
+from ns_abstract.io.assumptions import Assumption
 from ns_abstract.io.errors import InputError
+from ns_abstract.methods.overrides import Overrides
 from ns_abstract.methods.representation import ProgramOptions, Representation
 from ns_abstract.methods.runs import RunConfig
 from ns_abstract.perturbation.specification import Perturbation
@@ -37,6 +39,7 @@ class Wall:
     waves: np.ndarray
     #: parts of the bounds' width that are cut off: a planted fault
     fault: float = 0.0
+    assumptions: tuple[Assumption, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -194,7 +197,7 @@ def _reads(source: RunConfig | Path) -> bool:
     return isinstance(source, Path) and source.suffix == ".wall"
 
 
-def _load(source: RunConfig | Path) -> Wall:
+def _load(source: RunConfig | Path, overrides: Overrides) -> Wall:
     assert isinstance(source, Path)
     found = json.loads(source.read_text())
     return Wall(source.stem, np.array(found["waves"]), found["fault"])

@@ -22,6 +22,7 @@ from ns_abstract.execution.scheduler import Task, work
 from ns_abstract.execution.stopping import StopRequest, interruptible
 from ns_abstract.execution.threads import use_threads
 from ns_abstract.geometry.box import ParameterBox
+from ns_abstract.io.assumptions import Assumption
 from ns_abstract.io.errors import InputError
 from ns_abstract.refine.engine import Goal, groups, shared_goal
 from ns_abstract.refine.result import FrameResult, Layer, Leaves, PartResult, TracePoint
@@ -266,6 +267,7 @@ class BoundResult:
         interrupted: Whether the work was ended by Ctrl-C or by ``on_progress``.
         cells: Linear sets of the cells, if they were kept.
         layers: "depth" and "accumulation", if they were asked for; see `ns_abstract.refine.result.Layer`.
+        assumptions: What the bounds rest on, and where each choice came from.
     """
 
     lower: np.ndarray
@@ -285,6 +287,7 @@ class BoundResult:
     target_ratio: float = 1.05
     about: dict[str, Any] = field(default_factory=dict, repr=False)
     layers: Mapping[str, Layer] = field(default_factory=dict, repr=False)
+    assumptions: tuple[Assumption, ...] = field(default=(), repr=False)
 
     @classmethod
     def of(cls, frame: FrameResult, **more: Any) -> BoundResult:
@@ -429,7 +432,10 @@ def bound(
         "scene": job.describe(),
         "fingerprint": job.fingerprint,
     }
-    return BoundResult.of(frames[0], guarantee=guarantee, interrupted=stop(), target_ratio=target_ratio, about=about)
+    return BoundResult.of(
+        frames[0], guarantee=guarantee, interrupted=stop(), target_ratio=target_ratio, about=about,
+        assumptions=job.assumptions,
+    )  # fmt: skip
 
 
 def listener(stop: StopRequest, on_progress: Callable[[Any], object] | None) -> Callable[[Any], None]:

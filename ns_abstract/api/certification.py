@@ -9,7 +9,7 @@ import json
 import math
 import time
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any, cast
 import numpy as np
 import torch
 
+from ns_abstract.api.assumptions import choice
 from ns_abstract.api.files import Settings, path_sets, resized
 from ns_abstract.api.job import Job, require_sound_platform, warm_up
 from ns_abstract.arithmetic.forms import MAX_DIMENSIONS
@@ -27,6 +28,7 @@ from ns_abstract.geometry.box import ParameterBox
 from ns_abstract.geometry.camera_path import load_camera_path
 from ns_abstract.geometry.poses import PoseSet
 from ns_abstract.geometry.tiles import assemble
+from ns_abstract.io.assumptions import Assumption
 from ns_abstract.io.errors import InputError
 from ns_abstract.io.jsonio import load_json
 from ns_abstract.methods.overrides import Overrides
@@ -297,6 +299,21 @@ class Certification:
     def fixed(self) -> dict[int, dict[str, float]]:
         """Values of parameters that do not vary, by frame."""
         return {k: dict(poses.fixed) for k, poses in enumerate(self.job.pose_sets)}
+
+    @property
+    def assumptions(self) -> tuple[Assumption, ...]:
+        """What the verdicts rest on, and where each choice came from."""
+        source, resize = self.question.source, self.property.preprocess.resize
+        name, output = "property" if source.file is None else source.file.name, source.value.get("output")
+        arithmetic = None if self.model.arithmetic == "float32" else self.model.arithmetic
+        picture = None if self.picture == "float" else self.picture
+        drawn = {} if resize is None else {"picture size": f"{name}: preprocess.resize"}
+        return (
+            *(replace(entry, origin=drawn.get(entry.name, entry.origin)) for entry in self.job.assumptions),
+            choice("network output", self.network.output or "the only one", output, f"{name}: output"),
+            choice("network_arithmetic", self.model.arithmetic, arithmetic, "--network-arithmetic"),
+            choice("picture", self.picture, picture, "--picture"),
+        )
 
     @property
     def fingerprint(self) -> dict[str, Any]:
@@ -650,4 +667,5 @@ def open_certification(settings: CertifySettings) -> Certification:
         job = Job(scene, sets, arithmetic=settings.arithmetic, workers=settings.workers, notes=path.notes)
     except InputError as error:
         raise error.within(origin) if error.field and not error.field.startswith("--") else error from None
+    job.set_choices = files.set_choices(sets, path)
     return Certification(job, question, settings.memory, origin, settings.network_arithmetic, settings.picture)

@@ -28,6 +28,7 @@ from ns_abstract.execution.ending import AbandonedError, abandoning
 from ns_abstract.execution.engines import Engine, EngineName, started
 from ns_abstract.execution.stopping import StopRequest, interruptible
 from ns_abstract.geometry.box import ParameterBox
+from ns_abstract.io.assumptions import Assumption
 from ns_abstract.io.errors import InputError
 from ns_abstract.io.memory import allowed_memory
 from ns_abstract.report.cameras import Cameras, cameras_entry, cell_cameras, standing
@@ -140,6 +141,7 @@ class CertificateRun:
             command=command,
             plan=(*job.job.plan, *job.scenes, *prop.notes),
             picture=job.picture,
+            assumptions=job.assumptions,
         )
 
     def open(self, *, resume: bool) -> Store:
@@ -641,6 +643,11 @@ class Certificate:
     state: str
     seconds: float
     report: dict[str, Any] = field(repr=False)
+
+    @property
+    def assumptions(self) -> tuple[Assumption, ...]:
+        """What the verdict rests on, and where each choice came from."""
+        return tuple(Assumption(**entry) for entry in self.report["assumptions"])
 
     @property
     def interrupted(self) -> bool:

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+from ns_abstract.api.assumptions import file_choices
 from ns_abstract.api.job import Job
 from ns_abstract.api.scenes import Scene, SceneSource
 from ns_abstract.geometry.camera_path import CameraPath, load_camera_path
 from ns_abstract.geometry.poses import PoseSet
+from ns_abstract.io.assumptions import Assumption
 from ns_abstract.io.errors import InputError
 from ns_abstract.methods.overrides import Overrides
 from ns_abstract.methods.representation import ProgramOptions
@@ -68,6 +70,14 @@ class Settings:
         )  # fmt: skip
         return SceneSource(self.load_config, options, self.overrides)
 
+    def set_choices(self, pose_sets: Sequence[PoseSet], path: CameraPath) -> tuple[Assumption, ...]:
+        """Where the size of the pictures and their sets come from."""
+        inside = any(entry is not None for entry in path.perturbations)
+        return file_choices(
+            pose_sets, Path(path.source), self.downscale_factor, self.perturbation_filename,
+            self.given_set is not None, inside,
+        )  # fmt: skip
+
 
 class PathJob(Job):
     """The job of a camera path.
@@ -94,6 +104,7 @@ class PathJob(Job):
             # options have no file
             named = error.field is not None and not error.field.startswith("--")
             raise error.within(settings.perturbation_filename or path.source) if named else error from None
+        self.set_choices = settings.set_choices(pose_sets, path)
 
     def pose_set(self, index: int, perturbation: Perturbation) -> PoseSet:
         """The poses of ``perturbation`` around entry ``index`` of the path.

@@ -15,12 +15,14 @@ from typing import Any
 
 import numpy as np
 
+from ns_abstract.api.assumptions import scene_choices, set_choices
 from ns_abstract.api.scenes import Scene, SceneSource
 from ns_abstract.arithmetic.selfcheck import platform_problems
 from ns_abstract.execution.ending import AbandonedError, abandoning
 from ns_abstract.execution.opening import Recipe
 from ns_abstract.execution.threads import most_threads
 from ns_abstract.geometry.poses import PoseSet
+from ns_abstract.io.assumptions import Assumption
 from ns_abstract.io.errors import InputError
 from ns_abstract.io.memory import allowed_memory
 from ns_abstract.io.version import computed_by
@@ -74,6 +76,9 @@ class Job:
         self.method: Method = scene.method(arithmetic, workers)
         self.pose_sets, self.seed, self.memory_limit = tuple(pose_sets), seed, memory_limit
         self.workers = workers if scene.rays else 1
+        self._scene_choices = scene_choices(scene, self.method, arithmetic)
+        #: Where the size of the pictures and their sets come from.
+        self.set_choices = set_choices(self.pose_sets, "the camera", "the set of poses")
         self._warm: set[int] = set()
         self.method.prepare([poses.perturbation for poses in self.pose_sets])
         if self.layers:
@@ -245,6 +250,11 @@ class Job:
     def plan(self) -> tuple[str, ...]:
         """What is left out for this scene, whatever the frame."""
         return self.method.plan
+
+    @property
+    def assumptions(self) -> tuple[Assumption, ...]:
+        """What the bounds rest on, and where each choice came from."""
+        return (*self._scene_choices, *self.set_choices)
 
     @property
     def fingerprint(self) -> dict[str, Any]:

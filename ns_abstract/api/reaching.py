@@ -18,6 +18,7 @@ from typing import Any
 
 import numpy as np
 
+from ns_abstract.api.assumptions import choice, set_choices
 from ns_abstract.api.bounding import listener
 from ns_abstract.api.certification import MEMORY
 from ns_abstract.api.job import Job, require_sound_platform
@@ -31,6 +32,7 @@ from ns_abstract.execution.opening import Recipe, opened
 from ns_abstract.execution.stopping import StopRequest, interruptible
 from ns_abstract.execution.threads import use_threads
 from ns_abstract.geometry.box import ParameterBox
+from ns_abstract.io.assumptions import Assumption
 from ns_abstract.io.errors import InputError
 from ns_abstract.perturbation.specification import TRANSLATIONS
 from ns_abstract.perturbation.variations import SceneVariation
@@ -124,6 +126,8 @@ class LoopJob:
                 fix=f"write one column by output, {self.network.output_size}",
             )
         self.job = Job(scene, [loop.camera.poses(size)], arithmetic=arithmetic)
+        origin = "the network's input" if loop.preprocess.resize is None else "loop file: preprocess.resize"
+        self.job.set_choices = set_choices(self.job.pose_sets, origin, "loop file: camera")
         if self.job.rays:
             raise InputError(
                 f"loops are for splats, this run is a {self.job.method.content}",
@@ -198,6 +202,17 @@ class LoopJob:
             _open, self.job.recipe.open, dict(loop.value), loop.network.absolute().parent, self.model.arithmetic
         )
         return Recipe(again, self.fingerprint, self.job.source.file)
+
+    @property
+    def assumptions(self) -> tuple[Assumption, ...]:
+        """What the verdicts rest on, and where each choice came from."""
+        output = self.loop.value.get("output")
+        arithmetic = None if self.model.arithmetic == "float32" else self.model.arithmetic
+        return (
+            *self.job.assumptions,
+            choice("network output", self.network.output or "the only one", output, "loop file: output"),
+            choice("network_arithmetic", self.model.arithmetic, arithmetic, "--network-arithmetic"),
+        )
 
     @property
     def fingerprint(self) -> dict[str, Any]:
@@ -502,6 +517,7 @@ class ReachRun:
                 "network_guarantee": job.network.guarantee(job.model.arithmetic),
                 "renderer": {name: program[name] for name in ("name", "version")},
                 "scene": job.job.describe(),
+                "assumptions": [vars(entry) for entry in job.assumptions],
                 "model": file_stamp(loop.network),
                 "loop": loop.value,
                 "dynamics": loop.dynamics.about,
@@ -647,6 +663,11 @@ class ReachResult:
     state: str
     seconds: float
     report: dict[str, Any] = field(repr=False)
+
+    @property
+    def assumptions(self) -> tuple[Assumption, ...]:
+        """What the verdict rests on, and where each choice came from."""
+        return tuple(Assumption(**entry) for entry in self.report["assumptions"])
 
 
 def reach(

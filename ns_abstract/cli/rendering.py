@@ -64,6 +64,7 @@ def make_run(job: PathJob, order: Order, frames: tuple[int, ...], problems: tupl
         guarantee="sampled" if problems else job.method.guarantee,
         renderer=job.method.program,
         scene=job.describe(),
+        assumptions=job.assumptions,
         frames=frames,
         fingerprint=job.fingerprint,
         settings=order.options,

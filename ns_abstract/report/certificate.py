@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from ns_abstract.io.assumptions import Assumption
 from ns_abstract.io.atomic import write_atomic
 from ns_abstract.io.folder import unwritable
 from ns_abstract.report.record import guarantee_text, plain, versions
@@ -69,6 +70,7 @@ class CertifiedRun:
         plan: What was left out and why, one sentence each.
         limits: Conditions on the guarantee, one sentence each.
         picture: "float" or "8-bit": what the network is shown.
+        assumptions: What the verdicts rest on, and where each choice came from.
     """
 
     guarantee: str
@@ -84,6 +86,7 @@ class CertifiedRun:
     plan: tuple[str, ...] = ()
     limits: tuple[str, ...] = ()
     picture: str = "float"
+    assumptions: tuple[Assumption, ...] = ()
     started: str = field(default_factory=now)
 
 
@@ -149,6 +152,7 @@ def certificate_document(
             "picture": run.picture,
             "renderer": run.renderer,
             "scene": run.scene,
+            "assumptions": [vars(entry) for entry in run.assumptions],
             "model": run.model,
             "coverage": covered,
             "sampled": {"poses": poses, "right": right, "sampled_right": right / poses if poses else None},

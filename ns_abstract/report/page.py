@@ -600,8 +600,18 @@ def _files(document: Mapping[str, Any]) -> str:
     return f"<h2>How to read the files</h2><pre>{escape(code)}</pre>{cells}{extra}"
 
 
+def _assumptions(document: Mapping[str, Any]) -> str:
+    rows = "".join(
+        "<tr>" + "".join(f'<td class="left">{escape(entry[key])}</td>' for key in ("name", "value", "origin")) + "</tr>"
+        for entry in document["assumptions"]
+    )
+    head = "".join(f'<th class="left">{title}</th>' for title in ("choice", "value", "where it came from"))
+    table = f"<table><thead><tr>{head}</tr></thead><tbody>{rows}</tbody></table>"
+    return f'<h2>What this rests on</h2><div class="wide">{table}</div>' if rows else ""
+
+
 def reproduce(document: Mapping[str, Any]) -> str:
-    """Command line, versions and fingerprints."""
+    """Assumptions, command line, versions and fingerprints."""
     command = " ".join(shlex.quote(str(part)) for part in document["command"])
     rows = [("scene", document["scene"]), ("renderer", document["renderer"]), ("settings", document["settings"])]
     rows += [("packages", document["packages"]), ("fingerprint", document["fingerprint"])]
@@ -612,7 +622,8 @@ def reproduce(document: Mapping[str, Any]) -> str:
         for key, value in mapping.items()
     )
     return (
-        "<h2>How to reproduce</h2>"
+        _assumptions(document)
+        + "<h2>How to reproduce</h2>"
         + (f"<pre>{escape(command)}</pre>" if command else "")
         + f'<p class="soft">Started {escape(document["started"])}, this page written {escape(document["updated"])}.</p>'
         + f'<div class="wide"><table><tbody>{table}</tbody></table></div>'

@@ -16,6 +16,7 @@ from typing import Any, Literal
 
 import numpy as np
 
+from ns_abstract.io.assumptions import Assumption
 from ns_abstract.io.atomic import write_atomic
 from ns_abstract.io.errors import InputError
 from ns_abstract.io.folder import remove_parts, unwritable
@@ -192,6 +193,7 @@ class Run:
         command: The command line.
         limits: Further conditions on the guarantee, one sentence each.
         size: Height and width of the pictures; None: any that stored frames have.
+        assumptions: What the bounds rest on, and where each choice came from.
     """
 
     guarantee: str
@@ -204,6 +206,7 @@ class Run:
     command: tuple[str, ...] = ()
     limits: tuple[str, ...] = ()
     size: tuple[int, int] | None = None
+    assumptions: tuple[Assumption, ...] = ()
 
 
 def _leaves_of(value: Any, path: str = "") -> dict[str, Any]:
@@ -598,6 +601,7 @@ class Report:
                 "limits": [*([_LIMITS[name]] if name in _LIMITS else []), *run.limits],
                 "renderer": run.renderer,
                 "scene": run.scene,
+                "assumptions": [vars(entry) for entry in run.assumptions],
                 "plan": run.plan,
                 "frames": [
                     self._entries[k] | ({"explanation": why} if (why := self._explained.get(k)) else {})

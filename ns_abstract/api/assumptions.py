@@ -1,0 +1,101 @@
+"""Choices that bounds rest on: scene, program, pictures and their set, each with where it came from."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from ns_abstract.api.scenes import Scene
+from ns_abstract.geometry.poses import PoseSet
+from ns_abstract.io.assumptions import Assumption
+from ns_abstract.methods.overrides import chosen
+from ns_abstract.refine.protocol import Method
+
+DEFAULT = "default"
+
+
+def choice(name: str, value: object, given: object, flag: str, default: str = DEFAULT) -> Assumption:
+    """The record of an option: its origin is ``flag`` where ``given`` is there, else ``default``."""
+    return Assumption(name, str(value), default if given is None else flag)
+
+
+def scene_choices(scene: Scene, method: Method, arithmetic: str | None) -> tuple[Assumption, ...]:
+    """What was decided of a scene on reading it, and of the program that draws it."""
+    options, program = scene.source.options, method.program
+    found = list(scene.assumptions)
+    if options.renderer == "paper":
+        # the paper's programs draw on black, whatever a scene says
+        found = [
+            chosen(a.name, (0.0, 0.0, 0.0), "--renderer paper", a.value, a.origin) if a.name == "background" else a
+            for a in found
+        ]
+    renderer = "--sampling" if options.renderer is None and options.sampling is not None else "--renderer"
+    found.append(choice("renderer", program["name"], options.renderer or options.sampling, renderer))
+    if "sampling" not in program:
+        default = "--renderer" if options.renderer == "paper" else DEFAULT
+        found.append(
+            choice("renderer version", program["version"], options.gsplat_version, "--gsplat-version", default)
+        )
+    else:
+        found += _ray_choices(scene, program)
+    found.append(choice("arithmetic", method.guarantee.removesuffix("-sound"), arithmetic, "--arithmetic"))
+    return tuple(found)
+
+
+def _ray_choices(scene: Scene, program: dict[str, Any]) -> list[Assumption]:
+    options = scene.source.options
+    if program["sampling"] == "hierarchical":
+        samples = Assumption(
+            "num_coarse_samples", str(program["samples"]), "the run: pipeline.model.num_coarse_samples"
+        )
+    else:
+        samples = choice("num_samples", program["samples"], options.num_samples, "--num-samples")
+    found = [
+        choice("renderer version", program["version"], options.renderer, "--renderer"),
+        samples,
+        choice("near_plane", f"{program['near']:.9g}", options.near_plane, "--near-plane"),
+        choice("device", options.device or "cpu", options.device, "--device"),
+    ]
+    if options.occupancy_grid is not None:
+        found.append(Assumption("occupancy_grid", options.occupancy_grid.name, "--occupancy-grid"))
+    return found
+
+
+def set_choices(pose_sets: Sequence[PoseSet], size: str, varied: str) -> tuple[Assumption, ...]:
+    """The size of the pictures and the names of what varies in any set.
+
+    Args:
+        pose_sets: One by frame.
+        size: Origin of the size.
+        varied: Origin of the sets.
+    """
+    camera = pose_sets[0].camera
+    names = dict.fromkeys(name for poses in pose_sets for name in poses.box.names)
+    return (
+        Assumption("picture size", f"{camera.width} x {camera.height}", size),
+        Assumption("varied", ", ".join(names) or "nothing", varied),
+    )
+
+
+def file_choices(
+    pose_sets: Sequence[PoseSet], path: Path, factor: float, file: Path | None, given: bool, inside: bool
+) -> tuple[Assumption, ...]:
+    """The same for the files of a command line.
+
+    Args:
+        pose_sets: One by entry of the camera path.
+        path: The camera path.
+        factor: By which pictures are made smaller.
+        file: The perturbation file, or None.
+        given: Whether options say what varies.
+        inside: Whether the camera path says so.
+    """
+    varied = "options" if given else file.name if file is not None else f"{path.name}: perturbation"
+    if not (given or file is not None or inside):
+        varied = "default: single poses"
+    size = f"{path.name}: render_width, render_height"
+    return (
+        *set_choices(pose_sets, size if factor == 1 else f"{size}, by --downscale-factor", varied),
+        choice("downscale_factor", f"{factor:.9g}", None if factor == 1 else factor, "--downscale-factor"),
+    )
