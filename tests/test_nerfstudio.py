@@ -713,7 +713,8 @@ def test_a_nerf_in_the_viewer(nerfstudio: SimpleNamespace, folder: Path, monkeyp
 
 def test_stock_viewer_starts(nerfstudio: SimpleNamespace, folder: Path, config_file: Path) -> None:
     config = abstract_run(nerfstudio, folder, config_file)
-    with Server([*wrapped("ns-viewer"), "--load-config", config.relative_to(folder)], free_port(), folder, folder) as server:
+    arguments = [*wrapped("ns-viewer"), "--load-config", config.relative_to(folder)]
+    with Server(arguments, free_port(), folder, folder) as server:
         assert server.url
         time.sleep(3.0)
         assert server.process.poll() is None and "Traceback" not in server.said(), server.said()

@@ -1,6 +1,6 @@
 """Runs one of nerfstudio's commands where torchvision's build does not fit PyTorch's.
 
-    python -m ns_abstract.nerfstudio ns-train abstract-nerf --data my_scene
+python -m ns_abstract.nerfstudio ns-train abstract-nerf --data my_scene
 """
 
 from __future__ import annotations
