@@ -434,7 +434,8 @@ def _save_overload(cache: FunctionCache, signature: Any, data: Any) -> None:
 
 def install() -> None:
     """Have numba ask `KernelLocator` first, and `KernelStore` before it compiles a kernel."""
-    FunctionCache.load_overload, FunctionCache.save_overload = _load_overload, _save_overload
+    FunctionCache.load_overload = _load_overload  # pyright: ignore[reportAttributeAccessIssue]
+    FunctionCache.save_overload = _save_overload  # pyright: ignore[reportAttributeAccessIssue]
     ours = f"{KernelLocator.__module__}.{KernelLocator.__name__}"
     others = settings.CACHE_LOCATOR_CLASSES or _LOCATORS  # pyright: ignore[reportAttributeAccessIssue]
     if ours not in others:
