@@ -9,6 +9,7 @@ import subprocess
 import sys
 from multiprocessing import Pipe
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -72,18 +73,21 @@ def test_one_stage_alone_is_run_and_the_others_come_back(blobs: Inputs, monkeypa
     np.testing.assert_array_equal(before.upper, after.upper)
 
 
-def test_stages_are_missing_whose_kernels_are_not_kept(blobs: Inputs, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Whatever else is kept: other commands leave kernels of their own."""
+def test_no_stage_is_missing_after_all_were_compiled(blobs: Inputs) -> None:
     frame = open_job(Settings(blobs.config, blobs.path, blobs.spec)).frame(0)
     frame.warm_up()
     assert compiling.missing(frame) == []
+
+
+def test_stages_are_missing_whose_kernels_are_not_kept() -> None:
+    """Whatever else is kept: other commands leave kernels of their own."""
 
     def warm_up(stage: str) -> None:
         assert store()._complete
         if stage in ("pixel_stage", "render"):
             raise KernelMissingError(stage)
 
-    monkeypatch.setattr(frame, "warm_up", warm_up)
+    frame: Any = SimpleNamespace(stages=("pixel_stage", "gaussian_stage", "render"), warm_up=warm_up)
     assert compiling.missing(frame) == ["pixel_stage", "render"] and not store()._complete
 
 
@@ -126,6 +130,7 @@ _BUSY = """
 import sys, time
 from multiprocessing.connection import Connection
 from pathlib import Path
+from types import SimpleNamespace
 line = Connection(int(sys.argv[1]))
 line.recv()
 line.send(7)

@@ -3,22 +3,28 @@
 from __future__ import annotations
 
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
-from benchmark_scripts import script
 
 from ns_abstract.demo.buoy import WEIGHTS, buoy_scene, load_network
 from ns_abstract.demo.writing import write_nerf_demo
 from ns_abstract.io.errors import InputError
 from ns_abstract.methods.load import load_any
 
-fit = script("fit_buoy")
+
+@pytest.fixture
+def fit() -> ModuleType:
+    """The script that fitted the weights; tests are skipped where it is not beside them."""
+    from benchmark_scripts import script
+
+    return script("fit_buoy")
 
 
-def test_weights_show_the_buoy() -> None:
+def test_weights_show_the_buoy(fit: ModuleType) -> None:
     """Opacity of 3 cm and colour, on average, at points all around; an unfitted network errs by 0.3 and 0.4."""
     generator = torch.Generator().manual_seed(5)
     x = torch.randn(20_000, 3, generator=generator)
@@ -44,7 +50,7 @@ def test_run_holds_the_weights(tmp_path: Path) -> None:
         np.testing.assert_array_equal(found, wanted)
 
 
-def test_quantised_parameters_are_read_back(tmp_path: Path) -> None:
+def test_quantised_parameters_are_read_back(fit: ModuleType, tmp_path: Path) -> None:
     """Every weight within half a step of what was fitted."""
     network = load_network()
     np.savez(tmp_path / "again.npz", **fit.quantised(network))
