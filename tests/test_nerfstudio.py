@@ -566,6 +566,7 @@ def test_nerf_has_the_chosen_size(nerfstudio: SimpleNamespace) -> None:
 @pytest.mark.parametrize("first", ["splat", "nerf"])
 def test_registration_does_not_depend_on_what_is_imported_first(folder: Path, first: str) -> None:
     code = (
+        "from ns_abstract.nerfstudio.torchvision_operators import declare_missing\ndeclare_missing()\n"
         f"import ns_abstract.nerfstudio.{first}\n"
         "from nerfstudio.configs.method_configs import all_methods\n"
         "assert {'abstract-nerf', 'abstract-splatfacto'} <= set(all_methods)"
