@@ -15,10 +15,10 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from fit_buoy import REACH, buoy, fit_field
 from numpy.typing import ArrayLike, NDArray
 
-from ns_abstract.demo.buoy import REACH, buoy
-from ns_abstract.demo.nerf_fit import NerfNetwork, fit_field
+from ns_abstract.demo.nerf_fit import NerfNetwork
 from ns_abstract.demo.writing import TIMESTAMP
 from ns_abstract.geometry.views import View, around, look_at, path_json
 from ns_abstract.io.atomic import write_json

@@ -29,6 +29,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from ns_abstract.nerfstudio.torchvision_operators import declare_missing
+
 #: Bytes of memory that a case may take beside what a process has that has imported everything.
 MEMORY = 256 << 20
 #: Seconds after which a command hangs; what does not hang takes one or two, on a busy machine a few more.
@@ -62,7 +64,6 @@ _IMPORTS = (
     "ns_abstract.api.reaching", "ns_abstract.methods.splat.ply", "ns_abstract.verify.interop",
     "ns_abstract.report.picture",
 )  # fmt: skip
-_VIEWER_IMPORTS = ("ns_abstract.nerfstudio.torchvision_operators", "ns_abstract.nerfstudio.viewing")
 #: Names of files by what they are; a change may give another.
 _FILES = {
     "path": "path.json", "spec": "spec.json", "prop": "prop.json", "lib": "unsafe.vnnlib", "net": "net.onnx",
@@ -409,8 +410,8 @@ def _serve() -> None:
         asked = json.loads(line)
         if asked["module"].endswith("viewer") and not loaded:
             loaded = True
-            for name in _VIEWER_IMPORTS:
-                importlib.import_module(name)
+            declare_missing()
+            importlib.import_module("ns_abstract.nerfstudio.viewing")
         print(json.dumps(dataclasses.asdict(_tried(**asked))), file=answers, flush=True)
 
 

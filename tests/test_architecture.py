@@ -360,6 +360,42 @@ def test_ci_runs_in_a_copy_and_passes_the_exit_code_on(tmp_path: Path, status: i
     assert not (where / "made").exists()
 
 
+#: Stands in for python3: an environment that it makes holds tools that say their name and fail if they are told to.
+_PYTHON = """#!/bin/sh
+if [ "$2" != venv ]; then exec {python} "$@"; fi
+mkdir -p "$3/bin"
+for name in pip ruff pyright pytest; do
+    printf '#!/bin/sh\\necho "ran %s $*"\\n[ "%s" != "$FAILS" ]\\n' $name $name > "$3/bin/$name"
+    chmod +x "$3/bin/$name"
+done
+"""
+
+
+@pytest.mark.skipif(shutil.which("git") is None, reason="git is not installed")
+@pytest.mark.parametrize("fails", ["", "ruff", "pyright", "pytest"])
+def test_ci_lints_first_and_goes_on_after_a_failure(tmp_path: Path, fails: str) -> None:
+    tools = tmp_path / "tools"
+    tools.mkdir()
+    (tools / "python3").write_text(_PYTHON.replace("{python}", sys.executable))
+    (tools / "python3").chmod(0o755)
+    (tmp_path / "here").mkdir()
+    command = "python3 -m venv .venv && .venv/bin/pip install -e . && .venv/bin/pytest -n 2"
+    where = copy_of_ci(tmp_path / "here", f"```sh\n{command}\n```\n")
+    (where / "pyproject.toml").write_text("")
+    subprocess.run(["git", "init", "-q", str(where)], check=True, timeout=30)
+    found = subprocess.run(
+        ["bash", str(where / ".ci" / "run")], capture_output=True, text=True, timeout=60, check=False,
+        env={"PATH": ":".join(map(str, [tools, *_path()])), "NS_ABSTRACT_INSTALL": "0", "FAILS": fails},
+    )  # fmt: skip
+    ran = [line.removeprefix("ran ") for line in found.stdout.splitlines() if line.startswith("ran ")]
+    assert [line.split()[0] for line in ran] == ["pip", "ruff", "ruff", "pip", "pyright", "pip", "pytest"]
+    assert ran[0].endswith("ruff") and ran[1:3] == ["ruff check .", "ruff format --check ."]
+    assert f"+ {command}" in found.stdout.splitlines()
+    assert (found.returncode == 0) == (not fails)
+    told = {"": "", "ruff": "failed: lint format", "pyright": "failed: types", "pytest": "failed: tests"}
+    assert found.stderr.strip() == told[fails]
+
+
 def _path() -> list[Path]:
     folders = {Path(sys.executable).parent}
     for name in ("git", "bash", "tar", "mktemp"):

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import logging
+import os
+import re
 import subprocess
 import sys
 from multiprocessing import Pipe
@@ -16,7 +18,7 @@ from conftest import Inputs
 
 from ns_abstract.api import compiling
 from ns_abstract.api.files import Settings, open_job
-from ns_abstract.arithmetic.kernel_cache import store
+from ns_abstract.arithmetic.kernel_cache import SESSION, KernelMissingError, store
 from ns_abstract.cli.common import show_log
 from ns_abstract.methods.splat import bounds
 
@@ -50,6 +52,7 @@ def test_one_stage_alone_is_run_and_the_others_come_back(blobs: Inputs, monkeypa
 
     for name in bounds.STAGES:
         monkeypatch.setattr(bounds, name, spy(name))
+    assert set(bounds.STAGES) | {"render"} == set(frame.stages)
     frame.warm_up()
     assert all(len(calls) == 1 for calls in seen.values())
     for name in frame.stages:
@@ -58,7 +61,7 @@ def test_one_stage_alone_is_run_and_the_others_come_back(blobs: Inputs, monkeypa
             2 if other in frame.stages[: frame.stages.index(name) + 1] else 1 for other in bounds.STAGES
         ]
         # so that what was compiled is what will be used
-        assert seen[name][0] == seen[name][1]
+        assert name not in seen or seen[name][0] == seen[name][1]
     monkeypatch.undo()
     assert {name: getattr(bounds, name) for name in bounds.STAGES} == kernels
     with pytest.raises(ZeroDivisionError), bounds.alone("pixel_stage"):
@@ -70,12 +73,32 @@ def test_one_stage_alone_is_run_and_the_others_come_back(blobs: Inputs, monkeypa
     np.testing.assert_array_equal(before.upper, after.upper)
 
 
+def test_no_stage_is_missing_after_all_were_compiled(blobs: Inputs) -> None:
+    frame = open_job(Settings(blobs.config, blobs.path, blobs.spec)).frame(0)
+    frame.warm_up()
+    assert compiling.missing(frame) == []
+
+
+def test_stages_are_missing_whose_kernels_are_not_kept() -> None:
+    """Whatever else is kept: other commands leave kernels of their own."""
+
+    def warm_up(stage: str) -> None:
+        assert store()._complete
+        if stage in ("pixel_stage", "render"):
+            raise KernelMissingError(stage)
+
+    frame: Any = SimpleNamespace(stages=("pixel_stage", "gaussian_stage", "render"), warm_up=warm_up)
+    assert compiling.missing(frame) == ["pixel_stage", "render"] and not store()._complete
+
+
 def test_nothing_is_started_where_kernels_are(blobs: Inputs, monkeypatch: pytest.MonkeyPatch) -> None:
     job = open_job(Settings(blobs.config, blobs.path, blobs.spec))
     monkeypatch.setattr(compiling.subprocess, "Popen", lambda *a, **k: pytest.fail("a process was started"))
-    monkeypatch.setattr(compiling, "store", lambda: SimpleNamespace(empty=False, refresh=lambda: None))
+    monkeypatch.setattr(compiling, "missing", lambda frame: [])
     compiling.compile_beside(job, 0, 3)
-    monkeypatch.setattr(compiling, "store", lambda: SimpleNamespace(empty=True, refresh=lambda: None))
+    monkeypatch.setattr(compiling, "missing", lambda frame: ["render"])
+    compiling.compile_beside(job, 0, 3)
+    monkeypatch.setattr(compiling, "missing", lambda frame: list(frame.stages))
     compiling.compile_beside(job, 0, 1)
     with pytest.raises(pytest.fail.Exception):
         compiling.compile_beside(job, 0, 2)
@@ -83,30 +106,31 @@ def test_nothing_is_started_where_kernels_are(blobs: Inputs, monkeypatch: pytest
 
 def test_processes_that_fail_leave_the_work_to_this_one(blobs: Inputs, monkeypatch: pytest.MonkeyPatch) -> None:
     job = open_job(Settings(blobs.config, blobs.path, blobs.spec))
-    refreshed, started = [], []
-    monkeypatch.setattr(compiling, "store", lambda: SimpleNamespace(empty=True, refresh=lambda: refreshed.append(True)))
+    started: list[list[str]] = []
+    monkeypatch.setattr(compiling, "missing", lambda frame: list(frame.stages))
     popen = subprocess.Popen
 
     def failing(command: list[str], **more: Any) -> Any:
         started.append(command[4:])
+        assert more["env"][SESSION] == str(store().session)
         return popen([sys.executable, "-c", "raise SystemExit(3)"], **more)
 
     monkeypatch.setattr(compiling.subprocess, "Popen", failing)
     compiling.compile_beside(job, 0, 2)
-    assert started == [["gaussian_stage"], ["pixel_stage", "moving_colors"]] and refreshed == [True]
+    assert started == [["pixel_stage"], ["gaussian_stage", "moving_colors", "render"]]
 
     def refuse(*_: Any, **__: Any) -> None:
         raise OSError("no more processes")
 
     monkeypatch.setattr(compiling.subprocess, "Popen", refuse)
     compiling.compile_beside(job, 0, 2)
-    assert len(refreshed) == 2
 
 
 _BUSY = """
 import sys, time
 from multiprocessing.connection import Connection
 from pathlib import Path
+from types import SimpleNamespace
 line = Connection(int(sys.argv[1]))
 line.recv()
 line.send(7)
@@ -118,21 +142,21 @@ while not Path(sys.argv[2]).exists():
 def test_what_is_compiled_is_told_where_there_is_no_terminal(
     blobs: Inputs, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """A line with a count and what is at work, every few seconds."""
+    """A line with two counts and the seconds left, at once and every few seconds."""
     job = open_job(Settings(blobs.config, blobs.path, blobs.spec))
     popen, told = subprocess.Popen, logging.getLogger("ns_abstract.kernels")
-    wanted = "compiling kernels (first use only): 14 done; at work: gaussian stage, pixel stage, moving colors"
+    wanted = "compiling kernels (first use only): 14 of 273, about "
 
     def seen(record: logging.LogRecord) -> bool:
         # both processes work until it was said
-        if record.getMessage() == wanted:
+        if record.getMessage().startswith(wanted):
             (tmp_path / "said").touch()
         return True
 
     def busy(command: list[str], **more: Any) -> Any:
         return popen([sys.executable, "-c", _BUSY, command[3], str(tmp_path / "said")], **more)
 
-    monkeypatch.setattr(compiling, "store", lambda: SimpleNamespace(empty=True, refresh=lambda: None))
+    monkeypatch.setattr(compiling, "missing", lambda frame: list(frame.stages))
     monkeypatch.setattr(compiling.subprocess, "Popen", busy)
     monkeypatch.setattr(compiling, "_PACE", 0.0)
     monkeypatch.setattr(logging.getLogger("ns_abstract"), "handlers", [])
@@ -146,19 +170,24 @@ def test_what_is_compiled_is_told_where_there_is_no_terminal(
         told.removeFilter(seen)
         told.setLevel(level)
     said = capsys.readouterr().err.splitlines()
-    assert wanted in said and all(line.startswith("compiling kernels (first use only): ") for line in said)
+    assert all(
+        re.fullmatch(r"compiling kernels \(first use only\): \d+ of 273, about \d+ s left", line) for line in said
+    )
+    # before anything is done, too
+    assert said[0].startswith("compiling kernels (first use only): 0 of 273, about ")
+    assert any(line.startswith(wanted) for line in said)
 
 
 def test_worker_compiles_what_it_is_told(blobs: Inputs, tmp_path: Path) -> None:
     """A process of its own opens the job anew and runs one stage; kernels are there, so nothing is compiled."""
     job = open_job(Settings(blobs.config, blobs.path, blobs.spec))
     job.warm_up(0)
-    store().publish()
     here, there = Pipe()
     with there:
         worker = subprocess.Popen(
             [sys.executable, "-m", "ns_abstract.api.compiling", str(there.fileno()), "moving_colors"],
             pass_fds=[there.fileno()], stderr=subprocess.PIPE, cwd=Path(compiling.__file__).parents[2],
+            env=os.environ | {SESSION: str(store().session)},
         )  # fmt: skip
     with here:
         here.send((job.recipe, 0))

@@ -71,27 +71,79 @@ def test_other_module_changed(tmp_path: Path, folder: Path) -> None:
     assert not list(package.rglob("*.nb?"))
 
 
-def test_kernels_of_another_process_are_taken_while_this_one_runs(folder: Path) -> None:
-    """What others publish meanwhile is used, and what this process has compiled itself stays."""
-    other = (
-        "from ns_abstract.arithmetic.forms import set_norms; import numpy as np; set_norms(np.zeros((4, 3)), 0, 1, 1)"
-    )
-    program = f"""
-import subprocess, sys
+SHARED = """
+import subprocess, sys, os
+from ns_abstract.arithmetic.kernel_cache import SESSION, store
+program = '''
+import sys, time
 import numpy as np
 from ns_abstract.arithmetic.forms import set_norms
 from ns_abstract.arithmetic.kernel_cache import store
-assert store().empty
-subprocess.run([sys.executable, "-c", {other!r}], check=True)
-store().refresh()
+print("ready", flush=True)
+sys.stdin.readline()
+for dtype in (np.float64, np.float32):
+    set_norms(np.zeros((4, 3), dtype), 0, 1, 1)
+print(store().compiled, store().session)
+'''
+environment = os.environ | {SESSION: str(store().session)}
+pipe = dict(stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+others = [subprocess.Popen([sys.executable, "-c", program], env=environment, **pipe) for _ in range(COUNT)]
+for other in others:
+    assert other.stdout.readline() == "ready\\n"
+for other in others:
+    other.stdin.write("\\n")
+    other.stdin.flush()
+found = [other.communicate()[0].split() for other in others]
+assert not any(other.returncode for other in others)
+assert {session for _, session in found} == {str(store().session)} and store().session.is_dir()
+from ns_abstract.arithmetic.forms import set_norms
+import numpy as np
 set_norms(np.zeros((4, 3)), 0, 1, 1)
-print(sum(set_norms.stats.cache_hits.values()), store().compiled)
-set_norms(np.zeros((4, 3), np.float32), 0, 1, 1)
-own = store().compiled
-store().refresh()
-print(sum(set_norms.stats.cache_hits.values()), own > 0)
+assert store().compiled == 0
+print(sum(int(compiled) for compiled, _ in found))
 """
-    assert run(program, NS_ABSTRACT_CACHE_DIR=str(folder))[0] == "1 0\n1 True"
+
+
+def test_processes_of_one_session_compile_no_kernel_twice(tmp_path: Path) -> None:
+    """Two that begin at once compile together what one compiles alone, and their kernels are kept."""
+    alone, two = (run(SHARED.replace("COUNT", count), NS_ABSTRACT_CACHE_DIR=str(tmp_path / count))[0] for count in "13")
+    assert alone == two and int(alone) >= 2
+    # and published
+    assert run(NS_ABSTRACT_CACHE_DIR=str(tmp_path / "3"))[0] == HIT
+
+
+def test_session_of_another_version_is_not_shared(tmp_path: Path) -> None:
+    other = kernel_cache.KernelStore(tmp_path, "0" * 64)
+    store = kernel_cache.KernelStore(tmp_path, "1" * 64, other.session)
+    assert not store.shared and store.session != other.session
+    gone = kernel_cache.KernelStore(tmp_path, "0" * 64, other.session.with_name("session-none"))
+    assert not gone.shared
+    shared = kernel_cache.KernelStore(tmp_path, "0" * 64, other.session)
+    assert shared.shared
+    shared.close()
+    assert other.session.is_dir()
+    for each in (store, gone, other):
+        each.close()
+    assert not other.session.exists()
+
+
+def test_nothing_is_compiled_where_all_must_be_kept(folder: Path) -> None:
+    program = """
+import numpy as np
+from ns_abstract.arithmetic.forms import set_norms
+from ns_abstract.arithmetic.kernel_cache import KernelMissingError, store
+try:
+    with store().complete():
+        set_norms(np.zeros((4, 3)), 0, 1, 1)
+except KernelMissingError:
+    print("missing", store().compiled, end=" ")
+set_norms(np.zeros((4, 3)), 0, 1, 1)
+with store().complete():
+    set_norms(np.zeros((4, 3)), 0, 1, 1)
+print(store().compiled > 0)
+"""
+    assert run(program, NS_ABSTRACT_CACHE_DIR=str(folder))[0] == "missing 0 True"
+    assert run(program, NS_ABSTRACT_CACHE_DIR=str(folder))[0] == "False"
 
 
 @pytest.mark.parametrize("content", [b"", b"garbage", None], ids=["empty", "garbage", "truncated"])

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 import pytest
 from conftest import blob_scene, ring
-from nerfstudio_runs import BIN, Server, command, environment, free_port, lpips_cache, needs_nerfstudio
+from nerfstudio_runs import Server, command, environment, free_port, lpips_cache, needs_nerfstudio, wrapped
 from PIL import Image
 from waiting import until
 
@@ -52,7 +52,7 @@ OUTPUTS = ["abstract_lower", "abstract_upper", "abstract_gap", "abstract_witness
 @pytest.fixture(scope="module")
 def nerfstudio() -> SimpleNamespace:
     """nerfstudio's modules and this package's beside them."""
-    torchvision_operators.autoload()
+    torchvision_operators.declare_missing()
     # nerfstudio's other way of registration, for when this package is not installed
     found = [
         f"{n}=ns_abstract.nerfstudio.methods:{n.replace('-', '_')}" for n in ("abstract-nerf", "abstract-splatfacto")
@@ -566,6 +566,7 @@ def test_nerf_has_the_chosen_size(nerfstudio: SimpleNamespace) -> None:
 @pytest.mark.parametrize("first", ["splat", "nerf"])
 def test_registration_does_not_depend_on_what_is_imported_first(folder: Path, first: str) -> None:
     code = (
+        "from ns_abstract.nerfstudio.torchvision_operators import declare_missing\ndeclare_missing()\n"
         f"import ns_abstract.nerfstudio.{first}\n"
         "from nerfstudio.configs.method_configs import all_methods\n"
         "assert {'abstract-nerf', 'abstract-splatfacto'} <= set(all_methods)"
@@ -713,10 +714,8 @@ def test_a_nerf_in_the_viewer(nerfstudio: SimpleNamespace, folder: Path, monkeyp
 
 def test_stock_viewer_starts(nerfstudio: SimpleNamespace, folder: Path, config_file: Path) -> None:
     config = abstract_run(nerfstudio, folder, config_file)
-    program = BIN / "ns-viewer"
-    if not program.exists():
-        pytest.skip("ns-viewer is not installed")
-    with Server([program, "--load-config", config.relative_to(folder)], free_port(), folder, folder) as server:
+    arguments = [*wrapped("ns-viewer"), "--load-config", config.relative_to(folder)]
+    with Server(arguments, free_port(), folder, folder) as server:
         assert server.url
         time.sleep(3.0)
         assert server.process.poll() is None and "Traceback" not in server.said(), server.said()

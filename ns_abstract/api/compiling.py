@@ -1,4 +1,4 @@
-"""Kernels compiled side by side at first use: each process compiles some of a frame's stages and keeps them on disk."""
+"""Kernels compiled side by side at first use: processes compile stages of a frame into one folder of kernels."""
 
 from __future__ import annotations
 
@@ -14,11 +14,18 @@ from multiprocessing import Pipe
 from multiprocessing.connection import Connection
 
 from ns_abstract.api.job import Job
-from ns_abstract.arithmetic.kernel_cache import store
+from ns_abstract.arithmetic.kernel_cache import SESSION, KernelMissingError, store
 from ns_abstract.execution.opening import opened
+from ns_abstract.refine.protocol import Frame
 
-#: Seconds between two words on progress.
+#: Seconds between two lines on progress, and between two times that kernels are published.
 _PACE = 5.0
+#: Kernels of a stage and the seconds that one core took for them; measured for one parameter (docs/benchmarks.md).
+_MEASURED = {
+    "pixel_stage": (115, 70.0), "gaussian_stage": (118, 38.0), "moving_colors": (32, 14.0), "render": (8, 6.0),
+}  # fmt: skip
+#: The same of a stage that was not measured.
+_UNMEASURED = (50, 20.0)
 
 _log = logging.getLogger("ns_abstract.kernels")
 
@@ -29,19 +36,62 @@ def shares(stages: Sequence[str], count: int) -> list[list[str]]:
     return [[stage] for stage in stages[: count - 1]] + [list(stages[count - 1 :])]
 
 
-def compile_beside(job: Job, index: int, processes: int | None = None) -> None:
-    """Compile what frame ``index`` needs in several processes, if no kernel is there yet.
+def missing(frame: Frame) -> list[str]:
+    """The frame's stages whose kernels are not kept."""
+    found = []
+    for stage in frame.stages:
+        try:
+            with store().complete():
+                frame.warm_up(stage)
+        except KernelMissingError:
+            found.append(stage)
+    return found
 
-    What they cannot compile is left to this process, which takes the others' kernels from the folder of kernels.
+
+class _Progress:
+    """What is said while kernels are compiled."""
+
+    def __init__(self, parts: Sequence[Sequence[str]]) -> None:
+        measured = [[_MEASURED.get(stage, _UNMEASURED) for stage in part] for part in parts]
+        self.kernels = sum(count for part in measured for count, _ in part)
+        self.seconds = max(sum(seconds for _, seconds in part) for part in measured)
+        self.begin = time.monotonic()
+        self.said = self.begin
+        self.say(0)
+
+    def say(self, done: int) -> None:
+        """Say it, with an estimate by the measured times and by the kernels that are done, whichever is later."""
+        used = time.monotonic() - self.begin
+        done = min(done, self.kernels)
+        # the first kernels say little about the others
+        by_count = used * (self.kernels - done) / done if done > self.kernels // 3 else 0.0
+        left = max(self.seconds - used, by_count, 1.0)
+        _log.info("compiling kernels (first use only): %d of %d, about %.0f s left", done, self.kernels, left)
+
+    def due(self) -> bool:
+        """Whether it is time for the next line."""
+        due = time.monotonic() - self.said > _PACE
+        if due:
+            self.said = time.monotonic()
+        return due
+
+
+def compile_beside(job: Job, index: int, processes: int | None = None) -> None:
+    """Compile what frame ``index`` needs and is not kept in several processes, no kernel twice.
+
+    What they cannot compile is left to this process.
 
     Args:
         job: The scene with its sets.
         index: Number of a frame.
         processes: How many; None: one for every core.
     """
-    stages = job.frame(index).stages
-    parts = shares(stages, len(os.sched_getaffinity(0)) if processes is None else processes) if stages else []
-    if len(parts) < 2 or not store().empty:
+    frame = job.frame(index)
+    if not frame.stages or not (stages := missing(frame)):
+        return
+    parts = shares(stages, len(os.sched_getaffinity(0)) if processes is None else processes)
+    progress = _Progress(parts)
+    if len(parts) < 2:
         return
     compiled = [0] * len(parts)
     workers: list[subprocess.Popen[bytes]] = []
@@ -57,19 +107,18 @@ def compile_beside(job: Job, index: int, processes: int | None = None) -> None:
                 # a session of its own: signals are this process' to handle
                 workers.append(worker := subprocess.Popen(
                     command, pass_fds=[there.fileno()], start_new_session=True,
+                    env=os.environ | {SESSION: str(store().session)},
                     stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
                 ))  # fmt: skip
             stack.callback(_end, worker)
             here.send((job.recipe, index))
-        said = time.monotonic()
-        while running := [part for part, worker in zip(parts, workers, strict=True) if worker.poll() is None]:
+        while any(worker.poll() is None for worker in workers):
             time.sleep(0.1)
             compiled = [_latest(line, before) for line, before in zip(lines, compiled, strict=True)]
-            if time.monotonic() - said > _PACE:
-                said = time.monotonic()
-                names = ", ".join(stage.replace("_", " ") for part in running for stage in part)
-                _log.info("compiling kernels (first use only): %d done; at work: %s", sum(compiled), names)
-    store().refresh()
+            if progress.due():
+                progress.say(sum(compiled))
+                store().publish()
+    store().publish()
 
 
 def _end(worker: subprocess.Popen[bytes]) -> None:
@@ -103,7 +152,6 @@ def main() -> None:
     frame = opened(recipe).frame(index)
     for stage in sys.argv[2:]:
         frame.warm_up(stage)
-        store().publish()
 
 
 if __name__ == "__main__":

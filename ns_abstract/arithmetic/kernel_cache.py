@@ -7,7 +7,8 @@ may use, and what is read back is what was written:
 * ``ROOT/<hash of the sources>/manifest.json`` names the files of every kernel and their SHA-256;
 * ``ROOT/<hash>/blobs/<SHA-256>`` are these files; one that is damaged is dropped, and its kernel compiled again;
 * ``ROOT/<hash>/session-<host>-<process>-*`` is where numba reads and writes in one process. New files are published
-  from there, so that processes that start at once do not get into each other's way.
+  from there, so that processes that start at once do not get into each other's way. Processes that compile for
+  another one share its session: a lock for every kernel keeps two of them from compiling the same one.
 
 ROOT is ``$NS_ABSTRACT_CACHE_DIR``, or ``kernels`` in the cache folder that the platform provides. Where that cannot be
 written, a temporary folder serves the process and those that it starts. The installation itself is never written to.
@@ -24,8 +25,8 @@ import shutil
 import socket
 import tempfile
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager, suppress
 from functools import cache
 from multiprocessing.util import Finalize
 from pathlib import Path
@@ -34,6 +35,7 @@ from typing import Any
 import numba
 import numba.core.config as settings
 import platformdirs
+from numba.core.caching import FunctionCache
 
 from ns_abstract.io.atomic import write_atomic
 from ns_abstract.io.errors import InputError
@@ -45,6 +47,8 @@ FOLDERS = ("arithmetic", "geometry", "methods", "perturbation")
 OUTER = "verify"
 #: Variable that names the folder of compiled kernels.
 VARIABLE = "NS_ABSTRACT_CACHE_DIR"
+#: Variable that names the session that a process shares; set for processes that compile for another one.
+SESSION = "NS_ABSTRACT_KERNEL_SESSION"
 #: Versions of the sources whose kernels are kept.
 _KEPT = 4
 #: Bytes that have to be free where kernels are written.
@@ -67,24 +71,36 @@ def source_key() -> str:
     return found.hexdigest()
 
 
+class KernelMissingError(Exception):
+    """A kernel is not kept, where none may be compiled."""
+
+
 class KernelStore:
     """The kernels of one version of the sources, as one process sees them.
 
     Args:
         root: Folder of all versions.
         key: Names the version.
+        session: That of the process that this one compiles for; None: one of its own.
 
     Raises:
         OSError: ``root`` cannot be written.
     """
 
-    def __init__(self, root: Path, key: str) -> None:
+    def __init__(self, root: Path, key: str, session: Path | None = None) -> None:
         self._folder = root / key[:32]
         self._sources = [self._folder]
         self._blobs = self._folder / "blobs"
         self._blobs.mkdir(parents=True, exist_ok=True)
         owner = f"session-{socket.gethostname()}-{os.getpid()}-"
-        self.session = Path(tempfile.mkdtemp(prefix=owner, dir=self._folder))
+        # of another version's session nothing can be used
+        self.shared = session is not None and session.parent == self._folder and session.is_dir()
+        if session is not None and self.shared:
+            self.session = session
+        else:
+            self.session = Path(tempfile.mkdtemp(prefix=owner, dir=self._folder))
+        self._claims: dict[str, ExitStack] = {}
+        self._complete = False
         self._published: dict[Path, tuple[int, int]] = {}
         self._entries = _read_manifest(self._folder)
         self.compiled = 0
@@ -107,15 +123,51 @@ class KernelStore:
         """The session's folder of one module, with what is kept of its functions; damaged files are left out."""
         folder = self.session / place
         if not folder.exists():
-            folder.mkdir(parents=True)
-            self._link(place)
+            with _locked(self.session / "lock"):
+                if not folder.exists():
+                    folder.mkdir(parents=True)
+                    self._link(place)
         return str(folder)
 
-    def refresh(self) -> None:
-        """Take what other processes have published since this one began; what it has itself stays."""
-        self._entries = _read_manifest(self._folder) | self._entries
-        for folder in [path for path in self.session.rglob("*") if path.is_dir()]:
-            self._link(folder.relative_to(self.session).as_posix())
+    @contextmanager
+    def complete(self) -> Iterator[None]:
+        """Inside, a kernel that is not kept raises `KernelMissingError` instead of being compiled."""
+        self._complete = True
+        try:
+            yield
+        finally:
+            self._complete = False
+
+    def claim(self, kernel: str, load: Callable[[], Any]) -> Any:
+        """What ``load`` returns now, or once no other process of this session compiles the kernel; None: compile it.
+
+        Until `saved` is called, others wait for this process. They do not wait for each other in a circle, since
+        kernels do not call each other in one.
+
+        Raises:
+            KernelMissingError: It is not kept, inside `complete`.
+        """
+        found = load()
+        if found is None and self._complete:
+            raise KernelMissingError(kernel)
+        if found is not None or not self.shared or kernel in self._claims:
+            return found
+        claims = self.session / "claims"
+        claims.mkdir(exist_ok=True)
+        with ExitStack() as stack:
+            stack.enter_context(_locked(claims / hashlib.sha256(kernel.encode()).hexdigest()))
+            if (found := load()) is None:
+                self._claims[kernel] = stack.pop_all()
+        return found
+
+    def saved(self, kernel: str, save: Callable[[], Any]) -> None:
+        """Have ``save`` write a kernel that was compiled, and let others have it."""
+        if not self.shared:
+            save()
+            return
+        # the index of a function's kernels is read, changed and written
+        with self._claims.pop(kernel, ExitStack()), _locked(self.session / "lock"):
+            save()
 
     def _link(self, place: str) -> None:
         """Bring what is kept of a module's functions into the session's folder."""
@@ -184,12 +236,16 @@ class KernelStore:
         now = time.monotonic()
         if now - self._said > _PACE:
             self._said = now
+            if self.shared:
+                return
             # not after every kernel: it looks at all files of the session
             self.publish()
             _log.info("compiling kernels (first use only): %d done", self.compiled)
 
     def close(self) -> None:
-        """Publish, and remove the session's folder."""
+        """Publish, and remove the session's folder unless it is another process'."""
+        if self.shared:
+            return
         with suppress(OSError):
             self.publish()
         shutil.rmtree(self.session, ignore_errors=True)
@@ -274,9 +330,10 @@ def _open() -> KernelStore:
     named = os.environ.get(VARIABLE)
     key = source_key()
     root: Path | None = None
+    session = os.environ.get(SESSION)
     try:
         root = Path(named) if named else platformdirs.user_cache_path("ns-abstract") / "kernels"
-        return KernelStore(root.absolute(), key)
+        return KernelStore(root.absolute(), key, Path(session) if session else None)
     except (OSError, RuntimeError) as error:
         problem = error
     try:
@@ -350,8 +407,35 @@ class KernelLocator:
         store().before_saving()
 
 
+_load, _save = FunctionCache.load_overload, FunctionCache.save_overload
+
+
+def _kernel(cache: FunctionCache, signature: Any) -> str | None:
+    """Names a kernel of this package, or None."""
+    if not isinstance(cache._impl.locator, KernelLocator):  # pyright: ignore[reportAttributeAccessIssue]
+        return None
+    return f"{cache.cache_path} {cache._impl.filename_base} {signature}"  # pyright: ignore[reportAttributeAccessIssue]
+
+
+def _load_overload(cache: FunctionCache, signature: Any, context: Any) -> Any:
+    kernel = _kernel(cache, signature)
+    if kernel is None:
+        return _load(cache, signature, context)
+    return store().claim(kernel, lambda: _load(cache, signature, context))
+
+
+def _save_overload(cache: FunctionCache, signature: Any, data: Any) -> None:
+    kernel = _kernel(cache, signature)
+    if kernel is None:
+        _save(cache, signature, data)
+    else:
+        store().saved(kernel, lambda: _save(cache, signature, data))
+
+
 def install() -> None:
-    """Have numba ask `KernelLocator` first."""
+    """Have numba ask `KernelLocator` first, and `KernelStore` before it compiles a kernel."""
+    FunctionCache.load_overload = _load_overload  # pyright: ignore[reportAttributeAccessIssue]
+    FunctionCache.save_overload = _save_overload  # pyright: ignore[reportAttributeAccessIssue]
     ours = f"{KernelLocator.__module__}.{KernelLocator.__name__}"
     others = settings.CACHE_LOCATOR_CLASSES or _LOCATORS  # pyright: ignore[reportAttributeAccessIssue]
     if ours not in others:

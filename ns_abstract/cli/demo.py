@@ -17,14 +17,13 @@ class Demo:
     """Write scenes as real run folders, with camera paths, sets of poses and a network in a loop.
 
     An airfield as a Splatfacto run; a gate as another one, with a network that steers towards it (LOOP.json); and a
-    buoy as a vanilla-nerf run of full size, whose network is fitted to an analytic field: no network connection, a
-    minute or two.
+    buoy as a vanilla-nerf run of full size. Needs no network connection and takes about ten seconds.
     """
 
     output_dir: Path
     """Folder for the runs; made if missing."""
     splats_only: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
-    """Leave out the NeRF, whose fit takes most of the time."""
+    """Leave out the NeRF."""
 
 
 def demo(options: Demo) -> int:
@@ -46,7 +45,7 @@ def demo(options: Demo) -> int:
             course, loop = write_loop_demo(folder / "gate")
         nerf = None
         if not options.splats_only:
-            with console.status("fitting the NeRF (about a minute)"):
+            with console.status("writing the NeRF"):
                 nerf = write_nerf_demo(folder)
     except OSError as error:
         raise InputError(

@@ -69,9 +69,9 @@ def view(options: View) -> int:
     Raises:
         InputError: nerfstudio is missing, or the run cannot be opened.
     """
-    from ns_abstract.nerfstudio.torchvision_operators import autoload
+    from ns_abstract.nerfstudio.torchvision_operators import declare_missing
 
-    autoload()
+    declare_missing()
     warnings.filterwarnings("ignore", category=FutureWarning)
     try:
         from ns_abstract.nerfstudio.viewing import view as serve

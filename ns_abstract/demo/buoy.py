@@ -1,52 +1,67 @@
-"""The demo's NeRF: a buoy on a round float, an analytic field that a full-size network is fitted to."""
+"""The demo's NeRF: a buoy on a round float, from weights that `benchmarks/fit_buoy.py` fitted."""
 
 from __future__ import annotations
 
+import zipfile
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from ns_abstract.demo.nerf_fit import NerfNetwork, fit_field
+from ns_abstract.demo.nerf_fit import NerfNetwork
 from ns_abstract.geometry.views import View, look_at, path_json
+from ns_abstract.io.errors import InputError
 from ns_abstract.methods.nerf.scene import NerfScene
 
-#: Everything lies inside this distance of the origin.
-REACH = 1.2
-#: Steps of the fit: about a minute of one processor core.
-STEPS = 500
-BATCH = 1536
-_DENSITY, _EDGE = 40.0, 0.05
+#: Part of the package.
+WEIGHTS = Path(__file__).with_name("buoy.npz")
+_FIX = "install the package again"
 
 
-def buoy(x: Tensor, direction: Tensor) -> tuple[Tensor, Tensor]:
-    """Densities [n] and colours [n, 3] at points [n, 3] seen along unit ``direction`` [n, 3]."""
-    flat = x[:, :2].norm(dim=1)
-    height = x[:, 2]
-    float_ = torch.hypot((flat - 0.55).clamp(min=0.0), (height + 0.35).abs()) - 0.16
-    body = torch.hypot(
-        (flat - 0.12 - 0.22 * (0.6 - height).clamp(0.0, 0.9)).clamp(min=0.0), (height - 0.15).abs() - 0.45
-    )
-    body = torch.where((height - 0.15).abs() < 0.45, flat - 0.12 - 0.22 * (0.6 - height), body) - 0.02
-    lamp = (x - torch.tensor([0.0, 0.0, 0.78])).norm(dim=1) - 0.14
-    nearest = torch.stack([float_, body, lamp])
-    distance, part = nearest.min(dim=0)
-    density = _DENSITY * torch.sigmoid(-distance / _EDGE * 4.0)
-    stripes = torch.sigmoid(20.0 * torch.sin(9.0 * height))[:, None]
-    red, white = torch.tensor([0.85, 0.12, 0.1]), torch.tensor([0.95, 0.95, 0.92])
-    colors = torch.where((part == 0)[:, None], torch.tensor([0.15, 0.2, 0.35]), stripes * red + (1.0 - stripes) * white)
-    colors = torch.where((part == 2)[:, None], torch.tensor([1.0, 0.85, 0.3]), colors)
-    shade = 0.8 + 0.2 * (0.5 + 0.5 * (-direction @ torch.tensor([0.3, 0.2, 0.93])))
-    return density, (colors * shade[:, None]).clamp(0.0, 1.0)
+def load_network(file: Path = WEIGHTS) -> NerfNetwork:
+    """The fitted network of Nerfstudio's own size (8 x 256).
 
+    Args:
+        file: Holds every parameter by its name: float32, or for matrices int8 beside ``NAME.scale`` [rows, 1] float32.
 
-def buoy_scene(steps: int = STEPS) -> NerfScene:
-    """A NeRF of Nerfstudio's own size (8 x 256) fitted to the buoy."""
-    torch.manual_seed(0)
+    Raises:
+        InputError: The file cannot be read, or an array is missing, has another type or shape, or is not finite.
+    """
     network = NerfNetwork()
-    fit_field(network, buoy, REACH, steps, batch=BATCH)
-    weights = network.weights()
+    state: dict[str, Tensor] = {}
+    try:
+        with np.load(file, allow_pickle=False) as arrays:
+            for name, parameter in network.state_dict().items():
+                values, shape = arrays[name], tuple(parameter.shape)
+                matrix = len(shape) == 2
+                _check(file, name, values, shape, np.int8 if matrix else np.float32)
+                if matrix:
+                    scale = arrays[f"{name}.scale"]
+                    _check(file, f"{name}.scale", scale, (shape[0], 1), np.float32)
+                    values = values * scale
+                state[name] = torch.from_numpy(values)
+    except InputError:
+        raise
+    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
+        raise InputError(f"cannot be read ({error})", file=file, fix=_FIX) from None
+    network.load_state_dict(state)
+    return network
+
+
+def _check(file: Path, name: str, values: np.ndarray, shape: tuple[int, ...], kind: type) -> None:
+    if values.dtype != kind or values.shape != shape:
+        raise InputError(
+            f"{values.dtype}{list(values.shape)}, not {kind.__name__}{list(shape)}", file=file, field=name, fix=_FIX
+        )
+    if not np.isfinite(values).all():
+        raise InputError("not finite", file=file, field=name, fix=_FIX)
+
+
+def buoy_scene() -> NerfScene:
+    """A NeRF of Nerfstudio's own size (8 x 256) that shows the buoy."""
+    weights = load_network().weights()
     return NerfScene(weights, weights, background=np.array([1.0, 1.0, 1.0], np.float32), name="buoy")
 
 

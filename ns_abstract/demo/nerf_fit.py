@@ -1,9 +1,6 @@
-"""Small NeRF networks to be trained here: on an analytic field, or on pictures (benchmarks/train_lego.py)."""
+"""NeRF networks in PyTorch, to be trained by `benchmarks/fit_buoy.py` and `benchmarks/train_lego.py`."""
 
 from __future__ import annotations
-
-import math
-from collections.abc import Callable
 
 import numpy as np
 import torch
@@ -13,17 +10,10 @@ from torch.nn import functional
 from ns_abstract.methods.nerf.field import encode
 from ns_abstract.methods.nerf.scene import Encoding, FieldWeights, Layer
 
-#: Points [n, 3] and unit directions [n, 3] to densities [n] and colours [n, 3].
-AnalyticField = Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]
-
 POSITION = Encoding(10, 0.0, 8.0)
 DIRECTION = Encoding(4, 0.0, 4.0)
 #: Density before the softplus where training begins: nearly transparent.
 _EMPTY = -3.0
-#: Density before the softplus that counts as empty in `fit_field`.
-_CLEAR = -9.0
-#: Radius of the space that is fitted as empty, relative to that of the object.
-_FAR = 4.0
 
 
 class NerfNetwork(nn.Module):
@@ -91,39 +81,3 @@ class NerfNetwork(nn.Module):
             POSITION,
             DIRECTION,
         )
-
-
-def fit_field(
-    network: NerfNetwork,
-    field: AnalyticField,
-    radius: float,
-    steps: int,
-    *,
-    batch: int = 2048,
-    rate: float = 8e-4,
-    seed: int = 0,
-) -> None:
-    """Fit a network to an analytic field over the ball of radius ``radius``, and more coarsely around it.
-
-    Densities are compared before the softplus and squeezed, so that neither empty nor dense space dominates;
-    colours where there is something.
-    """
-    generator = torch.Generator().manual_seed(seed)
-    optimizer = torch.optim.Adam(network.parameters(), lr=rate, eps=1e-8)
-    for step in range(steps):
-        for group in optimizer.param_groups:
-            group["lr"] = rate * min(1.0, (step + 1) / 40) * 0.5 * (1.0 + math.cos(math.pi * step / steps)) + 1e-5
-        x = torch.randn(batch, 3, generator=generator)
-        # rays begin far outside of what there is to see
-        around = torch.where(torch.arange(batch)[:, None] % 4 == 0, _FAR * radius, radius)
-        x *= around * torch.rand(batch, 1, generator=generator).sqrt() / x.norm(dim=1, keepdim=True)
-        direction = functional.normalize(torch.randn(batch, 3, generator=generator), dim=1)
-        density, color = field(x, direction)
-        raw, h = network.raw_density(x)
-        target = torch.where(density > 20.0, density, torch.log(torch.expm1(density.clamp(1e-12, 30.0))))
-        loss = functional.mse_loss(functional.softsign(raw / 4.0), functional.softsign(target.clamp(min=_CLEAR) / 4.0))
-        opaque = (density > 0.5).float()[:, None]
-        loss = loss + (opaque * (network.colors(h, direction) - color) ** 2).mean() / opaque.mean().clamp(min=0.01)
-        optimizer.zero_grad(set_to_none=True)
-        loss.backward()
-        optimizer.step()

@@ -27,7 +27,7 @@ TIMESTAMP = "2026-01-01_120000"
 
 
 def write_nerf_demo(folder: Path) -> tuple[Path, Path]:
-    """Fit and write the NeRF and its camera path; returns config.yml and the path."""
+    """Write the NeRF and its camera path; returns config.yml and the path."""
     scene = buoy_scene()
     config = write_nerf_run(scene, folder, timestamp=TIMESTAMP, experiment_name="buoy", views=buoy_views())
     return config, write_json(folder / "camera_path_buoy.json", buoy_path())

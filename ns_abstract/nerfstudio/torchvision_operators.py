@@ -5,17 +5,15 @@ operators does not load, which torchvision allows for, except that ``torchvision
 describes two of them without asking. Declaring these two is enough; they have no kernels, so that
 calling them is an error. nerfstudio calls neither.
 
-PyTorch calls `autoload` at the end of ``import torch`` (entry point ``torch.backends``;
-TORCH_DEVICE_BACKEND_AUTOLOAD=0 switches that off), so nerfstudio's own commands profit as well.
+Nothing is declared unless `declare_missing` is called: `ns-abstract-viewer` and ``python -m ns_abstract.nerfstudio``
+do so before they import nerfstudio.
 """
 
 from __future__ import annotations
 
 import importlib.util
 import sys
-from importlib.machinery import ModuleSpec
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 _SCHEMAS = (
@@ -26,30 +24,22 @@ _SCHEMAS = (
 _declared: list[Any] = []
 
 
-class _Watch:
-    """Looks at torchvision right before it is imported, and at nothing else."""
-
-    def find_spec(self, name: str, path: Any = None, target: ModuleType | None = None) -> ModuleSpec | None:
-        if name == "torchvision":
-            sys.meta_path.remove(self)
-            declare_missing()
-        return None
-
-
 def autoload() -> None:
-    """Watch for the import of torchvision if this PyTorch has no CUDA."""
-    import torch
+    """Do nothing.
 
-    if torch.version.cuda is None and "torchvision" not in sys.modules:
-        sys.meta_path.insert(0, _Watch())
+    Editable installs of version 0.1 and before tell PyTorch to call this function; without it, every
+    ``import torch`` in their environment would fail.
+    """
 
 
 def declare_missing() -> None:
-    """Declare torchvision's two operators unless its own library does."""
+    """Declare torchvision's two operators if this PyTorch has no CUDA and torchvision's own library does not load."""
     import torch
 
+    if _declared or torch.version.cuda is not None or "torchvision" in sys.modules:
+        return
     spec = importlib.util.find_spec("torchvision")
-    if _declared or spec is None or spec.origin is None:
+    if spec is None or spec.origin is None:
         return
     for library in Path(spec.origin).parent.glob("_C*.so"):
         try:

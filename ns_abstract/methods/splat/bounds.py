@@ -37,7 +37,7 @@ from ns_abstract.methods.splat.stage_data import (
 from ns_abstract.methods.splat.variations import VariedSplats
 
 #: Kernels of a cell that write into memory that they are given, the slowest to compile first.
-STAGES = ("gaussian_stage", "pixel_stage", "moving_colors")
+STAGES = ("pixel_stage", "gaussian_stage", "moving_colors")
 #: Most pairs of fragments whose depth order is examined in one block of pixels.
 PAIR_LIMIT = 30_000
 

@@ -150,7 +150,7 @@ class SplatFrame:
     #: What tiles share is most of the work: every call bounds as many as it is given.
     tilewise = False
     tiles_at_once: int | None = None
-    stages = STAGES
+    stages = (*STAGES, "render")
     #: Poses rendered in every part of a cell that is split.
     witnesses = 1
 
@@ -193,12 +193,13 @@ class SplatFrame:
         box = self.box
         for axis in range(box.dimensions):
             box = box.split(axis, 1024)[0]
-        if stage is not None:
+        if stage is None:
+            self.bound(box, np.arange(1))
+        elif stage != "render":
             with alone(stage):
                 self.bound(box, np.arange(1))
-            return
-        self.bound(box, np.arange(1))
-        self.render(box.middle)
+        if stage in (None, "render"):
+            self.render(box.middle)
 
     def render(self, values: np.ndarray, tiles: np.ndarray | None = None) -> np.ndarray:
         """Tiles [t, side, side, channels] float32 of the concrete image at parameter values [d]."""

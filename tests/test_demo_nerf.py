@@ -1,0 +1,86 @@
+"""The demo's NeRF comes from weights that ship: they are what was fitted, and what is damaged is refused."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from ns_abstract.demo.buoy import WEIGHTS, buoy_scene, load_network
+from ns_abstract.demo.writing import write_nerf_demo
+from ns_abstract.io.errors import InputError
+from ns_abstract.methods.load import load_any
+
+
+@pytest.fixture
+def fit() -> ModuleType:
+    """The script that fitted the weights; tests are skipped where it is not beside them."""
+    from benchmark_scripts import script
+
+    return script("fit_buoy")
+
+
+def test_weights_show_the_buoy(fit: ModuleType) -> None:
+    """Opacity of 3 cm and colour, on average, at points all around; an unfitted network errs by 0.3 and 0.4."""
+    generator = torch.Generator().manual_seed(5)
+    x = torch.randn(20_000, 3, generator=generator)
+    x *= fit.REACH * torch.rand(20_000, 1, generator=generator).sqrt() / x.norm(dim=1, keepdim=True)
+    direction = torch.nn.functional.normalize(torch.randn(20_000, 3, generator=generator), dim=1)
+    density, color = fit.buoy(x, direction)
+    network = load_network()
+    with torch.no_grad():
+        raw, h = network.raw_density(x)
+        found = network.colors(h, direction)
+    clear = torch.exp(-0.03 * torch.nn.functional.softplus(raw)) - torch.exp(-0.03 * density)
+    assert float(clear.abs().mean()) < 0.03
+    assert float((found - color)[density > 0.5].abs().mean()) < 0.03
+
+
+def test_weights_are_small() -> None:
+    assert WEIGHTS.stat().st_size < 500_000
+
+
+def test_run_holds_the_weights(tmp_path: Path) -> None:
+    config, _ = write_nerf_demo(tmp_path)
+    for found, wanted in zip(load_any(config).fine.arrays(), buoy_scene().fine.arrays(), strict=True):
+        np.testing.assert_array_equal(found, wanted)
+
+
+def test_quantised_parameters_are_read_back(fit: ModuleType, tmp_path: Path) -> None:
+    """Every weight within half a step of what was fitted."""
+    network = load_network()
+    np.savez(tmp_path / "again.npz", **fit.quantised(network))
+    again = load_network(tmp_path / "again.npz")
+    for (name, before), after in zip(network.state_dict().items(), again.state_dict().values(), strict=True):
+        step = before.abs().amax(dim=1, keepdim=True) / 31 if before.ndim == 2 else torch.zeros(1)
+        assert bool(((before - after).abs() <= 0.51 * step).all()), name
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda a: a.pop("base.3.weight"), "base.3.weight"),
+        (lambda a: a.pop("base.3.weight.scale"), "base.3.weight.scale"),
+        (lambda a: a.update({"color.bias": np.zeros(4, np.float32)}), "color.bias"),
+        (lambda a: a.update({"density.bias": np.array([np.nan], np.float32)}), "not finite"),
+        (lambda a: a.update({"base.0.weight": a["base.0.weight"].astype(np.float32)}), "float32"),
+        (lambda a: a.update({"base.0.bias": np.array([{}], object)}), "base.0.bias|allow_pickle"),
+    ],
+)
+def test_damaged_weights_are_refused(tmp_path: Path, change: Any, words: str) -> None:
+    arrays = dict(np.load(WEIGHTS))
+    change(arrays)
+    np.savez(tmp_path / "changed.npz", **arrays)
+    with pytest.raises(InputError, match=words):
+        load_network(tmp_path / "changed.npz")
+
+
+def test_files_that_are_no_archive_are_refused(tmp_path: Path) -> None:
+    (tmp_path / "cut.npz").write_bytes(WEIGHTS.read_bytes()[:1000])
+    for file in (tmp_path / "cut.npz", tmp_path / "none.npz"):
+        with pytest.raises(InputError, match=r"cannot be read"):
+            load_network(file)
