@@ -30,6 +30,7 @@ from ns_abstract.methods import config_keys
 from ns_abstract.methods.load import load_any
 from ns_abstract.methods.nerf.write import write_nerf_run
 from ns_abstract.methods.splat.write import write_splatfacto_run
+from ns_abstract.nerfstudio.torchvision_operators import declare_missing
 from ns_abstract.perturbation.specification import FILE_KEYS, load_perturbation, parse_perturbation
 from ns_abstract.reach.loop import parse_loop
 from ns_abstract.verify.properties import parse_property
@@ -48,6 +49,7 @@ def named(table: KeyTable) -> dict[str, Key]:
 @pytest.fixture(scope="module")
 def nerfstudio() -> SimpleNamespace:
     """Nerfstudio's modules; this package declares what a torchvision built for another torch lacks."""
+    declare_missing()
     modules = {
         name: importlib.import_module(name)
         for name in (
