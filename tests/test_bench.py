@@ -183,7 +183,7 @@ def test_certified_fraction_against_time(monkeypatch: pytest.MonkeyPatch) -> Non
         )
 
     monkeypatch.setattr(certificates, "certify", certify)
-    monkeypatch.setattr(certificates.PoseSet, "from_json", lambda *_: None)
+    monkeypatch.setattr(certificates.PoseSet, "from_json", lambda *_, **__: None)
     said: list[str] = []
     any_: Any = None
     row = certificates.curve(any_, any_, "x", {}, Path("net.onnx"), any_, 60.0, 2, (3.0, 10.0, 32.0, 40.0), said.append)

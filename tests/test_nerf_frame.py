@@ -141,7 +141,7 @@ def test_the_whole_set_costs_nothing_and_rays_come_in_batches() -> None:
 
 @pytest.mark.parametrize("density", [8.0, 1e4])
 def test_colours_of_samples_that_add_nothing_are_not_needed(density: float, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The same pictures, bit for bit, as where slopes are asked for and every colour is."""
+    """The same pictures as where slopes are asked for and every colour is, but for the order of sums of fewer rows."""
     scene, pose_set = tiny_scene(2, density=density), poses(SETS["point"])
     renderer, points = NerfRenderer(scene, UNIFORM), []
     color = Field.color
@@ -151,7 +151,8 @@ def test_colours_of_samples_that_add_nothing_are_not_needed(density: float, monk
     pose = torch.from_numpy(pose_set.pose(pose_set.box.middle))
     whole = renderer.picture(pose_set.camera, pose.clone().requires_grad_()).detach().reshape(-1, 3)
     picture = renderer.pixels(pose_set.camera, pose.numpy(), pixels_of(pose_set.camera))
-    assert (picture == whole.numpy()).all()
+    # matrix libraries choose the order of a sum by the number of rows on some processors: a unit of float64 of each value
+    assert np.abs(picture - whole.numpy()).max() <= 2.0**-52
     assert (points[1] < 0.9 * points[0]) == (density > 1e3)
 
 
