@@ -151,7 +151,7 @@ def test_colours_of_samples_that_add_nothing_are_not_needed(density: float, monk
     pose = torch.from_numpy(pose_set.pose(pose_set.box.middle))
     whole = renderer.picture(pose_set.camera, pose.clone().requires_grad_()).detach().reshape(-1, 3)
     picture = renderer.pixels(pose_set.camera, pose.numpy(), pixels_of(pose_set.camera))
-    # matrix libraries choose the order of a sum by the number of rows on some processors: a unit of float64 of each value
+    # on some processors matrix libraries choose the order of a sum by the number of rows: a unit of float64
     assert np.abs(picture - whole.numpy()).max() <= 2.0**-52
     assert (points[1] < 0.9 * points[0]) == (density > 1e3)
 

@@ -500,7 +500,7 @@ def test_words_for_every_state(nerfstudio: SimpleNamespace) -> None:
     assert "no bounds yet" in text and "stopped: out of memory" in text
 
 
-def test_options_are_ns_viewers() -> None:
+def test_options_are_ns_viewers(nerfstudio: SimpleNamespace) -> None:
     from nerfstudio.configs.base_config import ViewerConfig
     from nerfstudio.scripts.viewer.run_viewer import RunViewer
 
