@@ -17,6 +17,7 @@ import numpy as np
 import pytest
 import torch
 from nerfs import UNIFORM, other_view, tiny_scene, view
+from scene_files import change, checkpoint_of
 from test_cli import one_line
 
 from ns_abstract.api.files import Settings, open_job
@@ -35,18 +36,6 @@ from ns_abstract.methods.nerf.write import write_nerf_run
 @pytest.fixture
 def run(tmp_path: Path) -> Path:
     return write_nerf_run(tiny_scene(1), tmp_path / "runs", timestamp="t", experiment_name="tiny")
-
-
-def checkpoint_of(config: Path) -> Path:
-    return next((config.parent / "nerfstudio_models").glob("*.ckpt"))
-
-
-def change(config: Path, edit: Callable[[dict[str, Any]], None]) -> None:
-    """Edit the model's state in the checkpoint."""
-    file = checkpoint_of(config)
-    state = torch.load(file, weights_only=True)
-    edit(state["pipeline"])
-    torch.save(state, file)
 
 
 def test_a_run_is_read_as_it_was_written(run: Path) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -80,7 +81,7 @@ def test_a_report_with_a_faulty_worker_is_sampled(
         return json.loads((tmp_path / "report.json").read_text())
 
     with monkeypatch.context() as patch:
-        patch.setattr(rendering, "started", lambda *_: _Entered(FaultyWorker()))
+        patch.setattr(rendering, "started", lambda *_: nullcontext(FaultyWorker()))
         report = command()
     assert report["guarantee"] == "sampled"
     assert any("self-check" in limit and "exp(" in limit for limit in report["limits"])
@@ -88,19 +89,6 @@ def test_a_report_with_a_faulty_worker_is_sampled(
     # what that worker left is not taken over where everything is sound
     report = command(resume=True)
     assert report["guarantee"] == "float32-sound" and "self-check" not in str(report["limits"])
-
-
-class _Entered:
-    """A context manager of an engine."""
-
-    def __init__(self, engine: Here) -> None:
-        self.engine = engine
-
-    def __enter__(self) -> Here:
-        return self.engine
-
-    def __exit__(self, *_: Any) -> None:
-        self.engine.close()
 
 
 def test_a_faulty_worker_certifies_nothing(blobs: Inputs, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

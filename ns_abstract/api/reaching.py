@@ -499,7 +499,7 @@ class ReachRun:
         job, loop = self.job, self.job.loop
         self.rows = {tally.frame: store.leaves(tally.frame) for tally in store.tallies()}
         entries = {QUESTIONS[tally.frame]: self._entry(tally) for tally in store.tallies()}
-        program = job.job.method.program
+        program, scene = job.job.method.program, job.job.describe()
         learned: dict[str, Any] = {}
         if isinstance(loop.dynamics, LearnedDynamics):
             law = loop.dynamics
@@ -511,12 +511,10 @@ class ReachRun:
                 "verdict": verdict(entries),
                 "questions": entries,
                 "guarantee": job.job.method.guarantee,
-                "guarantee_text": guarantee_text(
-                    job.job.method.guarantee, program["name"], job.job.describe().get("bounded")
-                ),
+                "guarantee_text": guarantee_text(job.job.method.guarantee, program["name"], scene.get("bounded")),
                 "network_guarantee": job.network.guarantee(job.model.arithmetic),
                 "renderer": {name: program[name] for name in ("name", "version")},
-                "scene": job.job.describe(),
+                "scene": scene,
                 "assumptions": [vars(entry) for entry in job.assumptions],
                 "model": file_stamp(loop.network),
                 "loop": loop.value,

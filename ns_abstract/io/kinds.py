@@ -10,6 +10,7 @@ from ns_abstract.io.errors import InputError
 
 #: Bytes that are looked at.
 _HEAD = 512
+_GIVE = "give the config.yml of a run, its folder, or a .ply"
 _EXPORT = "export the scene as .ply"
 _DOWNLOAD = "download the file itself (its raw version), not the page that shows it"
 _CONVERT = "convert with: splat-transform {name} out.ply"
@@ -26,13 +27,13 @@ _BEGINNINGS = (
     (b"\x28\xb5\x2f\xfd", "a file compressed by zstd", "unpack it with: zstd -d {name}"),
     (b"PXR-USDC", "a USD file", _EXPORT),
     (b"#usda", "a USD file", _EXPORT),
-    (b"\x93NUMPY", "a NumPy array", "give the config.yml of a run, its folder, or a .ply"),
-    (b"\x89PNG", "a PNG picture", "give the config.yml of a run, its folder, or a .ply"),
-    (b"\xff\xd8\xff", "a JPEG picture", "give the config.yml of a run, its folder, or a .ply"),
-    (b"%PDF", "a PDF document", "give the config.yml of a run, its folder, or a .ply"),
+    (b"\x93NUMPY", "a NumPy array", _GIVE),
+    (b"\x89PNG", "a PNG picture", _GIVE),
+    (b"\xff\xd8\xff", "a JPEG picture", _GIVE),
+    (b"%PDF", "a PDF document", _GIVE),
     (b"7z\xbc\xaf\x27\x1c", "a 7-Zip archive", "unpack it with: 7z x {name}"),
     (b"Rar!", "a RAR archive", "unpack it"),
-    (b"SQLite format 3\x00", "an SQLite database", "give the config.yml of a run, its folder, or a .ply"),
+    (b"SQLite format 3\x00", "an SQLite database", _GIVE),
 )
 #: Kinds without a mark of their own, by the ending of their names.
 _ENDINGS = {

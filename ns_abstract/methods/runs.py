@@ -74,7 +74,6 @@ class RunConfig:
         model: ``pipeline.model`` as a mapping; Python objects in it are :class:`Tagged`.
         model_folder: The folder of the checkpoints.
         root: The whole file as a mapping.
-        model_node: ``pipeline.model`` with its tag.
     """
 
     file: Path
@@ -84,7 +83,6 @@ class RunConfig:
     model: dict[str, Any]
     model_folder: Path
     root: dict[str, Any]
-    model_node: Any = None
 
     def integer(self, name: str, default: int, least: int, most: int | None = None) -> int:
         """Integer field of ``pipeline.model`` in [least, most]; ``default`` if absent."""
@@ -154,7 +152,6 @@ def read_config(path: str | os.PathLike[str]) -> RunConfig:
         model=model,
         model_folder=folder / _model_folder(root, file),
         root=root,
-        model_node=pipeline.get("model"),
     )
 
 
@@ -239,7 +236,7 @@ def step_assumption(run: RunConfig, checkpoint: Path, given: int | None) -> Assu
 def target_class(run: RunConfig) -> str:
     """Dotted name of the model's class that config.yml names; "" where it names none."""
     target = run.model.get("_target")
-    tagged = run.model_node if target is None else target
+    tagged = (as_mapping(run.root.get("pipeline")) or {}).get("model") if target is None else target
     if not isinstance(tagged, Tagged):
         return "" if target is None else show(target)
     name = tagged.tag.rpartition(":")[2]

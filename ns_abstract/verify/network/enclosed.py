@@ -15,6 +15,7 @@ import numpy as np
 import onnx
 from onnx import TensorProto
 
+from ns_abstract.arithmetic.network_charges import DOUBLE_UNIT, FLUSH, LIBRARY, OVERFLOW, UNIT, gamma
 from ns_abstract.io.errors import InputError
 from ns_abstract.verify.network.onnx_fold import fold
 
@@ -22,13 +23,13 @@ Ends = tuple[np.ndarray, np.ndarray]
 #: Unit roundoff of an evaluation, and its smallest normal number.
 Rounds = tuple[float, float]
 #: Unit roundoff and smallest normal number by type.
-_UNITS = {2: (2.0**-11, 2.0**-14), 4: (2.0**-24, 2.0**-126), 8: (2.0**-53, 2.0**-1022)}
+_UNITS = {2: (2.0**-11, 2.0**-14), 4: (UNIT, FLUSH), 8: (DOUBLE_UNIT, 2.0**-1022)}
 #: What float64's own operations and library functions may be off here, relative.
 _OWN = 2.0**-50
-#: What a library's function may be off in float32: relative to the value and 1 (as in `curves`).
-_LIBRARY = 2.0**-19
+#: What a library's function may be off in float32: relative to the value and 1, each as much as in `curves`.
+_LIBRARY = 2.0 * LIBRARY
 #: Numbers that a type holds no larger ones than; past half of it an order of sums may overflow.
-_OVERFLOW = {2: 2.0**15, 4: 2.0**126, 8: 2.0**1000}
+_OVERFLOW = {2: 2.0**15, 4: OVERFLOW, 8: 2.0**1000}
 _FIX = "fold constants when exporting, in float64"
 #: Arguments may be moved, but no number is computed.
 _MOVES = frozenset(
@@ -301,12 +302,6 @@ def _power(given: Sequence[Ends], rounds: Rounds) -> Ends:
     return _widened((low, high), _library(unit) * high + tiny)
 
 
-def _gamma(count: float, unit: float) -> float:
-    if count * unit >= 0.5:
-        raise InputError(f"sums up {count:,.0f} numbers", fix=_FIX)
-    return count * unit / (1.0 - count * unit)
-
-
 def _reduced(name: str, given: Ends, put: Callable[[np.ndarray], np.ndarray], rounds: Rounds) -> Ends:
     """Sums in any order; small multiples of one number are summed without rounding."""
     unit, tiny = rounds
@@ -318,9 +313,9 @@ def _reduced(name: str, given: Ends, put: Callable[[np.ndarray], np.ndarray], ro
             raise InputError("multiplies constants that are computed", fix=_FIX)
         if bool((given[0] == np.round(given[0])).all()) and bool((put(size[1]) < 2.0 ** _held(unit)).all()):
             return low, low
-        return _widened((low, low), _gamma(count + 2.0, unit + _OWN) * np.abs(low) + tiny)
+        return _widened((low, low), gamma(count + 2.0, unit + _OWN) * np.abs(low) + tiny)
     parts = count / max(1.0, float(put(given[0]).size))
-    reach = _gamma(parts + 4.0, unit + _OWN)
+    reach = gamma(parts + 4.0, unit + _OWN)
     if name == "ReduceL2":
         low, high = put(size[0]), put(size[1])
         return _widened((low, high), reach * high + math.sqrt(parts * tiny))
@@ -352,7 +347,7 @@ def _matmul(first: Ends, second: Ends, rounds: Rounds) -> Ends:
     # flushed operands lose a product with what is beside them
     lost = tiny * (np.abs(a).max(initial=0.0) + np.abs(b).max(initial=0.0) + 2.0) * count
     radius = np.abs(a) @ q + r @ (np.abs(b) + q)
-    return _widened((value, value), (radius + _gamma(count + 4.0, unit + _OWN) * size) * (1.0 + 2.0**-40) + lost)
+    return _widened((value, value), (radius + gamma(count + 4.0, unit + _OWN) * size) * (1.0 + 2.0**-40) + lost)
 
 
 def _plain(value: np.ndarray, tiny: float) -> bool:
