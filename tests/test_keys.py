@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import dataclasses
 import importlib
 import importlib.metadata
@@ -178,8 +179,9 @@ def test_nerfstudio_nerf_pictures_depend_on_what_is_used_or_refused(nerfstudio: 
     def picture(changed: Any) -> list[np.ndarray] | None:
         torch.manual_seed(1)
         try:
+            # Nerfstudio takes the kind of distortion out of the configuration's own dictionary
             model = nerfstudio.vanilla_nerf.NeRFModel(
-                changed, scene_box=SceneBox(torch.ones(2, 3)), num_train_data=3
+                copy.deepcopy(changed), scene_box=SceneBox(torch.ones(2, 3)), num_train_data=3
             ).eval()
             for field in (model.field_coarse, model.field_fine):
                 # neither opaque nor empty, and colourful
