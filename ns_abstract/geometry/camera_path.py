@@ -14,12 +14,10 @@ from numpy.typing import NDArray
 
 from ns_abstract.geometry.path_keys import ENTRY, KEYFRAME, PATH
 from ns_abstract.io.errors import InputError
-from ns_abstract.io.jsonio import is_number, load_json, parse_json, show
+from ns_abstract.io.jsonio import InputTuning, is_number, load_json, parse_json, show
 from ns_abstract.io.keys import sentence
 
 SIDE_LIMIT = 16384
-_ROTATION_TOLERANCE = 1e-3
-_LAST_ROW_TOLERANCE = 1e-6
 _FIX_FILE = "give the camera path that Nerfstudio's viewer saved"
 
 
@@ -360,12 +358,12 @@ def checked_pose(value: Any, field: str) -> NDArray[np.float64]:
     _refuse_scaled(matrix, field)
     with np.errstate(over="ignore", invalid="ignore"):
         distance = float(np.abs(rotation.T @ rotation - np.eye(3)).max())
-    if not distance <= _ROTATION_TOLERANCE:
+    if not distance <= InputTuning.rotation:
         with np.errstate(all="ignore"):
             scale = float(np.cbrt(np.linalg.det(rotation)))
-            whole = scale > 0 and np.abs(rotation.T @ rotation / scale**2 - np.eye(3)).max() <= _ROTATION_TOLERANCE
+            whole = scale > 0 and np.abs(rotation.T @ rotation / scale**2 - np.eye(3)).max() <= InputTuning.rotation
         fix = f"divide its nine numbers by {scale:.6g}" if whole else "remove scale and shear from the matrix"
-        problem = f"the rotation part is {distance:.3g} away from orthonormal (limit {_ROTATION_TOLERANCE:g})"
+        problem = f"the rotation part is {distance:.3g} away from orthonormal (limit {InputTuning.rotation:g})"
         raise InputError(problem, field=field, fix=fix)
     if np.linalg.det(rotation) < 0:
         raise InputError(
@@ -383,14 +381,14 @@ def _refuse_scaled(matrix: NDArray[np.float64], field: str) -> None:
         InputError: The row, and whether the matrix is scaled as a whole.
     """
     row = matrix[3]
-    if np.abs(row - (0, 0, 0, 1)).max() <= _LAST_ROW_TOLERANCE:
+    if np.abs(row - (0, 0, 0, 1)).max() <= InputTuning.last_row:
         return
     shown = f"the last row is ({', '.join(f'{x:.6g}' for x in row)}), not (0, 0, 0, 1)"
     scale = float(row[3])
     if not row[:3].any() and scale != 0.0:
         with np.errstate(all="ignore"):
             square = matrix[:3, :3].T @ matrix[:3, :3]
-            whole = np.abs(square / scale**2 - np.eye(3)).max() <= _ROTATION_TOLERANCE
+            whole = np.abs(square / scale**2 - np.eye(3)).max() <= InputTuning.rotation
         fix = (
             f"divide all 16 numbers by {scale:.6g}" if whole else "write 1 at its end; the rotation is not scaled by it"
         )

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from ns_abstract.arithmetic.forms import Basis, Float64Array, FormArray
-from ns_abstract.arithmetic.rounding import POSE_ROUNDING, UNIT64
+from ns_abstract.arithmetic.rounding import HALF_UP, POSE_ROUNDING, STILL_ROOM
 from ns_abstract.arithmetic.taylor import TaylorArray, TaylorBasis, taylor_cos_sin
 from ns_abstract.arithmetic.trigonometry import cos_sin
 from ns_abstract.geometry.box import ParameterBox
@@ -327,7 +327,7 @@ class PoseSet:
             index = box.names.index(name)
             low, high = box.lower[index], box.upper[index]
             middle = 0.5 * (low + high)
-            half = max(high - middle, middle - low) * (1.0 + 4.0 * UNIT64)
+            half = max(high - middle, middle - low) * HALF_UP
             return kind.parameter(basis, index, middle, half)
 
         def turned(axis: Float64Array, angle: Any) -> Any:
@@ -375,4 +375,4 @@ class PoseSet:
 def translation_only(forms: PoseForms) -> bool:
     """Whether the depth direction is the same for every pose, up to rounding: no depth order changes."""
     row = forms.rotation[2]
-    return bool(np.all(row.linear == 0.0) and np.all(row.radius < 1e-12))
+    return bool(np.all(row.linear == 0.0) and np.all(row.radius < STILL_ROOM))

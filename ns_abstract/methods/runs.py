@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from ns_abstract.io.assumptions import Assumption
 from ns_abstract.io.errors import InputError, first_line, visible
-from ns_abstract.io.jsonio import FIX_ACCESS, file_size, is_number, load_json, read_text, show
+from ns_abstract.io.jsonio import FIX_ACCESS, InputTuning, file_size, is_number, load_json, read_text, show
 from ns_abstract.io.kinds import refuse_other_kind
 from ns_abstract.methods.checkpoint import RECOPY, read_checkpoint
 from ns_abstract.methods.overrides import chosen
@@ -271,7 +271,7 @@ def read_dataparser_transform(run: RunConfig) -> tuple[DataparserTransform, tupl
     matrix = np.array(rows, np.float64)
     with np.errstate(all="ignore"):
         determinant = float(np.linalg.det(matrix[:, :3]))
-    if not math.isfinite(determinant) or abs(determinant) < 1e-12:
+    if not math.isfinite(determinant) or abs(determinant) < InputTuning.nothing:
         raise InputError(
             f"the 3x3 part cannot be inverted (determinant {determinant:.3g})",
             file=path,

@@ -16,7 +16,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
-from ns_abstract.arithmetic.elementary import EXP_HIGHEST, EXP_RELATIVE_ERROR, exp_kernel
+from ns_abstract.arithmetic.elementary import EXP_HIGHEST, exp_kernel
+from ns_abstract.arithmetic.rounding import EXP_RELATIVE_ERROR
 
 Float64Array = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]

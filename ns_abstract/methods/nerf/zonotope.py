@@ -24,18 +24,24 @@ from torch.nn import functional
 
 from ns_abstract.arithmetic.chebyshev import ChebyshevBasis
 from ns_abstract.arithmetic.rounding import (
+    BIAS_ROUNDING,
     CHEBYSHEV_ROUNDING,
+    ELLIPSE_UP,
     FIELD_UP,
+    INTERPOLATION_ROUNDING,
+    LEAST_SLOPE,
+    NARROW_ROUNDING,
+    PHASE_ROOM,
+    RELU_ROUNDING,
     UNDERFLOW_COLUMNS,
-    UNIT32,
-    UNIT64,
+    WAVE_ROUNDING,
     gamma,
 )
 from ns_abstract.arithmetic.simd.lanes import LINE
 from ns_abstract.methods.nerf import layer_kernel
 from ns_abstract.methods.nerf.field_kernel import Layers, Outputs, stacked, through_layers
 from ns_abstract.methods.nerf.layer_kernel import Weights, linear
-from ns_abstract.methods.nerf.relu_kernel import LEAST_SLOPE, Grid, grid_of
+from ns_abstract.methods.nerf.relu_kernel import Grid, grid_of
 from ns_abstract.methods.nerf.scene import Encoding, FieldWeights, Layer, Waves
 
 #: Radii of Bernstein ellipses that are tried for the remainder of an encoding.
@@ -45,8 +51,6 @@ _ELLIPSES = (1.05, 1.15, 1.3, 1.6, 2.0, 2.6, 3.5, 5.0, 8.0, 14.0, 30.0, 80.0, 30
 _NARROW_LAYERS = 4
 #: Error terms of a piece beyond which it is given up.
 ERROR_TERMS = 400
-#: What one rounding of a column in float32 is charged with, and what is of second order.
-_NARROW = (1.0 + 2.0**-10) * UNIT32
 
 
 #: Polynomials [B, m, k] and remainders [B, k] of an encoded vector.
@@ -213,9 +217,9 @@ class FieldBounds:
         ellipses = torch.tensor(_ELLIPSES, dtype=torch.float64, device=device)
         # [ellipses, d, m]: bound of |Im T_k| on the ellipse of one variable, rounded up
         self._imaginary = (0.5 * (ellipses[:, None, None] ** degrees.T - ellipses[:, None, None] ** -degrees.T)) * (
-            1.0 + 2.0**-30
+            ELLIPSE_UP
         )
-        self._decay = 4.0 * ellipses**-basis.degree / (ellipses - 1.0) * (1.0 + 2.0**-30)
+        self._decay = 4.0 * ellipses**-basis.degree / (ellipses - 1.0) * ELLIPSE_UP
 
         self._bernstein: dict[tuple[int, ...], Tensor] = {}
 
@@ -263,15 +267,17 @@ class FieldBounds:
             # the parts of x above the degree belong to the highest power that the basis has
             tops = self._imaginary[:, j].max(dim=1).values
             phase = torch.einsum("em,bmi->bie", self._imaginary[:, j], x.abs()) + rest[..., None] * tops
-            exponent = omega[:, None] * (phase * (1.0 + 2.0**-30) + 2.0**-40)[..., None, :]
+            exponent = omega[:, None] * (phase * ELLIPSE_UP + PHASE_ROOM)[..., None, :]
             growth = torch.where(exponent < 600.0, torch.cosh(exponent.clamp(max=600.0)), torch.inf)
             error = (growth * self._decay).amin(dim=-1).clamp(max=1.0 + lebesgue)
             remainder = remainder + lebesgue**j * error
         # the vector's own radius; the argument's and the functions' rounding, seen through the interpolation
         largest = nodes.abs().amax(dim=1)
-        rounding = lebesgue**self.basis.dimensions * (16.0 * UNIT64 * (omega * (largest[..., None] + 1.0)) + 2.0**-44)
+        rounding = lebesgue**self.basis.dimensions * (
+            WAVE_ROUNDING * (omega * (largest[..., None] + 1.0)) + INTERPOLATION_ROUNDING
+        )
         waves = (remainder + omega * radius[..., None] + rounding).flatten(-2)
-        plain = radius + rest + 2.0**-44 * (1.0 + largest) * lebesgue**self.basis.dimensions
+        plain = radius + rest + INTERPOLATION_ROUNDING * (1.0 + largest) * lebesgue**self.basis.dimensions
         return poly, (torch.cat([waves, waves, plain], dim=-1) + dropped) * FIELD_UP
 
     # --- layers --------------------------------------------------------------------------------
@@ -293,7 +299,7 @@ class FieldBounds:
             poly += encoded @ layer.weight[:seen]
             box += (remainder + rounding * (encoded.abs().sum(dim=1) + remainder)) @ layer.absolute[:seen]
         poly[:, 0] += layer.bias
-        box += 4.0 * UNIT64 * (layer.bias.abs() + poly[:, 0].abs())
+        box += BIAS_ROUNDING * (layer.bias.abs() + poly[:, 0].abs())
         spread = column_sums(columns, owner, poly.shape[0])
         return Affine(poly, columns, owner, spread, box * FIELD_UP, pieces.failed, pieces.count)
 
@@ -304,7 +310,7 @@ class FieldBounds:
         lines, absolute = layer.lines.numpy(), layer.absolute.numpy()
         return Weights(
             lines[:seen], absolute[:seen], lines[seen:], kind.numpy()[seen:], absolute[seen:], layer.bias.numpy(),
-            _rounding(len(absolute)), _NARROW if narrow else 0.0, UNDERFLOW_COLUMNS if narrow else 0.0,
+            _rounding(len(absolute)), NARROW_ROUNDING if narrow else 0.0, UNDERFLOW_COLUMNS if narrow else 0.0,
         )  # fmt: skip
 
     def _linear_compiled(self, pieces: Pieces, layer: _Linear, first: Encoded) -> Affine:
@@ -390,7 +396,7 @@ class FieldBounds:
         kept = torch.where(use_line, line, 0.5)
         error = torch.where(use_line, line_error, error)
         # the new polynomial's and the slopes' own rounding
-        error = error + 8.0 * UNIT64 * (q.abs().sum(dim=1) + e)
+        error = error + RELU_ROUNDING * (q.abs().sum(dim=1) + e)
         box = box * slope
         box[which, neuron] = r * torch.where(use_line, line, 1.0)
         poly = poly * slope[:, None]

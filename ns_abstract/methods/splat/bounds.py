@@ -9,7 +9,18 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ns_abstract.arithmetic.rounding import FRAGMENT_ROUNDING, REGION, UNIT64, Arithmetic, Charges, charges
+from ns_abstract.arithmetic.rounding import (
+    FRAGMENT_ROUNDING,
+    GRAM_ROOM,
+    GRAM_UP,
+    REGION,
+    SHIFTED_ROUNDING,
+    STILL_POSITION,
+    TIE_ROUNDING,
+    Arithmetic,
+    Charges,
+    charges,
+)
 from ns_abstract.execution.threads import lane, threads
 from ns_abstract.geometry.camera_path import Camera
 from ns_abstract.geometry.poses import PoseForms
@@ -132,7 +143,7 @@ class SplatBounds:
             self._least_step = min(float(step.min(initial=np.inf)) for step in steps)
         largest = float(np.abs(self.splats.means).max(initial=0.0)) + float(np.abs(origin).max())
         # two roundings of the differences
-        return self.varied.mean_radius.shape[0] == 0 and self._least_step > 4.0 * UNIT64 * largest
+        return self.varied.mean_radius.shape[0] == 0 and self._least_step > TIE_ROUNDING * largest
 
     def _buffer(self, name: str, shape: tuple[int, ...], dtype: type = np.float64) -> np.ndarray:
         """Uninitialised memory that begins with a cache line and is kept from call to call of the same lane."""
@@ -309,7 +320,7 @@ class SplatBounds:
             self._color_magnitudes, splats.degree,
         )  # fmt: skip
         position = forms.position
-        if not np.any(position.linear) and float(position.radius.max()) < 1e-9:
+        if not np.any(position.linear) and float(position.radius.max()) < STILL_POSITION:
             position_error += 2.0 * float(position.radius.max())
             view = (*position.center.tolist(), position_error)
             seen = self._seen_from.get(lane())
@@ -350,7 +361,7 @@ def _gram_deviation(forms: PoseForms) -> float:
     matrix = forms.rotation.data[0].reshape(3, 3)
     radius = float(np.linalg.norm(forms.rotation.data[forms.rotation.basis.monomials]))
     middle = float(np.linalg.norm(matrix.T @ matrix - np.eye(3)))
-    return (middle + 2.0 * float(np.linalg.norm(matrix)) * radius + radius * radius) * (1.0 + 2.0**-30) + 2.0**-46
+    return (middle + 2.0 * float(np.linalg.norm(matrix)) * radius + radius * radius) * GRAM_UP + GRAM_ROOM
 
 
 def _shifted_colors(varied: VariedSplats, charges: Charges) -> np.ndarray | None:
@@ -362,6 +373,6 @@ def _shifted_colors(varied: VariedSplats, charges: Charges) -> np.ndarray | None
     moved = (varied.color_low != 0.0) | (varied.color_high != 0.0)
     size = color + np.maximum(np.abs(varied.color_low), np.abs(varied.color_high))
     # one addition and the ends' own rounding
-    radius = 0.5 * (high - low) + (charges.shifted_color + 8.0 * UNIT64) * size
+    radius = 0.5 * (high - low) + (charges.shifted_color + SHIFTED_ROUNDING) * size
     found = np.stack([np.where(moved, 0.5 * (low + high), color), np.where(moved, radius, 0.0)], axis=-1)
     return np.ascontiguousarray(found.reshape(-1, 6))
