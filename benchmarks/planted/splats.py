@@ -21,15 +21,14 @@ _FORM_COLORS = "methods/splat/form_colors.py"
 _LINE_COLORS = "methods/splat/line_colors.py"
 _COLORS = "methods/splat/colors.py"
 _CONSTANTS = "methods/splat/constants.py"
-_ROWS = "methods/splat/rows.py"
 
 SPLATS = (
     Fault(
         "quaternions whose squares a GPU flushes are taken",
-        _ROWS,
+        "arithmetic/rounding.py",
         "",
-        "_LEAST_QUATERNION = 2.0**-100",
-        "_LEAST_QUATERNION = 2.0**-126",
+        "LEAST_QUATERNION = 2.0**-100",
+        "LEAST_QUATERNION = 2.0**-126",
         "test_load.py::test_bad_checkpoint[quaternion of flushed squares]",
     ),
     Fault(
@@ -108,7 +107,7 @@ SPLATS = (
         "compensation without its additive error",
         _RECORDS,
         "compensations",
-        "1.01 * (error + charges.determinant * (a + error_a) * (c + error_c) + flush) / det",
+        "SECOND_ORDER * (error + charges.determinant * (a + error_a) * (c + error_c) + flush) / det",
         "0.0",
         "test_antialiased.py::test_computed_factor[thin-one pose]",
     ),
@@ -236,15 +235,15 @@ SPLATS = (
         "layers of one mean keep their order though it varies",
         _BOUNDS,
         "SplatBounds._tied",
-        "self.varied.mean_radius.shape[0] == 0 and self._least_step > 4.0 * UNIT64 * largest",
-        "self._least_step > 4.0 * UNIT64 * largest",
+        "self.varied.mean_radius.shape[0] == 0 and self._least_step > TIE_ROUNDING * largest",
+        "self._least_step > TIE_ROUNDING * largest",
         "test_variations.py::test_one_mean_that_varies",
     ),
     Fault(
         "means are taken for one that the camera cannot tell apart",
         _BOUNDS,
         "SplatBounds._tied",
-        "self._least_step > 4.0 * UNIT64 * largest",
+        "self._least_step > TIE_ROUNDING * largest",
         "True",
         "test_bounds.py::test_nearly_coincident",
     ),
@@ -476,7 +475,7 @@ SPLATS = (
         "remainder of the exponential's fit is dropped",
         _ALPHAS,
         "_fitted_exponential",
-        "fma(1.2e-4 * x, (x * x) * (x * x), fit)",
+        "fma(SERIES_REST * x, (x * x) * (x * x), fit)",
         "0.0 * x",
         "test_pixel_forms.py::test_a_straight_exponent_is_fitted[2.0]",
     ),
@@ -484,7 +483,7 @@ SPLATS = (
         "remainder of the fit of degree 3 is dropped",
         _ALPHAS,
         "_cubic_exponential",
-        "fma(1.5e-4 * x, (x * x) * (x * x), fit)",
+        "fma(CUBIC_SERIES_REST * x, (x * x) * (x * x), fit)",
         "0.0 * x",
         "test_pixel_forms.py::test_the_fit_of_degree_three_holds_everywhere",
     ),
@@ -732,7 +731,7 @@ SPLATS = (
         "curvature stands for more of itself than the linear part allows",
         _ALPHAS,
         "_exponent_of_several",
-        "fma(0.5 * (1.0 - 2.0**-40), minimum(share, 1.0), 1.0)",
+        "fma(0.5 * TURN_DOWN, minimum(share, 1.0), 1.0)",
         "1.9",
         "test_pixel_forms.py::test_what_moves_along_or_across_its_offset[1.0]",
     ),

@@ -50,6 +50,9 @@ ANGLE_ROUNDING = 8.0 * UNIT64
 #: E1: `exp_kernel`, relative: truncation 2.2 units, reduction 0.4, Estrin's scheme 3, scaling none; 2.4 to spare.
 EXP_RELATIVE_ERROR = 2.0**-50
 
+#: E1: the exponential and a product with this factor, 9; 7 to spare.
+EXP_DOWN, EXP_UP = 1.0 - 2.0 * EXP_RELATIVE_ERROR, 1.0 + 2.0 * EXP_RELATIVE_ERROR
+
 # ---------------------------------------------------------------- poses (P)
 
 #: P1: a pose: fewer than 64 roundings of numbers of its size, five rotations. Sums of up to ten products likewise (P2).
@@ -57,6 +60,8 @@ POSE_ROUNDING = 64.0 * UNIT64
 #: P1, S2, L1: half of a range's width about its rounded middle: a difference and this product, 2; 2 to spare.
 HALF_UP = 1.0 + 4.0 * UNIT64
 
+#: P3: what three more turns make of the rounding of a rotation, 2.83 times, and of a position; 12 units of twice it.
+TURNED_ROTATION, TURNED_POSITION = 4.0, 8.0
 #: P1: no charge: a row of a rotation whose radius is below is taken to stand still: 2^7 times `POSE_ROUNDING`.
 STILL_ROOM = 1e-12
 #: C1: no charge: a position that moves by less is one, and what it moves by is an error of it.
@@ -210,8 +215,9 @@ COMPOSITE_ROUNDING = 2.0**-44
 SAMPLE_ROUNDING = 4.0 * COMPOSITE_ROUNDING
 #: F10: sums of weights of which the light is kept in float32, 1 of its units; 15 to spare.
 KEPT_LIGHT_UP = 1.0 + 2.0**-20
-#: F9: a shifted colour, and its hue in sixths of a turn: at most 2^8 roundings; hues four times that.
+#: F9: a shifted colour, and its hue in sixths of a turn: at most 2^8 roundings.
 HUE_ROUNDING = 2.0**-44
+#: F9: a hue of a box, in sixths of a turn, from four of them.
 HUE_ROOM = 4.0 * HUE_ROUNDING
 #: F11: a voxel's number: a difference and a product, here and by the concrete renderer, 4; as many to spare.
 VOXEL_ROUNDING = 8.0 * UNIT64
@@ -244,8 +250,9 @@ MEAN_DOWN = 1.0 - 2.0**-20
 PREPROCESS_ROUNDING = 10.0 * UNIT32
 #: V1: the package's own evaluation of it, 7; 1 to spare.
 PREPROCESSED_ROUNDING = 8.0 * UNIT64
-#: V14: relative error of a power or product, in float32 or better: at most eight of its roundings; and of two of them.
+#: V14: relative error of a power or product, in float32 or better: at most eight of its roundings.
 RESPONSE_ROUNDING = 8.0 * UNIT32
+#: V14: the same of offsets of planes, absolute: of the camera's value, up to 1, and of the planes' own evaluation.
 RESPONSE_ROUNDINGS = 2.0 * RESPONSE_ROUNDING
 #: L1: roundings on the longest way through a law: sums of up to 9 products, five more products, and four units of
 #: a library's sine or cosine; twice that, to spare. Slack: the forms charge each of their operations for more than

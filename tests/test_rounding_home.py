@@ -1,0 +1,171 @@
+"""Charges for rounding stand in their home, with a label of docs/design.md, and nowhere else."""
+
+from __future__ import annotations
+
+import ast
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from ns_abstract.arithmetic import rounding
+
+ROOT = Path(__file__).resolve().parents[1]
+PACKAGE = Path(rounding.__file__).resolve().parents[1]
+HOME = PACKAGE / "arithmetic" / "rounding.py"
+#: Homes, and folders that bound nothing. The checker shares no code with what it checks, its charges included.
+ELSEWHERE = (
+    "arithmetic/rounding.py", "arithmetic/network_charges.py", "verify/network/", "check/", "report/", "demo/", "cli/",
+    "bench/", "viewer/",
+)  # fmt: skip
+#: Small numbers that are no charges, by file: what they are.
+KNOWN = {
+    "arithmetic/elementary.py": {"1.9082149292705877e-10"},  # the low part of log 2
+    "methods/nerf/render.py": {"1e-05"},  # Nerfstudio's least sum of weights
+    "methods/splat/constants.py": {"1e-10"},  # gsplat's least accumulation
+    "methods/splat/rows.py": {"np.spacing"},  # a note on how coarse coordinates are
+    # an optimiser's settings, which no picture sees
+    "methods/nerf/write.py": {"1e-08"},
+    "methods/splat/write.py": {"1e-15"},
+    "nerfstudio/methods.py": {"1e-15", "1.6e-06", "5e-07", "1e-08"},
+}
+#: The formats' own numbers, which every label uses, and what stands for 0.
+UNITS = {"UNIT64", "UNIT32", "UNDERFLOW64", "UNDERFLOW32", "NONZERO"}
+#: What tells how exact a type is.
+_EXACTNESS = ("eps", "epsneg", "resolution", "spacing", "fromhex")
+
+
+def _number(node: ast.AST) -> float | None:
+    """The number that a literal is, with its sign."""
+    if isinstance(node, ast.UnaryOp) and isinstance(node.op, ast.USub):
+        value = _number(node.operand)
+        return None if value is None else -value
+    number = isinstance(node, ast.Constant) and type(node.value) in (int, float)
+    return float(node.value) if number else None  # pyright: ignore[reportAttributeAccessIssue]
+
+
+def _homely(tree: ast.AST) -> set[str]:
+    """Units and charges that a module imports from the home."""
+    names: set[str] = set()
+    for node in ast.walk(tree):
+        if isinstance(node, ast.ImportFrom) and node.module == "ns_abstract.arithmetic.rounding":
+            names |= {alias.asname or alias.name for alias in node.names}
+    return {name for name in names if re.match(r"UNIT|UNDERFLOW|.*(ROUNDING|ERROR)$", name)}
+
+
+def _looked_at(node: ast.AST) -> Iterator[ast.AST]:
+    """``node`` and what is below, but for records of preferences."""
+    if not (isinstance(node, ast.ClassDef) and node.name.endswith("Tuning")):
+        yield node
+        for child in ast.iter_child_nodes(node):
+            yield from _looked_at(child)
+
+
+def bare(text: str) -> list[str]:
+    """What of a module's ``text`` looks like a charge for rounding without a name."""
+    tree = ast.parse(text)
+    homely, found = _homely(tree), []
+    for node in _looked_at(tree):
+        if isinstance(node, ast.BinOp) and isinstance(node.op, ast.Pow):
+            base, power = _number(node.left), _number(node.right)
+            if base in (2.0, 10.0, 0.5, 0.1) and power is not None and (power < 0.0) == (base > 1.0):
+                found.append(ast.unparse(node))
+        elif isinstance(node, ast.BinOp) and isinstance(node.op, ast.Mult):
+            for one, other in ((node.left, node.right), (node.right, node.left)):
+                times = _number(one)
+                if times is not None and abs(times) > 1.0 and isinstance(other, ast.Name) and other.id in homely:
+                    found.append(ast.unparse(node))
+        elif isinstance(node, ast.Constant):
+            value = _number(node)
+            if value is not None and 0.0 < value < 1e-4:
+                found.append(ast.unparse(node))
+        elif isinstance(node, ast.Attribute) and node.attr in _EXACTNESS:
+            # a table of exact values is read as such
+            if node.attr != "fromhex" or "_TABLES" not in text:
+                found.append(ast.unparse(node))
+    return found
+
+
+def test_charges_have_names_in_their_home() -> None:
+    found = {}
+    for path in sorted(PACKAGE.rglob("*.py")):
+        place = path.relative_to(PACKAGE).as_posix()
+        if not place.startswith(ELSEWHERE):
+            strangers = set(bare(path.read_text(encoding="utf-8"))) - KNOWN.get(place, set())
+            if strangers:
+                found[place] = sorted(strangers)
+    assert found == {}, "name them in arithmetic/rounding.py, or in a record of preferences (Tuning)"
+
+
+@pytest.mark.parametrize(
+    "planted",
+    [
+        "x = y * (1.0 + 2.0**-40)",
+        "x = 2 ** -53 * y",
+        "x = 0.5**44 * y",
+        "def f(y):\n    return y + 1e-12",
+        "x = 0.00001 * y",
+        "x = float.fromhex('0x1p-44')",
+        "import numpy as np\nx = 4 * np.finfo(np.float64).eps",
+        "import numpy as np\nx = np.spacing(y)",
+        "from ns_abstract.arithmetic.rounding import UNIT64\nx = 8.0 * UNIT64 * y",
+        "from ns_abstract.arithmetic.rounding import FORM_ROUNDING as F_ROUNDING\nx = y * (F_ROUNDING * 4.0)",
+        "class Tuned:\n    room: float = 2.0**-20",
+    ],
+)
+def test_a_charge_without_a_name_is_found(planted: str) -> None:
+    assert len(bare(planted)) == 1
+    # and wherever it stands in a module of the product
+    text = (PACKAGE / "methods" / "splat" / "frame.py").read_text(encoding="utf-8")
+    assert bare(text) == [] and len(bare(f"{text}\n{planted}\n")) == 1
+
+
+def test_what_is_no_charge_is_left_alone() -> None:
+    text = """
+from ns_abstract.arithmetic.rounding import UNIT64, UP
+class FrameTuning:
+    step: float = 2.0**-10
+    share: float = 1e-9
+x = 2**20 + 0.5 * UP + count * UNIT64 + 1e-3 + 2.0**n + 1e300
+"""
+    assert bare(text) == []
+
+
+def stated() -> dict[str, str]:
+    """What the home says above every number that it names."""
+    found: dict[str, str] = {}
+    said: list[str] = []
+    for line in HOME.read_text(encoding="utf-8").splitlines():
+        if line.startswith("#: "):
+            said.append(line[3:])
+            continue
+        if match := re.match(r"([A-Z][A-Z0-9_]*(?:, [A-Z][A-Z0-9_]*)*) = ", line):
+            found |= dict.fromkeys(match[1].split(", "), " ".join(said))
+        said = []
+    return found
+
+
+def test_every_charge_says_what_it_is_for() -> None:
+    design = ROOT / "docs" / "design.md"
+    if not design.exists():
+        pytest.skip("the documents are not beside the tests")
+    labels = set(re.findall(r"(?m)^\*\*([A-Z]\d+)[ .]", design.read_text(encoding="utf-8")))
+    numbers = {name for name, value in vars(rounding).items() if name.isupper() and isinstance(value, int | float)}
+    said = {name: text for name, text in stated().items() if name in numbers}
+    assert numbers == set(said)
+    wrong = {}
+    for name, text in said.items():
+        first = re.match(r"([A-Z]\d+(?:, [A-Z]\d+)*): ", text)
+        cited = set(first[1].split(", ")) if first else set()
+        if (not cited and name not in UNITS) or not cited <= labels:
+            wrong[name] = text
+    assert wrong == {}
+
+
+def test_every_charge_is_used() -> None:
+    used: set[str] = set()
+    for path in PACKAGE.rglob("*.py"):
+        names = re.findall(r"\b[A-Z][A-Z0-9_]+\b", path.read_text(encoding="utf-8"))
+        used |= {name for name in names if path != HOME or names.count(name) > 1}
+    assert sorted(set(stated()) - used) == []
