@@ -5,11 +5,17 @@ from __future__ import annotations
 import ast
 import re
 from collections.abc import Iterator
+from fractions import Fraction
 from pathlib import Path
 
+import mpmath
+import numpy as np
 import pytest
 
 from ns_abstract.arithmetic import rounding
+from ns_abstract.arithmetic.chebyshev import ChebyshevBasis
+from ns_abstract.methods.nerf import bounds as fields
+from ns_abstract.methods.splat import fragments
 
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = Path(rounding.__file__).resolve().parents[1]
@@ -169,3 +175,59 @@ def test_every_charge_is_used() -> None:
         names = re.findall(r"\b[A-Z][A-Z0-9_]+\b", path.read_text(encoding="utf-8"))
         used |= {name for name in names if path != HOME or names.count(name) > 1}
     assert sorted(set(stated()) - used) == []
+
+
+#: Polynomials that fields are bounded with: number of variables, degree, grid.
+BASES = [(d, *size) for d, size in fields._DEGREES.items()] + [(1, *fields._SHALLOW_DEGREE)]
+BASES += [(d, 1, 2) for d in (5, 6, 7)]
+
+
+@pytest.mark.parametrize(("dimensions", "degree", "grid"), BASES)
+def test_interpolation_is_charged_for_its_matrices(dimensions: int, degree: int, grid: int) -> None:
+    """All coefficients are off by no more than `INTERPOLATION_ROUNDING`, whatever the values and the order of sums."""
+    basis = ChebyshevBasis(dimensions, degree, grid)
+    matrix = np.concatenate(basis.interpolation)
+    n = degree + 1
+    with mpmath.workprec(120):
+        exact = [
+            [mpmath.cos(k * mpmath.pi * (i + mpmath.mpf(1) / 2) / n) * (2 if k else 1) / n for i in range(n)]
+            for k in range(n)
+        ]
+    # its entries are products of these, in the same order of nodes; float64 of each is exact enough by axis but one
+    by_axis = np.array(exact, np.float64)
+    places = np.array(list(np.ndindex(*(n,) * dimensions))).reshape(n**dimensions, dimensions)
+    kept = basis.indices.tolist()
+    rest = [k for k in places.tolist() if sum(k) > degree]
+    rows = np.array([*kept, *rest], np.int64).reshape(len(matrix), dimensions)
+    true = np.ones(matrix.shape)
+    for axis in range(dimensions):
+        true *= by_axis[rows[:, axis, None], places[None, :, axis]]
+    size = np.abs(true)
+    entries = np.abs(matrix - true) + (2.0 * dimensions * rounding.UNIT64) * size
+    terms = len(places)
+    needed = float(entries.sum()) + rounding.gamma(terms + 1) * float(size.sum())
+    charged = rounding.INTERPOLATION_ROUNDING * basis.lebesgue**dimensions
+    # a function of a node is off by four units as well
+    assert needed + rounding.FUNCTION_ROUNDING * float(size.sum()) <= charged
+    # and the charge is no more than a few times what is needed where it matters
+    if (dimensions, degree) == (7, 1):
+        assert needed > 0.5 * charged
+
+
+def test_turns_near_one_are_charged_absolutely() -> None:
+    """One less a block's turn is a lower bound, however little of it is left (design.md, O1)."""
+    random, below = np.random.default_rng(0), 0
+    for _ in range(400):
+        m = int(random.integers(2, 9))
+        slope, ray = random.normal(size=(m + 1, 3)), random.normal(size=3)
+        slope[m] = np.abs(slope[m]) * random.choice([0.0, 1e-3])
+        slope *= (1.0 - 10.0 ** random.uniform(-9.0, -3.0)) / fragments._turn(slope, ray, m)
+        along = fragments._turn(slope, ray, m)
+        rows = [[Fraction(float(x)) for x in row] for row in slope]
+        there = [Fraction(float(x)) for x in ray]
+        true = sum((abs(sum(a * b for a, b in zip(row, there, strict=True))) for row in rows[1:m]), Fraction(0))
+        true += sum(a * abs(b) for a, b in zip(rows[m], there, strict=True))
+        assert Fraction(float(fragments._steadiness(along))) <= 1 - true
+        below += Fraction((1.0 - along) * (1.0 - rounding.TURN_ROOM)) > 1 - true
+    # a part of the difference would not do
+    assert below > 0

@@ -67,6 +67,11 @@ POLYNOMIALS = (
         "cycle[(k + offset) % 4] / math.factorial(k + (k == n))", _FUNCTIONS + "[0.5]",
     ),
     Fault(
+        "Chebyshev: an interpolant is charged less than its matrices round",
+        "arithmetic/rounding.py", "", "INTERPOLATION_ROUNDING = 2.0**-40", "INTERPOLATION_ROUNDING = 2.0**-44",
+        "test_rounding_home.py::test_interpolation_is_charged_for_its_matrices[3-4-10]",
+    ),
+    Fault(
         "Chebyshev: the grid's largest value bounds the polynomial",
         _CHEBYSHEV, "ChebyshevBasis.norming",
         "math.cos(0.5 * math.pi * self.degree / self.grid) ** -self.dimensions * GRID_UP", "0.97",

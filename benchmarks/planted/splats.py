@@ -216,6 +216,22 @@ SPLATS = (
         "test_bounds.py::test_depth_swap[2]",
     ),
     Fault(
+        "depth order: room for rounding is a part of what is left of a turn",
+        _FRAGMENTS,
+        "_steadiness",
+        "1.0 - along - TURN_ROOM",
+        "(1.0 - along) * (1.0 - TURN_ROOM)",
+        "test_rounding_home.py::test_turns_near_one_are_charged_absolutely",
+    ),
+    Fault(
+        "linear sets: a charge has no name",
+        "methods/splat/frame.py",
+        "linear_sets",
+        "forms[..., -1] * LINEAR_UP",
+        "forms[..., -1] * (1.0 + 2.0**-40)",
+        "test_rounding_home.py::test_charges_have_names_in_their_home",
+    ),
+    Fault(
         "order swap raises but does not lower",
         _BLEND,
         "blend_quadratic",

@@ -16,14 +16,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from ns_abstract.arithmetic.rounding import (
-    BOX_ROUNDING,
-    DIRECTION_ROUNDING,
-    FOLLOWED_UP,
-    LINE_ROUNDING,
-    NONZERO,
-    SAMPLE_ROUNDING,
-)
+from ns_abstract.arithmetic.rounding import DIRECTION_ROUNDING, FOLLOWED_UP, LINE_ROUNDING, NONZERO, SAMPLE_ROUNDING
 from ns_abstract.execution.ending import checkpoint
 from ns_abstract.methods.nerf.division import Division
 from ns_abstract.methods.nerf.hsv import Range, shifted_bounds
@@ -192,7 +185,7 @@ class Paths:
         kept, rest = field.basis.interpolation
         poly = kept @ nodes
         spread = np.abs(poly[:, 1:]).sum(axis=1) + np.abs(rest @ nodes).sum(axis=1) + radius
-        spread = spread + BOX_ROUNDING * (np.abs(poly[:, 0]) + spread)
+        spread = spread + field.interpolated * (np.abs(poly[:, 0]) + spread)
         empty, sure = self.occupancy.look(poly[:, 0] - spread, poly[:, 0] + spread)
         return ~empty, sure
 

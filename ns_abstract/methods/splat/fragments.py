@@ -124,6 +124,21 @@ def _uncertain(i, j, listed):
     return not (abs(center) > (spread + radius) * UP + rounding + depth_error[i] + depth_error[j])
 
 
+@njit(cache=True, error_model="numpy", forceinline=True)
+def _turn(slope, ray, m):
+    """By how much the depth of a point of unit depth on ``ray`` [3] changes over the cell, at most (design.md, O1)."""
+    along = 0.0
+    for k in range(1, m):
+        along += abs(slope[k, 0] * ray[0] + slope[k, 1] * ray[1] + slope[k, 2] * ray[2])
+    return along + (slope[m, 0] * abs(ray[0]) + slope[m, 1] * abs(ray[1]) + slope[m, 2] * abs(ray[2]))
+
+
+@njit(cache=True, error_model="numpy", forceinline=True)
+def _steadiness(along):
+    """Lower bound of one less the exact `_turn` (design.md, O1), of which a small one may be nothing but rounding."""
+    return 1.0 - along - TURN_ROOM
+
+
 @njit(cache=True, error_model="numpy")
 def _depth_radii(numbers, gaussians, slope, ray, m, entries):
     """How far in depth each entry may move against the block's central ray (design.md, O1).
@@ -133,10 +148,7 @@ def _depth_radii(numbers, gaussians, slope, ray, m, entries):
     depth, delta, depth_error = gaussians.depth, gaussians.delta, gaussians.depth_error
     radii, deep = entries.depth_radius, entries.depth
     count = numbers.size
-    along = 0.0
-    for k in range(1, m):
-        along += abs(slope[k, 0] * ray[0] + slope[k, 1] * ray[1] + slope[k, 2] * ray[2])
-    along += slope[m, 0] * abs(ray[0]) + slope[m, 1] * abs(ray[1]) + slope[m, 2] * abs(ray[2])
+    along = _turn(slope, ray, m)
     total = 0.0
     for k in range(count):
         ahead = numbers[min(k + AHEAD, count - 1)]
@@ -155,7 +167,7 @@ def _depth_radii(numbers, gaussians, slope, ray, m, entries):
         size = abs(delta[i, 0]) + abs(delta[i, 1]) + abs(delta[i, 2]) + abs(depth[i]) * (1.0 + along)
         radii[k] = e * UP + WINDOW_ROUNDING * size + depth_error[i]
         total += radii[k]
-    room = (1.0 - along) * (1.0 - TURN_ROOM)
+    room = _steadiness(along)
     if not total < np.inf:
         room = -1.0
     # few entries reach far: they are compared with all, the others within a window
