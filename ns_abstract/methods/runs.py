@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 import os
 import re
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath, PureWindowsPath
 from typing import Any, cast
@@ -44,14 +45,6 @@ _NUMBER_TAGS = {f"tag:yaml.org,2002:{python}{kind}" for python in ("", "python/"
 #: Steps that an error lists.
 _STEPS_SHOWN = 12
 _CHECKPOINT_NAME = re.compile(r"step-(\d{1,18})\.ckpt")
-# nerfstudio/utils/colors.py; "random" is what Splatfacto shows outside training.
-_COLORS = {
-    "white": (1.0, 1.0, 1.0),
-    "black": (0.0, 0.0, 0.0),
-    "red": (1.0, 0.0, 0.0),
-    "green": (0.0, 1.0, 0.0),
-    "blue": (0.0, 0.0, 1.0),
-}
 
 
 @dataclass(frozen=True)
@@ -100,24 +93,22 @@ class RunConfig:
             raise self._error(name, value, f"one of {', '.join(options)}")
         return value
 
-    def color(self, name: str, default: str, extra: dict[str, tuple[float, float, float]]) -> NDArray[np.float32]:
+    def color(self, name: str, default: str, names: Mapping[str, tuple[float, float, float]]) -> NDArray[np.float32]:
         """RGB field of ``pipeline.model`` as float32 [3] in [0, 1]; ``default`` if absent.
 
         Args:
             name: Field name.
             default: Colour name used if the field is absent.
-            extra: Names beyond Nerfstudio's own, with their colours.
+            names: Colours of the names that the model shows, letter by letter; it stops at others.
         """
         value = self.model.get(name, default)
         if isinstance(value, str):
-            found = extra.get(value) or _COLORS.get(value.lower())
-            if found is not None:
-                return np.array(found, np.float32)
+            if value in names:
+                return np.array(names[value], np.float32)
         elif isinstance(value, (list, tuple)) and len(value) == 3 and all(map(is_number, value)):
             if all(0 <= part <= 1 for part in value):
                 return np.array(value, np.float32)
-        names = ", ".join([*extra, *_COLORS])
-        raise self._error(name, value, f"{names} or three numbers from 0 to 1")
+        raise self._error(name, value, f"{', '.join(names)} or three numbers from 0 to 1")
 
     def _error(self, name: str, value: Any, wanted: str) -> InputError:
         return InputError(f"found {show(value)}", file=self.file, field=f"pipeline.model.{name}", fix=f"write {wanted}")

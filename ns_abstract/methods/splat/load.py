@@ -29,8 +29,9 @@ from ns_abstract.methods.splat.scene import Float32Array, SplatScene
 _STEP_AFTER_LOADING = 30000
 _MAX_DEGREE_STORED = 4
 _MAX_DEGREE = 3
-# nerfstudio/models/splatfacto.py: colour shown outside training for background "random".
-_RANDOM_BACKGROUND = (0.1490, 0.1647, 0.2157)
+#: nerfstudio/models/splatfacto.py:300-303, 498-509: what it shows outside training; at other names, also of another
+#: case, it stops.
+_BACKGROUNDS = {"random": (0.1490, 0.1647, 0.2157), "white": (1.0, 1.0, 1.0), "black": (0.0, 0.0, 0.0)}
 _MODEL_DEFAULTS: dict[str, Any] = {
     "sh_degree": 3,
     "sh_degree_interval": 1000,
@@ -185,8 +186,10 @@ def _picture(run: runs.RunConfig, overrides: Overrides) -> tuple[tuple[Assumptio
     }
     # what is replaced is read first, so that a file that says nonsense is refused either way
     mode = run.choice("rasterize_mode", _MODEL_DEFAULTS["rasterize_mode"], MODES)
-    background = run.color("background_color", _MODEL_DEFAULTS["background_color"], {"random": _RANDOM_BACKGROUND})
+    background = run.color("background_color", _MODEL_DEFAULTS["background_color"], _BACKGROUNDS)
     stored = tuple(float(part) for part in background)
+    if not isinstance(run.model.get("background_color", ""), str):
+        origins["background_color"] += ", three numbers, at which Nerfstudio's own model stops"
     choices = (
         chosen("rasterize_mode", overrides.rasterize_mode, "--rasterize-mode", mode, origins["rasterize_mode"]),
         chosen("background", overrides.background, "--background", stored, origins["background_color"]),
