@@ -12,8 +12,8 @@ may use, and what is read back is what was written:
 
 ROOT is ``$NS_ABSTRACT_CACHE_DIR``, or ``kernels`` in the cache folder that the platform provides. Where that cannot be
 written, a temporary folder serves the process and those that it starts. The installation itself is never written to.
-numba is told by its setting ``CACHE_LOCATOR_CLASSES``. Kept are kernels that Python calls; what they call is linked into
-them (`kernel_linking`).
+numba is told by its setting ``CACHE_LOCATOR_CLASSES``. Kept are kernels that Python calls; they hold what they call
+(`kernel_linking`).
 """
 
 from __future__ import annotations
