@@ -18,7 +18,7 @@ from ns_abstract.methods.load import open_scene
 from ns_abstract.methods.overrides import Overrides
 from ns_abstract.methods.representation import ProgramOptions
 from ns_abstract.perturbation.specification import Perturbation
-from ns_abstract.refine.protocol import Method
+from ns_abstract.refine.protocol import Method, PreciseFrame
 
 
 @dataclass(frozen=True)
@@ -149,10 +149,11 @@ def load_scene(
 
 
 def render(scene: Scene, camera: Camera) -> np.ndarray:
-    """The picture of one camera, float64 [H, W, 3] in [0, 1], of float32 precision: what `bound` encloses.
+    """The picture of one camera, float64 [H, W, 3] in [0, 1]: what `bound` encloses.
 
     Raises:
         InputError: The camera cannot be used.
     """
     frame = scene.method().frame(PoseSet.around(camera, Perturbation()))
-    return assemble(frame.render(frame.box.middle), frame.camera).astype(np.float64)
+    draw = frame.precise if isinstance(frame, PreciseFrame) else frame.render
+    return assemble(draw(frame.box.middle), frame.camera).astype(np.float64)

@@ -186,10 +186,14 @@ class NerfFrame:
 
     def render(self, values: np.ndarray, tiles: np.ndarray | None = None) -> np.ndarray:
         """Rays [t, 1, 1, 3] float32 of the concrete image at parameter values [d]."""
+        return self.precise(values, tiles).astype(np.float32)
+
+    def precise(self, values: np.ndarray, tiles: np.ndarray | None = None) -> np.ndarray:
+        """What `render` rounds: float64."""
         which = np.arange(self.tile_count) if tiles is None else tiles
         shift = color_shift(self.pose_set, values)
         colors = self.renderer.pixels(self.pose_set.camera, self.pose_set.pose(values), self._pixels(which), shift)
-        return colors.astype(np.float32)[:, None, None, :]
+        return colors[:, None, None, :]
 
     def feasible(self, box: ParameterBox) -> ParameterBox | None:
         """All of ``box``: every parameter in it belongs to a pose of the set."""

@@ -18,7 +18,7 @@ from ns_abstract.geometry.box import ParameterBox
 from ns_abstract.geometry.poses import PoseSet, translation_only
 from ns_abstract.geometry.tiles import laid_out, tile_grid
 from ns_abstract.methods.splat.activate import Splats
-from ns_abstract.methods.splat.bounds import STAGES, SplatBounds, alone
+from ns_abstract.methods.splat.bounds import STAGES, SceneSums, SplatBounds, alone
 from ns_abstract.methods.splat.constants import Rasteriser
 from ns_abstract.methods.splat.depths import ACCUMULATION_HIGH, ACCUMULATION_LOW, DEPTH_HIGH, DEPTH_LOW
 from ns_abstract.methods.splat.lists import summed_area, touching
@@ -156,6 +156,7 @@ class SplatFrame:
             parameters are then not those of ``pose_set``.
         layers: Whether accumulation and expected depth stand behind the colours, in renders and bounds.
         reference: Makes the renderer with gradients, for steps of `members`.
+        sums: See `SplatBounds`.
     """
 
     #: What tiles share is most of the work: every call bounds as many as it is given.
@@ -176,6 +177,7 @@ class SplatFrame:
         slanted: bool = False,
         layers: bool = False,
         reference: Callable[[], Reference] | None = None,
+        sums: SceneSums | None = None,
     ) -> None:
         self.channels = 5 if layers else COLORS
         self.pose_set = pose_set
@@ -183,7 +185,7 @@ class SplatFrame:
         self.box = pose_set.box
         self.order = order or (2 if self.box.dimensions == 1 else 1)
         self._reference = reference
-        self.bounds = SplatBounds(splats, rasteriser, arithmetic, varied)
+        self.bounds = SplatBounds(splats, rasteriser, arithmetic, varied, sums)
         self.varied = self.bounds.varied
         self.renderer = Renderer(self.varied.nearest, rasteriser)
         self.side = rasteriser.work_tile
@@ -219,8 +221,12 @@ class SplatFrame:
 
     def drawn(self, values: np.ndarray, tiles: np.ndarray | None, member: Splats | None) -> np.ndarray:
         """What `render` returns, of another scene of the set if one is given."""
+        return self.precise(values, tiles, member).astype(np.float32)
+
+    def precise(self, values: np.ndarray, tiles: np.ndarray | None = None, member: Splats | None = None) -> np.ndarray:
+        """What `drawn` rounds: float64."""
         draw = self.renderer.tiles if self.channels == COLORS else self.renderer.layer_tiles
-        return draw(self.camera, *self.pose_set.world_to_camera(values), tiles, member).astype(np.float32)
+        return draw(self.camera, *self.pose_set.world_to_camera(values), tiles, member)
 
     def members(self, seed: int) -> Iterator[SplatMember]:
         """Other scenes of the set, without end; none where nothing varies."""
