@@ -203,7 +203,8 @@ def layer(gene: Gene, n: int) -> Any:
         return extreme.plain(kind, SIMPLE[kind])
     if kind in ("softmax", "log softmax"):
         op = "Softmax" if kind == "softmax" else "LogSoftmax"
-        return extreme.plain(op, torch.softmax if kind == "softmax" else torch.log_softmax, axis=-1)
+        step = torch.softmax if kind == "softmax" else torch.log_softmax
+        return extreme.plain(op, lambda x: step(x, -1), axis=-1)
     if kind in ("residual", "gate", "mean"):
         return extreme.joined(kind)
     return joined(gene, n)

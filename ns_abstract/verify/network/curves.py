@@ -18,6 +18,8 @@ from torch import Tensor
 
 from ns_abstract.arithmetic.network_charges import (
     AFFINE,
+    ATTENTION,
+    ATTENTION_BLOCKS,
     FLUSH,
     FUNCTION_FLUSHES,
     HARD,
@@ -435,9 +437,15 @@ class Exp(Assumed):
         return torch.where(known, 2.0 * LIBRARY * upper.exp() + _FLUSHED, torch.full_like(upper, math.nan))
 
 
+@dataclass(frozen=True, eq=False)
 class CappedExp(Exp):
-    """``min(exp(z), exp(cap))``: of terms of a softmax, whose sums are as good as infinite past that (N11)."""
+    """``min(exp(z), exp(cap))``: of terms of a softmax, whose sums are as good as infinite past that (N11).
 
+    Attributes:
+        count: Terms of a sum.
+    """
+
+    count: int = 1
     cap: ClassVar[float] = CAP
 
     @property
@@ -457,7 +465,8 @@ class CappedExp(Exp):
     def error(self, lower: Tensor, upper: Tensor) -> Tensor | float:
         # the smaller of a number and the cap is the cap where any evaluation is past it
         known = lower > self.cap + 1.0
-        return torch.where(known, 0.0, 2.0 * LIBRARY * upper.clamp(max=self.cap).exp() + _FLUSHED)
+        relative = ATTENTION + ATTENTION_BLOCKS * self.count
+        return torch.where(known, 0.0, relative * upper.clamp(max=self.cap).exp() + _FLUSHED)
 
 
 @dataclass(frozen=True, eq=False)
