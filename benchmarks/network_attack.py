@@ -88,7 +88,7 @@ KINDS: dict[str, tuple[str, ...]] = {
     "quotient": ("s",),
     "attention": ("a",),
     "quantised": ("s",),
-    **{name: () for name in ("Abs", "Exp", "Sigmoid", "Tanh", "Erf", "Elu", "Selu", "Softplus", "HardSwish", "Mish")},
+    **dict.fromkeys(("Abs", "Exp", "Sigmoid", "Tanh", "Erf", "Elu", "Selu", "Softplus", "HardSwish", "Mish"), ()),
     "Gelu": (),
     "Log": (),
 }
@@ -212,7 +212,7 @@ def layer(gene: Gene, n: int) -> Any:
 
 def joined(gene: Gene, n: int) -> Any:
     """Layers of several nodes."""
-    kind, v = gene.kind, {name: value for name, value in gene.values.items()}
+    kind, v = gene.kind, dict(gene.values)
     t = {name: torch.from_numpy(np.asarray(value)) for name, value in v.items()}
     s = float(v["s"]) if "s" in v else 0.0
 

@@ -56,6 +56,8 @@ VARIANCE_PASSES = 3
 POSITION = 4.0 * UNIT
 #: What float32 makes of a cubic weight: about 112 roundings of 1, of a t^3 - 5 a t^2 + 8 a t - 4 a with t up to 2.
 POLYNOMIAL = 128.0 * UNIT
+#: The same roundings in float64, of the file's own weights in real arithmetic; as many to spare.
+OWN_POSITIONS = 2.0 * DOUBLE_UNIT / UNIT
 
 # ---------------------------------------------------------------- functions of one number (N10)
 
