@@ -255,7 +255,7 @@ def joined(gene: Gene, n: int) -> Any:
             torch.softmax((x * t["a"])[..., None] @ x[:, None], -1) @ x[..., None]
         )[..., 0],
         "quantised": lambda x: (x / t["s"]).round().clamp(-128, 127) * t["s"],
-        "Gelu": lambda x: functional.gelu(x),
+        "Gelu": functional.gelu,
     }  # fmt: skip
     return extreme.Layer(write, steps[kind], kind=kind)
 
@@ -270,7 +270,9 @@ def bounds(network: Network, image: Array) -> tuple[Array, Array]:
 
 
 def nearness(genome: Genome, folder: Path) -> tuple[float, str, int]:
-    """(greatest distance from the bounds' middle over half of their width, program, outputs compared); above 1: outside.
+    """(Greatest distance from the bounds' middle over half of their width, program, outputs compared).
+
+    An output is outside where the first is above 1.
 
     Raises:
         InputError: The network is refused.

@@ -392,17 +392,16 @@ def measure(given: Case, entry: Entry, folder: Path, everything: bool = False, c
         centre = [exact(genome, image) if ok.any() else None for image, ok in zip(given.images, finite, strict=True)]
         # how far the ends are from the exact value, and where the value lies
         places = [(i, j) for i, j in zip(*np.nonzero(finite), strict=True)]
-        below = np.array([float(centre[i][j] - mpmath.mpf(low[i, j])) for i, j in places])
-        above = np.array([float(mpmath.mpf(high[i, j]) - centre[i][j]) for i, j in places])
+        # the value as two numbers, from which differences are right to 2^-50
+        first = np.array([float(centre[i][j]) for i, j in places])
+        second = np.array([float(centre[i][j] - mpmath.mpf(v)) for (i, j), v in zip(places, first, strict=True)])
+        below, above = (first - low[finite]) + second, (high[finite] - first) - second
         entry.outside_real += sum(
             not mpmath.mpf(real[i, j]) <= centre[i][j] <= -mpmath.mpf(real[i, k + j]) for i, j in places
         )
         for name, y in programs(net, given.images, file, everything, compiled):
             value = y.astype(np.float64)[finite]
-            off = np.array([
-                float(mpmath.mpf(v) - centre[i][j]) if np.isfinite(v) else np.inf
-                for v, (i, j) in zip(value, places, strict=True)
-            ])  # fmt: skip
+            off = np.nan_to_num((value - first) - second, nan=np.inf)
             with np.errstate(all="ignore"):
                 ratio = np.where(off > 0.0, off / above, np.where(off < 0.0, -off / below, 0.0))
             ratio = np.where((value >= low[finite]) & (value <= high[finite]), np.minimum(ratio, 1.0), np.inf)

@@ -222,7 +222,8 @@ FUNCTIONS = (
     Row(
         "softmax's exponentials",
         ("CappedExp",),
-        "(ATTENTION + ATTENTION_BLOCKS * count) * exp(min(upper, cap)) + FUNCTION_FLUSHES * FLUSH",
+        "(ATTENTION + ATTENTION_BLOCKS * count) * exp(min(upper, cap)) + FUNCTION_FLUSHES * FLUSH"
+        " if lower <= cap + 1 else 0",
         "fused attention with exponentials within 20 ulp, in blocks that are rescaled; the greatest subtracted or not, "
         + _FLUSHED,
         "N11",

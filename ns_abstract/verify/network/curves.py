@@ -45,6 +45,8 @@ _STEPS = 6
 _FLUSHED = FUNCTION_FLUSHES * FLUSH
 #: A preference: better bounds of the input are asked for where the lines are this part of the width apart.
 _APART = 2.0**-6
+#: A preference: intervals of at most this part of their ends count as points.
+_POINT = 2.0**-36
 
 
 class _Cuts(NamedTuple):
@@ -208,7 +210,7 @@ class Curve(Activation):
         band = self.band(lower, upper)
         width = upper - lower
         # rounding alone keeps the lines of a point apart
-        wide = ~(width <= 2.0**-36 * _size(lower, upper))
+        wide = ~(width <= _POINT * _size(lower, upper))
         return torch.where(wide, (band.upper_offset - band.lower_offset) / width, torch.zeros_like(width))
 
     def open(self, lower: Tensor, upper: Tensor) -> Tensor:
