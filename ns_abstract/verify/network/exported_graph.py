@@ -17,13 +17,22 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 
+from ns_abstract.arithmetic.network_charges import (
+    DOUBTS_UP,
+    FLUSH,
+    FUNCTION_FLUSHES,
+    LEAST_DIVISOR,
+    OVERFLOW,
+    OWN_WEIGHT_NORM,
+    WEIGHT_NORM,
+    gamma,
+)
 from ns_abstract.io.errors import InputError
 from ns_abstract.io.jsonio import show
 from ns_abstract.verify.network.chosen import chosen_output
 from ns_abstract.verify.network.compose import Composer
 from ns_abstract.verify.network.doubtful import Doubts
 from ns_abstract.verify.network.graph import Network, item
-from ns_abstract.verify.network.rounding import gamma
 
 _LARGEST_GRAPH = 64 << 20
 _LARGEST_WEIGHTS = 4 << 30
@@ -395,9 +404,14 @@ class Reader:
             direction, size = (self._named(entry["arg"]["as_tensor"]["name"]) for entry in node["inputs"][:2])
             wide = self.by_torch(node, {k: np.asarray(v, np.float64) for k, v in self.constants.items()})
             made = [wide.numpy()]
-            count = np.size(direction) / max(1, np.size(size)) + 16
-            single = gamma(count) * (1.0 + 2.0**-4) * np.abs(made[0]) + 2.0**-100
-            self.doubted[_output(node)] = (2.0**-44 * np.abs(made[0]), single)
+            together = tuple(k for k, n in enumerate(np.shape(size)) if n == 1)
+            squares = np.square(np.asarray(direction, np.float64)).sum(together)
+            if not bool(((squares > LEAST_DIVISOR) & (squares < OVERFLOW)).all()):
+                raise InputError("divides by a norm that float32 cannot compute with", fix="train the network again")
+            # squares that are flushed are a quarter of a unit of that, each
+            count = np.size(direction) / max(1, np.size(size)) + WEIGHT_NORM
+            single = gamma(count) * DOUBTS_UP * np.abs(made[0]) + FUNCTION_FLUSHES * FLUSH * (1.0 + np.abs(made[0]))
+            self.doubted[_output(node)] = (OWN_WEIGHT_NORM * np.abs(made[0]), single)
         elif any(isinstance(v, np.ndarray) and v.dtype == np.float32 for v in made):
             self._check_exact(node, made)
         return made if isinstance(found, (list, tuple)) else made[0]
