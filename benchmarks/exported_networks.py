@@ -452,9 +452,7 @@ def export(name: str, exporter: str, file: Path) -> tuple[int, ...]:
     image = torch.randn(1, 3, side, side)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        if exporter == "pt2":
-            torch.export.save(torch.export.export(module, (image,)), file)
-        elif exporter == "dynamo":
+        if exporter == "dynamo":
             torch.onnx.export(module, (image,), str(file), dynamo=True, verbose=False)
         else:
             torch.onnx.export(module, (image,), str(file), dynamo=False, opset_version=int(exporter))
@@ -473,7 +471,7 @@ def measure(name: str, exporter: str, runs: int, width: float, arithmetic: Netwo
 
     torch.set_num_threads(1)
     with tempfile.TemporaryDirectory() as folder:
-        file = Path(folder) / ("net.pt2" if exporter == "pt2" else "net.onnx")
+        file = Path(folder) / "net.onnx"
         found: dict[str, Any] = {"name": name, "exporter": exporter}
         try:
             shape = export(name, exporter, file)
@@ -503,9 +501,6 @@ def measure(name: str, exporter: str, runs: int, width: float, arithmetic: Netwo
         lower = bounds.lower[0]
         found["bounded"] = bool(np.isfinite(lower).all())
         found["width"] = float(f"{-np.median(lower[:k] + lower[k:]):.3g}")
-        if exporter == "pt2":
-            found["runs"] = 0
-            return found
         print(json.dumps(found), flush=True)
         session = onnxruntime.InferenceSession(str(file), providers=["CPUExecutionProvider"])
         entry = session.get_inputs()[0].name
@@ -581,7 +576,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--only", nargs="*", default=None, help="parts of names")
     parser.add_argument("--exact", nargs="*", default=None, help="whole names")
-    parser.add_argument("--exporters", nargs="*", default=["dynamo", "17"], help="dynamo, pt2 or operator sets")
+    parser.add_argument("--exporters", nargs="*", default=["dynamo", "17"], help="dynamo or operator sets")
     parser.add_argument("--runs", type=int, default=2000, help="of onnxruntime; 0: networks are loaded and not bounded")
     parser.add_argument("--width", type=float, default=2e-3, help="how far an image moves with one parameter")
     parser.add_argument("--arithmetic", choices=["float32", "real"], default="float32", help="that bounds are of")

@@ -2,7 +2,7 @@
 
     python benchmarks/fit_buoy.py ns_abstract/demo/buoy.npz
 
-`ns_abstract.demo.buoy.load_network` reads the file.
+`ns_abstract.demo.scenes.buoy_weights` reads the file.
 """
 
 from __future__ import annotations
@@ -14,10 +14,10 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from nerf_network import NerfNetwork
 from torch import Tensor
 from torch.nn import functional
 
-from ns_abstract.demo.nerf_fit import NerfNetwork
 from ns_abstract.io.atomic import write_atomic
 
 #: Everything lies inside this distance of the origin.

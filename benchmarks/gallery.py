@@ -25,9 +25,9 @@ from textwrap import fill
 from typing import Any
 
 import numpy as np
+from approach import FOV, rotation
 from PIL import Image
 
-from ns_abstract.demo.approach import FOV, rotation
 from ns_abstract.geometry.views import View, path_json
 from ns_abstract.io.atomic import write_atomic
 from ns_abstract.refine.result import gap

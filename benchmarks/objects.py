@@ -16,9 +16,9 @@ from pathlib import Path
 import numpy as np
 import torch
 from fit_buoy import REACH, buoy, fit_field
+from nerf_network import NerfNetwork
 from numpy.typing import ArrayLike, NDArray
 
-from ns_abstract.demo.nerf_fit import NerfNetwork
 from ns_abstract.demo.writing import TIMESTAMP
 from ns_abstract.geometry.views import View, around, look_at, path_json
 from ns_abstract.io.atomic import write_json

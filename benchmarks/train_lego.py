@@ -19,9 +19,9 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from nerf_network import NerfNetwork
 from torch.nn import functional
 
-from ns_abstract.demo.nerf_fit import NerfNetwork
 from ns_abstract.geometry.camera_path import Camera
 from ns_abstract.methods.nerf.render import NerfRenderer, Sampling, camera_rays
 from ns_abstract.methods.nerf.scene import NerfScene

@@ -6,9 +6,9 @@ import dataclasses
 
 import numpy as np
 import torch
+from benchmark_scripts import script
 from torch.nn import functional
 
-from ns_abstract.demo.nerf_fit import NerfNetwork
 from ns_abstract.geometry.camera_path import Camera
 from ns_abstract.geometry.poses import PoseSet
 from ns_abstract.geometry.views import look_at
@@ -20,6 +20,7 @@ from ns_abstract.perturbation.specification import parse_perturbation
 from ns_abstract.verify.attack.falsify import falsify
 from ns_abstract.verify.attack.soundness import nerf_renderer
 
+NerfNetwork = script("nerf_network").NerfNetwork
 UNIFORM = Sampling("uniform", 0.0, 4.0, 24, 0, (0.2, 0.6, 1.0))
 BINS = dataclasses.replace(UNIFORM, kind="hierarchical", samples=32, importance=40)
 

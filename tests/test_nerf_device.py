@@ -5,12 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
-from nerfs import UNIFORM, pixels_of, poses, tiny_scene
+from nerfs import UNIFORM, NerfNetwork, pixels_of, poses, tiny_scene
 from test_nerf_certify import COSTLY, cells, outside
 from test_nerf_frame import FIELDS, SETS, attack
 
 from ns_abstract.arithmetic.rounding import UNIT64
-from ns_abstract.demo.nerf_fit import NerfNetwork
 from ns_abstract.io.errors import InputError
 from ns_abstract.methods.nerf import device as device_module
 from ns_abstract.methods.nerf import zonotope

@@ -16,13 +16,12 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from nerfs import UNIFORM, other_view, tiny_scene, view
+from nerfs import UNIFORM, NerfNetwork, other_view, tiny_scene, view
 from scene_files import change, checkpoint_of
 from test_cli import one_line
 
 from ns_abstract.api.files import Settings, open_job
 from ns_abstract.cli import render as render_command
-from ns_abstract.demo.nerf_fit import NerfNetwork
 from ns_abstract.geometry.views import View, path_json
 from ns_abstract.io.errors import InputError
 from ns_abstract.methods import runs

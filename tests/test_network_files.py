@@ -2,19 +2,16 @@
 
 from __future__ import annotations
 
-import json
 import os
 import pickle
-import zipfile
 from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import onnx
 import pytest
-import torch
 from onnx import TensorProto, numpy_helper
-from onnx_files import OnnxFile, attack, image_sets, session
+from onnx_files import OnnxFile, image_sets, session
 
 from ns_abstract.io.errors import InputError
 from ns_abstract.verify.network import bound_outputs, load_network
@@ -185,103 +182,6 @@ def test_a_reading_that_computes_something_else_is_refused(tmp_path: Path, monke
 # ---------------------------------------------------------------- torch.export
 
 
-class Small(torch.nn.Module):
-    def __init__(self) -> None:
-        super().__init__()
-        torch.manual_seed(0)
-        self.conv = torch.nn.Conv2d(2, 4, 3, padding=1)
-        self.norm = torch.nn.BatchNorm2d(4)
-        self.norm.running_mean, self.norm.running_var = torch.randn(4), torch.rand(4) + 0.5
-        self.act = torch.nn.ReLU(inplace=True)
-        self.pool = torch.nn.MaxPool2d(2)
-        self.mean = torch.nn.AdaptiveAvgPool2d(1)
-        self.line = torch.nn.Linear(4, 3)
-
-    def forward(self, x: torch.Tensor) -> torch.Tensor:
-        y = self.act(self.norm(self.conv(x)))
-        y = y + torch.nn.functional.leaky_relu(y - 0.1, 0.2)
-        y = torch.cat([y[:, :2], torch.sigmoid(y[:, 2:])], 1)
-        return 2.0 * self.line(torch.flatten(self.mean(self.pool(y)), 1))
-
-
-def exported(module: torch.nn.Module, file: Path, batch: bool = True) -> Path:
-    shapes = ({0: torch.export.Dim("batch")},) if batch else None
-    count = 2 if batch else 1
-    torch.export.save(torch.export.export(module.eval(), (torch.randn(count, *SHAPE),), dynamic_shapes=shapes), file)
-    return file
-
-
-@pytest.mark.parametrize("batch", [True, False])
-def test_exported_network(tmp_path: Path, batch: bool) -> None:
-    module = Small()
-    network = load_network(exported(module, tmp_path / "net.pt2", batch))
-    x = torch.randn(5, *SHAPE)
-    with torch.no_grad():
-        torch.testing.assert_close(network(x), module(x), rtol=1e-5, atol=1e-5)
-
-    def run(images: np.ndarray) -> np.ndarray:
-        with torch.no_grad():
-            return module(torch.from_numpy(images)).numpy()
-
-    images = image_sets(SHAPE, 1, 2, 0.2, 0.1)
-    rows = np.eye(3)
-    least, _ = attack(network, run, images, 0, rows)
-    lower = bound_outputs(network, images, rows, np.zeros(3)).lower[0]
-    assert (lower <= least).all() and np.isfinite(lower).all()
-
-
-class Cosine(torch.nn.Module):
-    def forward(self, x: torch.Tensor) -> torch.Tensor:
-        return torch.cos(x)
-
-
-class ReadAgain(torch.nn.Module):
-    def forward(self, x: torch.Tensor) -> torch.Tensor:
-        y = 2.0 * x
-        z = torch.nn.functional.relu_(y)
-        return y + z
-
-
-def test_exported_networks_that_are_refused(tmp_path: Path) -> None:
-    refused(exported(Cosine(), tmp_path / "cos.pt2"), "aten.cos", "not supported")
-    file, bad = exported(ReadAgain(), tmp_path / "again.pt2"), tmp_path / "bad.pt2"
-    load_network(file)
-    with zipfile.ZipFile(file) as old, zipfile.ZipFile(bad, "w") as new:
-        for info in old.infolist():
-            data = old.read(info)
-            if info.filename.endswith("models/model.json"):
-                model = json.loads(data)
-                # the tracer itself never writes this: a value that was changed in place is read again
-                model["graph_module"]["graph"]["nodes"][-1]["inputs"][1]["arg"] = {"as_tensor": {"name": "mul"}}
-                data = json.dumps(model).encode()
-            new.writestr(info.filename, data)
-    refused(bad, "changed in place")
-
-
-class Bomb:
-    def __reduce__(self):
-        return (Path.touch, (Path("unpickled"),))
-
-
-def test_nothing_is_unpickled(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
-    file = exported(Small(), tmp_path / "net.pt2")
-    bad = tmp_path / "bad.pt2"
-    with zipfile.ZipFile(file) as old, zipfile.ZipFile(bad, "w") as new:
-        for info in old.infolist():
-            data = old.read(info)
-            if info.filename.endswith(".pt") or info.filename.endswith("weight_0"):
-                data = pickle.dumps(Bomb())
-            if info.filename.endswith("model_weights_config.json"):
-                config = json.loads(data)
-                for entry in config["config"].values():
-                    entry["use_pickle"] = entry["path_name"] == "weight_0"
-                data = json.dumps(config).encode()
-            new.writestr(info.filename, data)
-    refused(bad, "pickled")
-    assert not (tmp_path / "unpickled").exists()
-
-
 def test_networks_are_pickled_for_other_processes(tmp_path: Path) -> None:
     file = small().write(tmp_path / "net.onnx")
     network = load_network(file)
@@ -345,14 +245,6 @@ def test_data_that_is_no_plain_file_is_not_opened(tmp_path: Path) -> None:
     with (tmp_path / "hole").open("wb") as stream:
         stream.truncate(3 << 30)
     refused(_external(tmp_path, "hole", length=str(3 << 30)), "initializer c0", "bytes")
-
-
-def test_deflated_weights_are_refused(tmp_path: Path) -> None:
-    file, bad = exported(torch.nn.Sequential(torch.nn.Flatten(), torch.nn.Linear(32, 4)), tmp_path / "a.pt2"), tmp_path
-    with zipfile.ZipFile(file) as old, zipfile.ZipFile(bad / "b.pt2", "w", zipfile.ZIP_DEFLATED) as new:
-        for info in old.infolist():
-            new.writestr(info.filename, old.read(info))
-    refused(bad / "b.pt2", "compressed")
 
 
 def test_channels_that_double_are_refused_by_their_number(tmp_path: Path) -> None:

@@ -12,10 +12,10 @@ from typing import Any
 import mpmath
 import numpy as np
 import pytest
+from benchmark_scripts import script
 from onnx_files import OnnxFile
 from waves import Waves
 
-from ns_abstract.demo.approach import write_network
 from ns_abstract.geometry.poses import SCENE_TURNS
 from ns_abstract.io.errors import InputError
 from ns_abstract.reach.dynamics import Dynamics, Floats, affine, double_integrator, fixed_wing, quadrotor, unicycle
@@ -27,6 +27,7 @@ from ns_abstract.verify.cells import Grid
 from ns_abstract.verify.model import NetworkModel
 from ns_abstract.verify.network import load_network
 
+write_network = script("approach").write_network
 SIDE = 2
 RNG = np.random.default_rng(3)
 LAWS: dict[str, Dynamics] = {

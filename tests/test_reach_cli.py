@@ -25,7 +25,7 @@ from waiting import LONG, until
 from ns_abstract.api.reaching import LoopJob, open_loop, reach
 from ns_abstract.api.scenes import load_scene
 from ns_abstract.cli import reach as reach_command
-from ns_abstract.demo.gate import gate
+from ns_abstract.demo.scenes import splat_scene
 from ns_abstract.demo.writing import write_loop_demo
 from ns_abstract.geometry.box import ParameterBox
 from ns_abstract.geometry.poses import SCENE_TURNS
@@ -113,7 +113,7 @@ def test_a_network_that_does_not_fit_into_the_memory_is_refused(
 
 
 def test_no_two_gaussians_are_equally_deep() -> None:
-    assert np.diff(np.sort(gate().means[:, 0])).min() > 5e-4
+    assert np.diff(np.sort(splat_scene("gate").means[:, 0])).min() > 5e-4
 
 
 def test_a_part_of_the_box_is_certified(course: Course, tmp_path: Path) -> None:

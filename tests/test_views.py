@@ -13,8 +13,8 @@ from benchmark_scripts import BENCHMARKS, script
 from torch import nn
 
 import ns_abstract as nsa
-from ns_abstract.demo.airfield import airfield
 from ns_abstract.demo.paths import airfield_orbit
+from ns_abstract.demo.scenes import splat_scene
 from ns_abstract.demo.writing import write_demo
 from ns_abstract.geometry.poses import PoseSet
 from ns_abstract.methods.splat.method import SplatMethod
@@ -295,7 +295,7 @@ def test_estimator_of_the_airfield(scripts: Any) -> None:
     translation = {"x": (-0.35, 0.35), "y": (-0.1, 0.1), "z": (-0.15, 0.15)}
     poses = PoseSet.around(camera, Perturbation(translation=translation))
     values = poses.box.sample(12, np.random.default_rng(5))
-    shown = scripts.views.pictures(SplatMethod(airfield(), None, None), poses, values)
+    shown = scripts.views.pictures(SplatMethod(splat_scene("airfield"), None, None), poses, values)
     outputs = judge("estimator_airfield").outputs(shown.permute(0, 2, 3, 1).numpy())
     truth = scripts.train.truths(value["perturbation"]["orbit"]["target"], poses, values)
     assert scripts.train.within(torch.from_numpy(outputs), truth, 0.1) >= 0.9

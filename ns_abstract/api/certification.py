@@ -189,7 +189,7 @@ class Question:
     """A network and what is to hold of it.
 
     Args:
-        model: Network, .onnx or .pt2.
+        model: Network, .onnx.
         source: What is to hold.
 
     Raises:
@@ -599,7 +599,7 @@ class CertifySettings:
     Attributes:
         load_config: config.yml of a run, or a standard 3DGS .ply.
         camera_path_filename: Camera path JSON.
-        model: Network, .onnx or .pt2.
+        model: Network, .onnx.
         property: PROP.json.
         perturbation_filename: Perturbation JSON; None: the camera path holds it.
         renderer: "gsplat" or "paper"; None: gsplat.

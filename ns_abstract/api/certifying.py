@@ -690,7 +690,7 @@ def certify(
     Args:
         scene: The scene.
         poses: One set, or several.
-        model: Network, .onnx or .pt2 of torch.export.
+        model: Network, .onnx.
         property: What is to hold, as the object of a property file, or that file.
         time_budget: Seconds for all sets together.
         output_dir: Folder for cells.sqlite, the report and counterexamples, as ns-abstract-certify writes them; None:

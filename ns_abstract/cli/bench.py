@@ -171,7 +171,7 @@ class Certificates(Scenes):
     """Certified fraction against time, by set of poses."""
 
     model: Path | None = None
-    """Network, .onnx or .pt2."""
+    """Network, .onnx."""
     property: Path | None = None
     """What is to hold (JSON)."""
     sets: tuple[str, ...] = ("xyz",)

@@ -35,7 +35,7 @@ class Certify(GivenSet, GivenScene):
     camera_path_filename: Path
     """Camera path as Nerfstudio's viewer writes it."""
     model: Path
-    """Network: .onnx, or .pt2 of torch.export."""
+    """Network: .onnx."""
     property: Path
     """What is to hold (JSON): classification, regression, detection or vnnlib, with the preprocessing."""
     output_dir: Path
@@ -132,7 +132,7 @@ class Explain:
     """Print a network's layers, and what a cell of it will take; nothing is bounded."""
 
     model: Path
-    """Network: .onnx, or .pt2 of torch.export."""
+    """Network: .onnx."""
     explain: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
     """Only this."""
     parameters: int = 2

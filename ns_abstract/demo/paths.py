@@ -7,9 +7,11 @@ from typing import Any
 
 import numpy as np
 
-from ns_abstract.demo.airfield import TARGET
-from ns_abstract.geometry.views import View, around, path_json, ring
+from ns_abstract.geometry.views import View, around, look_at, path_json, ring
 from ns_abstract.io.atomic import write_json
+
+#: The middle of the airfield's aircraft.
+TARGET = (0.0, 0.0, 0.01)
 
 
 def airfield_views(size: int = 200) -> list[View]:
@@ -21,6 +23,21 @@ def airfield_views(size: int = 200) -> list[View]:
 def dataset_views(count: int = 10, size: int = 200) -> list[View]:
     """Views all around the airfield for the data set beside a run."""
     return ring(TARGET, 1.05, count, size)
+
+
+def gate_views(count: int = 10, size: int = 200) -> list[View]:
+    """Views along the gate's course for the data set beside a run; the nearer to the gate, the nearer to its axis."""
+    rng = np.random.default_rng(0)
+    end = 0.06 + 0.1 * 0.35 * 24
+    along = rng.uniform(0.0, end, count)
+    room = 1.1 - 0.5 * along / end
+    across, up = (room * rng.uniform(-most, most, count) for most in (0.45, 0.3))
+    found = []
+    for place in np.stack([along, across, up], axis=1):
+        pose = look_at((0.0, 0.0, 0.0), (1.0, 0.0, 0.0))
+        pose[:3, 3] = place
+        found.append(View(pose, 60.0, size, size))
+    return found
 
 
 def airfield_path(size: int = 200) -> dict[str, Any]:

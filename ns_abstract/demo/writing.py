@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ns_abstract.demo.airfield import airfield
-from ns_abstract.demo.approach import FOV, SIZE, rotation, samples, write_approach
-from ns_abstract.demo.buoy import buoy_path, buoy_scene, buoy_views
-from ns_abstract.demo.gate import gate
-from ns_abstract.demo.paths import dataset_views, write_airfield_paths
+from ns_abstract.demo.paths import dataset_views, gate_views, write_airfield_paths
+from ns_abstract.demo.scenes import DATA, buoy_path, buoy_scene, buoy_views, splat_scene
 from ns_abstract.geometry.camera_path import Camera, focal_length
 from ns_abstract.geometry.views import View
 from ns_abstract.io.atomic import write_json
@@ -56,7 +54,7 @@ def _picture(renderer: Renderer) -> Callable[[View], NDArray[np.float64]]:
 
 def write_demo(folder: Path) -> tuple[Path, dict[str, Path]]:
     """Write run, camera paths and perturbation; returns config.yml and the files by name."""
-    scene = airfield()
+    scene = splat_scene("airfield")
     picture = _picture(Renderer(activate(scene, GSPLAT_1_4_0), GSPLAT_1_4_0))
     config = write_splatfacto_run(
         scene, folder, timestamp=TIMESTAMP, experiment_name="airfield", views=dataset_views(), render=picture
@@ -66,16 +64,11 @@ def write_demo(folder: Path) -> tuple[Path, dict[str, Path]]:
 
 def write_loop_demo(folder: Path) -> tuple[Path, Path]:
     """Write the gate's run, and the network and LOOP.json of a flight towards it; returns config.yml and LOOP.json."""
-    scene = gate()
+    scene = splat_scene("gate")
     picture = _picture(Renderer(activate(scene, GSPLAT_1_4_0), GSPLAT_1_4_0))
-
-    def seen(place: NDArray[np.float64], size: int) -> View:
-        pose = rotation()
-        pose[:3, 3] = place
-        return View(pose, FOV, size, size)
-
     config = write_splatfacto_run(
-        scene, folder, timestamp=TIMESTAMP, experiment_name="gate", render=picture,
-        views=[seen(place, 200) for place in samples(10)],
-    )  # fmt: skip
-    return config, write_approach(folder, lambda place: picture(seen(place, SIZE)).astype(np.float32))
+        scene, folder, timestamp=TIMESTAMP, experiment_name="gate", render=picture, views=gate_views()
+    )
+    for name in ("estimator.onnx", "LOOP.json"):
+        shutil.copyfile(DATA / name, folder / name)
+    return config, folder / "LOOP.json"

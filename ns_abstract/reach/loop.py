@@ -255,7 +255,7 @@ def parse_loop(value: Any, folder: Path) -> Loop:
     dt = number(value.get("sampling_time"), "sampling_time", fail, positive=True)
     dynamics = parse_dynamics(value.get("dynamics"), n, dt, folder, fail)
     disturbance = np.stack(_ranges(value.get("disturbance", {}), "disturbance", names, fail))
-    network = named_file(value.get("network"), "network", folder, "an .onnx or .pt2", fail)
+    network = named_file(value.get("network"), "network", folder, "an .onnx", fail)
     if "output" in value and not (isinstance(output := value["output"], str) and output):
         raise fail("output", f"found {show(output)}", "write the name of one of the network's outputs")
     unsafe = value.get("unsafe", [])

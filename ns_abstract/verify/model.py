@@ -42,15 +42,12 @@ class NetworkModel:
         self.arithmetic: NetworkArithmetic = arithmetic
 
     @cached_property
-    def _run(self) -> Callable[[np.ndarray], np.ndarray] | None:
-        """Runs the file in onnxruntime; None for other files than ONNX."""
-        network = self.network
-        if network.source.suffix.lower() == ".pt2":
-            return None
-        return onnx_runner(network.source, network.output, network.input_shape)
+    def _run(self) -> Callable[[np.ndarray], np.ndarray]:
+        """Runs the file in onnxruntime."""
+        return onnx_runner(self.network.source, self.network.output, self.network.input_shape)
 
     def outputs(self, images: np.ndarray) -> np.ndarray:
-        """[B, n] of onnxruntime (torch for .pt2 files) in float32, picture by picture.
+        """[B, n] of onnxruntime in float32, picture by picture.
 
         With network arithmetic real: of the same weights in float64.
         """
@@ -58,8 +55,6 @@ class NetworkModel:
             inputs = self.preprocess.apply(torch.from_numpy(np.asarray(images, np.float32)))
             if self.arithmetic == "real":
                 return np.concatenate([self.network(x[None].double()).numpy() for x in inputs])
-            if self._run is None:
-                return np.concatenate([self.network(x[None]).numpy() for x in inputs])
         # one at a time: the same picture gives the same bits whatever stands beside it
         return np.stack([self._run(x[None].numpy()) for x in inputs])
 

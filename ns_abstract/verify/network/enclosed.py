@@ -49,7 +49,7 @@ _GROWS = frozenset(("Clip", "Max", "Min", "ReduceMax", "ReduceMin", "Relu"))
 _STEPS = frozenset(("Ceil", "Floor", "Round", "Sign"))
 _LIBRARIES = frozenset(("Erf", "Exp", "Log", "Sigmoid", "Tanh"))
 #: Functions of shapes, which no rounding changes.
-_SHAPES = frozenset(("ConstantOfShape", "Shape", "Size"))
+_SHAPES = frozenset(("ConstantOfShape", "EyeLike", "Shape", "Size"))
 
 
 class Enclosed(NamedTuple):

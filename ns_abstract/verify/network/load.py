@@ -10,9 +10,8 @@ import numpy as np
 import onnxruntime
 
 from ns_abstract.io.errors import InputError
-from ns_abstract.io.jsonio import file_size
+from ns_abstract.io.jsonio import file_size, show
 from ns_abstract.verify.network.comparison import Run, compare, probes
-from ns_abstract.verify.network.exported import read_exported
 from ns_abstract.verify.network.graph import Network
 from ns_abstract.verify.network.onnx_file import read_onnx
 from ns_abstract.verify.network.onnx_graph import Asked
@@ -30,11 +29,11 @@ def load_network(
     layout: str = "NCHW",
     shown: Callable[[tuple[int, ...]], Iterable[np.ndarray]] | None = None,
 ) -> Network:
-    """The network in an .onnx, .onnx.gz or .pt2 file, compared with the program that usually runs such a file.
+    """The network in an .onnx or .onnx.gz file, compared with onnxruntime.
 
     Args:
         path: The file.
-        vector: Whether an .onnx file's input may be a vector [n], without a batch.
+        vector: Whether the input may be a vector [n], without a batch.
         output: Name of the output that is read; None: the only one.
         picture: Height and width of pictures, used where the file leaves them free.
         layout: "NCHW" or "NHWC", of such pictures.
@@ -46,21 +45,27 @@ def load_network(
     path = Path(path)
     file_size(path, "network")
     name = path.name.lower()
-    if name.endswith((".onnx", PACKED)):
-        network = read_onnx(path, Asked(output, vector, picture, layout == "NHWC"))
-        run = onnx_runner(path, network.output, network.input_shape)
-    elif name.endswith(".pt2"):
-        network, run = read_exported(path, output)
-    else:
-        raise InputError(
-            f"has the ending {path.suffix!r}", file=path, fix="give an .onnx file or a .pt2 file of torch.export"
-        )
+    if not name.endswith((".onnx", PACKED)):
+        raise InputError(f"has the ending {path.suffix!r}", file=path, fix=_instead(path))
+    network = read_onnx(path, Asked(output, vector, picture, layout == "NHWC"))
+    run = onnx_runner(path, network.output, network.input_shape)
     usual, strange = probes(network)
     compare(network, run, usual)
     compare(
         network, run, strange if shown is None else itertools.chain(shown(network.input_shape), strange), usual=False
     )
     return network
+
+
+def _instead(path: Path) -> str:
+    """What to do with a file that is not ONNX."""
+    target = show(f"{path.stem}.onnx")
+    if path.suffix.lower() == ".pt2":
+        load = f"program = torch.export.load({show(path.name)})"
+        return f"convert it in Python: {load}; torch.onnx.export(program, (), {target}, dynamo=True)"
+    if path.suffix.lower() in (".pt", ".pth", ".ckpt"):
+        return f"export the model in Python: torch.onnx.export(model.eval(), (images,), {target}, dynamo=True)"
+    return "give an .onnx file"
 
 
 def onnx_session(path: Path) -> onnxruntime.InferenceSession:

@@ -48,6 +48,7 @@ _PLAIN = frozenset(
         "Cos",
         "Erf",
         "Exp",
+        "EyeLike",
         "Flatten",
         "Floor",
         "Identity",

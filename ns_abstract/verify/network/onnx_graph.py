@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import difflib
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -11,16 +11,19 @@ import numpy as np
 import onnx
 
 from ns_abstract.io.errors import InputError
-from ns_abstract.verify.network.chosen import chosen_output
+from ns_abstract.io.jsonio import show
 from ns_abstract.verify.network.compose import Composer
 from ns_abstract.verify.network.enclosed import Enclosed, arithmetic, fold_enclosed
 from ns_abstract.verify.network.graph import Network
 from ns_abstract.verify.network.layers import Shape
+from ns_abstract.verify.network.onnx_choices import without_choices
 from ns_abstract.verify.network.onnx_fold import FOLDED, fold
 from ns_abstract.verify.network.onnx_tensors import StoredTensors
 
 #: Operator sets whose meaning is known here.
 _OPSETS = range(7, 24)
+#: Outputs that a message names.
+_NAMED = 8
 
 Rule = Callable[["Reader", onnx.NodeProto, "Attributes"], None]
 
@@ -52,7 +55,9 @@ _INSTEAD = {
     "GatherElements": "use Gather with constant indices",
     "GridSample": "use Resize",
     "If": "export without branches",
+    "GreaterOrEqual": "use Max, Min or Clip instead of a choice",
     "Less": "use Max, Min or Clip instead of a choice",
+    "LessOrEqual": "use Max, Min or Clip instead of a choice",
     "Loop": "export with fixed sizes",
     "LRN": "use BatchNormalization",
     "LpPool": "use AveragePool",
@@ -198,12 +203,12 @@ class Reader:
 
     def network(self) -> Network:
         """The network up to the chosen output; nodes that it does not depend on are not read."""
-        needed = {self.output}
-        for node in reversed(self.graph.node):
+        needed, nodes = {self.output}, without_choices(self.graph)
+        for node in reversed(nodes):
             if needed.intersection(node.output):
                 needed.update(node.input, _outer_names(node))
         needed.discard("")
-        for node in self.graph.node:
+        for node in nodes:
             wanted = [name if name in needed else "" for name in node.output]
             if not any(wanted):
                 continue
@@ -227,7 +232,11 @@ class Reader:
         return self.builder.network(self.values[name].index, name)
 
     def _chosen(self, asked: str | None) -> str:
-        """The name of the output that is read."""
+        """The name of the output that is read: the one asked for, or the only one.
+
+        Outputs are never joined: a label would count through all of them. Those that are no scores, such as masks
+        and indices, are read only where they are asked for.
+        """
         shapes, beside = {}, []
         for value in self.graph.output:
             kind = value.type.tensor_type
@@ -236,7 +245,20 @@ class Reader:
             ]
             if kind.elem_type not in (0, onnx.TensorProto.FLOAT, onnx.TensorProto.DOUBLE, onnx.TensorProto.FLOAT16):
                 beside.append(value.name)
-        return chosen_output(self.path, shapes, asked, beside)
+        if asked is not None:
+            if asked not in shapes:
+                fix = f"write {_named(shapes)}"
+                raise InputError(f"has no output {show(asked)}", file=self.path, field="output", fix=fix)
+            return asked
+        scores = [name for name in shapes if name not in beside] or list(shapes)
+        if len(scores) == 1:
+            return scores[0]
+        raise InputError(
+            f"has {len(scores)} outputs: {_named({name: shapes[name] for name in scores})}",
+            file=self.path,
+            field="output",
+            fix=f'write "output": {show(scores[0])} in the property, or export the network with one output',
+        )
 
     def _read(self, node: onnx.NodeProto) -> None:
         kind = node.op_type
@@ -378,6 +400,11 @@ class Attributes:
         for name in self.found:
             if name not in self.asked:
                 raise InputError(f"attribute {name} is not supported", fix="export without it")
+
+
+def _named(shapes: Mapping[str, Sequence[object]]) -> str:
+    shown = [f"{show(name)} {list(shape)}".replace("'", "") for name, shape in list(shapes.items())[:_NAMED]]
+    return ", ".join(shown) + (f" and {len(shapes) - _NAMED} more" if len(shapes) > _NAMED else "")
 
 
 def _outer_names(node: onnx.NodeProto) -> set[str]:

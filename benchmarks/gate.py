@@ -1,4 +1,6 @@
-"""A procedural Gaussian-splat scene: a gate on a meadow, for a drone that flies towards it.
+"""Makes the demo's gate on a meadow, the network of a drone that flies towards it, and LOOP.json.
+
+    python benchmarks/gate.py ns_abstract/demo
 
 Frame: z up, the course runs along +x from about x = 0, the gate's ring stands at x = `GATE`. All Gaussians are wide and
 soft, so that pictures of few pixels change smoothly with the camera's place, and no two are equally far along +x, so
@@ -7,13 +9,20 @@ that their order is known from everywhere on the course.
 
 from __future__ import annotations
 
+import sys
 from itertools import pairwise
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+from airfield import write_scene
+from approach import FOV, SIZE, rotation, write_approach
 from numpy.typing import ArrayLike, NDArray
 
-from ns_abstract.methods.splat.activate import SH_C0
+from ns_abstract.geometry.camera_path import Camera, focal_length
+from ns_abstract.methods.splat.activate import SH_C0, activate
+from ns_abstract.methods.splat.constants import GSPLAT_1_4_0
+from ns_abstract.methods.splat.render import Renderer
 from ns_abstract.methods.splat.scene import SplatScene
 
 Array = NDArray[np.float64]
@@ -98,3 +107,23 @@ def gate(seed: int = 0) -> SplatScene:
         background=_SKY.astype(np.float32),
         name="gate",
     )
+
+
+def main(folder: Path) -> None:
+    scene = gate()
+    write_scene(folder / "gate.npz", scene)
+    renderer = Renderer(activate(scene, GSPLAT_1_4_0), GSPLAT_1_4_0)
+    pose = rotation()
+    turn = np.ascontiguousarray(pose[:3, :3].T * np.array([1.0, -1.0, -1.0])[:, None])
+    focal = focal_length(FOV, SIZE, "fov")
+
+    def render(place: Array) -> NDArray[np.float32]:
+        pose[:3, 3] = place
+        camera = Camera(camera_to_world=pose, fx=focal, fy=focal, cx=0.5 * SIZE, cy=0.5 * SIZE, width=SIZE, height=SIZE)
+        return renderer.image(camera, turn, np.ascontiguousarray(place)).astype(np.float32)
+
+    write_approach(folder, render)
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1]))

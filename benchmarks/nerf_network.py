@@ -1,4 +1,4 @@
-"""NeRF networks in PyTorch, to be trained by `benchmarks/fit_buoy.py` and `benchmarks/train_lego.py`."""
+"""NeRF networks in PyTorch, which `fit_buoy.py`, `objects.py` and `train_lego.py` train."""
 
 from __future__ import annotations
 

@@ -1,4 +1,6 @@
-"""A procedural Gaussian-splat scene: an airliner on short final over a small airfield.
+"""Makes the demo's airfield: an airliner on short final over a small airfield, without data from elsewhere.
+
+    python benchmarks/airfield.py ns_abstract/demo/airfield.npz
 
 Frame: z up, the runway lies along x, the aircraft flies towards +x. The ground is the plane
 z = ``GROUND``; aircraft and airfield lie within [-1.2, 1.2]^3, hills and the sky dome up to 4 away.
@@ -10,12 +12,15 @@ what a glossy surface reflects of the sky, the ground and the sun.
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ns_abstract.io.atomic import write_atomic
 from ns_abstract.methods.splat.scene import SplatScene
 
 Array = NDArray[np.float64]
@@ -1024,3 +1029,14 @@ def airfield(seed: int = 0) -> SplatScene:
         background=np.ones(3, np.float32),
         name="airfield",
     )
+
+
+def write_scene(file: Path, scene: SplatScene) -> None:
+    """Write the arrays that `ns_abstract.demo.scenes.splat_scene` reads."""
+    names = "means", "log_scales", "quats", "opacity_logits", "sh", "background"
+    arrays = {name: getattr(scene, name) for name in names}
+    write_atomic(file, lambda stream: np.savez_compressed(stream, **arrays))
+
+
+if __name__ == "__main__":
+    write_scene(Path(sys.argv[1]), airfield())

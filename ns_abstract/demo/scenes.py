@@ -1,0 +1,127 @@
+"""The demonstration scenes, from arrays that ship with the package; scripts in `benchmarks/` made these."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ns_abstract.geometry.views import View, look_at, path_json
+from ns_abstract.io.arrays import open_archive
+from ns_abstract.io.errors import InputError
+from ns_abstract.methods.nerf.scene import Encoding, FieldWeights, Layer, NerfScene
+from ns_abstract.methods.splat.scene import SplatScene
+
+#: Part of the package: scenes, and the gate's network and loop.
+DATA = Path(__file__).parent
+_FIX = "install the package again"
+#: Nerfstudio's encodings of positions and directions, and the columns that they have.
+_POSITION, _DIRECTION = Encoding(10, 0.0, 8.0), Encoding(4, 0.0, 4.0)
+#: Width and layers of the base of Nerfstudio's field, the layer that takes the encoding again, and the head's width.
+_WIDTH, _LAYERS, _SKIP, _HEAD = 256, 8, 4, 128
+
+
+class _Reader(Protocol):
+    """Reads an array of a type and shape; None stands for any length."""
+
+    def __call__(self, name: str, kind: type, *shape: int | None) -> NDArray[Any]: ...
+
+
+@contextmanager
+def _stored(file: Path) -> Iterator[_Reader]:
+    """Open an archive of the package.
+
+    Raises:
+        InputError: The file cannot be read, or an array is missing, has another type or shape, or is not finite.
+    """
+    with open_archive(file, "scene", _FIX) as archive:
+
+        def read(name: str, kind: type, *shape: int | None) -> NDArray[Any]:
+            if name not in archive.declared:
+                raise InputError("is missing", field=name)
+            found, stored = archive.declared[name]
+            wanted = tuple(m if n is None else n for n, m in zip(shape, found, strict=False))
+            if stored != kind or found != wanted or len(found) != len(shape):
+                raise InputError(f"{stored}{list(found)}, not {kind.__name__}{list(shape)}", field=name)
+            values = archive.read(name)
+            if not np.isfinite(values).all():
+                raise InputError("not finite", field=name)
+            return values
+
+        yield read
+
+
+def splat_scene(name: str, file: Path | None = None) -> SplatScene:
+    """The airfield or the gate.
+
+    The airfield: an airliner on short final over a small airfield, 17,564 Gaussians with spherical harmonics of
+    degree 2; z is up, the runway lies along x. The gate: a ring on two posts on a meadow, 75 wide Gaussians, no two of
+    them equally far along x, which is the course of a drone.
+
+    Raises:
+        InputError: The file is damaged.
+    """
+    with _stored(file or DATA / f"{name}.npz") as read:
+        sh = read("sh", np.float32, None, None, 3)
+        n = len(sh)
+        return SplatScene(
+            means=read("means", np.float32, n, 3),
+            log_scales=read("log_scales", np.float32, n, 3),
+            quats=read("quats", np.float32, n, 4),
+            opacity_logits=read("opacity_logits", np.float32, n),
+            sh=sh,
+            sh_degree=round(sh.shape[1] ** 0.5) - 1,
+            background=read("background", np.float32, 3),
+            name=name,
+        )
+
+
+def buoy_weights(file: Path = DATA / "buoy.npz") -> FieldWeights:
+    """A field of Nerfstudio's own size (8 x 256) that was fitted to a buoy on a round float.
+
+    Args:
+        file: Holds biases in float32, and matrices in int8 beside ``NAME.scale`` [rows, 1] in float32.
+
+    Raises:
+        InputError: The file is damaged.
+    """
+    with _stored(file) as read:
+
+        def layer(name: str, rows: int, columns: int, skip: bool = False) -> Layer:
+            weight = read(f"{name}.weight", np.int8, rows, columns)
+            scale = read(f"{name}.weight.scale", np.float32, rows, 1)
+            return Layer(weight * scale, read(f"{name}.bias", np.float32, rows), skip)
+
+        position, direction = _POSITION.size, _DIRECTION.size
+        widths = [position, *(_WIDTH + (position if i == _SKIP else 0) for i in range(1, _LAYERS))]
+        return FieldWeights(
+            tuple(layer(f"base.{i}", _WIDTH, width, i == _SKIP) for i, width in enumerate(widths)),
+            layer("density", 1, _WIDTH),
+            (layer("head.0", _HEAD, _WIDTH + direction), layer("head.1", _HEAD, _HEAD)),
+            layer("color", 3, _HEAD),
+            _POSITION,
+            _DIRECTION,
+        )
+
+
+def buoy_scene() -> NerfScene:
+    """A NeRF of Nerfstudio's own size that shows the buoy."""
+    weights = buoy_weights()
+    return NerfScene(weights, weights, background=np.array([1.0, 1.0, 1.0], np.float32), name="buoy")
+
+
+def buoy_views(count: int = 8, size: int = 64) -> list[View]:
+    """Views all around the buoy for the data set beside the run."""
+    angles = 2.0 * np.pi * np.arange(count) / count
+    eyes = [(3.2 * np.cos(a), 3.2 * np.sin(a), 1.2) for a in angles]
+    return [View(look_at(eye, (0.0, 0.0, 0.1)), 40.0, size, size) for eye in eyes]
+
+
+def buoy_path(size: int = 16) -> dict[str, Any]:
+    """One small view of the buoy, and a yaw of 0.002 rad either way."""
+    view = View(look_at((2.6, -1.8, 1.2), (0.0, 0.0, 0.1)), 40.0, size, size)
+    return path_json([view], seconds=1.0, perturbation={"version": 1, "rotation": {"yaw": 0.002}})
