@@ -25,7 +25,7 @@ import pytest
 import torch
 from certifying import classifier, linear
 from conftest import InProcess, Inputs, environment
-from interrupting import check_ended_in_a_library_call, check_interrupted, interrupted_at, stored
+from interrupting import check_ended_in_a_library_call, check_interrupted, held_at, interrupted_at
 from PIL import Image
 from waiting import LONG, until
 
@@ -461,22 +461,12 @@ def test_same_again(planted: Case, finished: Path, tmp_path: Path) -> None:
 
 def test_killed_run_resumed_equals_an_uninterrupted_one(planted: Case, finished: Path, tmp_path: Path) -> None:
     folder = tmp_path / "out"
-    kills = 0
-    for round_ in range(40):
-        process = start(planted.options(folder, resume=round_ > 0))
-        known = stored(folder)
+    for resume in (False, True, True):
         # killed as soon as it has stored something new
-        until(lambda: stored(folder) > known or process.poll() is not None)  # noqa: B023
-        if process.poll() is not None:
-            assert process.returncode == 0, process.stderr and process.stderr.read()
-            break
-        process.send_signal(signal.SIGKILL)
+        process = held_at(1, MODULE, planted.options(folder, resume=resume))
+        process.kill()
         process.wait()
-        kills += 1
-        if kills == 3:
-            assert certify(Certify(**planted.values(folder, resume=True))) == 0
-            break
-    assert kills >= 2
+    planted.run(folder, resume=True)
     assert cells(folder) == cells(finished)
     one, other = report(folder), report(finished)
     for key in ("verdict", "coverage", "sampled"):
@@ -486,12 +476,9 @@ def test_killed_run_resumed_equals_an_uninterrupted_one(planted: Case, finished:
 
 def test_interrupt_leaves_what_is_finished(planted: Case, finished: Path, tmp_path: Path) -> None:
     folder = tmp_path / "out"
-    process = start(planted.options(folder, workers=2))
-    until(lambda: stored(folder) >= 3 or process.poll() is not None)
+    process = held_at(3, MODULE, planted.options(folder, workers=2))
     process.send_signal(signal.SIGINT)
     _, said = process.communicate(timeout=LONG)
-    if process.returncode == 0:
-        pytest.skip("the command was quicker than the signal")
     assert process.returncode == 3 and "Traceback" not in said, said
     assert report(folder)["state"] == "interrupted"
     covered = sum(json.loads(row[2])[0] - json.loads(row[1])[0] for row in cells(folder))

@@ -103,21 +103,13 @@ def check_samples(inputs: Inputs, folder: Path, index: int, **settings: Any) -> 
         ("ns_abstract.cli.check", "--claims"),
     ],
 )
-def test_help_is_quick_and_light(module: str, option: str) -> None:
-    seconds = []
-    for _ in range(3):
-        start = time.perf_counter()
-        shown = outside(["--help"], "-X", "importtime", module=module)
-        seconds.append(time.perf_counter() - start)
-        if seconds[-1] < 2.0:
-            break
+def test_help_is_light(module: str, option: str) -> None:
+    shown = outside(["--help"], "-X", "importtime", module=module)
     assert shown.returncode == 0
     assert option in shown.stdout
     loaded = {line.rpartition("|")[2].strip().split(".")[0] for line in shown.stderr.splitlines()}
     assert "tyro" in loaded
     assert not loaded & {"torch", "numba", "nerfstudio", "matplotlib", "numpy"}
-    # a busy machine may delay one or two
-    assert min(seconds) < 2.0
 
 
 def test_help_states_every_option_and_exit_code() -> None:
