@@ -16,7 +16,6 @@ import pytest
 from conftest import InProcess, environment
 from waiting import LONG
 
-
 #: Waits at the first block after which so many more cells are stored.
 _HELD = """
 import importlib, sys
