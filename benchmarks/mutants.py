@@ -115,7 +115,7 @@ def table(outcomes: dict[str, Outcome]) -> str:
     lines = [
         "# Planted faults and the tests that catch them",
         "",
-        f"Written by `python benchmarks/mutants.py`. {len(FAULTS)} faults are planted. {len(known)} of them were run as "
+        f"Written by `python benchmarks/mutants.py`. {len(FAULTS)} faults are planted. {len(known)} were run as "
         f"they are, and {killed} of these were killed.",
         "",
         "| mutant | file | test | version | outcome | seconds | day |",

@@ -301,6 +301,7 @@ def test_mistake_is_one_line(
     assert not list((tmp_path / "out").glob("frame_*"))
 
 
+@pytest.mark.slow_cases
 @pytest.mark.parametrize("name", ["path is no JSON", "unknown option", "half a checkpoint"])
 def test_mistake_is_one_line_from_a_shell(name: str, make_blobs: Callable[..., Inputs], tmp_path: Path) -> None:
     change, fragments = MISTAKES[name]
@@ -405,6 +406,7 @@ def finished(blobs: Inputs, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.mark.slow
 def test_a_run_writes_what_it_promises(blobs: Inputs, finished: Path) -> None:
     names = {file.name for file in finished.iterdir()}
     frames = {f"frame_0000{k}.{kind}" for k in range(3) for kind in ("npz", "png")}
@@ -495,6 +497,7 @@ def write_ply(scene: SplatScene, file: Path) -> None:
 # ---------------------------------------------------------------- stored cells
 
 
+@pytest.mark.slow_cases
 @pytest.mark.parametrize(
     "spec",
     [SHIFT, {"translation": {"x": 0.01}, "rotation": {"yaw": [-0.005, 0.01]}}],
@@ -611,6 +614,7 @@ def test_resuming_with_other_settings_is_refused(
     assert (folder / "frame_00000.npz").read_bytes() == before
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM], ids=["SIGINT", "SIGTERM"])
 def test_signal_saves_what_is_finished(number: int, make_blobs: Callable[..., Inputs], tmp_path: Path) -> None:
     inputs, folder = make_blobs(), tmp_path / "out"
@@ -685,6 +689,7 @@ def test_engine_without_dask_says_how_to_get_it(
 needs_dask = pytest.mark.skipif(importlib.util.find_spec("distributed") is None, reason="dask is not installed")
 
 
+@pytest.mark.slow
 @needs_dask
 def test_cluster_on_this_machine_gives_the_same(blobs: Inputs, finished: Path, tmp_path: Path) -> None:
     # relative paths: a worker's folder is another one
