@@ -1,4 +1,4 @@
-"""The fast set (``-m "not slow"``) looks at everything: a test of each file here, and at each file with planted faults."""
+"""The fast set (``-m "not slow"``) looks at everything: at each file of tests, and at each that has planted faults."""
 
 from __future__ import annotations
 
