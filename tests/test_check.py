@@ -132,6 +132,7 @@ def opaque(scene: SplatScene) -> SplatScene:
     return dataclasses.replace(scene, opacity_logits=3.0 * scene.opacity_logits)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("version", VERSIONS)
 @pytest.mark.parametrize("mode", ["classic", "antialiased"])
 def test_pixels_contain_pictures_of_another_renderer(mode: str, version: str) -> None:
@@ -165,6 +166,7 @@ def test_pixels_contain_pictures_of_another_renderer(mode: str, version: str) ->
     assert narrow > 80
 
 
+@pytest.mark.slow
 def test_a_change_of_order_is_enclosed() -> None:
     """Two Gaussians at nearly one depth, of other colours, seen from both sides of the tie."""
     scene = blob_scene(2, degree=0)
@@ -209,6 +211,7 @@ def test_a_capped_alpha_lets_light_through() -> None:
     assert abs(form.c[0] - (0.999 * 0.5 + 0.001)) <= form.r[0] < 1e-12
 
 
+@pytest.mark.slow
 def test_a_stop_that_is_open_is_enclosed() -> None:
     """Behind 0.999 the rasteriser stops at an alpha of 0.9, which a second Gaussian has for some poses of a box."""
     scene = dataclasses.replace(
@@ -312,6 +315,7 @@ def report(folder: Path, change: Callable[[dict[str, Any]], object]) -> None:
     file.write_text(json.dumps(document))
 
 
+@pytest.mark.slow
 def test_a_sound_result_is_proved(copy: Path) -> None:
     found = check(copy, claims=30, seconds=200)
     assert (found.claims, found.refuted, found.structure) == (30, 0, [])
@@ -323,6 +327,7 @@ def test_a_sound_result_is_proved(copy: Path) -> None:
     ]  # fmt: skip
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("version", ["1.4.0", "1.5.3", "1.6.0"])
 def test_antialiased_results_of_every_version_are_proved(
     version: str, make_blobs: Callable[..., Inputs], tmp_path: Path
@@ -336,6 +341,7 @@ def test_antialiased_results_of_every_version_are_proved(
     assert found.refuted == 0 and found.proved >= 16 and found.exit_code == 0
 
 
+@pytest.mark.slow
 def test_bounds_moved_inward_are_refuted(copy: Path) -> None:
     def inward(a: dict[str, np.ndarray]) -> None:
         # where renders come: beyond them by 2e-3
@@ -349,6 +355,7 @@ def test_bounds_moved_inward_are_refuted(copy: Path) -> None:
     assert worst["bound"] == "upper" and worst["error"] < 1e-6 and worst["excess"] > worst["error"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("side", ["lower", "upper"])
 def test_linear_sets_moved_inward_are_never_proved(copy: Path, side: str) -> None:
     def inward(a: dict[str, np.ndarray]) -> None:
@@ -396,6 +403,7 @@ BAD: dict[str, tuple[Callable[[Path], object], str]] = {
 }
 
 
+@pytest.mark.slow_cases
 @pytest.mark.parametrize("name", BAD)
 def test_bad_input_is_one_line(name: str, copy: Path, in_process: InProcess) -> None:
     damage, words = BAD[name]
@@ -429,6 +437,7 @@ def test_another_set_of_poses_is_refused(copy: Path, blobs: Inputs, tmp_path: Pa
     assert check(copy, claims=2, perturbation=other, camera_path=blobs.path, load_config=blobs.config).refuted == 0
 
 
+@pytest.mark.slow_cases
 @pytest.mark.parametrize(
     "spec",
     [

@@ -89,6 +89,7 @@ def missing(table: KeyTable, names: Iterator[str], prefix: str) -> list[str]:
     return [name for name in found if name not in sections and table.find(name) is None]
 
 
+@pytest.mark.slow_cases
 @needs_nerfstudio
 @pytest.mark.parametrize("method", MODELS)
 def test_every_field_of_the_models_is_in_a_table(nerfstudio: SimpleNamespace, method: str) -> None:
@@ -205,6 +206,7 @@ def test_nerfstudio_nerf_pictures_depend_on_what_is_used_or_refused(nerfstudio: 
     assert {"num_coarse_samples", "collider_params.far_plane", "enable_temporal_distortion"} <= changing
 
 
+@pytest.mark.slow
 @needs_nerfstudio
 @pytest.mark.usefixtures("no_metric")
 def test_nerfstudio_splat_pictures_depend_on_what_is_used(
@@ -300,6 +302,7 @@ VALUES = {
 }  # fmt: skip
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", MODELS)
 def test_irrelevant_keys_leave_the_scene_as_it_is(tmp_path: Path, method: str) -> None:
     before = arrays_of(load_any(write_config(tmp_path / "before", method)))
@@ -320,6 +323,7 @@ USED = {
 }  # fmt: skip
 
 
+@pytest.mark.slow_cases
 @pytest.mark.parametrize(("method", "line"), [(m, line) for m, lines in USED.items() for line in lines])
 def test_used_keys_change_the_scene(tmp_path: Path, method: str, line: str) -> None:
     before = arrays_of(load_any(write_config(tmp_path / "before", method)))
