@@ -56,7 +56,9 @@ def inputs(folder: Path) -> dict[str, Path]:
         scene = replace(scene, rasterize_mode=mode, opacity_logits=2.0 * scene.opacity_logits)
         config = where / "blobs"
         found[name] = (
-            next(config.rglob("config.yml")) if config.exists() else write_splatfacto_run(scene, where, experiment_name="blobs")
+            next(config.rglob("config.yml"))
+            if config.exists()
+            else write_splatfacto_run(scene, where, timestamp="2026-01-01_120000", experiment_name="blobs")
         )
         found[f"{name} set"] = write_json(where / "spec.json", _SPECS[name])
     found["path"] = write_json(folder / "path.json", path_json(ring(1, 24)))
