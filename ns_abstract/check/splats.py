@@ -476,3 +476,16 @@ def pixels(
         kept = np.zeros(f.shows.shape, bool)
         kept[:, used] = keep
         return form, kept, f.motion
+
+
+def picture(splats: Splats, cam: Camera, view: View, unit: float) -> Form:
+    """The picture [H, W, 3] over one box of poses."""
+    ends, rows, parts = reaches(splats, cam, view, unit), np.arange(cam.height), []
+    for row in rows:
+        lists = [meeting(ends, row, column) for column in range(cam.width)]
+        index = np.full((cam.width, max(1, *map(len, lists))), -1)
+        for place, numbers in zip(index, lists, strict=True):
+            place[: len(numbers)] = numbers
+        columns = np.arange(cam.width)
+        parts.append(pixels(splats, cam, view, index, (np.full(cam.width, row), columns), unit)[0].clamped(0.0, 1.0))
+    return Form(*(np.stack([getattr(p, name) for p in parts], axis=-3) for name in ("c", "g", "r")))
