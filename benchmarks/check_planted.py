@@ -21,7 +21,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-
 from mutants import copy_package, mutate
 from planted import FAULTS, Fault
 
@@ -44,9 +43,9 @@ def candidates() -> list[Fault]:
 def inputs(folder: Path) -> dict[str, Path]:
     """Writes the runs, the camera path and the sets; the path of each by its name."""
     sys.path.insert(0, str(ROOT / "tests"))
-    from conftest import blob_scene, path_json, ring, write_json, write_splatfacto_run
-
     from dataclasses import replace
+
+    from conftest import blob_scene, path_json, ring, write_json, write_splatfacto_run
 
     found: dict[str, Path] = {}
     for name, mode in (("shift", "classic"), ("turn", "antialiased")):

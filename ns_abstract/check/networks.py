@@ -55,7 +55,7 @@ class Network:
         graph = onnx.load(str(file)).graph
         read = {t.name: torch.from_numpy(np.array(onnx.numpy_helper.to_array(t))) for t in graph.initializer}
         names = [o.name for o in graph.output]
-        if output is None and len(names) != 1 or output not in (None, *names):
+        if (output is None and len(names) != 1) or output not in (None, *names):
             raise ValueError("the output is not said")
         self.input = next(i.name for i in graph.input if i.name not in read)
         self.output, self.unit = output or names[0], unit

@@ -98,7 +98,7 @@ class Picture:
                 if row < height and column < width:
                     break
             claim = Claim(cell, row, column, int(rng.integers(3)))
-            (low, b), (slope, c) = self.bounds(claim).planes
+            (_, b), (slope, c) = self.bounds(claim).planes
             interest = float((np.abs(slope).sum() + 1e-4) / max(c - b, 1e-7)) if np.any(slope) else 0.0
             best, found = (interest, claim) if interest > best else (best, found)
         return found
@@ -199,7 +199,9 @@ def divided(low: Array, high: Array, motion: Array, full: Array) -> list[tuple[A
     if not (width > 0.0).any():
         return [(low, high)]
     weight = np.where(np.isfinite(motion), motion, 0.0)
-    weight = np.where(width > 0.0, weight + 1e-3 * (weight.max() + 1e-30) * width / np.where(full > 0.0, full, 1.0), -1.0)
+    weight = np.where(
+        width > 0.0, weight + 1e-3 * (weight.max() + 1e-30) * width / np.where(full > 0.0, full, 1.0), -1.0
+    )
     axis, count = int(np.argmax(weight)), 4 if len(width) == 1 else 2
     parts, rest = [], (low, high)
     for k in range(1, count):

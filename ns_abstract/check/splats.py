@@ -1,8 +1,8 @@
 """Enclosures of pixels of Splatfacto's picture over boxes of camera poses, by gsplat's rules.
 
 The picture is blended from the back by forms in the pose. What depends on decisions that are open within a box
-(threshold, tile, depth order, stop) is enclosed with both outcomes. With ``unit`` 0 that is the picture in real numbers;
-with ``FLOAT`` every evaluation of gsplat's formulas in float32 lies within the enclosure, too (docs/check.md).
+(threshold, tile, depth order, stop) is enclosed with both outcomes. With ``unit`` 0 that is the picture in real
+numbers; with ``FLOAT`` every evaluation of gsplat's formulas in float32 lies within the enclosure, too (docs/check.md).
 """
 
 from __future__ import annotations
@@ -182,7 +182,9 @@ def _fragments(
         ]
         m.append(across * (turned[0] - uc * turned[2]))
         n.append(down * (turned[1] - vc * turned[2]))
-    mm, nn, mn = (total(a * b for a, b in zip(p, q, strict=True)) for p, q in ((m, m), (n, n), (m, n)))
+    mm, nn, mn = (
+        total(e) for e in ((a.square() for a in m), (b.square() for b in n), (a * b for a, b in zip(m, n, strict=True)))
+    )
     flat = total((m[a] * n[b] - m[b] * n[a]).square() for a, b in ((0, 1), (0, 2), (1, 2)))
     det = flat + (mm + nn) * BLUR + BLUR * BLUR
     near = total((n[k] * dx - m[k] * dy).square() for k in range(3))
@@ -436,7 +438,7 @@ def _swaps(clean: Array, dlow: Array, dhigh: Array, inside: Array, most: Array, 
     light = np.take_along_axis(most, begin, 1)
     lower, upper = np.zeros((count, 3)), np.zeros((count, 3))
     longest = (np.where(inside, place - begin, 0)).max(axis=1, initial=0)
-    for k in range(1, min(int(longest.max(initial=0)), LONGEST_GROUP) + 1):
+    for k in range(1, int(np.where(longest > LONGEST_GROUP, 0, longest).max(initial=0)) + 1):
         pair = inside[:, :-k] & inside[:, k:] & (begin[:, k:] <= place[:, :-k]) & ~(dhigh[:, :-k] < dlow[:, k:])
         if pair.any():
             weight = np.where(pair, light[:, :-k] * ah[:, :-k] * ah[:, k:], 0.0)[..., None]

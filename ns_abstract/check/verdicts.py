@@ -147,7 +147,9 @@ class Loop(_Verdicts):
         self.loop = loop = report["loop"]
         super().__init__(cells, scene, report, model, loop)
         if loop["dynamics"].get("type") != "affine":
-            raise BadInput("has dynamics that this program does not follow", model, "dynamics.type", "audit an affine loop")
+            raise BadInput(
+                "has dynamics that this program does not follow", model, "dynamics.type", "audit an affine loop"
+            )
         height, width = self.shape["resize"]
         focal = float(height / 2.0 / np.tan(float(loop["camera"]["fov"]) * (np.pi / 180.0) / 2.0))
         pose = np.array(loop["camera"]["camera_to_world"], np.float64)[:3]

@@ -66,7 +66,7 @@ def check(options: Check) -> int:
         if "pixel" in entry:
             row, column = entry["pixel"]
             what = f"{entry['value']:.6f} is beyond the {entry['bound']} bound by {entry['excess']:.2g}"
-            where, what = f"{where}, pixel ({row}, {column}), channel {entry['channel']}", what
+            where = f"{where}, pixel ({row}, {column}), channel {entry['channel']}"
         else:
             what = f"the margin is {entry['margin']:.6g} at most, {entry['excess']:.2g} below what is claimed"
         print(f"refuted: {where}: {what} at {entry['pose']}")
