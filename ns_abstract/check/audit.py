@@ -30,7 +30,7 @@ class Audit:
     Attributes:
         claims: Number of claims that were looked at.
         proved, refuted, unsettled: Their numbers by outcome.
-        float32: Number of those proved of every float32 evaluation, too; the others concern the picture in real numbers.
+        float32: Number of those proved of every float32 evaluation; the others concern the picture in real numbers.
         refutations: By refuted claim: frame, cell, pose, what is wrong.
         uniform: Claims and proofs of the uniform sample, and the least part of all claims that holds, at 95 %.
         structure: What is wrong with the cells; empty: they tile every set, every pixel is bounded, counts are right.

@@ -13,8 +13,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-import torch.nn.functional as F
 from torch import Tensor
+from torch.nn import functional
 
 from ns_abstract.check.forms import Form, U
 
@@ -176,7 +176,8 @@ def _layer(kind: str, options: dict[str, Any], constants: list[Tensor], inputs: 
         more = {"stride": options.get("strides", 1), "dilation": options.get("dilations", 1)}
         more["groups"] = options.get("group", 1)
         f, size = (
-            lambda x, w=w: F.conv2d(F.pad(x, (left, right, top, bottom)), w, **more) for w in (weight, weight.abs())
+            lambda x, w=w: functional.conv2d(functional.pad(x, (left, right, top, bottom)), w, **more)
+            for w in (weight, weight.abs())
         )
         bias = rest[0].reshape(-1, 1, 1) if rest else none
         return f, size, bias, weight[0].numel() + weight.numel() // weight.shape[1]
@@ -187,12 +188,12 @@ def _layer(kind: str, options: dict[str, Any], constants: list[Tensor], inputs: 
         return (lambda x: x @ weight), (lambda x: x @ weight.abs()), (values[1:] or [none])[0], sum(weight.shape)
     if kind == "AveragePool" and not options.get("ceil_mode") and not any(options.get("pads", [0])):
         kernel, stride = options["kernel_shape"], options.get("strides", 1)
-        f = lambda x: F.avg_pool2d(x, kernel, stride)  # noqa: E731
+        f = lambda x: functional.avg_pool2d(x, kernel, stride)  # noqa: E731
         return f, f, none, math.prod(kernel) + 4
     if kind == "Pad" and options.get("mode", b"constant") == b"constant" and not any(float(v) for v in values[:1]):
-        pads = [int(v) for v in (options.get("pads") or [c for c in constants if not c.is_floating_point()][0])]
+        pads = [int(v) for v in (options.get("pads") or next(c for c in constants if not c.is_floating_point()))]
         if len(pads) == 8 and not any(pads[k] for k in (0, 1, 4, 5)):
-            f = lambda x: F.pad(x, (pads[3], pads[7], pads[2], pads[6]))  # noqa: E731
+            f = lambda x: functional.pad(x, (pads[3], pads[7], pads[2], pads[6]))  # noqa: E731
             return f, f, none, 1
     if (kind == "Flatten" and options.get("axis", 1) == 1) or kind in ("Identity", "Reshape"):
         shape = [int(v) for v in constants[0].tolist()] if kind == "Reshape" else [0, -1]

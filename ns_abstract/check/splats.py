@@ -156,50 +156,88 @@ class _Fragments(NamedTuple):
     motion: Array
 
 
-def _fragments(
-    splats: Splats, cam: Camera, view: View, index: Array, pixel: tuple[Array, Array], unit: float
-) -> _Fragments:
-    rules, at = splats.rules, np.maximum(index, 0)
+class Projected(NamedTuple):
+    """Gaussians on the image plane, forms [B, n]: all that does not depend on the pixel.
+
+    ``axes`` are the three columns of the covariance's root, ``errors`` those of the covariance's entries in float32,
+    ``kappa`` the exponent's relative error there; ``color`` [B, n, 3].
+    """
+
+    centre: list[Form]
+    axes: list[list[Form]]
+    squares: list[Form]
+    inverse: Form
+    opacity: Form
+    color: Form
+    depth: Form
+    errors: list[Array]
+    kappa: Array
+
+    def among(self, index: Array) -> Projected:
+        """Rows of Gaussians ``index`` [W, n] out of one row of all [1, N]."""
+
+        def pick(part: Any) -> Any:
+            if isinstance(part, list):
+                return [pick(e) for e in part]
+            return part.of(lambda a: a[..., 0, index]) if isinstance(part, Form) else part[0, index]
+
+        rest = {name: pick(getattr(self, name)) for name in self._fields if name != "color"}
+        return Projected(**rest, color=self.color.of(lambda a: a[..., 0, index, :]))
+
+
+def projected(splats: Splats, cam: Camera, view: View, at: Array, unit: float) -> Projected:
+    """The Gaussians ``at`` [B, n] for cameras over B boxes."""
     x, y, z = _points(splats, view, at, unit)
     iz = z.reciprocal()
     iz = iz.wider(6.0 * unit * iz.size())
     u, v = ((e * iz).wider(4.0 * unit * e.size() * iz.size()) for e in (x, y))
-    mx, my = (
-        (e * f + centre).wider(4.0 * unit * (f * e.size() + centre))
-        for e, f, centre in ((u, cam.fx, cam.cx), (v, cam.fy, cam.cy))
-    )
-    dx, dy = (e + -(place[:, None] + 0.5) for e, place in ((mx, pixel[1]), (my, pixel[0])))
-    tx, ty = MARGIN * 0.5 * cam.width / cam.fx, MARGIN * 0.5 * cam.height / cam.fy
-    uc = u.clamped(-(cam.cx / cam.fx + tx), (cam.width - cam.cx) / cam.fx + tx)
-    vc = v.clamped(-(cam.cy / cam.fy + ty), (cam.height - cam.cy) / cam.fy + ty)
-    axes, sizes = splats.axes[at], splats.scales[at]
-    across, down = iz * cam.fx, iz * cam.fy
-    m, n = [], []
-    for k in range(3):
-        turned = [
+    ends = ((u, cam.fx, cam.cx, cam.width), (v, cam.fy, cam.cy, cam.height))
+    centre = [(e * f + c).wider(4.0 * unit * (f * e.size() + c)) for e, f, c, _ in ends]
+    slopes, roots, axes, sizes = [], [], splats.axes[at], splats.scales[at]
+    turned = [
+        [
             total(wide(view.rotation[r][s]) * axes[..., s, k] for s in range(3)).wider(4.0 * 96.0 * U * sizes[..., k])
             for r in range(3)
         ]
-        m.append(across * (turned[0] - uc * turned[2]))
-        n.append(down * (turned[1] - vc * turned[2]))
-    mm, nn, mn = (
-        total(e) for e in ((a.square() for a in m), (b.square() for b in n), (a * b for a, b in zip(m, n, strict=True)))
-    )
+        for k in range(3)
+    ]
+    for row, (e, f, c, side) in enumerate(ends):
+        spare = MARGIN * 0.5 * side / f
+        slopes.append(e.clamped(-(c / f + spare), (side - c) / f + spare))
+        roots.append([(iz * f) * (t[row] - slopes[-1] * t[2]) for t in turned])
+    m, n = roots
+    pairs = zip(m, n, strict=True)
+    mm, nn, mn = total(a.square() for a in m), total(b.square() for b in n), total(a * b for a, b in pairs)
     flat = total((m[a] * n[b] - m[b] * n[a]).square() for a, b in ((0, 1), (0, 2), (1, 2)))
     det = flat + (mm + nn) * BLUR + BLUR * BLUR
-    near = total((n[k] * dx - m[k] * dy).square() for k in range(3))
-    exponent = (near + (dx.square() + dy.square()) * BLUR) * 0.5 * det.reciprocal()
-    errors, wild = [0.0, 0.0, 0.0], np.zeros(at.shape, bool)
+    inverse, errors, kappa = det.reciprocal(), [np.zeros(at.shape)] * 3, np.zeros(at.shape)
     if unit:
-        errors, wild, exponent, flat, det = _rounded(exponent, flat, det, (mm, nn), (across, down), (uc, vc), sizes)
-    opacity = Form.constant(splats.opacity[at], dx, 32.0 * U * splats.opacity[at])
+        h = [(iz * f).size() * (1.0 + e.size()) for e, f in zip(slopes, (cam.fx, cam.fy), strict=True)]
+        errors, kappa, error = _rounded(det, (mm, nn), h, sizes)
+        flat, det = flat.wider(error), det.wider(error)
+    opacity = Form.constant(splats.opacity[at], z, 32.0 * U * splats.opacity[at])
     if splats.antialiased:
-        opacity = opacity * _factor(flat, det, rules.least_factor, unit)
+        opacity = opacity * _factor(flat, det, splats.rules.least_factor, unit)
+    color = _colors(splats, view, at, z, unit)
+    return Projected(centre, roots, [mm, nn, mn], inverse, opacity, color, z, errors, kappa)
+
+
+def _fragments(
+    splats: Splats, cam: Camera, p: Projected, index: Array, pixel: tuple[Array, Array], unit: float
+) -> _Fragments:
+    rules, (mx, my), (m, n), opacity, z = splats.rules, p.centre, p.axes, p.opacity, p.depth
+    dx, dy = (e + -(place[:, None] + 0.5) for e, place in ((mx, pixel[1]), (my, pixel[0])))
+    near = total((n[k] * dx - m[k] * dy).square() for k in range(3))
+    exponent = (near + (dx.square() + dy.square()) * BLUR) * 0.5 * p.inverse
+    wild = ~((p.kappa < 0.125) & np.isfinite(exponent.r)) & (unit > 0.0)
+    exponent = exponent.wider(np.where(wild, 0.0, 1.2 * p.kappa) * exponent.size() + 1e-30 * (unit > 0.0))
     elow, ehigh = exponent.range()
     olow, ohigh = opacity.range()
     room = ROOM + 80.0 * unit
     plain = np.exp(-np.clip(np.stack([elow, ehigh]), 0.0, 700.0)) * np.array([1 + room, 1 - room])[:, None, None]
-    most = np.where(np.isfinite(elow) & ~wild, np.maximum(ohigh, 0.0) * plain[0], 1.0 if unit else splats.opacity[at])
+    # where the exponent is not known the opacity is; an exponent that is no number is drawn with the largest alpha
+    anything = np.ones_like(ohigh) if unit else np.minimum(ohigh, 1.0)
+    most = np.where(np.isfinite(elow) & ~wild, np.maximum(ohigh, 0.0) * plain[0], anything)
     most = np.where(np.isfinite(most), most, 1.0)
     least = np.where(np.isfinite(ehigh) & np.isfinite(olow) & ~wild, np.maximum(olow, 0.0) * plain[1], 0.0)
     alpha = (-exponent).exp() * opacity
@@ -208,7 +246,7 @@ def _fragments(
     shows = (most >= LEAST_ALPHA * (1.0 - room)) & ~(zh < NEAR * (1.0 - ROOM)) & ~(zl > FAR) & (index >= 0)
     surely = (least >= LEAST_ALPHA * (1.0 + room)) & (zl >= NEAR * (1.0 + ROOM)) & (zh <= FAR)
     if rules.tiles:
-        squares = [e.wider(error) for e, error in zip((mm, nn, mn), errors, strict=True)]
+        squares = [e.wider(error) for e, error in zip(p.squares, p.errors, strict=True)]
         maybe, certain = _tiles(cam, pixel, (mx, my), squares, unit)
         shows, surely = shows & maybe, surely & certain & ~wild
     alow, ahigh = alpha.range()
@@ -218,31 +256,27 @@ def _fragments(
     gone = np.where(shows, 1.0, 0.0)
     alpha = alpha.boxed(rough, bottom, np.maximum(top, bottom)).of(lambda a: a * gone)
     motion = np.where(shows[None], np.abs(mx.g) + np.abs(my.g), 0.0).max(axis=2, initial=0.0)
-    return _Fragments(alpha, _colors(splats, view, at, dx, unit), z, shows, motion)
+    return _Fragments(alpha, p.color, z, shows, motion)
 
 
-def _rounded(
-    exponent: Form, flat: Form, det: Form, squares: Any, scale: Any, slopes: Any, sizes: Array
-) -> tuple[list[Array], Array, Form, Form, Form]:
-    """Errors of the covariance's entries, where nothing is known, and exponent and determinants with their rounding.
+def _rounded(det: Form, squares: Any, h: list[Array], sizes: Array) -> tuple[list[Array], Array, Array]:
+    """Errors in float32 of the covariance's entries (xx, yy, xy), of the exponent (relative) and of determinants.
 
     The covariance J R M M^T R^T J^T is a sum of products of factors that err by 12 (J), 2 (R) and 64 units of a scale
     (M: 46 of a quaternion's rotation, 18 of scale and product), in 15 products and sums of three: below 165 units a
-    side of h h^T, h = |J| |R| |M|. What the entries E do to the exponent is bounded by eta, the size of E against the
+    side of h h^T, h = |J| |R| |M|. What the entries do to the exponent is bounded by eta, their size against the
     covariance; conic and exponent carry 48 units of their terms, whose sum is 4 ac / det times the exponent at most.
+    Where kappa is not below 1/8 nothing is known of the exponent.
     """
-    hx, hy = (f.size() * (1.0 + s.size()) for f, s in zip(scale, slopes, strict=True))
-    square = (sizes * sizes).sum(axis=-1) * (1.0 + 1e-9)
+    square, (hx, hy) = (sizes * sizes).sum(axis=-1) * (1.0 + 1e-9), h
     a, c = (e.size() + BLUR for e in squares)
-    ends = ((hx, hx, a), (hx, hy, 0.0), (hy, hy, c))
-    ea, eb, ec = (FLOAT * (330.0 * p * q * square + 3.0 * d) for p, q, d in ends)
+    ends = ((hx, hx, a), (hy, hy, c), (hx, hy, 0.0))
+    ea, ec, eb = (FLOAT * (330.0 * p * q * square + 3.0 * d) for p, q, d in ends)
     low = np.maximum(det.range()[0], BLUR * BLUR)
     eta = (c * ea + 2.0 * np.sqrt(a * c) * eb + a * ec) / low
-    kappa = 1.05 * (eta + 48.0 * FLOAT * a * c / low)
-    wild = ~((kappa < 0.125) & (a * c < 1e30) & np.isfinite(exponent.r))
-    exponent = exponent.wider(1.2 * kappa * exponent.size() + 1e-30)
+    kappa = np.where(a * c < 1e30, 1.05 * (eta + 48.0 * FLOAT * a * c / low), np.inf)
     error = a * ec + c * ea + 2.0 * np.sqrt(a * c) * eb + ea * ec + eb * eb + 8.0 * FLOAT * a * c + 1e-30
-    return [ea, ec, eb], wild, exponent, flat.wider(error), det.wider(error)
+    return [ea, ec, eb], kappa, error
 
 
 def _factor(flat: Form, det: Form, least: float, unit: float) -> Form:
@@ -450,7 +484,7 @@ def _swaps(clean: Array, dlow: Array, dhigh: Array, inside: Array, most: Array, 
 
 
 def pixels(
-    splats: Splats, cam: Camera, view: View, index: Array, pixel: tuple[Array, Array], unit: float = 0.0
+    splats: Splats, cam: Camera, view: View | Projected, index: Array, pixel: tuple[Array, Array], unit: float = 0.0
 ) -> tuple[Form, Array, Array]:
     """Colours [B, 3] before the clamp of one pixel over each of B boxes; which Gaussians matter [B, n]; their motion.
 
@@ -458,12 +492,14 @@ def pixels(
 
     Args:
         splats, cam: The scene, and the camera's intrinsics.
-        view: Cameras over B boxes.
+        view: Cameras over B boxes, or what `projected` makes of them.
         index: [B, n] numbers of the Gaussians that may show (`reaches`); negative ones stand for none.
         pixel: Rows [B] and columns [B].
         unit: 0 for the picture in real numbers, `FLOAT` for all those in float32.
     """
     with np.errstate(all="ignore"):
+        if not isinstance(view, Projected):
+            view = projected(splats, cam, view, np.maximum(index, 0), unit)
         f = _fragments(splats, cam, view, index, pixel, unit)
         used = np.flatnonzero(f.shows.any(axis=0))
         if not len(used):
@@ -482,12 +518,18 @@ def pixels(
 
 def picture(splats: Splats, cam: Camera, view: View, unit: float) -> Form:
     """The picture [H, W, 3] over one box of poses."""
-    ends, rows, parts = reaches(splats, cam, view, unit), np.arange(cam.height), []
-    for row in rows:
-        lists = [meeting(ends, row, column) for column in range(cam.width)]
+    ends, columns, parts = reaches(splats, cam, view, unit), np.arange(cam.width), []
+    inside = (ends[:, 0] <= cam.width) & (ends[:, 1] >= 0.0) & (ends[:, 2] <= cam.height) & (ends[:, 3] >= 0.0)
+    # one more, so that there is one
+    some = np.append(np.flatnonzero(inside), 0)
+    ends = np.concatenate([ends[some[:-1]], [[np.inf, -np.inf] * 2]])
+    with np.errstate(all="ignore"):
+        whole = projected(splats, cam, view, some[None], unit)
+    for row in range(cam.height):
+        lists = [meeting(ends, row, column) for column in columns]
         index = np.full((cam.width, max(1, *map(len, lists))), -1)
         for place, numbers in zip(index, lists, strict=True):
             place[: len(numbers)] = numbers
-        columns = np.arange(cam.width)
-        parts.append(pixels(splats, cam, view, index, (np.full(cam.width, row), columns), unit)[0].clamped(0.0, 1.0))
+        part, pixel = whole.among(index), (np.full(cam.width, row), columns)
+        parts.append(pixels(splats, cam, part, index, pixel, unit)[0].clamped(0.0, 1.0))
     return Form(*(np.stack([getattr(p, name) for p in parts], axis=-3) for name in ("c", "g", "r")))
