@@ -138,9 +138,12 @@ def _splats(file: Path) -> dict[str, np.ndarray]:
     count = len(arrays["means"]) if arrays["means"].ndim else 0
     bands = 1 + (arrays["shN"].shape[1] if arrays["shN"].ndim == 3 else 0)
     shapes = {"means": (3,), "scales": (3,), "quats": (4,), "opacities": (), "sh0": (1, 3), "shN": (bands - 1, 3)}
+    if bands not in _BANDS:
+        problem = f"{bands} bands of spherical harmonics, more than degree 3 has, or not all of a degree"
+        raise InputError(problem, file=file, field="splats.shN", fix="train with degree 3 or less")
     for name, shape in shapes.items():
-        if arrays[name].shape != (count, *shape) or bands not in _BANDS:
-            problem = f"shape {list(arrays[name].shape)}, expected {[count, *shape]} of degree 3 at most"
+        if arrays[name].shape != (count, *shape):
+            problem = f"shape {list(arrays[name].shape)}, expected {[count, *shape]}"
             raise InputError(problem, file=file, field=f"splats.{name}", fix="give a checkpoint of gsplat's trainer")
     reserve(count, bands, file)
     return {

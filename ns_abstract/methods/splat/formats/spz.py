@@ -64,11 +64,14 @@ def decode_spz(path: Path, overrides: Overrides) -> DecodedSplats:
     size = file_size(path, ".spz file")
     with path.open("rb") as stream:
         head = stream.read(_HEADER_4)
-    if head.startswith(MAGIC):
-        header = _header(head, path)
+    if not head.startswith(MAGIC):
+        header, data = _packed_streams(path, size)
+    elif (header := _header(head, path)).version == 4:
         data = _streams_4(path, size, head, header)
     else:
-        header, data = _streams_3(path, size)
+        with path.open("rb") as stream:
+            stream.seek(_HEADER)
+            data = _split(header, stream.read(sum(header.sizes.values()) + 1), path)
     means = _signed_24(data["positions"]).reshape(-1, 3) * 2.0**-header.fraction
     rest = None
     if header.degree:
@@ -110,7 +113,19 @@ def _header(head: bytes, path: Path) -> _Header:
     return header
 
 
-def _streams_3(path: Path, size: int) -> tuple[_Header, dict[str, NDArray[np.uint8]]]:
+def _split(header: _Header, data: bytes, path: Path) -> dict[str, NDArray[np.uint8]]:
+    """Streams of versions 2 and 3, one behind the other."""
+    wanted = sum(header.sizes.values())
+    if len(data) != wanted:
+        raise InputError(f"{len(data)} bytes of Gaussians or more, expected {wanted}: cut off", file=path, fix=_FIX)
+    streams, at = {}, 0
+    for name, length in header.sizes.items():
+        streams[name] = np.frombuffer(data, np.uint8, length, at)
+        at += length
+    return streams
+
+
+def _packed_streams(path: Path, size: int) -> tuple[_Header, dict[str, NDArray[np.uint8]]]:
     """Header and streams of versions 2 and 3: unpacked only as far as the header says."""
     inflate = zlib.decompressobj(31)
     try:
@@ -130,19 +145,15 @@ def _streams_3(path: Path, size: int) -> tuple[_Header, dict[str, NDArray[np.uin
     except OSError as error:
         problem = f"cannot be read: {error.strerror or type(error).__name__}"
         raise InputError(problem, file=path, fix="check the permissions") from None
-    if len(data) != wanted or not inflate.eof:
-        raise InputError(f"{len(data)} bytes of Gaussians or more, expected {wanted}: cut off", file=path, fix=_FIX)
-    streams, at = {}, 0
-    for name, length in header.sizes.items():
-        streams[name] = np.frombuffer(data, np.uint8, length, at)
-        at += length
-    return header, streams
+    if len(data) == wanted and not inflate.eof:
+        raise InputError("a gzip stream without its end: cut off", file=path, fix=_FIX)
+    return header, _split(header, data, path)
 
 
 def _streams_4(path: Path, size: int, head: bytes, header: _Header) -> dict[str, NDArray[np.uint8]]:
     """Streams of version 4."""
-    if header.version != 4 or len(head) < _HEADER_4:
-        raise InputError("an SPZ header without its gzip stream", file=path, field="version", fix=_FIX)
+    if len(head) < _HEADER_4:
+        raise InputError(f"{len(head)} bytes: cut off", file=path, fix=_FIX)
     sizes = {name: length for name, length in header.sizes.items() if length}
     number, table = head[15], int.from_bytes(head[16:20], "little")
     if number != len(sizes) or table != _HEADER_4 or table + 16 * number > size:
