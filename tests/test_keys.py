@@ -475,7 +475,7 @@ def test_paths_that_show_something_else_are_refused(tmp_path: Path, case: str) -
 FILES: dict[str, tuple[Any, tuple[str, ...]]] = {
     "transforms.json": (
         {"camera_model": "OPENCV", "fl_x": 500.0, "w": 100, "h": 100, "frames": [{"transform_matrix": []}]},
-        ("transforms.json", "dataparser_transforms.json", "viewer"),
+        ("transforms.json", "config.yml of a run", "camera path"),
     ),
     "transforms_train.json": ({"camera_angle_x": 0.7, "frames": []}, ("transforms.json",)),
     "exported cameras": ([{"file_path": "a.png", "transform": []}], ("ns-export cameras",)),
@@ -525,7 +525,7 @@ def test_keys_of_a_path_do_what_the_table_says(tmp_path: Path) -> None:
 
     def told(data: Any) -> list[Any]:
         path = read(tmp_path, data)
-        cameras = [(c.camera_to_world.tolist(), c.fx, c.fy, c.width, c.height) for c in path.cameras]
+        cameras = [(c.camera_to_world.tolist(), c.intrinsics) for c in path.cameras]
         return [cameras, path.perturbations, path.is_cycle, path.notes]
 
     new: dict[str, Any] = {

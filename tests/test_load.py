@@ -936,7 +936,7 @@ BAD_PLYS: dict[str, tuple[Callable[[bytes], bytes], tuple[str, ...]]] = {
     "no rotation": (_header(b"float rot_3", b"float rod_3"), ("vertex.rot_3",)),
     "compressed": (
         _header(b"float f_dc_0", b"float packed_0"),
-        ("vertex.packed_0", "splat-transform scene.ply out.ply"),
+        ("header", "expected chunk, vertex and sh"),
     ),
     "colors": (_header(b"float f_dc_0", b"float red"), ("vertex.f_dc_0", "sh_coeffs")),
     "one coefficient less": (_header(b"float f_rest_44", b"float g_rest_44"), ("f_rest_", "44 properties")),

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
+from ns_abstract.geometry.camera_files import RunFrame
 from ns_abstract.geometry.camera_path import Camera
 from ns_abstract.geometry.poses import PoseSet
 from ns_abstract.geometry.tiles import assemble
@@ -90,6 +91,14 @@ class Scene:
     def notes(self) -> tuple[str, ...]:
         """What was assumed on reading it, one sentence each."""
         return tuple(self.method().notes)
+
+    @property
+    def run_frame(self) -> RunFrame | None:
+        """From the frame of the run's data set to the run's; None where the scene is no run."""
+        if self.source.file.is_file() and self.source.file.suffix.lower() not in (".yml", ".yaml"):
+            return None
+        transform = self._content.dataparser
+        return RunFrame(transform.matrix, transform.scale)
 
     @property
     def assumptions(self) -> tuple[Assumption, ...]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -12,9 +12,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from ns_abstract.geometry.camera_files import FileCamera, RunFrame, inria_cameras, is_inria, transforms_cameras
 from ns_abstract.geometry.path_keys import ENTRY, KEYFRAME, PATH
 from ns_abstract.io.errors import InputError
-from ns_abstract.io.jsonio import InputTuning, is_number, load_json, parse_json, show
+from ns_abstract.io.jsonio import InputTuning, is_moderate, is_number, load_json, parse_json, show
 from ns_abstract.io.keys import sentence
 
 SIDE_LIMIT = 16384
@@ -152,15 +153,19 @@ class CameraPath:
         return self.cameras[0] if self.is_cycle and len(self.cameras) > 1 else None
 
 
-def load_camera_path(path: str | os.PathLike[str], downscale_factor: float = 1) -> CameraPath:
-    """Read the JSON that Nerfstudio's viewer writes.
+def load_camera_path(
+    path: str | os.PathLike[str], downscale_factor: float = 1, run_frame: RunFrame | None = None
+) -> CameraPath:
+    """Read the JSON that Nerfstudio's viewer writes, Inria's ``cameras.json`` or a data set's ``transforms.json``.
 
-    Focal lengths are ``(height / 2) / tan(fov / 2)`` in both directions (fov is vertical) and
-    the principal point is the image centre, as in ``nerfstudio.cameras.camera_paths``.
+    In the viewer's paths, focal lengths are ``(height / 2) / tan(fov / 2)`` in both directions (fov is vertical) and
+    the principal point is the image centre, as in ``nerfstudio.cameras.camera_paths``, unless an entry has fx, fy, cx
+    or cy.
 
     Args:
         path: The file.
         downscale_factor: Images become this many times smaller.
+        run_frame: From the data set's frame to the run's; without it a ``transforms.json`` is refused.
 
     Raises:
         InputError: The file or a field in it cannot be used.
@@ -168,10 +173,37 @@ def load_camera_path(path: str | os.PathLike[str], downscale_factor: float = 1) 
     path = Path(path)
     root = load_json(path, "camera path")
     try:
+        if is_inria(root):
+            return _photo_path(inria_cameras(root), str(path), downscale_factor)
+        if isinstance(root, dict) and "camera_path" not in root and "frames" in root:
+            return _photo_path(transforms_cameras(root, run_frame), str(path), downscale_factor)
         _refuse_others(root)
         return _parse(root, str(path), downscale_factor)
     except InputError as error:
         raise error.within(path) from None
+
+
+def _photo_path(found: Iterable[FileCamera], source: str, downscale_factor: float) -> CameraPath:
+    """The path of the cameras of photos."""
+    cameras = []
+    for entry in found:
+        camera = Camera(
+            camera_to_world=checked_pose([*entry.camera_to_world, [0, 0, 0, 1]], entry.field),
+            fx=_pixels(entry.fx, f"{entry.field}: focal length"),
+            fy=_pixels(entry.fy, f"{entry.field}: focal length"),
+            cx=entry.cx,
+            cy=entry.cy,
+            width=checked_side(entry.width, f"{entry.field}: width"),
+            height=checked_side(entry.height, f"{entry.field}: height"),
+        )
+        cameras.append(camera.rescaled(downscale_factor))
+    return CameraPath(tuple(cameras), None, (None,) * len(cameras), None, False, source)
+
+
+def _pixels(value: Any, field: str) -> float:
+    if not is_moderate(value) or not value > 0:
+        raise InputError(f"found {show(value)}", field=field, fix="write a number of pixels above 0")
+    return float(value)
 
 
 def _parse(root: dict[str, Any], source: str, downscale_factor: float) -> CameraPath:
@@ -181,13 +213,18 @@ def _parse(root: dict[str, Any], source: str, downscale_factor: float) -> Camera
     cameras = []
     overrides = []
     for field, entry in _entries(root, unknown):
-        focal = _focal(entry, root, field, height)
+        own = {key: entry.get(key, root.get(key)) for key in ("fx", "fy", "cx", "cy")}
+        focal = _focal(entry, root, field, height) if own["fx"] is None else _pixels(own["fx"], f"{field}.fx")
+        for key, side in (("cx", width), ("cy", height)):
+            own[key] = side / 2 if own[key] is None else own[key]
+            if not is_moderate(own[key]):
+                raise InputError(f"found {show(own[key])}", field=f"{field}.{key}", fix="write a number of pixels")
         camera = Camera(
             camera_to_world=checked_pose(entry.get("camera_to_world"), f"{field}.camera_to_world"),
             fx=focal,
-            fy=focal,
-            cx=width / 2,
-            cy=height / 2,
+            fy=focal if own["fy"] is None else _pixels(own["fy"], f"{field}.fy"),
+            cx=float(own["cx"]),
+            cy=float(own["cy"]),
             width=width,
             height=height,
         )
@@ -211,12 +248,7 @@ def _parse(root: dict[str, Any], source: str, downscale_factor: float) -> Camera
 
 
 #: Files of Nerfstudio and of this program that are taken for camera paths, by a key that these lack.
-_OTHERS = {
-    "frames": (
-        "a data set's transforms.json, not a camera path",
-        "make a path in Nerfstudio's viewer, or write one whose camera_to_world are the transform_matrix entries, "
-        "taken to the run's frame by dataparser_transforms.json",
-    ),
+_OTHERS: dict[str, tuple[str, str]] = {
     "transform": ("a run's dataparser_transforms.json, not a camera path", _FIX_FILE),
     "dynamics": ("a loop, not a camera path", "give it to ns-abstract-reach as --loop"),
     **dict.fromkeys(

@@ -127,11 +127,7 @@ def read_config(path: str | os.PathLike[str]) -> RunConfig:
     if os.path.isdir(file):
         file = file / CONFIG_NAME
         file_size(file, "run configuration", fix="give a folder that ns-train wrote, or its config.yml")
-    refuse_other_kind(file)
-    text = read_text(file, "run configuration", CONFIG_BYTES_LIMIT)
-    root = as_mapping(_parse_yaml(text, file))
-    if root is None:
-        raise InputError("the top level is not a mapping", file=file, fix="give the config.yml of ns-train")
+    root = read_mapping(file, "run configuration")
     pipeline = _section(root, "pipeline", "pipeline", file)
     model = _section(pipeline, "model", "pipeline.model", file)
     folder = file.parent
@@ -144,6 +140,19 @@ def read_config(path: str | os.PathLike[str]) -> RunConfig:
         model_folder=folder / _model_folder(root, file),
         root=root,
     )
+
+
+def read_mapping(file: Path, what: str) -> dict[str, Any]:
+    """What a YAML file of a mapping holds; Python objects in it are kept as `Tagged`, never built.
+
+    Raises:
+        InputError: The file is absent, not YAML, too large, or no mapping.
+    """
+    refuse_other_kind(file)
+    root = as_mapping(_parse_yaml(read_text(file, what, CONFIG_BYTES_LIMIT), file))
+    if root is None:
+        raise InputError("the top level is not a mapping", file=file, fix="give the configuration that training wrote")
+    return root
 
 
 def as_mapping(value: Any) -> dict[str, Any] | None:
