@@ -206,6 +206,13 @@ def _pixels(value: Any, field: str) -> float:
     return float(value)
 
 
+def _place(value: Any, side: int, field: str) -> float:
+    """A coordinate of the principal point; without it the middle of a side."""
+    if value is not None and not is_moderate(value):
+        raise InputError(f"found {show(value)}", field=field, fix="write a number of pixels")
+    return side / 2 if value is None else float(value)
+
+
 def _parse(root: dict[str, Any], source: str, downscale_factor: float) -> CameraPath:
     unknown = PATH.unknown(root)
     height = checked_side(root.get("render_height"), "render_height")
@@ -215,16 +222,12 @@ def _parse(root: dict[str, Any], source: str, downscale_factor: float) -> Camera
     for field, entry in _entries(root, unknown):
         own = {key: entry.get(key, root.get(key)) for key in ("fx", "fy", "cx", "cy")}
         focal = _focal(entry, root, field, height) if own["fx"] is None else _pixels(own["fx"], f"{field}.fx")
-        for key, side in (("cx", width), ("cy", height)):
-            own[key] = side / 2 if own[key] is None else own[key]
-            if not is_moderate(own[key]):
-                raise InputError(f"found {show(own[key])}", field=f"{field}.{key}", fix="write a number of pixels")
         camera = Camera(
             camera_to_world=checked_pose(entry.get("camera_to_world"), f"{field}.camera_to_world"),
             fx=focal,
             fy=focal if own["fy"] is None else _pixels(own["fy"], f"{field}.fy"),
-            cx=float(own["cx"]),
-            cy=float(own["cy"]),
+            cx=_place(own["cx"], width, f"{field}.cx"),
+            cy=_place(own["cy"], height, f"{field}.cy"),
             width=width,
             height=height,
         )
