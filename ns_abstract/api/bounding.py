@@ -26,7 +26,7 @@ from ns_abstract.io.assumptions import Assumption
 from ns_abstract.io.errors import InputError
 from ns_abstract.refine.engine import Goal, groups, shared_goal
 from ns_abstract.refine.result import FrameResult, Layer, Leaves, PartResult, TracePoint
-from ns_abstract.report.figures import interval, metrics, number
+from ns_abstract.report.figures import interval, metrics, number, short_guarantee
 from ns_abstract.report.files import save_frame
 from ns_abstract.report.notebook import frame_html
 
@@ -258,7 +258,8 @@ class BoundResult:
             really rendered.
         image: [H, W, 3] float32, the picture at the middle of the set.
         parameters: Names, units and ranges of what varies.
-        guarantee: "float32-sound", "real-sound", or "sampled" (this machine's arithmetic failed its self-check).
+        guarantee: "float32-sound", "real-sound", or "sampled" (this machine's arithmetic failed its self-check); with
+            ", of the Gaussians alone" behind it where the run's model may draw more (``assume_splatfacto``).
         seconds: Time spent.
         trace: Error over time.
         cell_count: Cells that were bounded.
@@ -432,8 +433,9 @@ def bound(
         "scene": job.describe(),
         "fingerprint": job.fingerprint,
     }
+    told = short_guarantee(guarantee, about["scene"].get("bounded"))
     return BoundResult.of(
-        frames[0], guarantee=guarantee, interrupted=stop(), target_ratio=target_ratio, about=about,
+        frames[0], guarantee=told, interrupted=stop(), target_ratio=target_ratio, about=about,
         assumptions=job.assumptions,
     )  # fmt: skip
 

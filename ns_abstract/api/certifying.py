@@ -34,6 +34,7 @@ from ns_abstract.io.memory import allowed_memory
 from ns_abstract.report.cameras import Cameras, cameras_entry, cell_cameras, standing
 from ns_abstract.report.certificate import CertifiedRun, LastReport, certificate_document, coverage, verdict
 from ns_abstract.report.certificate_page import Closer, certificate_page, percent
+from ns_abstract.report.figures import short_guarantee
 from ns_abstract.report.notebook import verdicts_html
 from ns_abstract.report.outside import Outside
 from ns_abstract.report.picture import preview, to_bytes
@@ -624,7 +625,8 @@ class Certificate:
         verdict: "falsified" if any pose breaks the property, "certified" if all is proved, else "unknown".
         parameters: Names and units of the cells' axes.
         sentence: The property in words, as the end of "on every image ...".
-        guarantee: Of the pictures: "float32-sound" or "real-sound".
+        guarantee: Of the pictures: "float32-sound" or "real-sound", and what of the scene it holds if not all (as in
+            `ns_abstract.BoundResult`).
         network_guarantee: What holds of the network, one sentence each.
         state: "done", "budget" (the time ended first) or "interrupted".
         seconds: Time spent.
@@ -777,7 +779,7 @@ def certificate(run: CertificateRun, document: Mapping[str, Any]) -> Certificate
         verdict=verdict(document["frames"]),
         parameters=tuple(run.job.parameters),
         sentence=run.about.sentence,
-        guarantee=run.about.guarantee,
+        guarantee=short_guarantee(run.about.guarantee, run.about.scene.get("bounded")),
         network_guarantee=run.about.network_guarantee,
         state=document["state"],
         seconds=document["seconds"],

@@ -13,7 +13,7 @@ from ns_abstract.reach.loop import Loop
 from ns_abstract.reach.planes import Marks, View, plane_marks, region, views
 from ns_abstract.reach.search import QUESTIONS
 from ns_abstract.report.certificate_page import percent
-from ns_abstract.report.figures import interval, number
+from ns_abstract.report.figures import interval, number, short_guarantee
 from ns_abstract.report.margins import scene_margin
 from ns_abstract.report.outside import PICTURE_WIDTH, Outside, behind, draw_plane, plane_axes
 from ns_abstract.report.page import Axis, draw_legend, draw_line, draw_plot, reproduce, uri, whole_page
@@ -216,11 +216,12 @@ def _cell(document: Mapping[str, Any], entry: Mapping[str, Any]) -> str:
 
 
 def _guarantee(document: Mapping[str, Any]) -> str:
+    guarantee = short_guarantee(document["guarantee"], document["scene"].get("bounded"))
     lines = [
         "What is certified: sequences of states where every next one is f(x, u) + w, f in real numbers or in float64 "
         "as this program evaluates it, w anything in its box; u comes from the picture of the pose at x by the network "
         "and the control law. Between sampling times nothing is said.",
-        f"Pictures: <b>{escape(document['guarantee'])}</b>, each bound {escape(document['guarantee_text'])}.",
+        f"Pictures: <b>{escape(guarantee)}</b>, each bound {escape(document['guarantee_text'])}.",
         "Network: " + escape("; ".join(document["network_guarantee"])) + ".",
     ]
     if "dynamics_guarantee" in document:

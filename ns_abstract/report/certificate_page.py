@@ -10,7 +10,7 @@ from html import escape
 from typing import Any
 
 from ns_abstract.report.cameras import Cameras
-from ns_abstract.report.figures import interval, number, percent, unit_of_axis
+from ns_abstract.report.figures import interval, number, percent, short_guarantee, unit_of_axis
 from ns_abstract.report.margins import scene_margin
 from ns_abstract.report.page import Axis, counted, draw_line, draw_plot, reproduce, script, uri, whole_page
 from ns_abstract.report.record import plain
@@ -625,8 +625,9 @@ _PICTURES = {
 
 
 def _guarantee(document: Mapping[str, Any]) -> str:
+    guarantee = short_guarantee(document["guarantee"], document["scene"].get("bounded"))
     lines = [
-        f"Images: guarantee <b>{escape(document['guarantee'])}</b>, each {escape(document['guarantee_text'])}.",
+        f"Images: guarantee <b>{escape(guarantee)}</b>, each {escape(document['guarantee_text'])}.",
         f"What is bounded is {_PICTURES[document['picture']]}; preprocessing in float32 is part of it. Resizing means "
         "rendering at the network's resolution.",
         "Network: " + escape("; ".join(document["network_guarantee"])) + ".",

@@ -13,7 +13,7 @@ from pathlib import Path
 from statistics import median
 from typing import Any
 
-from ns_abstract.report.figures import MARKS, interval, number
+from ns_abstract.report.figures import MARKS, interval, number, short_guarantee
 
 #: Points drawn of one curve.
 _CURVE_POINTS = 200
@@ -193,7 +193,7 @@ def _verdict(document: Mapping[str, Any], name: str) -> str:
     asked, missing = len(document["frames_asked"]), len(document["missing"])
     bounded = asked - missing
     sampled = document["guarantee"] == "sampled"
-    frames = document["frames"]
+    frames, of = document["frames"], document["scene"].get("bounded")
     if sampled:
         kind, title = "bad", f"No guarantee: rendered samples of {counted(asked, 'frame')}"
     elif not bounded:
@@ -211,7 +211,8 @@ def _verdict(document: Mapping[str, Any], name: str) -> str:
     elif bounded:
         lines.append(
             f"For each of them: take any camera pose of the frame's set and render <b>{escape(name)}</b> with "
-            f"{escape(_program(document))}. Every pixel lies between the frame's lower and upper image."
+            f"{escape(_program(document))}. Every pixel{'' if of is None else f' {escape(of)}'} lies between the "
+            "frame's lower and upper image."
         )
     sets = {_set(entry) for entry in frames}
     if len(sets) == 1:
@@ -219,7 +220,8 @@ def _verdict(document: Mapping[str, Any], name: str) -> str:
     elif sets:
         lines.append("The frames have different sets, which stand with each frame below.")
     lines.append(
-        f"Guarantee <b>{escape(document['guarantee'])}</b>: the abstract image {escape(document['guarantee_text'])}."
+        f"Guarantee <b>{escape(short_guarantee(document['guarantee'], of))}</b>: the abstract image "
+        f"{escape(document['guarantee_text'])}."
     )
     lines += [escape(limit) for limit in document["limits"]]
     ratios = [entry["ratio"] for entry in frames if entry["ratio"] is not None and entry["status"] != "missing"]
