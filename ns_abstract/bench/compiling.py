@@ -16,6 +16,7 @@ from typing import Any
 from ns_abstract.api.files import PathJob
 from ns_abstract.bench.sets import pose_set
 from ns_abstract.execution.opening import Recipe, opened
+from ns_abstract.geometry.poses import PoseSet
 
 #: Functions that a row names: those that took most by themselves.
 _NAMED = 3
@@ -78,7 +79,7 @@ class _Recorder:
         self._llvm += seconds
 
 
-def _measured(recipe: Recipe[Any], name: str, frame: int) -> list[dict[str, Any]]:
+def _measured(recipe: Recipe[Any], poses: PoseSet) -> list[dict[str, Any]]:
     """The rows of one process, which has no kernel."""
     from numba.core import event
 
@@ -89,7 +90,7 @@ def _measured(recipe: Recipe[Any], name: str, frame: int) -> list[dict[str, Any]
         on_end: Callable[[Any], None] = staticmethod(found.end)
 
     job = opened(recipe)
-    view = job.method.frame(pose_set(job, name, frame))
+    view = job.method.frame(poses)
     listener = Listener()
     with event.install_listener("numba:compile", listener), event.install_timer("numba:llvm_lock", found.llvm):
         for stage in (*view.stages, None):
@@ -127,7 +128,7 @@ def compile_times(job: PathJob, name: str, frame: int) -> list[dict[str, Any]]:
         LLVM, and what took most of it.
     """
     with _without_kernels(), ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool:
-        rows = pool.submit(_measured, job.recipe, name, frame).result()
+        rows = pool.submit(_measured, job.recipe, pose_set(job, name, frame)).result()
     counted = ("functions", "wall s", "processor s", "LLVM s")
     total = {key: sum(row[key] for row in rows) for key in counted}
     return [{"set": name, **row} for row in [*rows, {"stage": "all", "kernel": "", **total, "of it": ""}]]
