@@ -22,6 +22,7 @@ _STUCK = 900.0
 #: Headings of the tables by benchmark.
 _TITLES = {
     "cell": "Cost of a cell",
+    "compile": "Seconds of compiling",
     "tightness": "Error against run time",
     "soundness": "Soundness",
     "plan": "What is left out, taken back",
@@ -58,6 +59,14 @@ class Cell(Scenes):
     """Sets of poses: x, yaw, roll, six, segments, orbit, point."""
     repeats: int = 15
     """Times that everything is measured."""
+
+
+@dataclass
+class Compile(Scenes):
+    """What compiling costs at first use, by kernel: seconds by the clock, of the processor, and inside LLVM."""
+
+    sets: tuple[str, ...] = ("x",)
+    """Sets of poses: x, yaw, roll, six, segments, orbit, point."""
 
 
 @dataclass
@@ -402,12 +411,16 @@ def loops(options: Loops) -> int:
     return 1 if found.search[0]["violations"] else DONE
 
 
-def rows_of(options: Cell | Soundness | Plan | Rules | Rays, job: PathJob, name: str) -> list[dict[str, Any]]:
+def rows_of(options: Cell | Compile | Soundness | Plan | Rules | Rays, job: PathJob, name: str) -> list[dict[str, Any]]:
     """What a benchmark without curves finds for one scene and set of poses."""
     if isinstance(options, Cell):
         from ns_abstract.bench.cell import cell_cost
 
         return [cell_cost(job, name, options.frame, options.repeats)]
+    if isinstance(options, Compile):
+        from ns_abstract.bench.compiling import compile_times
+
+        return compile_times(job, name, options.frame)
     if isinstance(options, Soundness):
         from ns_abstract.bench.soundness import attack
 
@@ -440,7 +453,18 @@ def rows_of(options: Cell | Soundness | Plan | Rules | Rays, job: PathJob, name:
 
 
 def bench(
-    options: Cell | Tightness | Soundness | Plan | Rules | Rays | Scale | Certificates | Loops | Stiff | Vnnlib,
+    options: Cell
+    | Compile
+    | Tightness
+    | Soundness
+    | Plan
+    | Rules
+    | Rays
+    | Scale
+    | Certificates
+    | Loops
+    | Stiff
+    | Vnnlib,
 ) -> int:
     """Run one benchmark; the exit code is 1 if a bound was violated."""
     if isinstance(options, Vnnlib):
@@ -505,6 +529,7 @@ def main() -> None:
     kinds = tyro.extras.subcommand_type_from_defaults(
         {
             "cell": Cell(),
+            "compile": Compile(),
             "tightness": Tightness(),
             "soundness": Soundness(),
             "plan": Plan(),
