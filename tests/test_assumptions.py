@@ -15,7 +15,7 @@ from nerfs import tiny_scene, view
 
 import ns_abstract as nsa
 from ns_abstract.api.certification import CertifySettings, open_certification
-from ns_abstract.api.certifying import CertificateRun
+from ns_abstract.api.certifying import CertificateQuestion
 from ns_abstract.api.files import Settings, open_job
 from ns_abstract.api.reaching import open_loop
 from ns_abstract.cli import render as render_command
@@ -104,7 +104,7 @@ def test_certificate(blobs: Inputs, tmp_path: Path) -> None:
         "--network-arithmetic",
     )
     assert found["varied"] == ("nothing", "default: single poses")
-    assert CertificateRun(job, [0], tmp_path / "out", {}, ()).about.assumptions == job.assumptions
+    assert CertificateQuestion(job, [0], {}, ()).about.assumptions == job.assumptions
 
 
 def test_loop(tmp_path: Path) -> None:

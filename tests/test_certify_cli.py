@@ -30,11 +30,11 @@ from PIL import Image
 from waiting import LONG, until
 
 from ns_abstract.api import certifying, showing
+from ns_abstract.api.cell_search import examine_block
 from ns_abstract.api.certification import (
     Certification,
     CertifySettings,
     FramePictures,
-    examine_block,
     open_certification,
 )
 from ns_abstract.api.showing import look_closer
@@ -505,8 +505,8 @@ def test_interrupt_leaves_what_is_finished(planted: Case, finished: Path, tmp_pa
     [
         "ns_abstract.cli.certifying:open_certification",
         "ns_abstract.cli.certifying:compile_beside",
-        "ns_abstract.api.certifying:preview",
-        "ns_abstract.api.certifying:examine_here",
+        "ns_abstract.api.certificate_report:preview",
+        "ns_abstract.api.cell_search:examine_here",
     ],
 )
 def test_interrupted_before_the_first_block(
@@ -995,7 +995,7 @@ def test_scene_margin(blobs: Inputs, bright: tuple[Path, float, float], tmp_path
             pictures = FramePictures(job.job.method, job.job.pose_sets[0], "float", set_)
         else:
             ends: dict[str, Any] = {name: (-radius, radius)}
-            pictures = job.around(SceneVariation(Selection(), **ends)).pictures(0)
+            pictures = FramePictures(job.job.method, job.job.varied(0, SceneVariation(Selection(), **ends)))
         claim = job.claim(job.pictures(0))
 
         def loss(picture: torch.Tensor, values: torch.Tensor, claim: Any = claim) -> torch.Tensor:

@@ -258,7 +258,8 @@ def test_scene_margin(course: Course, tmp_path: Path) -> None:
             scenes = [(member, None) for member in itertools.islice(view.members(1), 24)]
         else:
             ends: dict[str, Any] = {name: (-radius, radius)}
-            reacher = job.around(SceneVariation(Selection(), **ends)).reacher()
+            view = Pictures(job.job.method, job.job.varied(0, SceneVariation(Selection(), **ends)))
+            reacher = replace(job.reacher(), view=view)
             scenes = [(member, None) for member in itertools.islice(reacher.view.members(1), 24)]
         tube = reacher.tube(box)
         for number, (member, shift) in enumerate(scenes):
@@ -320,8 +321,8 @@ def test_interrupted_and_resumed(edge: Course, finished: Path, tmp_path: Path) -
     [
         "ns_abstract.api.reaching:open_loop",
         "ns_abstract.api.compiling:compile_beside",
-        "ns_abstract.api.reaching:simulate",
-        "ns_abstract.api.reaching:examine_here",
+        "ns_abstract.api.loop_report:simulate",
+        "ns_abstract.api.cell_search:examine_here",
     ],
 )
 def test_interrupted_before_the_first_block(

@@ -99,12 +99,12 @@ class PathJob(Job):
                 workers=settings.workers,
                 layers=[name for name in settings.outputs if name != "rgb"],
                 notes=path.notes,
+                set_choices=settings.set_choices(pose_sets, path),
             )
         except InputError as error:
             # options have no file
             named = error.field is not None and not error.field.startswith("--")
             raise error.within(settings.perturbation_filename or path.source) if named else error from None
-        self.set_choices = settings.set_choices(pose_sets, path)
 
     def pose_set(self, index: int, perturbation: Perturbation) -> PoseSet:
         """The poses of ``perturbation`` around entry ``index`` of the path.

@@ -13,13 +13,14 @@ from typing import Any
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
+from ns_abstract.api.cell_search import CellSearch, Request
 from ns_abstract.api.certification import Certification, CertifySettings, open_certification
-from ns_abstract.api.certifying import CertificateRun, CertifyProgress, check_network_memory, network_memory
+from ns_abstract.api.certifying import CertificateQuestion, CertifyProgress, check_network_memory, network_memory
 from ns_abstract.api.compiling import compile_beside
 from ns_abstract.api.job import check_frames
 from ns_abstract.cli.common import Stop, plain_console
 from ns_abstract.execution.engines import EngineName, Tls, started
-from ns_abstract.report.certificate import coverage
+from ns_abstract.report.certificate import CertifiedRun, coverage
 from ns_abstract.report.certificate_page import percent
 from ns_abstract.verify.store import Store
 
@@ -72,10 +73,10 @@ class _Display:
         self.progress.update(self.task, completed=1.0 - point.open, state=state)
 
 
-def _introduce(console: Console, job: Certification, run: CertificateRun) -> None:
+def _introduce(console: Console, job: Certification, about: CertifiedRun) -> None:
     method = job.job.method
-    console.print(f"{method.name}: {method.content}; {job.network.source.name}; {run.about.sentence}", markup=False)
-    for note in run.about.plan:
+    console.print(f"{method.name}: {method.content}; {job.network.source.name}; {about.sentence}", markup=False)
+    for note in about.plan:
         console.print(f"  {note}", markup=False, soft_wrap=True)
 
 
@@ -92,8 +93,8 @@ def certify_path(order: Order, stop: Stop) -> bool:
         job = open_certification(dataclasses.replace(order.settings, memory=memory))
         check_network_memory(job, order.memory_limit, workers)
         frames = check_frames(order.frames, job.job.frame_count)
-        run = CertificateRun(job, frames, order.output_dir, order.options, ("ns-abstract-certify", *sys.argv[1:]))
-    _introduce(console, job, run)
+        question = CertificateQuestion(job, frames, order.options, ("ns-abstract-certify", *sys.argv[1:]))
+    _introduce(console, job, question.about)
 
     def opened(store: Store) -> None:
         display.opened(store)
@@ -108,18 +109,20 @@ def certify_path(order: Order, stop: Stop) -> bool:
     )  # fmt: skip
     with progress:
         display = _Display(console, progress)
-        document = run.run(
+        document = CellSearch(question, order.output_dir).run(
             # the processes of a NeRF bound its rays, which all cells share
             lambda stack: stack.enter_context(
                 started(order.engine, order.scheduler_address, 1 if job.job.rays else workers, order.tls)
             ),
-            order.budget,
             stop,
-            resume=order.resume,
-            on_open=opened,
-            on_progress=display.told,
-            scene_margin=order.scene_margin,
-            on_margin=lambda found: console.print(f"scene margin: {found.sentence}", markup=False, soft_wrap=True),
+            Request(
+                order.budget,
+                order.resume,
+                scene_margin=order.scene_margin,
+                on_open=opened,
+                on_progress=display.told,
+                on_margin=lambda found: console.print(f"scene margin: {found.sentence}", markup=False, soft_wrap=True),
+            ),
         )
     covered = coverage(document["frames"])
     parts = ", ".join(f"{kind} {percent(covered[kind])}" for kind in ("certified", "falsified", "unknown"))

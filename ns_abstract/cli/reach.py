@@ -75,8 +75,9 @@ def reach(options: Reach) -> int:
     stop = Stop()
     with stop.installed():
         with stop.at_once():
+            from ns_abstract.api.cell_search import CellSearch, Request
             from ns_abstract.api.compiling import compile_beside
-            from ns_abstract.api.reaching import ReachProgress, ReachRun, open_loop
+            from ns_abstract.api.reaching import LoopQuestion, ReachProgress, open_loop
             from ns_abstract.api.scenes import SceneSource
             from ns_abstract.execution.engines import started
             from ns_abstract.methods.representation import ProgramOptions
@@ -85,7 +86,8 @@ def reach(options: Reach) -> int:
             program = ProgramOptions(renderer=options.renderer, gsplat_version=options.gsplat_version)
             scene = SceneSource(options.load_config, program, overrides(options)).open()
             job = open_loop(scene, options.loop, options.arithmetic, options.network_arithmetic, options.workers)
-            found = ReachRun(job, options.output_dir, vars(options), ("ns-abstract-reach", *sys.argv[1:]))
+            command = ("ns-abstract-reach", *sys.argv[1:])
+            question = LoopQuestion(job, vars(options), command, film=options.film)
         console = plain_console()
         said = 0.0
 
@@ -98,16 +100,17 @@ def reach(options: Reach) -> int:
             text = ", ".join(f"{name} {percent(share)}" for name, share in shares.items() if share is not None)
             console.print(f"{point.seconds:7.0f} s: {text}", markup=False)
 
-        document = found.run(
+        document = CellSearch(question, options.output_dir).run(
             lambda stack: stack.enter_context(started(options.engine, options.scheduler_address, options.workers)),
-            options.time_budget,
             stop,
-            resume=options.resume,
-            on_open=lambda: compile_beside(job.job, 0) if options.engine == "local" else None,
-            on_progress=told,
-            scene_margin=options.scene_margin,
-            film=options.film,
-            on_margin=lambda found: console.print(f"scene margin: {found.sentence}", markup=False, soft_wrap=True),
+            Request(
+                options.time_budget,
+                options.resume,
+                scene_margin=options.scene_margin,
+                on_open=lambda store: compile_beside(job.job, 0) if options.engine == "local" else None,
+                on_progress=told,
+                on_margin=lambda found: console.print(f"scene margin: {found.sentence}", markup=False, soft_wrap=True),
+            ),
         )
         for question, entry in document["questions"].items():
             console.print(

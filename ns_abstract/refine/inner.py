@@ -77,7 +77,7 @@ class InnerBound:
         if parent.box.dimensions > 1:
             if children:
                 # one of them: the first corners have shown most of what there is to see
-                child = children[self.random.integers(len(children))]
+                child = children[int(self.random.integers(len(children)))]
                 self.render(self.outlying(child.part), places)
             return
         steps = self.tiles.frame.witnesses
