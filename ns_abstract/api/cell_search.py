@@ -141,13 +141,9 @@ class CellQuestion(ABC, Generic[P]):
     def finish(self, search: CellSearch[P]) -> None:
         """Prepare for the last report, also after a failure."""
 
-    def kinds(self) -> Sequence[Kind]:
-        """What may vary of the scene while certified cells stay certified; nothing: there are no such margins."""
-        return ()
-
-    def settle(self, kind: Kind) -> Settle:
-        """Bounds and attacks cells for all scenes around the stored one (V13)."""
-        raise NotImplementedError
+    def varied_scenes(self) -> tuple[Sequence[Kind], Callable[[Kind], Settle]] | None:
+        """What may vary of the scene, and what bounds and attacks cells for all such scenes (V13); None: nothing."""
+        return None
 
     def margin_rows(self, rows: dict[int, list[Row]]) -> tuple[dict[int, list[Row]], dict[str, Any]]:
         """Those of the certified rows whose scene margin is looked for, and what report.json says besides."""
@@ -330,11 +326,15 @@ class CellSearch(Generic[P]):
     def _margins(self, deadline: Deadline) -> None:
         """How far the scene may vary before what is certified is lost."""
         question, store = self.question, self.store
+        varied = question.varied_scenes()
+        if varied is None:
+            return
+        kinds, settle = varied
         certified = {tally.frame: store.leaves(tally.frame, "certified") for tally in store.tallies()}
         rows, about = question.margin_rows(certified)
-        margins = Margins(certified_cells(rows, self.box), question.settle, store, self.request.on_margin)
+        margins = Margins(certified_cells(rows, self.box), settle, store, self.request.on_margin)
         try:
-            margins.find(deadline, question.kinds())
+            margins.find(deadline, kinds)
         finally:
             margins.keep()
             self.scene_margin = {**about, **margins.entry}

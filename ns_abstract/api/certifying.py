@@ -174,11 +174,8 @@ class CertificateQuestion(CellQuestion[CertifyProgress]):
     def finish(self, search: CellSearch[CertifyProgress]) -> None:
         search.deadline = search.deadline.extended(_LAST)
 
-    def kinds(self) -> Sequence[Kind]:
-        return (*KINDS, *CAMERA_KINDS, *(kind for kind in PLACES if self.job.places(kind)))
-
-    def settle(self, kind: Kind) -> Settle:
-        return self.job.settle(kind)
+    def varied_scenes(self) -> tuple[Sequence[Kind], Callable[[Kind], Settle]]:
+        return (*KINDS, *CAMERA_KINDS, *(kind for kind in PLACES if self.job.places(kind))), self.job.settle
 
     def progress(self, store: Store) -> CertifyProgress:
         shares = [fractions(tally) for tally in store.tallies()]

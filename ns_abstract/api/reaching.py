@@ -92,11 +92,8 @@ class LoopQuestion(CellQuestion[ReachProgress]):
         if self.film:
             self.reports.make_film(search.store, deadline)
 
-    def kinds(self) -> Sequence[Kind]:
-        return (*KINDS, *CAMERA_KINDS, *(kind for kind in PLACES if self.job.places(kind)))
-
-    def settle(self, kind: Kind) -> Settle:
-        return self.job.settle(kind)
+    def varied_scenes(self) -> tuple[Sequence[Kind], Callable[[Kind], Settle]]:
+        return (*KINDS, *CAMERA_KINDS, *(kind for kind in PLACES if self.job.places(kind))), self.job.settle
 
     def margin_rows(self, rows: dict[int, list[Row]]) -> tuple[dict[int, list[Row]], dict[str, Any]]:
         # the strongest question of which anything is certified
