@@ -83,6 +83,7 @@ def same_pictures(first: StoredFrame, second: StoredFrame) -> None:
 
 def check_samples(inputs: Inputs, folder: Path, index: int, **settings: Any) -> None:
     """Renders at random poses lie in a stored frame's bounds, without any tolerance."""
+    settings["program"] = ProgramOptions(settings.pop("renderer", None))
     job = open_job(Settings(inputs.config, inputs.path, inputs.spec, **settings))
     live, result = job.frame(index), frame(folder, index).result
     for values in live.box.sample(12, np.random.default_rng(5)):

@@ -30,6 +30,7 @@ from ns_abstract.io.assumptions import Assumption
 from ns_abstract.io.errors import InputError
 from ns_abstract.io.jsonio import load_json
 from ns_abstract.methods.overrides import Overrides
+from ns_abstract.methods.program_options import ProgramOptions
 from ns_abstract.perturbation.specification import Perturbation
 from ns_abstract.refine.protocol import Frame, Member, Method, RayFrame
 from ns_abstract.report.record import file_stamp
@@ -577,17 +578,13 @@ class CertifySettings:
         model: Network, .onnx or .pt2.
         property: PROP.json.
         perturbation_filename: Perturbation JSON; None: the camera path holds it.
-        renderer: "gsplat" or "paper"; None: gsplat.
-        gsplat_version: Of gsplat's rules; None: 1.4.0.
-        sampling, num_samples, near_plane: Of the rays of a NeRF; None: the method's own.
-        occupancy_grid: File of a grid that is declared as part of a NeRF.
-        device: Where a NeRF is bounded, "cpu" or "cuda"; None: "cpu".
         workers: Processes that bound the rays of a NeRF.
         arithmetic: "float32" or "real"; None: the strongest that the scene has.
         network_arithmetic: The same of the network.
         picture: Whether the network is shown floats or pictures of 8 bits.
         memory: Bytes for the bounds of one process.
         given_set: The content of a perturbation file, in place of one; errors name its keys as options.
+        program: Which program draws the scene.
         overrides: What the user says of the scene in place of its files.
     """
 
@@ -596,19 +593,13 @@ class CertifySettings:
     model: Path
     property: Path
     perturbation_filename: Path | None = None
-    renderer: str | None = None
-    gsplat_version: str | None = None
     arithmetic: str | None = None
     network_arithmetic: NetworkArithmetic = "float32"
     picture: Picture = "float"
     memory: int = MEMORY
-    sampling: str | None = None
-    num_samples: int | None = None
-    near_plane: float | None = None
-    occupancy_grid: Path | None = None
     workers: int = 1
     given_set: Mapping[str, Any] | None = None
-    device: str | None = None
+    program: ProgramOptions = field(default_factory=ProgramOptions)
     overrides: Overrides = field(default_factory=Overrides)
 
 
@@ -623,15 +614,9 @@ def open_certification(settings: CertifySettings) -> Certification:
         settings.load_config,
         settings.camera_path_filename,
         settings.perturbation_filename,
-        renderer=settings.renderer,
-        gsplat_version=settings.gsplat_version,
         arithmetic=settings.arithmetic,
-        sampling=settings.sampling,
-        num_samples=settings.num_samples,
-        near_plane=settings.near_plane,
-        occupancy_grid=settings.occupancy_grid,
         given_set=settings.given_set,
-        device=settings.device,
+        program=settings.program,
         overrides=settings.overrides,
     )
     path = load_camera_path(files.camera_path_filename)
