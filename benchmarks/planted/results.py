@@ -77,4 +77,28 @@ RESULTS = (
         "entry[key]",
         "test_assumptions.py::test_page_escapes",
     ),
+    Fault(
+        "search: cells of a set that is not asked for again stay open",
+        "api/cell_search.py",
+        "CellSearch.open",
+        "question.stored_set(tally.frame)",
+        "None",
+        "test_cell_search.py::test_an_ended_search_loses_nothing[1]",
+    ),
+    Fault(
+        "search: counterexamples of a set are stored in one file",
+        "api/cell_search.py",
+        "cell_place",
+        '"_".join(f"{a}-{b}" for a, b in zip(cell.first, cell.past, strict=True)) or otherwise',
+        "otherwise",
+        "test_cell_search.py::test_verdicts_of_a_claim_about_the_picture",
+    ),
+    Fault(
+        "deadlines: a part of the time does not hear requests to stop",
+        "execution/ending.py",
+        "Deadline.within",
+        "Deadline(min(seconds, self.left), self.request)",
+        "Deadline(min(seconds, self.left))",
+        "test_cell_search.py::test_deadlines_divide_time_and_hear_requests",
+    ),
 )
