@@ -29,6 +29,7 @@ from ns_abstract.cli.common import complaint
 from ns_abstract.geometry.views import View, path_json
 from ns_abstract.io.atomic import write_json
 from ns_abstract.io.folder import MARK
+from ns_abstract.methods.program_options import ProgramOptions
 from ns_abstract.methods.splat.scene import SplatScene
 from ns_abstract.report.figures import listed
 from ns_abstract.report.files import StoredFrame, load_frame

@@ -181,7 +181,7 @@ def test_interrupted_in_a_film(
 ) -> None:
     part = course.changed("cut.json", "goal", initial=SMALL, steps=10)
     with monkeypatch.context() as patched:
-        interrupted_at("ns_abstract.api.reaching:along", patched)
+        interrupted_at("ns_abstract.api.loop_report:along", patched)
         code, _, said = in_process(reach_command.main, part.options(tmp_path / "out", film=True))
     assert code == 3 and "Traceback" not in said
     document = json.loads((tmp_path / "out" / "report.json").read_text())

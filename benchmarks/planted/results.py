@@ -31,8 +31,8 @@ RESULTS = (
     ),
     Fault(
         "a search of other rules goes on",
-        "verify/store.py",
-        "Store._check",
+        "verify/store_file.py",
+        "StoreFile._check",
         "stale(stored, asked)",
         "None",
         "test_stale.py::test_search_is_not_resumed[other rules of the search]",

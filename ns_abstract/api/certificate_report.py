@@ -22,7 +22,8 @@ from ns_abstract.report.certificate_page import certificate_page
 from ns_abstract.report.outside import Outside
 from ns_abstract.report.picture import preview, to_bytes
 from ns_abstract.report.verdict_picture import write_pictures
-from ns_abstract.verify.store import IMAGES, Store, Tally, fractions
+from ns_abstract.verify.store import Store, Tally, fractions
+from ns_abstract.verify.store_file import IMAGES
 
 #: Counterexamples in report.json by frame, and images of each kind on the page.
 _EXAMPLES, _IMAGES = 5, 6
