@@ -206,12 +206,12 @@ class Frame(Protocol):
         """
         ...
 
-    def watch(self, tiles: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> None:
-        """Take notice of the inner bounds [t, side, side, 3] of ``tiles`` [t], which a refinement changes meanwhile."""
+    def observe(self, tiles: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> None:
+        """Take the inner bounds [t, side, side, 3] of ``tiles`` [t] so far; a refinement calls it at every change."""
         ...
 
-    def allow(self, excess: float) -> float:
-        """Save time from now on where that loosens gaps by no more than a small part of ``excess`` on average.
+    def set_tolerance(self, excess: float) -> float:
+        """Let later bounds be looser by a small part of ``excess`` on average, where that saves time.
 
         Returns:
             What no more light comes to is left out; 0: nothing is.
