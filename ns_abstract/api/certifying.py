@@ -33,7 +33,8 @@ from ns_abstract.io.errors import InputError
 from ns_abstract.io.memory import allowed_memory
 from ns_abstract.report.cameras import Cameras, cameras_entry, cell_cameras, standing
 from ns_abstract.report.certificate import CertifiedRun, LastReport, certificate_document, coverage, verdict
-from ns_abstract.report.certificate_page import Closer, certificate_page, percent
+from ns_abstract.report.certificate_page import Closer, certificate_page
+from ns_abstract.report.figures import percent
 from ns_abstract.report.notebook import verdicts_html
 from ns_abstract.report.outside import Outside
 from ns_abstract.report.picture import preview, to_bytes

@@ -80,7 +80,7 @@ def reach(options: Reach) -> int:
             from ns_abstract.api.scenes import SceneSource
             from ns_abstract.execution.engines import started
             from ns_abstract.methods.representation import ProgramOptions
-            from ns_abstract.report.certificate_page import percent
+            from ns_abstract.report.figures import percent
 
             program = ProgramOptions(renderer=options.renderer, gsplat_version=options.gsplat_version)
             scene = SceneSource(options.load_config, program, overrides(options)).open()

@@ -7,11 +7,13 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from markupsafe import Markup
 from numpy.typing import NDArray
 
 from ns_abstract.geometry.camera_path import Camera
 from ns_abstract.geometry.poses import PoseSet
 from ns_abstract.report.figures import number
+from ns_abstract.report.html import fill
 from ns_abstract.report.outside import (
     ABOVE,
     PICTURE_WIDTH,
@@ -23,7 +25,6 @@ from ns_abstract.report.outside import (
     plane_axes,
     sideways,
 )
-from ns_abstract.report.page import counted
 
 Float64 = NDArray[np.float64]
 
@@ -198,10 +199,10 @@ class Cameras:
             found.append(View(title, nearest, window, shapes))
         return found
 
-    def html(self, numbers: Mapping[tuple[int, int], int]) -> str:
+    def html(self, numbers: Mapping[tuple[int, int], int]) -> Markup:
         """The page's part; cells with numbers, by frame and position, can be chosen."""
         if not self.cells:
-            return ""
+            return Markup()
         low, high = self.ends
         figures = []
         for view in self.views(PICTURE_WIDTH):
@@ -215,20 +216,12 @@ class Cameras:
             marks = f'<g class="frusta">{"".join(shapes)}</g>'
             plot = draw_plane(self.outside, view.window, view.nearest, marks, f"Cameras seen {view.title}")
             scene = behind(self.outside, view.nearest, "cameras alone")
-            figures.append(f"<figure>{plot}<figcaption><b>{view.title}</b> {scene}</figcaption></figure>")
-        left = ""
-        if self.left_out:
-            left = f" {counted(self.left_out, 'further cell')}, none wider than those of its verdict here, not shown."
+            figures.append((plot, view.title, scene))
         where = " · ".join(
             f"{name} {number(a, 4)}" if a == b else f"{name} {number(a, 4)} to {number(b, 4)}"
             for name, a, b in zip("xyz", low.tolist(), high.tolist(), strict=True)
         )
-        return (
-            "<h2>Where the cameras stand</h2><p>One frustum for the middle pose of a cell, in the colour of the cell's "
-            f"verdict, in the run's normalised frame ({where}); its tip is the camera's position, it opens as the "
-            f"picture does, its length means nothing. Where frusta overlap, red is over grey, grey over green."
-            f"{left}</p>{''.join(figures)}"
-        )
+        return fill("cameras.html", figures=figures, left_out=self.left_out, where=where)
 
 
 def _hull(points: Sequence[tuple[float, float]]) -> list[tuple[float, float]]:
