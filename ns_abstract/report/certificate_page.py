@@ -83,7 +83,7 @@ def certificate_page(
         "falsified": ("bad", f"Falsified; certified on {covered} of the poses"),
         "unknown": ("fair", f"Undecided; certified on {covered} of the poses"),
     }[document["verdict"]]
-    maps, drawn = _maps(document, cells, numbers)
+    maps, drawn = verdict_drawings(document["frames"][:_MOST_ROWS], cells, numbers)
     matrices, more_matrices = _matrices(document, cells)
     scripts = ["cells.js"] if numbers else []
     scripts += ["sliders.js", "walk.js"] if len(closer.stops) > 1 else []
@@ -180,8 +180,8 @@ def _chosen(number_of: int | None) -> str:
     return "" if number_of is None else f' data-cell="{number_of}"'
 
 
-def _maps(
-    document: Mapping[str, Any],
+def verdict_drawings(
+    frames: Sequence[Mapping[str, Any]],
     cells: Mapping[int, Sequence[Mapping[str, Any]]],
     numbers: Mapping[tuple[int, int], int],
 ) -> tuple[list[tuple[Markup, Mapping[str, Any], str]], list[tuple[Markup, str]]]:
@@ -190,7 +190,6 @@ def _maps(
     Returns:
         Drawings of frames with the frames and notes, and drawings of several frames with captions.
     """
-    frames = document["frames"][:_MOST_ROWS]
     if way := along_path(frames):
         return [], [(_path(way, cells, numbers), "the whole path, from keyframe to keyframe")]
     maps, bars = [], []
