@@ -6,23 +6,27 @@ The compiled kernels run interpreted (NUMBA_DISABLE_JIT=1), so that nothing is c
 compiles instead, into a cache of each mutant's own. Each test is also run once on the unchanged copy, where it
 has to pass.
 
-    python benchmarks/mutants.py [--only NAME ...] [--compiled] [--list] [--outcomes FILE [--seconds N]]
+    python benchmarks/mutants.py [--only NAME ... | --sample N | --missing] [--compiled] [--seconds N]
 
-writes benchmarks/mutants.md and exits with 1 if not all are killed. With ``--outcomes`` what is known of a mutant is
-kept in FILE, so that the list can be gone through in pieces; what survived is run again.
+runs the mutants that are chosen, all of them if nothing is said, and exits with 1 if not all of these are killed.
+benchmarks/mutants.md has a row for every mutant: what became of it when it was last run as it is, and on what day.
+``--table`` writes that file without running any; ``--list`` checks that every change applies.
 """
 
 from __future__ import annotations
 
 import argparse
-import json
+import hashlib
 import os
+import random
+import re
 import shutil
 import subprocess
 import sys
 import tempfile
 import time
-from dataclasses import asdict, dataclass
+from dataclasses import astuple, dataclass
+from datetime import date
 from pathlib import Path
 
 from planted import FAULTS, Fault, apply
@@ -37,11 +41,17 @@ _LATE = -1
 
 @dataclass
 class Outcome:
-    """What became of one mutant: how it ended and how long its test took, seconds."""
+    """What became of one mutant: how it ended, how long its test took, and the day.
 
-    mutant: Fault
+    Attributes:
+        verdict: "killed", or what happened instead.
+        seconds: That the test took.
+        day: ISO date.
+    """
+
     verdict: str
     seconds: float
+    day: str
 
 
 def copy_package(folder: Path) -> None:
@@ -90,37 +100,62 @@ def run_test(folder: Path, test: str, compiled: bool) -> tuple[int, str, float]:
         return done.returncode, done.stdout + done.stderr, time.perf_counter() - start
 
 
-def read_outcomes(path: Path | None) -> dict[Fault, Outcome]:
-    """Outcomes that an earlier run left, of mutants that were killed."""
-    lines = path.read_text().splitlines() if path is not None and path.exists() else []
-    found = [json.loads(line) for line in lines]
-    outcomes = [Outcome(Fault(**line["fault"]), line["verdict"], line["seconds"]) for line in found]
-    return {outcome.mutant: outcome for outcome in outcomes if outcome.verdict == "killed"}
+def digest(fault: Fault) -> str:
+    """Eight hexadecimal digits that change whenever anything of the fault does."""
+    return hashlib.sha256(repr(astuple(fault)).encode()).hexdigest()[:8]
 
 
-def table(outcomes: list[Outcome]) -> str:
-    """The outcomes as a Markdown table."""
-    rows = ["| mutant | file | killed by | seconds |", "| --- | --- | --- | --- |"]
-    for outcome in outcomes:
-        m = outcome.mutant
-        killer = f"`{m.test}`" if outcome.verdict == "killed" else f"**{outcome.verdict}** (`{m.test}`)"
-        rows.append(f"| {m.name} | {m.file} | {killer} | {outcome.seconds:.1f} |")
-    return "\n".join(rows)
+def read_outcomes(text: str) -> dict[str, Outcome]:
+    """The outcomes in a table, by `digest`."""
+    rows = re.findall(r"^\|.*\| `([0-9a-f]{8})` \| (.+) \| ([\d.]+) \| (\S+) \|$", text, re.M)
+    return {key: Outcome(verdict.strip("*"), float(seconds), day) for key, verdict, seconds, day in rows}
+
+
+def table(outcomes: dict[str, Outcome]) -> str:
+    """All mutants and what is known of them, in Markdown."""
+    known = [outcomes[key] for key in map(digest, FAULTS) if key in outcomes]
+    killed = sum(outcome.verdict == "killed" for outcome in known)
+    lines = [
+        "# Planted faults and the tests that catch them",
+        "",
+        f"Written by `python benchmarks/mutants.py`. {len(FAULTS)} faults are planted. {len(known)} were run as "
+        f"they are, and {killed} of these were killed.",
+        "",
+        "| mutant | file | test | version | outcome | seconds | day |",
+        "| --- | --- | --- | --- | --- | --- | --- |",
+    ]
+    for fault in FAULTS:
+        key = digest(fault)
+        end = "not run since it was planted or changed | |"
+        if key in outcomes:
+            one = outcomes[key]
+            word = one.verdict if one.verdict == "killed" else f"**{one.verdict}**"
+            end = f"{word} | {one.seconds:.1f} | {one.day} |"
+        lines.append(f"| {fault.name} | {fault.file} | `{fault.test}` | `{key}` | {end}")
+    return "\n".join(lines) + "\n"
 
 
 def main() -> int:
     """Run the mutants one after the other."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--only", nargs="+", default=[], help="run the mutants whose names contain one of these")
+    parser.add_argument("--sample", type=int, help="run so many, drawn at random")
+    parser.add_argument("--missing", action="store_true", help="run those that were not run as they are")
     parser.add_argument("--compiled", action="store_true", help="compile the kernels, into a private cache")
     parser.add_argument("--list", action="store_true", help="check that every change applies, and stop")
-    parser.add_argument("--outcomes", type=Path, help="keep outcomes in this file, and go on from what it holds")
+    parser.add_argument("--table", action="store_true", help="write the table, and stop")
     parser.add_argument("--seconds", type=float, default=float("inf"), help="begin with no mutant after so many")
     options = parser.parse_args()
-    begun = time.perf_counter()
+    outcomes = read_outcomes(REPORT.read_text())
     chosen = [m for m in FAULTS if not options.only or any(part in m.name for part in options.only)]
-    known = read_outcomes(options.outcomes)
-    outcomes: list[Outcome] = []
+    if options.missing:
+        chosen = [m for m in chosen if digest(m) not in outcomes]
+    if options.sample is not None:
+        chosen = random.sample(chosen, min(options.sample, len(chosen)))
+    if options.table:
+        REPORT.write_text(table(outcomes))
+        return 0
+    begun, ran, killed = time.perf_counter(), 0, 0
     with tempfile.TemporaryDirectory() as temporary:
         folder = Path(temporary)
         copy_package(folder)
@@ -130,14 +165,10 @@ def main() -> int:
         if options.list:
             print(f"{len(chosen)} mutants apply")
             return 0
-        # what killed a mutant passed without it
-        healthy = {outcome.mutant.test: True for outcome in known.values()}
+        healthy: dict[str, bool] = {}
         for mutant in chosen:
-            if mutant in known:
-                outcomes.append(known[mutant])
-                continue
             if time.perf_counter() - begun > options.seconds:
-                continue
+                break
             compiled = options.compiled or mutant.compiled
             if mutant.test not in healthy:
                 code, output, _ = run_test(folder, mutant.test, compiled)
@@ -153,19 +184,11 @@ def main() -> int:
                 asserted = code == _FAILED and ("AssertionError" in output or "DID NOT RAISE" in output)
                 verdicts = {_PASSED: "survived", _FAILED: "killed" if asserted else "crashed", _LATE: "timed out"}
                 verdict = verdicts.get(code, f"pytest {code}")
-            outcomes.append(Outcome(mutant, verdict, seconds))
+            ran, killed = ran + 1, killed + (verdict == "killed")
+            outcomes[digest(mutant)] = Outcome(verdict, seconds, date.today().isoformat())
+            REPORT.write_text(table(outcomes))
             print(f"{verdict:10s} {seconds:6.1f} s  {mutant.name}", flush=True)
-            if options.outcomes:
-                with options.outcomes.open("a") as file:
-                    file.write(json.dumps({"verdict": verdict, "seconds": seconds, "fault": asdict(mutant)}) + "\n")
-    killed = sum(outcome.verdict == "killed" for outcome in outcomes)
-    summary = f"{killed} of {len(chosen)} mutants killed, {sum(o.seconds for o in outcomes):.0f} s."
-    if len(outcomes) < len(chosen):
-        summary += f" {len(chosen) - len(outcomes)} were not run."
-    print(summary)
-    if not options.only:
-        header = "# Planted faults and the tests that catch them\n\nWritten by `python benchmarks/mutants.py`. "
-        REPORT.write_text(f"{header}{summary}\n\n{table(outcomes)}\n")
+    print(f"{killed} of {len(chosen)} mutants killed, {len(chosen) - ran} were not run.")
     return 0 if killed == len(chosen) else 1
 
 

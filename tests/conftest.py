@@ -28,6 +28,21 @@ ROOT = Path(__file__).resolve().parents[1]
 TIMESTAMP = "2026-01-01_000000"
 
 
+@pytest.hookimpl(tryfirst=True)
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Gives `slow` to the cases that `slow_cases` leaves out of the fast set, before ``-m`` chooses."""
+    seen: dict[str, int] = {}
+    for item in items:
+        mark = item.get_closest_marker("slow_cases")
+        if mark is None:
+            continue
+        function = item.nodeid.partition("[")[0]
+        number = seen.get(function, 0)
+        seen[function] = number + 1
+        if number % mark.kwargs.get("every", 1 << 30):
+            item.add_marker("slow")
+
+
 @pytest.fixture(autouse=True, scope="session")
 def one_thread():
     """Small pictures gain nothing from threads, and waiting threads take the processor from other workers."""

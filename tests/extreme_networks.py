@@ -196,16 +196,16 @@ class Extreme:
             for flushed in (False, True):
                 with flushing(flushed):
                     found = [(name, run(x)) for name, run in zip(("onnxruntime", "plain"), runners, strict=False)]
-                    found.append(("torch", _through(self.layers, x, lambda layer: layer.step)))
-                    found.append(("one pass", _through(self.layers, x, single)))
-                    found.append(("in order", _through(self.layers, x, ordered)))
+                    found.append(("torch", through(self.layers, x, lambda layer: layer.step)))
+                    found.append(("one pass", through(self.layers, x, single)))
+                    found.append(("in order", through(self.layers, x, ordered)))
                     for forwards in (False, True):
                         name = "folded " + ("forwards" if forwards else "backwards")
-                        found.append((name, _through(folded(self.layers, forwards), x, ordered)))
+                        found.append((name, through(folded(self.layers, forwards), x, ordered)))
                 yield from ((name + " flushed" * flushed, value) for name, value in found)
 
 
-def _through(layers: list[Layer], x: Array, step: Callable[[Layer], Step]) -> Array:
+def through(layers: list[Layer], x: Array, step: Callable[[Layer], Step]) -> Array:
     value = torch.from_numpy(x)
     for layer in layers:
         value = step(layer)(value)

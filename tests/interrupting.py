@@ -6,11 +6,9 @@ import importlib
 import json
 import os
 import signal
-import sqlite3
 import subprocess
 import sys
 from collections.abc import Callable
-from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -18,15 +16,39 @@ import pytest
 from conftest import InProcess, environment
 from waiting import LONG
 
+#: Waits at the first block after which so many more cells are stored.
+_HELD = """
+import importlib, sys
+from ns_abstract.verify.store import Store
+module, cells, *options = sys.argv[1:]
+close_block, least = Store.close_block, []
 
-def stored(folder: Path) -> int:
-    """Cells that a command at work has stored."""
-    try:
-        with closing(sqlite3.connect(f"file:{folder / 'cells.sqlite'}?mode=ro", uri=True)) as base:
-            return base.execute("SELECT COUNT(*) FROM cells").fetchone()[0]
-    except sqlite3.OperationalError:
-        # not there yet, or the log of a killed command that nobody has read
-        return 0
+def held(store, *arguments):
+    least or least.append(store.count + int(cells))
+    closed = close_block(store, *arguments)
+    if len(least) == 1 and store.count >= least[0]:
+        print("held", flush=True)
+        least.append(sys.stdin.read())
+    return closed
+
+Store.close_block = held
+sys.argv = ["command", *options]
+importlib.import_module(module).main()
+"""
+
+
+def held_at(cells: int, module: str, options: list[str]) -> subprocess.Popen[str]:
+    """A command that has stored ``cells`` new cells, and waits until it is ended or its stdin is closed.
+
+    It goes on where it is asked to communicate, and then handles the signals that came before.
+    """
+    process = subprocess.Popen(
+        [sys.executable, "-c", _HELD, module, str(cells), *options],
+        text=True, env=environment(), stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE,
+    )  # fmt: skip
+    assert process.stdout is not None
+    assert "held\n" in iter(process.stdout.readline, ""), process.communicate()[1]
+    return process
 
 
 def interrupted_at(place: str, monkeypatch: pytest.MonkeyPatch, number: int = signal.SIGINT) -> None:

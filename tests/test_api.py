@@ -27,8 +27,12 @@ from ns_abstract.geometry.camera_path import Camera as PinholeCamera
 from ns_abstract.geometry.views import look_at
 from ns_abstract.methods import load
 from ns_abstract.methods.nerf.write import write_nerf_run
+from ns_abstract.methods.splat import bounds
+from ns_abstract.methods.splat.constants import GSPLAT_1_4_0
+from ns_abstract.methods.splat.frame import SplatFrame
 from ns_abstract.report.files import load_frame
 
+OPACITY = {"select": {"indices": [0]}, "opacity": 0.1}
 PICTURES = ("lower", "upper", "witness_lower", "witness_upper", "image")
 
 
@@ -59,6 +63,35 @@ def outside(result: nsa.BoundResult, scene: nsa.Scene, poses: nsa.PoseSet, count
 
 def _fields(camera: PinholeCamera) -> dict[str, Any]:
     return {field.name: getattr(camera, field.name) for field in dataclasses.fields(PinholeCamera)}
+
+
+def test_pictures_are_not_rounded_and_need_no_sums_of_bounds(blobs: Inputs, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The renderer's own float64 numbers; what bounds alone need is made by the first of them, once for a scene."""
+    made: list[int] = []
+
+    def counted(axes: np.ndarray, charges: Any) -> np.ndarray:
+        made.append(len(axes))
+        return covariance_noise(axes, charges)
+
+    covariance_noise = bounds.covariance_noise
+    monkeypatch.setattr(bounds, "covariance_noise", counted)
+    scene = nsa.load_scene(blobs.config)
+    camera = nsa.load_camera_path(blobs.path).cameras[0]
+    image = nsa.render(scene, camera)
+    first, second = (scene.method().frame(nsa.PoseSet(camera, translation={"x": x}).of(scene)) for x in (0.001, 0.002))
+    assert isinstance(first, SplatFrame) and isinstance(second, SplatFrame) and made == []
+    view = first.renderer.image(first.camera, *first.pose_set.world_to_camera(first.box.middle))
+    assert image.dtype == np.float64 and np.array_equal(image, view)
+    assert np.any(image != image.astype(np.float32))
+    cells = [frame.bound(frame.box, np.arange(2)) for frame in (first, second)]
+    assert len(made) == 1
+    # another set of scenes has sums of its own
+    varied = nsa.PoseSet.from_json(camera, {"version": 1, "translation": {"x": 0.001}, "scene": [OPACITY]})
+    third = scene.method().frame(varied.of(scene))
+    third.bound(third.box, np.arange(2))
+    assert len(made) == 2
+    alone = SplatFrame(first.bounds.splats, GSPLAT_1_4_0, first.bounds.arithmetic, second.pose_set)
+    np.testing.assert_array_equal(cells[1].lower, alone.bound(alone.box, np.arange(2)).lower)
 
 
 # ---------------------------------------------------------------- a third representation

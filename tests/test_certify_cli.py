@@ -25,7 +25,7 @@ import pytest
 import torch
 from certifying import classifier, linear
 from conftest import InProcess, Inputs, environment
-from interrupting import check_ended_in_a_library_call, check_interrupted, interrupted_at, stored
+from interrupting import check_ended_in_a_library_call, check_interrupted, held_at, interrupted_at
 from PIL import Image
 from waiting import LONG, until
 
@@ -234,6 +234,7 @@ def test_given_set_is_that_of_a_file(
     assert caught.value.field == "--rotation.yaw" and caught.value.file is None
 
 
+@pytest.mark.slow
 def test_planted_violation(planted: Case, finished: Path, bright: tuple[Path, float, float]) -> None:
     """The set holds poses whose images break the property: they are found, and no cell with one is certified."""
     document = report(finished)
@@ -252,6 +253,7 @@ def test_planted_violation(planted: Case, finished: Path, bright: tuple[Path, fl
         assert "certified" not in kinds
 
 
+@pytest.mark.slow
 def test_every_certified_cell_is_attacked(planted: Case, finished: Path) -> None:
     comparisons, violations, slack = attack(planted, finished)
     assert comparisons > 100 and violations == 0
@@ -259,6 +261,7 @@ def test_every_certified_cell_is_attacked(planted: Case, finished: Path) -> None
     assert 0.0 <= slack < 0.05
 
 
+@pytest.mark.slow
 def test_counterexamples_are_stored_and_break_the_property(planted: Case, finished: Path) -> None:
     rows = [row for row in cells(finished) if row[3] == "falsified"]
     files = sorted((finished / "counterexamples").iterdir())
@@ -276,6 +279,7 @@ def test_counterexamples_are_stored_and_break_the_property(planted: Case, finish
     assert stored == {tuple(json.loads(row[5])) for row in rows}
 
 
+@pytest.mark.slow
 def test_rounded_pictures(planted: Case, tmp_path: Path) -> None:
     """8 bits: certified cells are attacked, and counterexamples stored, with the pictures of a file."""
     case = Case(tmp_path / "case", planted.blobs, planted.net, json.loads(planted.prop.read_text()), picture="8-bit")
@@ -310,6 +314,7 @@ def test_random_network(blobs: Inputs, net: Path, tmp_path: Path) -> None:
     assert comparisons and violations == 0
 
 
+@pytest.mark.slow
 def test_unsound_network_bounds_are_caught_by_the_attack(
     planted: Case, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -333,6 +338,7 @@ def test_unsound_network_bounds_are_caught_by_the_attack(
     assert attack(planted, tmp_path / "out")[1] > 0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["nan", "infinite", "crossed", "raises"])
 def test_broken_bounds_never_certify(kind: str, planted: Case, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     real = model.bound_outputs
@@ -356,6 +362,7 @@ def test_broken_bounds_never_certify(kind: str, planted: Case, tmp_path: Path, m
     assert {row[3] for row in cells(tmp_path / "out")} <= {"falsified", "unknown"}
 
 
+@pytest.mark.slow
 def test_single_poses_and_paths_without_a_perturbation(
     blobs: Inputs, bright: tuple[Path, float, float], tmp_path: Path
 ) -> None:
@@ -375,6 +382,7 @@ def test_single_poses_and_paths_without_a_perturbation(
     assert "one pose" in (tmp_path / "out" / "report.html").read_text()
 
 
+@pytest.mark.slow
 def test_segments_have_one_table_of_parameters(
     blobs: Inputs, bright: tuple[Path, float, float], tmp_path: Path
 ) -> None:
@@ -389,6 +397,7 @@ def test_segments_have_one_table_of_parameters(
     assert all(low[1] == high[1] == 0.0 for frame, low, high in sides if frame == 2)
 
 
+@pytest.mark.slow
 def test_partitions(blobs: Inputs, bright: tuple[Path, float, float], tmp_path: Path) -> None:
     prop = {"type": "classification", "label": 0, "preprocess": PRE, "partitions": 300}
     case = Case(tmp_path / "case", blobs, bright[0], prop)
@@ -408,6 +417,7 @@ def test_partitions(blobs: Inputs, bright: tuple[Path, float, float], tmp_path: 
         assert round(size) == pytest.approx(size) and (verdict == "certified" or round(size) == 1)
 
 
+@pytest.mark.slow
 def test_parts_without_a_number_are_not_right(
     blobs: Inputs, bright: tuple[Path, float, float], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -454,29 +464,21 @@ def test_parts_without_a_number_are_not_right(
 # ---------------------------------------------------------------- long runs
 
 
+@pytest.mark.slow
 def test_same_again(planted: Case, finished: Path, tmp_path: Path) -> None:
     planted.run(tmp_path / "out")
     assert cells(tmp_path / "out") == cells(finished)
 
 
+@pytest.mark.slow
 def test_killed_run_resumed_equals_an_uninterrupted_one(planted: Case, finished: Path, tmp_path: Path) -> None:
     folder = tmp_path / "out"
-    kills = 0
-    for round_ in range(40):
-        process = start(planted.options(folder, resume=round_ > 0))
-        known = stored(folder)
+    for resume in (False, True, True):
         # killed as soon as it has stored something new
-        until(lambda: stored(folder) > known or process.poll() is not None)  # noqa: B023
-        if process.poll() is not None:
-            assert process.returncode == 0, process.stderr and process.stderr.read()
-            break
-        process.send_signal(signal.SIGKILL)
+        process = held_at(1, MODULE, planted.options(folder, resume=resume))
+        process.kill()
         process.wait()
-        kills += 1
-        if kills == 3:
-            assert certify(Certify(**planted.values(folder, resume=True))) == 0
-            break
-    assert kills >= 2
+    planted.run(folder, resume=True)
     assert cells(folder) == cells(finished)
     one, other = report(folder), report(finished)
     for key in ("verdict", "coverage", "sampled"):
@@ -484,14 +486,12 @@ def test_killed_run_resumed_equals_an_uninterrupted_one(planted: Case, finished:
     assert one["frames"] == other["frames"]
 
 
+@pytest.mark.slow
 def test_interrupt_leaves_what_is_finished(planted: Case, finished: Path, tmp_path: Path) -> None:
     folder = tmp_path / "out"
-    process = start(planted.options(folder, workers=2))
-    until(lambda: stored(folder) >= 3 or process.poll() is not None)
+    process = held_at(3, MODULE, planted.options(folder, workers=2))
     process.send_signal(signal.SIGINT)
     _, said = process.communicate(timeout=LONG)
-    if process.returncode == 0:
-        pytest.skip("the command was quicker than the signal")
     assert process.returncode == 3 and "Traceback" not in said, said
     assert report(folder)["state"] == "interrupted"
     covered = sum(json.loads(row[2])[0] - json.loads(row[1])[0] for row in cells(folder))
@@ -500,6 +500,7 @@ def test_interrupt_leaves_what_is_finished(planted: Case, finished: Path, tmp_pa
     assert cells(folder) == cells(finished)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "place",
     [
@@ -521,12 +522,14 @@ def test_interrupted_before_the_first_block(
     assert cells(folder) == cells(finished)
 
 
+@pytest.mark.slow
 def test_ended_while_kernels_are_compiled(planted: Case, tmp_path: Path) -> None:
     folder = tmp_path / "out"
     options = planted.options(folder)
     check_ended_in_a_library_call(MODULE, "ns_abstract.cli.certifying.compile_beside", options, folder)
 
 
+@pytest.mark.slow
 def test_budget_ends_with_a_result_and_is_continued(planted: Case, finished: Path, tmp_path: Path) -> None:
     folder = tmp_path / "out"
     assert certify(Certify(**planted.values(folder, time_budget=1e-6))) == 0
@@ -550,6 +553,7 @@ def test_resume_refuses_other_inputs(planted: Case, net: Path, finished: Path, t
     assert [row[:3] for row in cells(folder)] == [row[:3] for row in before]
 
 
+@pytest.mark.slow
 def test_processes_equal_one_process(planted: Case, finished: Path, tmp_path: Path) -> None:
     planted.run(tmp_path / "out", workers=2)
     assert cells(tmp_path / "out") == cells(finished)
@@ -568,6 +572,7 @@ def die(number: int) -> int:
     os._exit(7)
 
 
+@pytest.mark.slow
 def test_killed_worker_loses_nothing_and_counts_nothing_twice(tmp_path: Path) -> None:
     engine = Processes(2)
     try:
@@ -581,6 +586,7 @@ def test_killed_worker_loses_nothing_and_counts_nothing_twice(tmp_path: Path) ->
         engine.close()
 
 
+@pytest.mark.slow
 def test_worker_that_always_dies_is_an_error() -> None:
     engine = Processes(1)
     try:
@@ -601,6 +607,7 @@ def test_engine_here() -> None:
 needs_dask = pytest.mark.skipif(importlib.util.find_spec("distributed") is None, reason="dask is not installed")
 
 
+@pytest.mark.slow
 @needs_dask
 def test_two_dask_workers_equal_one_process(planted: Case, finished: Path, tmp_path: Path) -> None:
     folder = tmp_path / "out"
@@ -610,6 +617,7 @@ def test_two_dask_workers_equal_one_process(planted: Case, finished: Path, tmp_p
     assert cells(folder) == cells(finished)
 
 
+@pytest.mark.slow
 @needs_dask
 def test_dask_worker_killed(planted: Case, finished: Path, tmp_path: Path) -> None:
     from ns_abstract.execution.engines import Cluster, connected
@@ -640,6 +648,7 @@ def test_dask_worker_killed(planted: Case, finished: Path, tmp_path: Path) -> No
     assert cells(tmp_path / "out") == cells(finished)
 
 
+@pytest.mark.slow
 @needs_dask
 def test_cluster_on_this_machine_keeps_torch_quick() -> None:
     from ns_abstract.execution.engines import connected
@@ -682,6 +691,7 @@ def test_report(planted: Case, finished: Path) -> None:
     np.testing.assert_allclose(found, sorted(poses.pose(np.array([x]))[:, 3].tolist() for x in middles), atol=1e-5)
 
 
+@pytest.mark.slow
 def test_substitutions_are_compared(blobs: Inputs, net: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Half-widths that any way certifies hold under attack, and the way of the verdicts gives no smaller ones."""
     monkeypatch.setattr(certifying, "_COMPARE_LEAST", 120.0)
@@ -712,6 +722,7 @@ def test_substitutions_are_compared(blobs: Inputs, net: Path, tmp_path: Path, mo
     assert "What the shared parameters are worth" in page and "margin, everywhere" in page
 
 
+@pytest.mark.slow
 def test_substitutions_are_not_compared(
     blobs: Inputs, bright: tuple[Path, float, float], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -798,6 +809,7 @@ def test_where_it_fails_is_looked_at_closely(planted: Case, finished: Path, monk
     assert any(good and "not certified" in good.title and good.margin > 0.0 for _, good in found.pictures)  # type: ignore[operator]
 
 
+@pytest.mark.slow
 def test_pictures_of_a_resumed_command(planted: Case, finished: Path, tmp_path: Path) -> None:
     """They are made again, and are the same; what an interrupted command leaves is none of them."""
     page = (finished / "report.html").read_text()
@@ -845,6 +857,7 @@ def test_ring_strip_plane_and_bars() -> None:
     ]  # fmt: skip
 
 
+@pytest.mark.slow
 def test_foreign_text_is_escaped(blobs: Inputs, bright: tuple[Path, float, float], tmp_path: Path) -> None:
     net = tmp_path / "<b>net&.onnx"
     net.write_bytes(bright[0].read_bytes())
@@ -905,6 +918,7 @@ def test_partition_that_does_not_fit(
 EVERYTHING = {"select": {"box": [[-9, -9, -9], [9, 9, 9]]}}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "entry", [{"color": 0.02}, {"opacity": [-0.1, 0.02]}, {"mean": 0.002}], ids=lambda e: next(iter(e))
 )
@@ -950,6 +964,7 @@ def test_scene_variations(
                 assert name == f"scene_{next(iter(entry))}"
 
 
+@pytest.mark.slow
 def test_a_variation_of_the_scene_breaks_what_poses_do_not(
     blobs: Inputs, bright: tuple[Path, float, float], tmp_path: Path
 ) -> None:
@@ -971,6 +986,7 @@ def test_a_variation_of_the_scene_breaks_what_poses_do_not(
 KINDS_BY_NAME = {kind.name: kind for kind in (*KINDS, *CAMERA_KINDS, *PLACES)}
 
 
+@pytest.mark.slow
 def test_scene_margin(blobs: Inputs, bright: tuple[Path, float, float], tmp_path: Path) -> None:
     """Scenes at the ends of the certified radius break nothing, whatever varies; scenes that do lie farther off."""
     spec = {"version": 1, "translation": {"x": [0.1, 0.11]}}
@@ -1056,6 +1072,7 @@ def test_help_is_quick_and_light() -> None:
 # ---------------------------------------------------------------- whole scenes
 
 
+@pytest.mark.slow
 def test_demo_from_end_to_end(tmp_path: Path) -> None:
     """The demo's orbit, a random network, the label of the middle: some part is certified and nothing wrongly."""
     config, files = write_demo(tmp_path / "demo")

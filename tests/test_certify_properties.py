@@ -274,6 +274,7 @@ TARGETS = ("camera", "object", ["distance", 0.4, "object.z"], [1.0, -0.5, 0.25])
 TOLERANCES = ({"relative": 0.4}, {"absolute": 0.7}, {"absolute": [0.7, 0.8, 0.9]})
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("tolerance", TOLERANCES, ids=str)
 @pytest.mark.parametrize("target", TARGETS, ids=str)
 def test_regression(target: Any, tolerance: dict[str, Any], tmp_path: Path) -> None:
@@ -372,6 +373,7 @@ def test_detection(label: int | None, iou: float | None, tmp_path: Path) -> None
     assert not boxed(claim, low * np.nan, high, poses(), centre) > 0.0
 
 
+@pytest.mark.slow
 def test_overlap_against_sampling() -> None:
     rng = np.random.default_rng(5)
     for _ in range(200):

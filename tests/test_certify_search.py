@@ -122,6 +122,7 @@ def same(first: list[Leaf], second: list[Leaf]) -> None:
 # ---------------------------------------------------------------- right verdicts
 
 
+@pytest.mark.slow_cases
 @pytest.mark.parametrize("threshold", [0.0, 0.31, 0.43, 0.5, 0.6, 1.0])
 @pytest.mark.parametrize("d", [1, 2])
 def test_verdicts_are_the_truth(threshold: float, d: int) -> None:
@@ -392,6 +393,7 @@ class Shaded(Ramp):
         return (a, low - self.reach, a, high + self.reach), lower - self.reach, upper + self.reach, slopes
 
 
+@pytest.mark.slow
 def test_scenes_of_a_set() -> None:
     """Where some scene is too dark the cell is falsified by it, although the stored scene is bright enough there."""
     scene = Shaded()

@@ -25,6 +25,7 @@ CHANGED = {"flush": 1.0, "overflow": 1.0}
 CAMERA = Camera(np.concatenate([np.eye(3), np.zeros((3, 1))], 1), 20.0, 20.0, 8.0, 8.0, 16, 16)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("arithmetic", [FLOAT32, REAL], ids=["float32", "real"])
 def test_every_charge_pays(arithmetic: Arithmetic) -> None:
     """No error seen is larger than the error charged, and every charge but those named is measured."""
@@ -34,6 +35,7 @@ def test_every_charge_pays(arithmetic: Arithmetic) -> None:
     assert {name: ratio for name, ratio in found.items() if not ratio <= 1.0 + 1e-5} == {}
 
 
+@pytest.mark.slow_cases(every=20)
 @pytest.mark.parametrize("name", MEASURED)
 def test_every_charge_is_needed(name: str) -> None:
     """A charge that is left out is missed."""

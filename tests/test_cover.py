@@ -96,6 +96,7 @@ def others(images: ImageSets, local: str) -> ImageSets:
     return ImageSets(*(np.concatenate([getattr(cell, name) for cell in cells]) for name in fields))
 
 
+@pytest.mark.slow_cases(every=12)
 @pytest.mark.parametrize("local", ["", "product", "maximum", "short"])
 @pytest.mark.parametrize("fresh", [False, True])
 @pytest.mark.parametrize(("radius", "slack"), [(0.02, 0.02), (0.1, 0.05), (1e-6, 1e-6)])
@@ -118,6 +119,7 @@ def test_rows_of_one_cell_hold_for_others(
             assert (found.lower[cell] <= least).all()
 
 
+@pytest.mark.slow_cases
 @pytest.mark.parametrize("local", ["", "product", "maximum", "short"])
 def test_rows_of_one_cell_hold_every_value(local: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """What the first cell's rows say of every number, against the exact network on images of each other one."""
@@ -229,6 +231,7 @@ def test_rounding_is_charged_by_all_parts_at_once(tmp_path: Path, monkeypatch: p
     assert (together.known.flush >= (1.0 - 1e-5) * alone.known.flush).all()
 
 
+@pytest.mark.slow
 def test_rows_of_a_cell_say_as_much_of_it_as_its_bounds(tmp_path: Path) -> None:
     """Of itself nothing is lost but rounding; of neighbours not much."""
     near = []
@@ -251,6 +254,7 @@ def test_rows_of_a_cell_say_as_much_of_it_as_its_bounds(tmp_path: Path) -> None:
     assert np.mean(near, axis=0)[0] < 1.5 and np.mean(near, axis=0)[1] < 1.4
 
 
+@pytest.mark.slow_cases
 @pytest.mark.parametrize("local", ["product", "maximum"])
 def test_rows_of_a_whole_serve_its_parts_behind_products_and_maxima(local: str, tmp_path: Path) -> None:
     gains = []

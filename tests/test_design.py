@@ -98,6 +98,7 @@ def test_tests_exist(label: str) -> None:
         assert function in {n.name for n in ast.walk(tree(path)) if isinstance(n, ast.FunctionDef)}, name
 
 
+@pytest.mark.slow
 def test_names_in_the_text_exist() -> None:
     """What stands in backticks is the name of something, somewhere in the package."""
     defined = set()

@@ -79,6 +79,7 @@ def test_checkpoints_end_what_is_over() -> None:
     checkpoint()
 
 
+@pytest.mark.slow_cases
 @pytest.mark.parametrize("kind", ["uniform", "hierarchical"])
 @pytest.mark.parametrize("asked", [0, 3, 12])
 def test_rays_without_time_are_left_open(kind: Any, asked: int, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -119,6 +120,7 @@ def test_one_ray_is_given_up_inside(monkeypatch: pytest.MonkeyPatch) -> None:
     assert len(steps) == 2
 
 
+@pytest.mark.slow_cases
 @pytest.mark.parametrize("count", [0, 1, 5, 40, 200])
 def test_refinement_ends_soundly_wherever_it_is_stopped(count: int) -> None:
     scene, pose_set = tiny_scene(0), poses(YAW)
@@ -208,6 +210,7 @@ def test_a_ray_that_takes_long_is_given_up_when_kernels_are_compiled(
     assert looks
 
 
+@pytest.mark.slow
 def test_a_frame_ends_with_its_time_while_the_first_picture_is_rendered(
     nerf: Settings, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -246,6 +249,7 @@ def square(number: int) -> int:
     return number * number
 
 
+@pytest.mark.slow
 def test_workers_are_asked_to_end_and_work_on(tmp_path: Path) -> None:
     engine = Processes(1)
     try:
@@ -292,6 +296,7 @@ except InputError as error:
 """
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(importlib.util.find_spec("distributed") is None, reason="dask is not installed")
 def test_a_cluster_without_a_guard_is_told_what_it_needs(tmp_path: Path) -> None:
     script = tmp_path / "script.py"
@@ -321,6 +326,7 @@ finally:
 """
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("guarded", [False, True])
 def test_a_script_without_a_guard_is_told_what_it_needs(tmp_path: Path, guarded: bool) -> None:
     """Fresh processes import the script, and would start processes of their own."""
@@ -349,6 +355,7 @@ def alive(pid: int) -> bool:
         return False
 
 
+@pytest.mark.slow
 def test_workers_end_with_a_killed_parent(tmp_path: Path) -> None:
     """Also in the middle of a task that looks at nothing."""
     (tmp_path / "parent.py").write_text(PARENT)
@@ -434,6 +441,7 @@ def test_a_signal_in_the_middle_of_a_print() -> None:
         sys.stderr = before
 
 
+@pytest.mark.slow
 def test_a_signal_ends_a_library_call() -> None:
     """Nothing runs between two lines of Python while a kernel is compiled."""
     code = """
@@ -538,6 +546,7 @@ def test_a_certificate_has_no_downscale_factor(
     assert "downscale" not in said
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("limit", [0.5, 1.0, 2.0])
 def test_a_small_address_space_is_one_line(limit: float, blobs: Inputs, tmp_path: Path) -> None:
     most = int(limit * 2**30)
@@ -614,6 +623,7 @@ class Starting:
         self.tasks.clear()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("looks", [0, 1, 4, 1000])
 def test_blocks_are_examined_while_workers_start(looks: int, tmp_path: Path) -> None:
     """Each once, and the cells are those of an uninterrupted search; a stop is heeded meanwhile."""
@@ -658,6 +668,7 @@ def test_blocks_are_examined_while_workers_start(looks: int, tmp_path: Path) -> 
     store.close()
 
 
+@pytest.mark.slow
 def test_processes_start_until_the_first_result() -> None:
     engine = Processes(1)
     try:

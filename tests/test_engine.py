@@ -738,6 +738,7 @@ class Triangle(Waves):
         return super().render(nearest, tiles)
 
 
+@pytest.mark.slow_cases
 @pytest.mark.parametrize("pace", [0.0, 4.0])
 @pytest.mark.parametrize("shrinks", [True, False])
 def test_parts_without_poses_take_no_work_and_leave_nothing_open(shrinks: bool, pace: float) -> None:

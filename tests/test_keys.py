@@ -89,6 +89,7 @@ def missing(table: KeyTable, names: Iterator[str], prefix: str) -> list[str]:
     return [name for name in found if name not in sections and table.find(name) is None]
 
 
+@pytest.mark.slow_cases
 @needs_nerfstudio
 @pytest.mark.parametrize("method", MODELS)
 def test_every_field_of_the_models_is_in_a_table(nerfstudio: SimpleNamespace, method: str) -> None:
@@ -205,6 +206,7 @@ def test_nerfstudio_nerf_pictures_depend_on_what_is_used_or_refused(nerfstudio: 
     assert {"num_coarse_samples", "collider_params.far_plane", "enable_temporal_distortion"} <= changing
 
 
+@pytest.mark.slow
 @needs_nerfstudio
 @pytest.mark.usefixtures("no_metric")
 def test_nerfstudio_splat_pictures_depend_on_what_is_used(
@@ -300,6 +302,7 @@ VALUES = {
 }  # fmt: skip
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", MODELS)
 def test_irrelevant_keys_leave_the_scene_as_it_is(tmp_path: Path, method: str) -> None:
     before = arrays_of(load_any(write_config(tmp_path / "before", method)))
@@ -320,6 +323,7 @@ USED = {
 }  # fmt: skip
 
 
+@pytest.mark.slow_cases
 @pytest.mark.parametrize(("method", "line"), [(m, line) for m, lines in USED.items() for line in lines])
 def test_used_keys_change_the_scene(tmp_path: Path, method: str, line: str) -> None:
     before = arrays_of(load_any(write_config(tmp_path / "before", method)))
@@ -471,7 +475,7 @@ def test_paths_that_show_something_else_are_refused(tmp_path: Path, case: str) -
 FILES: dict[str, tuple[Any, tuple[str, ...]]] = {
     "transforms.json": (
         {"camera_model": "OPENCV", "fl_x": 500.0, "w": 100, "h": 100, "frames": [{"transform_matrix": []}]},
-        ("transforms.json", "dataparser_transforms.json", "viewer"),
+        ("transforms.json", "config.yml of a run", "camera path"),
     ),
     "transforms_train.json": ({"camera_angle_x": 0.7, "frames": []}, ("transforms.json",)),
     "exported cameras": ([{"file_path": "a.png", "transform": []}], ("ns-export cameras",)),
@@ -521,7 +525,7 @@ def test_keys_of_a_path_do_what_the_table_says(tmp_path: Path) -> None:
 
     def told(data: Any) -> list[Any]:
         path = read(tmp_path, data)
-        cameras = [(c.camera_to_world.tolist(), c.fx, c.fy, c.width, c.height) for c in path.cameras]
+        cameras = [(c.camera_to_world.tolist(), c.intrinsics) for c in path.cameras]
         return [cameras, path.perturbations, path.is_cycle, path.notes]
 
     new: dict[str, Any] = {

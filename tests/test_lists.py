@@ -208,6 +208,7 @@ def test_cells_that_are_bounded_at_once_have_memory_of_their_own():
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("radii", [{"yaw": 0.03}, {"x": 0.02, "yaw": 0.03}])
 @pytest.mark.usefixtures("four_threads")
 def test_cells_that_are_bounded_at_once_are_those_bounded_one_by_one(radii):
@@ -254,6 +255,7 @@ def test_partial_pictures_are_parts_of_the_whole():
     assert np.ptp(whole.lower[some]) > 0.1
 
 
+@pytest.mark.slow_cases(every=10)
 @pytest.mark.parametrize("arithmetic", [REAL, FLOAT32])
 @pytest.mark.parametrize("antialiased", [False, True])
 @pytest.mark.parametrize("order", [1, 2])

@@ -66,6 +66,7 @@ def bounded(scene: NerfScene, pose_set: PoseSet, tolerance: float = 0.02) -> Ray
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", SETS)
 def test_sets_of_poses_are_enclosed(name: str) -> None:
     scene, pose_set = tiny_scene(3), poses(SETS[name])

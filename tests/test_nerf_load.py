@@ -77,6 +77,8 @@ def test_damaged_checkpoints(run: Path, edit: Callable[[dict], None], fragments:
         ("far_plane: 4.0", "far_plane: -1.0", "far_plane"),
         ("far_plane: 4.0", "far_plane: .nan", "far_plane"),
         ("background_color: white", "background_color: last_sample", "background_color"),
+        ("background_color: white", "background_color: White", "random, white, black, red, green, blue"),
+        ("background_color: white", "background_color: purple", "random, white, black, red, green, blue"),
         ("num_coarse_samples: 64", "num_coarse_samples: 0", "num_coarse_samples"),
     ],
 )
@@ -86,6 +88,12 @@ def test_configurations_that_cannot_be_bounded(run: Path, old: str, new: str, fr
     run.write_text(text.replace(old, new))
     with pytest.raises(InputError, match=fragment):
         load_any(run)
+
+
+@pytest.mark.parametrize(("name", "color"), [("random", [0, 0, 0]), ("green", [0, 1, 0])])
+def test_backgrounds_are_those_that_nerfstudio_shows(run: Path, name: str, color: list[float]) -> None:
+    run.write_text(run.read_text().replace("background_color: white", f"background_color: {name}"))
+    assert load_any(run).background.tolist() == color
 
 
 # ---------------------------------------------------------------- command line

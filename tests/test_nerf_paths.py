@@ -61,6 +61,7 @@ def reached(scene: NerfScene, pose_set: PoseSet) -> float:
     return float((shown.max(axis=0) - shown.min(axis=0)).mean())
 
 
+@pytest.mark.slow_cases
 @pytest.mark.parametrize("kind", FIELDS)
 @pytest.mark.parametrize("name", SETS)
 def test_rays_are_enclosed_and_tight(name: str, kind: str) -> None:

@@ -77,6 +77,7 @@ def worst(
     return excess, compared, float(np.mean(ratios)) if ratios else np.inf
 
 
+@pytest.mark.slow_cases(every=10)
 @pytest.mark.parametrize("name", FIELDS)
 @pytest.mark.parametrize("half", [0.0, 1e-4, 3e-3, 3e-2, 0.3])
 def test_fields_are_enclosed(name: str, half: float) -> None:
@@ -216,6 +217,7 @@ def test_every_unit_is_enclosed(dimensions: int, compiled: bool) -> None:
     assert kinds == {"open", "closed"}
 
 
+@pytest.mark.slow_cases
 @pytest.mark.parametrize(("compiled", "narrow"), [(True, True), (True, False), (False, False)])
 def test_linear_layers_are_enclosed(compiled: bool, narrow: bool) -> None:
     """Error terms keep their values through a layer: those that move one neuron, too."""
@@ -459,6 +461,7 @@ def faulty_sums(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(FieldBounds, "_linear", narrowed)
 
 
+@pytest.mark.slow_cases
 @pytest.mark.parametrize(
     ("fault", "half"),
     [(faulty_fit, 2e-2), (faulty_remainder, 0.1), (faulty_columns, 2e-2), (faulty_sums, 2e-2)],

@@ -174,6 +174,7 @@ def residual(folder: Path) -> Path:
     return f.write(folder / "residual.onnx")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("allowed", [1e12, 3e6, 0.0])
 def test_deep_networks_are_bounded(allowed: float, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Rationed rows are sound, whatever they may take; with enough of them little is lost."""
@@ -203,6 +204,7 @@ def test_deep_networks_are_bounded(allowed: float, tmp_path: Path, monkeypatch: 
     assert gaps[1] >= (0.9 if allowed else 1.1) * gaps[0]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("enough", [0.0, 0.3, 1e9])
 def test_rows_that_end_on_the_way_lie_below_the_exact_minimum(
     enough: float, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -273,6 +275,7 @@ def planned(monkeypatch: pytest.MonkeyPatch, which: int | None = None) -> list[s
     return used
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("which", [0, 1, 9])
 def test_rows_that_end_by_plan_lie_below_the_exact_minimum(
     which: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -309,6 +312,7 @@ def test_rows_that_end_by_plan_lie_below_the_exact_minimum(
     assert gaps <= 7.0 * spans
 
 
+@pytest.mark.slow_cases
 @pytest.mark.parametrize("which", [0, 1, 2, None])
 @pytest.mark.parametrize("net", ["residual", "gate"])
 def test_rows_that_rest_on_several_nodes(
@@ -437,6 +441,7 @@ print(peak("VmHWM") - before, estimate(network, 2)[0], np.isfinite(found.lower).
 """
 
 
+@pytest.mark.slow
 def test_rows_that_end_by_plan_keep_within_memory(tmp_path: Path) -> None:
     """Wide maps whose rows would take gigabytes together stay within what is allowed, and near the estimate."""
     f = OnnxFile((3, 24, 24), 5)
@@ -505,6 +510,7 @@ def test_what_ends_rows() -> None:
     np.testing.assert_array_equal(enough[4:].done(found, every[:3]), [False, False, True])
 
 
+@pytest.mark.slow
 def test_early_rows_keep_later_ones_exact(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """What rows lose of themselves is relative to what is known: cheap nodes are bounded though none is open."""
     shape = (2, 8, 8)
@@ -528,6 +534,7 @@ def test_early_rows_keep_later_ones_exact(tmp_path: Path, monkeypatch: pytest.Mo
     assert 0.0 < gaps[1] < 0.5 * gaps[0]
 
 
+@pytest.mark.slow_cases
 @pytest.mark.parametrize("arithmetic", ["float32", "real"])
 def test_chosen_slopes_are_never_worse_and_sound(arithmetic: NetworkArithmetic, tmp_path: Path) -> None:
     gains = 0.0
@@ -549,6 +556,7 @@ def test_chosen_slopes_are_never_worse_and_sound(arithmetic: NetworkArithmetic, 
     assert gains > 1.0
 
 
+@pytest.mark.slow
 def test_chosen_slopes_behind_maxima_and_products(tmp_path: Path) -> None:
     """Planes with slopes of their own hold wherever images are; something is gained."""
     f = OnnxFile((2, 16, 16), 3)
@@ -579,6 +587,7 @@ def test_chosen_slopes_behind_maxima_and_products(tmp_path: Path) -> None:
             assert inside.any() and (planes <= y)[inside].all()
 
 
+@pytest.mark.slow
 def test_chains_of_maxima_beside_their_input(tmp_path: Path) -> None:
     """Pooling makes windows of rows as large as the map, beside windows of a single number."""
     f = OnnxFile((2, 4, 4), 2)
@@ -726,6 +735,7 @@ def test_a_bad_cell_is_unknown_and_leaves_the_others_alone(damage: str, tmp_path
     assert not np.isnan(found.a).any() and not np.isnan(found.b).any()
 
 
+@pytest.mark.slow
 def test_parts_change_nothing_but_rounding(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     f = OnnxFile(SHAPE)
     f.conv(2, 4, pads=[1, 1, 1, 1])

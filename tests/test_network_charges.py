@@ -74,6 +74,7 @@ def within(net: Extreme, folder: Path, low: Array, high: Array, seed: int = 0) -
 # ---------------------------------------------------------------- norms in one pass
 
 
+@pytest.mark.slow_cases
 @pytest.mark.parametrize("op", [True, False])
 @pytest.mark.parametrize(("mean", "spread"), [(15.1, 1e-3), (5.1, 0.02), (0.5, 1e-3), (20.0, 0.3), (300.0, 1e-3)])
 def test_norms_of_one_pass(op: bool, mean: float, spread: float, tmp_path: Path) -> None:
@@ -89,6 +90,7 @@ def test_norms_of_one_pass(op: bool, mean: float, spread: float, tmp_path: Path)
     assert (low <= exact + 1e-6).all() and (high - low < 1e-6).all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("op", [True, False])
 def test_variances_below_zero(op: bool, tmp_path: Path) -> None:
     """Where one pass has no root, or one of next to nothing, nothing is known."""
@@ -215,6 +217,7 @@ def leaky(alpha: float) -> Layer:
     return plain("LeakyRelu", lambda x: functional.leaky_relu(x, alpha), alpha=alpha)
 
 
+@pytest.mark.slow_cases
 @pytest.mark.parametrize("name", tiny_factors())
 def test_flushed_numbers(name: str, tmp_path: Path) -> None:
     """Subnormal numbers that are kept or flushed to zero, before and behind every kind of layer."""
@@ -338,6 +341,7 @@ def test_folded_biases_lose_sums(tmp_path: Path) -> None:
 # ---------------------------------------------------------------- networks at random
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("first", range(0, 90, 30))
 def test_extreme_networks(first: int, tmp_path: Path) -> None:
     compared = finite = 0
@@ -353,6 +357,7 @@ def test_extreme_networks(first: int, tmp_path: Path) -> None:
     assert compared > 30_000 and finite > 30
 
 
+@pytest.mark.slow_cases
 @pytest.mark.parametrize("first", range(0, 16, 8))
 def test_extreme_maps(first: int, tmp_path: Path) -> None:
     compared = 0

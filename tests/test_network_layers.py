@@ -272,6 +272,7 @@ def test_read_like_onnxruntime(name: str, tmp_path: Path) -> None:
         np.testing.assert_allclose(network(torch.from_numpy(x).double()).numpy(), expected, rtol=2e-5, atol=2e-6)
 
 
+@pytest.mark.slow_cases(every=12)
 @pytest.mark.parametrize("name", CASES)
 @pytest.mark.parametrize(("d", "radius", "slack"), [(1, 0.1, 0.01), (2, 0.5, 0.3), (3, 0.003, 1e-7)])
 def test_contained_under_attack(name: str, d: int, radius: float, slack: float, tmp_path: Path) -> None:
@@ -296,6 +297,7 @@ def test_contained_under_attack(name: str, d: int, radius: float, slack: float, 
     assert compared > 250
 
 
+@pytest.mark.slow_cases
 @pytest.mark.parametrize("name", CASES)
 def test_planes_hold_at_every_parameter(name: str, tmp_path: Path) -> None:
     file = written(name, tmp_path)
@@ -318,6 +320,7 @@ def test_planes_hold_at_every_parameter(name: str, tmp_path: Path) -> None:
         assert (bounds.a[0] @ p + bounds.b[0] <= least).all()
 
 
+@pytest.mark.slow_cases
 @pytest.mark.parametrize("name", CASES)
 def test_narrow_sets_have_tight_bounds(name: str, tmp_path: Path) -> None:
     worst = 0.0
@@ -460,6 +463,7 @@ def _caught(name: str, tmp_path: Path, mutate: Callable[[pytest.MonkeyPatch], No
     return False
 
 
+@pytest.mark.slow_cases
 @pytest.mark.parametrize("mutant", MUTANTS)
 def test_attack_catches(mutant: str, tmp_path: Path) -> None:
     mutate, name = MUTANTS[mutant]

@@ -318,6 +318,7 @@ def _rows(size: int) -> np.ndarray:
 LEDGER = {"layer norm in steps": 3.0, "attention": 2.6}
 
 
+@pytest.mark.slow_cases(every=8)
 @pytest.mark.parametrize("name", CASES)
 def test_contained_under_attack(name: str, tmp_path: Path) -> None:
     file = written(name, tmp_path)
@@ -334,6 +335,7 @@ def test_contained_under_attack(name: str, tmp_path: Path) -> None:
         assert (bounds.b - np.abs(bounds.a).sum(-1) <= bounds.lower + 1e-9 * np.abs(bounds.lower)).all()
 
 
+@pytest.mark.slow_cases
 @pytest.mark.parametrize("name", CASES)
 def test_narrow_sets_have_tight_bounds(name: str, tmp_path: Path) -> None:
     file = written(name, tmp_path)

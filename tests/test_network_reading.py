@@ -214,6 +214,7 @@ def cancelling(seed: int, n: int = 401) -> np.ndarray:
     return v
 
 
+@pytest.mark.slow_cases
 @pytest.mark.parametrize("seed", range(4))
 @pytest.mark.parametrize("use", ["Mul", "Add", "Sub", "Gemm", "MatMul", "Conv"])
 def test_folded_sums_hold_for_every_order(use: str, seed: int, tmp_path: Path) -> None:
@@ -478,6 +479,7 @@ def test_stored_integers_are_weights(axis: int | None, tmp_path: Path) -> None:
     assert (low <= value).all() and (value <= high).all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(3))
 def test_values_that_are_rounded_to_steps_are_contained(seed: int, tmp_path: Path) -> None:
     f = OnnxFile((4,), seed=seed)

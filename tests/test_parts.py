@@ -241,6 +241,7 @@ class Machines:
         self.capacity = 2 * self.threads
         self.goals: list[Goal] = []
         self.parts: list[Part] = []
+        self.done: list[int] = []
         self._tasks: list[tuple[int, Any, Any]] = []
 
     def machine(self) -> Machine:
@@ -254,6 +255,7 @@ class Machines:
 
     def collect(self, seconds: float) -> list[tuple[int, Any]]:
         key, function, arguments = self._tasks.pop(0)
+        self.done.append(key)
         return [(key, function(*arguments))]
 
     def close(self) -> None:
@@ -264,17 +266,21 @@ def options(blobs: Inputs, folder: Path, **more: Any) -> Render:
     return Render(blobs.config, blobs.path, folder, perturbation_filename=blobs.spec, **more)
 
 
-def test_frames_are_divided_where_threads_are_many(blobs: Inputs) -> None:
+def test_frames_are_divided_where_threads_are_many(blobs: Inputs, monkeypatch: pytest.MonkeyPatch) -> None:
+    """By a clock that every task puts forward by a second."""
     job = job_of(blobs)
     for frames, threads, tasks in (([0, 1, 2], 2, 3), ([0], 1, 1), ([0], 2, 4), ([0, 2], 3, 6)):
         engine = Machines([threads])
+        monkeypatch.setattr(bounding, "perf_counter", lambda done=engine.done: float(len(done)))
         results = list(bound_frames(job, frames, engine=engine, budget=60.0, target_ratio=3.0))
         assert sorted(r.index for r in results) == frames and all(r.bounded for r in results)
         assert len(engine.goals) == tasks
-        # all the time, shared by the rounds, and what is left goes to the last one
-        rounds = -(-tasks // threads)
-        assert engine.goals[0].seconds == pytest.approx(60.0 / rounds, rel=0.05)
-        assert engine.goals[-1].seconds > 0.5 * 60.0 / rounds
+        # all the time that is left, shared by the rounds that are
+        seconds = []
+        for number in range(tasks):
+            spent = max(0, number - threads + 1)
+            seconds.append((60.0 - spent) / -(-(tasks - number) // threads))
+        assert [goal.seconds for goal in engine.goals] == pytest.approx(seconds)
         for result in results:
             assert violations(job, result, 5, result.index) == 0
 

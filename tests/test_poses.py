@@ -284,12 +284,14 @@ def test_segment_and_more(order):
     assert escapes(poses, poses.box, order, 2) == []
 
 
+@pytest.mark.slow_cases
 @pytest.mark.parametrize("angle", [0.0, 1e-12, 1e-9, 4e-7, 6e-7, 1e-6, 1e-4])
 def test_segment_nearly_equal(angle):
     poses = segment(angle)
     assert escapes(poses, poses.box, 1) == [] and thin_escapes(poses) == []
 
 
+@pytest.mark.slow_cases
 @pytest.mark.parametrize("gap", [1e-1, 1e-2, 1e-4, 1e-6, 4e-7, 1e-9])
 def test_segment_nearly_opposite(gap):
     for seed in range(3):

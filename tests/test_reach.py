@@ -97,6 +97,7 @@ def law_file(file: Path, kind: str, n: int = 3, m: int = 2) -> Path:
     return f.write(file)
 
 
+@pytest.mark.slow_cases
 @pytest.mark.parametrize("kind", ["tanh", "relu", "vector", "selection"])
 def test_a_step_of_a_file_is_enclosed(tmp_path: Path, kind: str) -> None:
     """More than 2500 steps by kind as onnxruntime computes them, of states and controls in a set, exactly."""
@@ -246,6 +247,7 @@ def reacher(folder: Path, value: dict[str, Any], dependence: Dependence = "kept"
     return Reacher(loop, wall, Pilot(model, loop.control), dependence)
 
 
+@pytest.mark.slow_cases
 @pytest.mark.parametrize("kind", ["affine", "unicycle", "double integrator", "fixed wing", "quadrotor", "onnx"])
 def test_tubes_hold_every_run(tmp_path: Path, kind: str) -> None:
     """More than 1000 simulated states by law of motion, in tubes of every kind, without a tolerance."""

@@ -18,9 +18,9 @@ from typing import Any
 import numpy as np
 import pytest
 from conftest import InProcess, environment
-from interrupting import check_ended_in_a_library_call, check_interrupted, interrupted_at, stored
+from interrupting import check_ended_in_a_library_call, check_interrupted, held_at, interrupted_at
 from onnx_files import OnnxFile
-from waiting import LONG, until
+from waiting import LONG
 
 from ns_abstract.api.reaching import LoopJob, open_loop, reach
 from ns_abstract.api.scenes import load_scene
@@ -300,8 +300,7 @@ def start(options: list[str]) -> subprocess.Popen[str]:
 
 def test_interrupted_and_resumed(edge: Course, finished: Path, tmp_path: Path) -> None:
     folder = tmp_path / "out"
-    process = start(edge.options(folder))
-    until(lambda: stored(folder) >= 3 or process.poll() is not None)
+    process = held_at(3, MODULE, edge.options(folder))
     process.send_signal(signal.SIGINT)
     _, said = process.communicate(timeout=LONG)
     assert process.returncode == 3 and "Traceback" not in said, said

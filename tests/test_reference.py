@@ -271,6 +271,7 @@ def run_scene(name: str) -> tuple[SplatScene, Path]:
     return load_scene(next(iter(sorted(folder.glob("splatfacto/*/config.yml"))))), folder / "camera_path.json"
 
 
+@pytest.mark.slow_cases
 @pytest.mark.parametrize(
     ("name", "downscale", "frames"),
     [("playbot_lod4", 2, (0, 3)), ("playbot_lod3", 4, (1,)), ("airplane", 4, (2,)), ("plant", 5, (0,))],

@@ -285,6 +285,7 @@ def test_matplotlib_is_imported_late(tmp_path):
     subprocess.run([sys.executable, "-c", code, str(tmp_path)], cwd=ROOT, env=environment, check=True)
 
 
+@pytest.mark.slow_cases
 @pytest.mark.parametrize(
     ("height", "width", "changes"),
     [

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import time
 
 import flint
 import numpy as np
@@ -25,10 +24,9 @@ EXACT = {
 
 
 def test_passes_here():
-    check_functions()
-    start = time.process_time()
     assert check_functions() == []
-    assert time.process_time() - start < 0.2
+    # every start pays for them: milliseconds
+    assert sum(table(name)[0].size for name in FUNCTIONS) < 500
 
 
 @pytest.mark.parametrize("name", EXACT)

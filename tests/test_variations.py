@@ -102,6 +102,7 @@ POSES = {
 EVERYTHING = {"mean": 0.02, "opacity": [-0.3, 0.1], "color": [-0.4, 0.2]}
 
 
+@pytest.mark.slow_cases
 @pytest.mark.parametrize("dimensions", [0, 1, 3])
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
 def test_blobs(degree: int, dimensions: int) -> None:
@@ -273,6 +274,7 @@ def test_nothing_varies(degree: int, dimensions: int) -> None:
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "ranges, most", [({"color": 0.1}, 1.001), ({"opacity": 0.1}, 1.06), ({"mean": 0.005}, 2.4), (EVERYTHING, 2.4)]
 )

@@ -156,7 +156,7 @@ CERTIFICATES = (
     ),
     Fault(
         "preprocessing: rounding is not charged",
-        _PREPROCESS, "Preprocess.sets.move", "_ROUNDINGS * UNIT32 * size + 8.0 * UNIT64 * np.abs(b * factor)",
+        _PREPROCESS, "Preprocess.sets.move", "PREPROCESS_ROUNDING * size + PREPROCESSED_ROUNDING * np.abs(b * factor)",
         "0.0 * np.abs(b * factor)", _TIGHT,
     ),
     Fault(

@@ -40,7 +40,7 @@ DEPTHS = (
     ),
     Fault(
         "accumulation: its rounding is not charged",
-        _DEPTHS, "shade_layers", "1.01 * (charges.blend_fragment * n + charges.blend_pixel)", "0.0",
+        _DEPTHS, "shade_layers", "SECOND_ORDER * (charges.blend_fragment * n + charges.blend_pixel)", "0.0",
         "test_depths.py::test_the_accumulation_is_rounded",
     ),
     Fault(

@@ -25,7 +25,8 @@ FIELDS = (
     Fault(
         "fields: narrow sets are bounded no better than wide ones",
         "methods/nerf/frame.py", "NerfFrame._tolerance",
-        "min(_LEAST_TOLERANCE, max(_FINEST_TOLERANCE, _LEAST_SHARE * self._variation))", "_LEAST_TOLERANCE",
+        "min(_TUNING.least_tolerance, max(_TUNING.finest_tolerance, _TUNING.least_share * self._variation))",
+        "_TUNING.least_tolerance",
         "test_nerf_frame.py::test_a_tolerance_is_not_finer_than_bounds_are_kept",
     ),
     Fault(
@@ -191,12 +192,12 @@ FIELDS = (
     ),
     Fault(
         "opacity: an upper bound is rounded down",
-        _OUTPUTS, "opacity", "found * (1.0 + 2.0**-46) + 2.0**-1000",
-        "found * (1.0 - 2.0**-40) + 2.0**-1000", _OPACITY,
+        _OUTPUTS, "opacity", "found * (1.0 + ACTIVATION_ROUNDING) + ACTIVATION_FLOOR",
+        "found * (1.0 - 2.0**-40) + ACTIVATION_FLOOR", _OPACITY,
     ),
     Fault(
         "opacity: torch's threshold of softplus is forgotten",
-        _OUTPUTS, "density", "z > 19.0", "z > 1e9", _OPACITY,
+        _OUTPUTS, "density", "z > SOFTPLUS_LINE", "z > 1e9", _OPACITY,
     ),
     Fault(
         "rays: the error of the pose is not charged to the direction",
@@ -239,7 +240,7 @@ FIELDS = (
     Fault(
         "voxels: the room for rounding is forgotten",
         _OCCUPANCY, "OccupancyGrid.look",
-        "8.0 * UNIT64 * (np.maximum(np.abs(lower), np.abs(upper)) + np.abs(self.lower)) * self.scale",
+        "VOXEL_ROUNDING * (np.maximum(np.abs(lower), np.abs(upper)) + np.abs(self.lower)) * self.scale",
         "0.0 * lower", _VOXELS,
     ),
     Fault(
@@ -296,7 +297,7 @@ FIELDS = (
     ),
     Fault(
         "samples: the rounding of shares is not charged",
-        _SAMPLES, "edge_bounds", "2.0**-46 * (bins + 16)", "0.0",
+        _SAMPLES, "edge_bounds", "EDGE_ROUNDING * (bins + EDGE_BINS)", "0.0",
         "test_nerf_hierarchical.py::test_edges_of_samples_are_enclosed[known]",
     ),
     Fault(
@@ -317,7 +318,7 @@ FIELDS = (
     ),
     Fault(
         "followed samples: what is negligible costs nothing",
-        _PATHS, "Samples.composite", "self.price.reshape(rows, 1) * (1.0 + 2.0**-40)",
+        _PATHS, "Samples.composite", "self.price.reshape(rows, 1) * FOLLOWED_UP",
         "0.0 * self.price.reshape(rows, 1)",
         "test_nerf_paths.py::test_what_is_negligible_is_charged",
     ),

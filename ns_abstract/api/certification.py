@@ -659,8 +659,8 @@ def open_certification(settings: CertifySettings) -> Certification:
         device=settings.device,
         overrides=settings.overrides,
     )
-    path = load_camera_path(files.camera_path_filename)
     scene = files.scene.open()
+    path = load_camera_path(files.camera_path_filename, 1, scene.run_frame)
     sets = [question.drawn(poses) for poses in path_sets(files, scene, path, default=Perturbation())]
     origin = settings.perturbation_filename or settings.camera_path_filename
     try:

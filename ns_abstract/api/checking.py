@@ -20,16 +20,20 @@ def check(
     load_config: str | os.PathLike[str] | None = None,
     camera_path: str | os.PathLike[str] | None = None,
     perturbation: str | os.PathLike[str] | None = None,
+    model: str | os.PathLike[str] | None = None,
+    loop: str | os.PathLike[str] | None = None,
     on_progress: Callable[[Audit], object] | None = None,
 ) -> Audit:
     """Numbers of claims of a result that were proved, refuted and left open by a second program.
 
     Args:
-        output_dir: Output folder of ``ns-abstract-render --save-cells``; ``check.json`` is written there.
-        claims: Number of claims to draw; a claim is one channel of a pixel over one cell.
+        output_dir: Output folder of ``ns-abstract-render --save-cells``, ``ns-abstract-certify`` or
+            ``ns-abstract-reach``; ``check.json`` is written there.
+        claims: Number of claims to draw; a claim is one channel of a pixel over one cell, or one certified cell.
         seconds: Time for all of them.
         seed: Of the draws.
-        load_config, camera_path, perturbation: Where files lie that have been moved since; None: where the report says.
+        load_config, camera_path, perturbation, model, loop: Where files lie that have been moved since; None: where
+            the report says.
         on_progress: Called after every claim; returning False ends the audit.
 
     Raises:
@@ -43,11 +47,13 @@ def check(
         raise InputError(f"found {seed}", field="seed", fix="give a number from 0 on")
     moved = {
         "load_config": load_config,
-        "camera_path": camera_path,
-        "perturbation": perturbation,
+        "camera_path_filename": camera_path,
+        "perturbation_filename": perturbation,
+        "model": model,
+        "loop": loop,
     }
     files = {name: None if file is None else Path(file) for name, file in moved.items()}
     try:
-        return run(Path(output_dir), claims=claims, seconds=seconds, seed=seed, on_claim=on_progress, **files)
+        return run(Path(output_dir), claims=claims, seconds=seconds, seed=seed, moved=files, on_claim=on_progress)
     except BadInput as error:
         raise InputError(error.problem, fix=error.fix, file=error.file, field=error.field) from None

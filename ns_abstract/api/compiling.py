@@ -139,7 +139,7 @@ def _watch(line: Connection) -> None:
     while True:
         time.sleep(1.0)
         try:
-            line.send(store().compiled)
+            line.send(store().functions)
         except OSError:
             os._exit(1)
 

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ns_abstract.api.job import Job
+from ns_abstract.arithmetic.rounding import NONZERO
 from ns_abstract.geometry.box import ParameterBox
 from ns_abstract.io.errors import InputError
 from ns_abstract.refine.protocol import Frame
@@ -105,7 +106,7 @@ def explain(job: Job, index: int, result: FrameResult, seed: int = 0) -> Explana
     causes = {}
     for name, other in job.method.easier(frame.pose_set):
         left = sum(_excess(other, box, tile, seed) for box, tile in chosen)
-        causes[name] = float(min(1.0, max(0.0, 1.0 - left / max(sum(now), 1e-300))))
+        causes[name] = float(min(1.0, max(0.0, 1.0 - left / max(sum(now), NONZERO))))
     most = np.argsort(tiles)[::-1][:_REGIONS]
     regions = tuple((tiles[k] / total, *_extent(frame, int(k))) for k in most if tiles[k] > 0.0)
     box, tile = chosen[int(np.argmax(now))]

@@ -140,8 +140,8 @@ def open_job(
     Raises:
         InputError: A file, a field or an option cannot be used.
     """
-    path = load_camera_path(settings.camera_path_filename, settings.downscale_factor)
     scene = settings.scene.open()
+    path = load_camera_path(settings.camera_path_filename, settings.downscale_factor, scene.run_frame)
     # a set that cannot be made is found before hours of work
     return PathJob(settings, scene, path, path_sets(settings, scene, path, perturbation, default))
 

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
+from ns_abstract.geometry.camera_files import RunFrame
 from ns_abstract.geometry.camera_path import Camera
 from ns_abstract.geometry.poses import PoseSet
 from ns_abstract.geometry.tiles import assemble
@@ -18,7 +19,7 @@ from ns_abstract.methods.load import open_scene
 from ns_abstract.methods.overrides import Overrides
 from ns_abstract.methods.representation import ProgramOptions
 from ns_abstract.perturbation.specification import Perturbation
-from ns_abstract.refine.protocol import Method
+from ns_abstract.refine.protocol import Method, PreciseFrame
 
 
 @dataclass(frozen=True)
@@ -92,6 +93,14 @@ class Scene:
         return tuple(self.method().notes)
 
     @property
+    def run_frame(self) -> RunFrame | None:
+        """From the frame of the run's data set to the run's; None where the scene is no run."""
+        if self.source.file.is_file() and self.source.file.suffix.lower() not in (".yml", ".yaml"):
+            return None
+        transform = self._content.dataparser
+        return RunFrame(transform.matrix, transform.scale)
+
+    @property
     def assumptions(self) -> tuple[Assumption, ...]:
         """What was decided of the picture on reading it, and where each choice came from."""
         return tuple(self._content.assumptions)
@@ -149,10 +158,11 @@ def load_scene(
 
 
 def render(scene: Scene, camera: Camera) -> np.ndarray:
-    """The picture of one camera, float64 [H, W, 3] in [0, 1], of float32 precision: what `bound` encloses.
+    """The picture of one camera, float64 [H, W, 3] in [0, 1]: what `bound` encloses.
 
     Raises:
         InputError: The camera cannot be used.
     """
     frame = scene.method().frame(PoseSet.around(camera, Perturbation()))
-    return assemble(frame.render(frame.box.middle), frame.camera).astype(np.float64)
+    draw = frame.precise if isinstance(frame, PreciseFrame) else frame.render
+    return assemble(draw(frame.box.middle), frame.camera).astype(np.float64)

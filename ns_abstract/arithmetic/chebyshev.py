@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ns_abstract.arithmetic.forms import Float64Array
+from ns_abstract.arithmetic.rounding import GRID_UP
 
 
 def chebyshev_values(points: Float64Array, degree: int) -> Float64Array:
@@ -108,7 +109,7 @@ class ChebyshevBasis:
     @property
     def norming(self) -> float:
         """A polynomial's largest absolute value over the largest on the grid, at most (Ehlich and Zeller 1964)."""
-        return math.cos(0.5 * math.pi * self.degree / self.grid) ** -self.dimensions * (1.0 + 1e-12)
+        return math.cos(0.5 * math.pi * self.degree / self.grid) ** -self.dimensions * GRID_UP
 
     @cached_property
     def chord(self) -> Float64Array:
@@ -118,7 +119,7 @@ class ChebyshevBasis:
         T_k is at most ``k_j^2`` along axis j.
         """
         step = np.pi / self.grid
-        return 0.125 * step * step * (1.0 + 1e-12) * np.square(self.indices.astype(np.float64)).sum(axis=1)
+        return 0.125 * step * step * GRID_UP * np.square(self.indices.astype(np.float64)).sum(axis=1)
 
     def bernstein(self, parts: tuple[int, ...]) -> Float64Array:
         """[n, (degree + 1)^d, m]: Bernstein coefficients of every basis polynomial on equal parts of ``[-1, 1]^d``.

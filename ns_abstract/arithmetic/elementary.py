@@ -17,9 +17,7 @@ from numba.extending import intrinsic
 
 from ns_abstract.arithmetic.simd.lanes import LanesType, by_intrinsic, common_type, operands
 
-#: Proven bound of ``|exp_kernel(x) - exp(x)| / exp(x)`` for ``EXP_LOWEST <= x <= EXP_HIGHEST``
-#: (design.md, E1): truncation 2.4e-16, reduction and Horner rounding 3 units, scaling exact.
-EXP_RELATIVE_ERROR = 2.0**-50
+#: Where `exp_kernel` errs by no more than `rounding.EXP_RELATIVE_ERROR` of the value (design.md, E1).
 EXP_LOWEST = -700.0
 EXP_HIGHEST = 700.0
 

@@ -29,14 +29,21 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from ns_abstract.arithmetic.rounding import FORM_ROUNDING, UNDERFLOW64, UP
+from ns_abstract.arithmetic.rounding import (
+    ADDED_PRODUCT_ROUNDING,
+    CURVATURE_DOWN,
+    FORM_ROUNDING,
+    LARGEST,
+    RANGE_ROUNDING,
+    SMALLEST,
+    UNDERFLOW64,
+    UP,
+)
 
 Float64Array = NDArray[np.float64]
 
 #: Largest number of parameters of a set.
 MAX_DIMENSIONS = 8
-# Between these, fourth powers and their reciprocals neither overflow nor lose digits to underflow.
-SMALLEST, LARGEST = 1e-75, 1e75
 
 
 @dataclass(frozen=True)
@@ -242,7 +249,7 @@ def add_product(a, b, sign, out, d, order, m):
     for q in range(n):
         pa = out[m + 1, q]
         pb = out[m + 2, q]
-        out[m, q] += pa * b[m, q] + pb * a[m, q] + a[m, q] * b[m, q] + 4.0 * FORM_ROUNDING * (pa * pb)
+        out[m, q] += pa * b[m, q] + pb * a[m, q] + a[m, q] * b[m, q] + ADDED_PRODUCT_ROUNDING * (pa * pb)
     for q in range(n):
         out[0, q] += sign * (a[0, q] * b[0, q])
     for k in range(1, m):
@@ -286,7 +293,7 @@ def add_square(a, out, d, order, m):
         r = a[m, q]
         half = 0.5 * (l * l)
         p = abs(a[0, q]) + l
-        out[m, q] = (out[m, q] + (2.0 * p + r) * r + half + 4.0 * FORM_ROUNDING * (p * p)) * UP + UNDERFLOW64
+        out[m, q] = (out[m, q] + (2.0 * p + r) * r + half + ADDED_PRODUCT_ROUNDING * (p * p)) * UP + UNDERFLOW64
     for q in range(n):
         out[0, q] += a[0, q] * a[0, q] + 0.5 * (a[m + 1, q] * a[m + 1, q])
     for k in range(1, m):
@@ -305,7 +312,7 @@ def bounds(a, low, high, d, order, m):
             high[q] = a[0, q] + spread
         return
     for q in range(n):
-        spread = a[m, q] + 8.0 * FORM_ROUNDING * (abs(a[0, q]) + a[m + 1, q] + a[m + 2, q])
+        spread = a[m, q] + RANGE_ROUNDING * (abs(a[0, q]) + a[m + 1, q] + a[m + 2, q])
         low[q] = -spread * UP
         high[q] = spread * UP
     row = d + 1
@@ -375,7 +382,7 @@ def square_root(a, work, out, d, order, m):
         else:
             high = (c + e) * UP
             work[2, q] = -0.125 / (low * np.sqrt(low)) * UP if inside else -np.inf
-            work[3, q] = -0.125 / (high * np.sqrt(high)) * (1.0 - 4.0 * FORM_ROUNDING) if inside else np.inf
+            work[3, q] = -0.125 / (high * np.sqrt(high)) * CURVATURE_DOWN if inside else np.inf
     compose(a, work[0], work[1], work[2], work[3], work[4], out, d, order, m)
 
 
@@ -396,7 +403,7 @@ def reciprocal_square_root(a, work, out, d, order, m):
             work[4, q] = 0.3125 / (low * low * low * np.sqrt(low)) * UP if inside else np.inf
         else:
             high = (c + e) * UP
-            work[2, q] = 0.375 / (high * high * np.sqrt(high)) * (1.0 - 4.0 * FORM_ROUNDING) if inside else -np.inf
+            work[2, q] = 0.375 / (high * high * np.sqrt(high)) * CURVATURE_DOWN if inside else -np.inf
             work[3, q] = 0.375 / (low * low * np.sqrt(low)) * UP if inside else np.inf
     compose(a, work[0], work[1], work[2], work[3], work[4], out, d, order, m)
 
@@ -422,7 +429,7 @@ def logarithm(a, work, out, d, order, m):
         else:
             high = (c + e) * UP
             work[2, q] = -0.5 / (low * low) * UP if inside else -np.inf
-            work[3, q] = -0.5 / (high * high) * (1.0 - 4.0 * FORM_ROUNDING) if inside else np.inf
+            work[3, q] = -0.5 / (high * high) * CURVATURE_DOWN if inside else np.inf
     compose(a, work[0], work[1], work[2], work[3], work[4], out, d, order, m)
     for q in range(out.shape[1]):
         out[m, q] += FORM_ROUNDING

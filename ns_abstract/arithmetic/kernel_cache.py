@@ -12,7 +12,8 @@ may use, and what is read back is what was written:
 
 ROOT is ``$NS_ABSTRACT_CACHE_DIR``, or ``kernels`` in the cache folder that the platform provides. Where that cannot be
 written, a temporary folder serves the process and those that it starts. The installation itself is never written to.
-numba is told by its setting ``CACHE_LOCATOR_CLASSES``.
+numba is told by its setting ``CACHE_LOCATOR_CLASSES``. Kept are kernels that Python calls; they hold what they call
+(`kernel_linking`).
 """
 
 from __future__ import annotations
@@ -37,6 +38,7 @@ import numba.core.config as settings
 import platformdirs
 from numba.core.caching import FunctionCache
 
+from ns_abstract.arithmetic import kernel_linking
 from ns_abstract.io.atomic import write_atomic
 from ns_abstract.io.errors import InputError
 
@@ -103,7 +105,7 @@ class KernelStore:
         self._complete = False
         self._published: dict[Path, tuple[int, int]] = {}
         self._entries = _read_manifest(self._folder)
-        self.compiled = 0
+        self.compiled, self.functions = 0, 0
         self._said = time.monotonic()
         with suppress(OSError):
             os.utime(self._folder)
@@ -233,6 +235,10 @@ class KernelStore:
                 fix=f"free some, or set {VARIABLE} to a folder elsewhere",
             )
         self.compiled += 1
+
+    def function_done(self) -> None:
+        """A kernel, or a function that one calls, was compiled."""
+        self.functions += 1
         now = time.monotonic()
         if now - self._said > _PACE:
             self._said = now
@@ -240,7 +246,7 @@ class KernelStore:
                 return
             # not after every kernel: it looks at all files of the session
             self.publish()
-            _log.info("compiling kernels (first use only): %d done", self.compiled)
+            _log.info("compiling kernels (first use only): %d functions done", self.functions)
 
     def close(self) -> None:
         """Publish, and remove the session's folder unless it is another process'."""
@@ -421,6 +427,9 @@ def _load_overload(cache: FunctionCache, signature: Any, context: Any) -> Any:
     kernel = _kernel(cache, signature)
     if kernel is None:
         return _load(cache, signature, context)
+    if kernel_linking.within_kernel():
+        # it becomes a part of that one
+        return None
     return store().claim(kernel, lambda: _load(cache, signature, context))
 
 
@@ -428,7 +437,7 @@ def _save_overload(cache: FunctionCache, signature: Any, data: Any) -> None:
     kernel = _kernel(cache, signature)
     if kernel is None:
         _save(cache, signature, data)
-    else:
+    elif not kernel_linking.within_kernel():
         store().saved(kernel, lambda: _save(cache, signature, data))
 
 
@@ -440,6 +449,7 @@ def install() -> None:
     others = settings.CACHE_LOCATOR_CLASSES or _LOCATORS  # pyright: ignore[reportAttributeAccessIssue]
     if ours not in others:
         settings.CACHE_LOCATOR_CLASSES = f"{ours},{others}"  # pyright: ignore[reportAttributeAccessIssue]
+    kernel_linking.install(lambda: store().function_done())
 
 
 install()

@@ -13,8 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
-from ns_abstract.arithmetic.forms import LARGEST, SMALLEST
-from ns_abstract.arithmetic.rounding import FORM_ROUNDING, UNDERFLOW64, UP
+from ns_abstract.arithmetic.rounding import FORM_ROUNDING, LARGEST, RANGE_ROUNDING, SMALLEST, UNDERFLOW64, UP
 
 
 class LineForm(NamedTuple):
@@ -106,7 +105,7 @@ def inverse_root(a):
 def ends(a):
     """Bounds of ``a`` over the box, rounded outward (A4; `forms.bounds`)."""
     g, s = abs(a.slope), a.bend
-    spread = (a.radius + 8.0 * FORM_ROUNDING * (abs(a.center) + g + abs(s))) * UP
+    spread = (a.radius + RANGE_ROUNDING * (abs(a.center) + g + abs(s))) * UP
     # g p + s p^2 over [-1, 1]: the ends, and the vertex where it lies inside
     vertex = -(g / (4.0 * (s if s != 0.0 else 1.0))) * g
     inside = g < 2.0 * abs(s)

@@ -15,7 +15,7 @@ A result that may be past `OVERFLOW`, in any grouping of scales, is not bounded 
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 from ns_abstract.io.errors import InputError
 
@@ -56,6 +56,8 @@ VARIANCE_PASSES = 3
 POSITION = 4.0 * UNIT
 #: What float32 makes of a cubic weight: about 112 roundings of 1, of a t^3 - 5 a t^2 + 8 a t - 4 a with t up to 2.
 POLYNOMIAL = 128.0 * UNIT
+#: The same roundings in float64, of the file's own weights in real arithmetic; as many to spare.
+OWN_POSITIONS = 2.0 * DOUBLE_UNIT / UNIT
 
 # ---------------------------------------------------------------- functions of one number (N10)
 
@@ -76,12 +78,60 @@ HARD = 16.0 * UNIT
 PRODUCT = 2.0 * UNIT
 #: Flushed numbers of a function of one number: what it reads, its constants, up to two numbers between, its result.
 FUNCTION_FLUSHES = 8.0
+#: A softmax's exponential: fused attentions compute two of them, each within 20 ulp (torch's `exp_u20`; 40 units),
+#: beside what is subtracted first, a share's product and its quotient: 80 and 16 units.
+ATTENTION = 96.0 * UNIT
+#: By each number of its sum: such a program takes blocks of 64 numbers with exponentials within 2 ulp, or of 512 within
+#: 20, and multiplies what it has by another exponential at each: 2 * 4 / 64 and 2 * 40 / 512 units, at most a quarter.
+ATTENTION_BLOCKS = 0.25 * UNIT
 #: More than exp(-30), what a softmax's share is at most where its sum is cut off.
 LOST_SHARE = 2.0**-43
 #: Largest argument of an exponential; 2^126 is past exp(87).
 LARGEST_EXPONENT = 80.0
+#: Values in steps: a quotient before the rounding, a product behind it, both of the largest step; 6 to spare.
+STEPS = 8.0 * UNIT
+#: Softplus above its switch: a library's exponential, taken to be within 16 units, at the file's limit.
+SWITCH = 1.0 + LIBRARY
 #: How far a constant in a file may be from the number that it stands for, relative: 2 roundings, 2 to spare.
 NEAR = 4.0 * UNIT
+
+# ---------------------------------------------------------------- constants that are computed (N23)
+
+
+class Format(NamedTuple):
+    """A floating-point type: unit roundoff, smallest normal number, and a number past which sums may overflow."""
+
+    unit: float
+    tiny: float
+    largest: float
+
+
+#: Half, single and double precision, by the bytes of a number; sums stay a factor 2, 4 or 2^24 below the largest one.
+FORMATS = {
+    2: Format(2.0**-11, 2.0**-14, 2.0**15),
+    4: Format(UNIT, FLUSH, OVERFLOW),
+    8: Format(DOUBLE_UNIT, 2.0**-1022, 2.0**1000),
+}
+#: One operation rounds once in the constant's own type, and 1 to spare.
+ONCE = 2.0
+#: Flushed numbers of one operation: two that are read, one that is written; 1 to spare.
+ONCE_FLUSHES = 4.0
+#: A float64 operation or library function, of up to three operations here: 4 units; 4 to spare.
+OWN_CONSTANT = 8.0 * DOUBLE_UNIT
+#: The argument of a sine or cosine, rounded as the middle of two numbers.
+OWN_ARGUMENT = 2.0 * DOUBLE_UNIT
+#: Roundings of sums beside their terms: a mean's quotient or a root, products; 2 to spare.
+CONSTANT_SUMS = 4.0
+#: A library's function in another type: 4 ulp.
+OTHER_LIBRARY = 8.0
+#: Exact constants, enclosed by float64 operations: nothing is flushed.
+EXACT = Format(OWN_CONSTANT, 0.0, 2.0**1000)
+#: How far a constant may be off, where what is off multiplies it: second order, far less than a sixteenth.
+DOUBTS_UP = 1.0 + 2.0**-4
+#: A weight norm: squares, their root, quotient, product: 5; 11 to spare, beside its sum. In float64: 2^9 units.
+WEIGHT_NORM, OWN_WEIGHT_NORM = 16.0, 2.0**9 * DOUBLE_UNIT
+#: A file's numbers divided in float64, where a function is recognised: up to 2^4 roundings; as many to spare.
+OWN_QUOTIENTS = 2.0**5 * DOUBLE_UNIT
 
 # ---------------------------------------------------------------- the package's own float64 (N0, N1, N4, N5)
 
@@ -103,6 +153,9 @@ OWN_WINDOW = 2.0**11 * DOUBLE_UNIT
 UP = 1.0 + 2.0**13 * DOUBLE_UNIT
 #: Magnitudes |W| |x|: sums of at most 2^24 products, twice.
 MAGNITUDES_UP = 1.0 + 2.0**25 * DOUBLE_UNIT
+#: Rows on images: sums of at most 2^24 products of two roundings each, a middle and a half; what they have gathered
+#: on the way is moved by up to 2^4 roundings, twice.
+OWN_ROWS, OWN_GATHERED = 2.0**25 * DOUBLE_UNIT, 2.0**5 * DOUBLE_UNIT
 #: Ends of images: an offset and a reference, one difference of them, 1 each; 2 to spare.
 OWN_IMAGE = 4.0 * DOUBLE_UNIT
 

@@ -19,19 +19,19 @@ from functools import cache
 import numpy as np
 from numba import njit
 
-from ns_abstract.arithmetic.elementary import EXP_RELATIVE_ERROR, exp_kernel
+from ns_abstract.arithmetic.elementary import exp_kernel
 from ns_abstract.arithmetic.forms import Float64Array
-from ns_abstract.arithmetic.rounding import UNIT64
+from ns_abstract.arithmetic.rounding import EXP_RELATIVE_ERROR, FUNCTION_ROUNDING, UNIT64
 
 #: Assumed errors: (relative to the value, absolute), by function.
-#: exp: `elementary.EXP_RELATIVE_ERROR`. log: `forms.logarithm` charges four units of ``|log x| + 1``. sqrt and
+#: exp: `rounding.EXP_RELATIVE_ERROR`. log: `forms.logarithm` charges four units of ``|log x| + 1``. sqrt and
 #: reciprocal: one rounding, as everywhere in `forms`. sin, cos: `trigonometry.cos_sin` charges four units.
 ASSUMED_ERRORS = {
     "exp": (EXP_RELATIVE_ERROR, 0.0),
-    "log": (4.0 * UNIT64, 4.0 * UNIT64),
+    "log": (FUNCTION_ROUNDING, FUNCTION_ROUNDING),
     "sqrt": (UNIT64, 0.0),
-    "sin": (0.0, 4.0 * UNIT64),
-    "cos": (0.0, 4.0 * UNIT64),
+    "sin": (0.0, FUNCTION_ROUNDING),
+    "cos": (0.0, FUNCTION_ROUNDING),
     "reciprocal": (UNIT64, 0.0),
 }
 

@@ -19,7 +19,17 @@ from typing import Any
 import numpy as np
 
 from ns_abstract.arithmetic.forms import Float64Array
-from ns_abstract.arithmetic.rounding import TAYLOR_UP, UNDERFLOW64, UNIT64
+from ns_abstract.arithmetic.rounding import (
+    ANGLE_ROUNDING,
+    FACTORIAL_UP,
+    LOWER_ROUNDING,
+    REMAINDER_UP,
+    TAYLOR_ROUNDING,
+    TAYLOR_UP,
+    UNDERFLOW64,
+    UNIT64,
+    taylor_product_rounding,
+)
 
 
 @dataclass(frozen=True)
@@ -131,7 +141,7 @@ class TaylorArray:
             else:
                 total[place] += product
         # a coefficient is a sum of at most as many products as there are monomials
-        rounding = (len(self.basis.exponents) + 2.0) * UNIT64 * a.size * b.size
+        rounding = taylor_product_rounding(len(self.basis.exponents)) * a.size * b.size
         radius = a.size * b.radius + b.size * a.radius + a.radius * b.radius + dropped + rounding
         return TaylorArray(self.basis, total, radius * TAYLOR_UP + UNDERFLOW64)
 
@@ -168,22 +178,22 @@ class TaylorArray:
         total = TaylorArray.constant(self.basis, derivatives[-1])
         for value in reversed(derivatives[:-1]):
             total = total * step + value
-        slack = sum(np.abs(v) * largest**k for k, v in enumerate(derivatives)) * (64.0 * UNIT64)
+        slack = sum(np.abs(v) * largest**k for k, v in enumerate(derivatives)) * TAYLOR_ROUNDING
         # powers of the largest take up to degree + 1 roundings
-        return total.widened((slack + last * largest ** (self.basis.degree + 1)) * (1.0 + 128.0 * UNIT64))
+        return total.widened((slack + last * largest ** (self.basis.degree + 1)) * REMAINDER_UP)
 
     def rsqrt(self) -> TaylorArray:
         """``1 / sqrt(x)``; not finite where ``x`` may be 0 or below."""
         n = self.basis.degree
         with np.errstate(all="ignore"):
-            low = (self.center - (self.size - np.abs(self.center)) - self.radius) * (1.0 - 64.0 * UNIT64)
-            low = low - 64.0 * UNIT64 * np.abs(self.center)
+            low = (self.center - (self.size - np.abs(self.center)) - self.radius) * (1.0 - LOWER_ROUNDING)
+            low = low - LOWER_ROUNDING * np.abs(self.center)
             low = np.where(low > 0.0, low, np.nan)
             factors = [1.0]
             for k in range(n + 1):
                 factors.append(factors[-1] * (-0.5 - k) / (k + 1))
             derivatives = [f * self.center ** (-0.5 - k) for k, f in enumerate(factors[:-1])]
-            last = abs(factors[-1]) * low ** (-0.5 - (n + 1)) * (1.0 + 128.0 * UNIT64)
+            last = abs(factors[-1]) * low ** (-0.5 - (n + 1)) * REMAINDER_UP
             result = self.compose(derivatives, last)
         result.radius = np.where(np.isfinite(result.radius), result.radius, np.inf)
         return result
@@ -195,10 +205,10 @@ def taylor_cos_sin(angle: TaylorArray) -> tuple[TaylorArray, TaylorArray]:
     middle = angle.center
     cosine, sine = np.cos(middle), np.sin(middle)
     cycle = (cosine, -sine, -cosine, sine)
-    last = np.full(angle.shape, 1.0 / math.factorial(n + 1) * (1.0 + 8.0 * UNIT64))
+    last = np.full(angle.shape, 1.0 / math.factorial(n + 1) * FACTORIAL_UP)
     # an absolute error of the centre's function moves every derivative
     largest = np.minimum(angle.size - np.abs(middle) + angle.radius, 700.0)
-    slack = 8.0 * UNIT64 * (np.abs(middle) + 2.0) * np.exp(largest)
+    slack = ANGLE_ROUNDING * (np.abs(middle) + 2.0) * np.exp(largest)
     found = []
     for offset in (0, 3):
         derivatives = [cycle[(k + offset) % 4] / math.factorial(k) for k in range(n + 1)]

@@ -5,16 +5,16 @@ from __future__ import annotations
 import numpy as np
 
 from ns_abstract.arithmetic.forms import Float64Array, FormArray
-from ns_abstract.arithmetic.rounding import UNIT64
+from ns_abstract.arithmetic.rounding import ANGLE_ROUNDING, FUNCTION_ROUNDING
 
 
 def _cosine_range(low: Float64Array, high: Float64Array) -> tuple[Float64Array, Float64Array]:
     """Bounds of cos over [low, high], rounded outward by four units."""
     at_low, at_high = np.cos(low), np.cos(high)
-    least = np.minimum(at_low, at_high) - 4 * UNIT64
-    most = np.maximum(at_low, at_high) + 4 * UNIT64
+    least = np.minimum(at_low, at_high) - FUNCTION_ROUNDING
+    most = np.maximum(at_low, at_high) + FUNCTION_ROUNDING
     # a multiple of 2 pi (or an odd multiple of pi) inside, tested with room for the rounding of pi
-    slack = 8 * UNIT64 * (np.abs(low) + np.abs(high) + 1.0)
+    slack = ANGLE_ROUNDING * (np.abs(low) + np.abs(high) + 1.0)
     turn = 2 * np.pi
     has_top = np.floor((high + slack) / turn) >= np.ceil((low - slack) / turn)
     has_bottom = np.floor((high + slack) / turn - 0.5) >= np.ceil((low - slack) / turn - 0.5)
@@ -30,7 +30,7 @@ def cos_sin(angle: FormArray) -> tuple[FormArray, FormArray]:
     low, high = angle.bounds()
     middle = angle.center
     cosine, sine = np.cos(middle), np.sin(middle)
-    slack = 8 * UNIT64 * (np.abs(middle) + 2.0)
+    slack = ANGLE_ROUNDING * (np.abs(middle) + 2.0)
     if angle.basis.order == 2:
         cos_form = angle.compose(cosine, -sine, -0.5 * cosine, -0.5 * cosine, 1.0 / 6.0)
         sin_form = angle.compose(sine, cosine, -0.5 * sine, -0.5 * sine, 1.0 / 6.0)

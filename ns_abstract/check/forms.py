@@ -10,10 +10,8 @@ from typing import Any
 
 import numpy as np
 
-#: Unit roundoff of float64.
-U = 2.0**-53
-#: What underflow may add.
-TINY = 1e-290
+#: Unit roundoff of float64, and what underflow may add.
+U, TINY = 2.0**-53, 1e-290
 #: Relative error, in units, of numpy's exponential, sine and cosine; the libraries' own figure is 4 at most.
 FUNCTION = 8.0
 
@@ -31,8 +29,8 @@ class Form:
     @classmethod
     def constant(cls, c: Array, like: Form, r: Array = 0.0) -> Form:
         """``c`` within ``r``, of the shape of ``like``."""
-        c = np.broadcast_to(np.asarray(c, np.float64), like.c.shape)
-        return cls(c, np.zeros_like(like.g), np.broadcast_to(np.asarray(r, np.float64), like.c.shape))
+        shape = like.c.shape
+        return cls(np.broadcast_to(np.float64(c), shape), np.zeros_like(like.g), np.broadcast_to(np.float64(r), shape))
 
     @property
     def slope(self) -> Array:
@@ -48,6 +46,14 @@ class Form:
         """Lower and upper bounds."""
         w = self.width + 2.0 * U * np.abs(self.c)
         return self.c - w, self.c + w
+
+    def size(self) -> Array:
+        """The largest absolute value."""
+        return np.abs(self.c) + self.width
+
+    def wider(self, r: Array) -> Form:
+        """The form with an error that is larger by ``r``."""
+        return Form(self.c, self.g, (self.r + r) * (1.0 + 2.0 * U))
 
     def __neg__(self) -> Form:
         return Form(-self.c, -self.g, self.r)
@@ -83,64 +89,54 @@ class Form:
     def square(self) -> Form:
         """The form of the square."""
         a = self.slope
-        p = np.abs(self.c) + a
-        half = 0.5 * a * a
+        p, half = np.abs(self.c) + a, 0.5 * a * a
         # (g . s)^2 lies in [0, a^2]
         r = half + self.r * (2.0 * p + self.r) + 32.0 * U * p * p
         return Form(self.c * self.c + half, 2.0 * self.c * self.g, r * (1.0 + 32.0 * U) + TINY)
 
-    def composed(self, f: Array, slope: Array, low: Array, high: Array) -> Form:
+    def composed(self, f: Array, slope: Array, low: Array, high: Array, bad: Array = False) -> Form:
         """The form of a function with value ``f`` and slope at the centre, half its second derivative in [low, high].
 
-        The remainder of Taylor's formula is ``t^2`` times half the second derivative, ``t^2`` in [0, width^2].
+        The remainder of Taylor's formula is ``t^2`` times half the second derivative, ``t^2`` in [0, width^2]. The
+        form is unbounded where ``bad``.
         """
         w = self.width
-        square = w * w
-        low, high = np.minimum(low, 0.0) * square, np.maximum(high, 0.0) * square
-        r = np.abs(slope) * self.r + 0.5 * (high - low)
+        low, high = np.minimum(low, 0.0) * (w * w), np.maximum(high, 0.0) * (w * w)
         size = np.abs(f) + np.abs(slope) * w + high - low
-        r = (r + 4.0 * FUNCTION * U * size) * (1.0 + 32.0 * U) + TINY
-        good = np.isfinite(r) & np.isfinite(f)
-        return Form(f + 0.5 * (high + low), slope * self.g, np.where(good, r, np.inf))
+        r = (np.abs(slope) * self.r + 0.5 * (high - low) + 4.0 * FUNCTION * U * size) * (1.0 + 32.0 * U) + TINY
+        bad = bad | ~(np.isfinite(r) & np.isfinite(f))
+        f = f + 0.5 * (high + low)
+        return Form(np.where(bad, 0.0, f), np.where(bad, 0.0, slope * self.g), np.where(bad, np.inf, r))
 
     def reciprocal(self) -> Form:
         """1 / x; unbounded where the form is not surely above 0."""
         low, high = self.range()
-        good = low > 0.0
-        low, high, c = (np.where(good, v, 1.0) for v in (low, high, self.c))
-        found = self.composed(1.0 / c, -1.0 / (c * c), high**-3.0, low**-3.0 * (1.0 + 16.0 * U))
-        return found.unless(~good)
+        bad = ~(low > 0.0)
+        low, high, c = (np.where(bad, 1.0, v) for v in (low, high, self.c))
+        return self.composed(1.0 / c, -1.0 / (c * c), high**-3.0, low**-3.0 * (1.0 + 16.0 * U), bad)
 
     def root(self) -> Form:
         """The square root; unbounded where the form is not surely above 0."""
-        low, _ = self.range()
-        good = low > 0.0
-        low, c = np.where(good, low, 1.0), np.where(good, self.c, 1.0)
-        f = np.sqrt(c)
-        found = self.composed(f, 0.5 / f, -0.125 * low**-1.5 * (1.0 + 32.0 * U), 0.0 * f)
-        return found.unless(~good)
+        low = self.range()[0]
+        bad = ~(low > 0.0)
+        low, f = np.where(bad, 1.0, low), np.sqrt(np.where(bad, 1.0, self.c))
+        return self.composed(f, 0.5 / f, -0.125 * low**-1.5 * (1.0 + 32.0 * U), 0.0 * f, bad)
 
     def exp(self) -> Form:
         """The exponential."""
         high = self.range()[1]
         f = np.exp(np.minimum(self.c, 700.0))
         top = 0.5 * np.exp(np.minimum(high, 700.0)) * (1.0 + 16.0 * FUNCTION * U)
-        return self.composed(f, f, 0.0 * f, top).unless(high > 690.0)
+        return self.composed(f, f, 0.0 * f, top, ~(high <= 690.0))
 
     def sine(self) -> tuple[Form, Form]:
         """Sine and cosine."""
         s, c = np.sin(self.c), np.cos(self.c)
-        half = np.full(np.shape(s), 0.5 * (1.0 + 8.0 * U))
+        half, room = 0.5 * (1.0 + 8.0 * U), 0.5 * self.width + 1e-15
         # the second derivative moves by no more than the angle
-        found = []
-        for f, slope in ((s, c), (c, -s)):
-            middle, room = -0.5 * f, 0.5 * self.width + 1e-15
-            found.append(self.composed(f, slope, np.maximum(middle - room, -half), np.minimum(middle + room, half)))
-        return found[0], found[1]
-
-    def unless(self, bad: Array) -> Form:
-        """The form, unbounded where ``bad``."""
-        return Form(np.where(bad, 0.0, self.c), np.where(bad, 0.0, self.g), np.where(bad, np.inf, self.r))
+        ends = ((np.maximum(-0.5 * f - room, -half), np.minimum(-0.5 * f + room, half)) for f in (s, c))
+        a, b = (self.composed(f, slope, *end) for f, slope, end in zip((s, c), (c, -s), ends, strict=True))
+        return a, b
 
     def boxed(self, where: Array, low: Array, high: Array) -> Form:
         """The form, but the interval [low, high] ``where`` that is asked for."""
@@ -154,25 +150,18 @@ class Form:
         met = ~((least >= low) & (most <= high))
         return self.boxed(met, np.clip(least, low, high), np.clip(most, low, high))
 
-    def among(self, index: Array) -> Form:
-        """Some of the n functions of every row [B, n]."""
-        return Form(self.c[:, index], self.g[:, :, index], self.r[:, index])
-
-    def take(self, order: Array) -> Form:
-        """The functions of every row in another order: ``order`` [B, n]."""
-        along = np.take_along_axis
-        return Form(along(self.c, order, 1), along(self.g, order[None], 2), along(self.r, order, 1))
+    def of(self, pick: Any) -> Form:
+        """The form of what ``pick`` makes of its arrays, whose axes it must count from the last one."""
+        return Form(pick(self.c), pick(self.g), pick(self.r))
 
 
 def parameters(middle: Array, half: Array) -> list[Form]:
-    """The d parameters over the boxes ``middle`` +- ``half`` [B, d], as forms [B]."""
+    """The d parameters over the boxes ``middle`` +- ``half`` [B, d], as forms [B]; a constant if there is none."""
     d = middle.shape[1]
-    found = []
-    for k in range(d):
-        g = np.zeros((d, len(middle)))
-        g[k] = half[:, k]
-        found.append(Form(middle[:, k], g, 4.0 * U * (np.abs(middle[:, k]) + half[:, k])))
-    return found
+    g = np.eye(d)[:, :, None] * half.T[:, None]
+    room = 4.0 * U * (np.abs(middle) + half)
+    found = [Form(middle[:, k], g[:, k], room[:, k]) for k in range(d)]
+    return found or [Form(np.zeros(len(middle)), np.zeros((0, len(middle))), np.zeros(len(middle)))]
 
 
 def product(a: list[list[Form]], b: list[list[Form]]) -> list[list[Form]]:
@@ -188,14 +177,13 @@ def total(items: Any) -> Form:
     return first
 
 
-def rotation(axis: Array, angle: Form) -> list[list[Form]]:
-    """Right-handed rotation about the unit vector ``axis``: I + sin K + (1 - cos) K^2."""
+def rotation(axis: Array, angle: Form, error: float = 0.0) -> list[list[Form]]:
+    """Right-handed rotation about the unit vector ``axis``: I + sin K + (1 - cos) K^2, entries within ``error``."""
     x, y, z = (float(v) for v in axis)
     k = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-    kk, (s, c) = k @ k, angle.sine()
+    kk, (s, c), one = k @ k, angle.sine(), np.eye(3)
     rest = -c + 1.0
-    one = np.eye(3)
-    return [[s * k[i, j] + rest * kk[i, j] + one[i, j] for j in range(3)] for i in range(3)]
+    return [[(s * k[i, j] + rest * kk[i, j] + one[i, j]).wider(error) for j in range(3)] for i in range(3)]
 
 
 def fixed(matrix: Array, like: Form, r: float = 0.0) -> list[list[Form]]:

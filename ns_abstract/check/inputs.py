@@ -15,9 +15,10 @@ import torch
 import yaml
 
 from ns_abstract.check.poses import SHIFTS, TURNS, Camera, Poses
-from ns_abstract.check.splats import RULES, Splats, activated
+from ns_abstract.check.splats import Splats, activated
 
 Array = Any
+Field: Any = None
 
 _COLORS = {
     "random": (0.1490, 0.1647, 0.2157), "white": (1.0, 1.0, 1.0), "black": (0.0, 0.0, 0.0),
@@ -25,7 +26,10 @@ _COLORS = {
 }  # fmt: skip
 #: Bytes of the largest text that is read.
 _TEXT = 256 << 20
-_MODES = {"classic": "classic", "default": "classic", "antialiased": "antialiased", "mip": "antialiased"}
+_MODES = {"mip": "antialiased", "1": "antialiased", "true": "antialiased"}
+_MODES |= {"default": "classic", "0": "classic", "false": "classic"}
+_MOVED = "say with --load-config where the scene lies now"
+_SCENE = "give the run of the result"
 
 
 class BadInput(ValueError):
@@ -60,110 +64,107 @@ class _Inert(yaml.SafeLoader):
 def _plain(loader: Any, suffix: str, node: Any) -> Any:
     if isinstance(node, yaml.SequenceNode):
         return loader.construct_sequence(node, deep=True)
-    if isinstance(node, yaml.MappingNode):
-        return loader.construct_mapping(node, deep=True)
-    return loader.construct_scalar(node)
+    mapping = isinstance(node, yaml.MappingNode)
+    return loader.construct_mapping(node, deep=True) if mapping else loader.construct_scalar(node)
 
 
 _Inert.add_multi_constructor("tag:yaml.org,2002:python/", _plain)
 _Inert.add_multi_constructor("!", _plain)
 
 
-def read_scene(file: Path, settings: dict[str, Any], about: dict[str, Any], version: str) -> tuple[Splats, str]:
-    """The scene that a result is about, and the digest that its report must give.
+def read_scene(file: Path, report: dict[str, Any]) -> Splats | Field:
+    """The scene that a result is about: what its digest in the report says, or nothing.
 
     Args:
-        file: config.yml or .ply.
-        settings: The options that the result was made with.
-        about: The report's ``scene``.
-        version: gsplat's.
+        file: config.yml, its folder or .ply.
+        report: Of the result.
     """
-    if file.is_dir():
-        file = file / "config.yml"
+    settings, about, renderer = report["settings"], report["scene"], report["renderer"]
+    file = file / "config.yml" if file.is_dir() else file
     if not file.is_file():
-        raise BadInput("no such run", file, fix="say with --load-config where the scene lies now")
-    stored, mode, background, sigmoid, degree = (_read_ply if file.suffix == ".ply" else _read_run)(file, settings)
-    mode = settings.get("rasterize_mode") or mode
-    if settings.get("background") is not None:
-        background = settings["background"]
-    background = np.array(background, np.float32)
-    squares = np.square(stored[2].astype(np.float64)).sum(axis=1)
-    stored = [np.ascontiguousarray(a[squares > 0.0], np.float32) for a in stored]
-    if settings.get("drop_nan_gaussians"):
-        good = np.all([np.isfinite(a).reshape(len(a), -1).all(axis=1) for a in stored], axis=0)
-        stored = [np.ascontiguousarray(a[good]) for a in stored]
-    if not all(np.isfinite(a).all() for a in stored):
+        raise BadInput("no such run", file, fix=_MOVED)
+    with file.open("rb") as stream:
+        ply = stream.read(4) in (b"ply\n", b"ply\r")
+    if renderer["name"] == "nerf-uniform":
+        found, digest = _read_field(*_read_run(file, settings), file, settings, renderer)
+        digest = digest.hexdigest()
+    else:
+        (*stored, mode, background, sigmoid, degree) = (_read_ply if ply else _read_splats)(file, settings)
+        mode, background = settings.get("rasterize_mode") or mode, settings.get("background") or background
+        background = np.array(background, np.float32)
+        if mode != about.get("rasterize_mode") or [float(v) for v in background] != about.get("background"):
+            raise BadInput("the result was made with another mode or background", file, fix=_SCENE)
+        stored = [np.ascontiguousarray(a, np.float32) for a in _drawn(stored, file, settings)]
+        digest = hashlib.sha256(b"".join(a.tobytes() for a in (*stored, background)))
+        digest.update(repr(("sigmoid" if sigmoid else "sh", degree, mode)).encode())
+        about = {"sigmoid": sigmoid, "degree": degree, "antialiased": mode == "antialiased", "background": background}
+        found, digest = activated(*stored, **about, version=renderer["version"]), digest.hexdigest()
+    if digest != report["fingerprint"].get("scene"):
+        raise BadInput("is not the scene of the result (its digest differs)", file, fix=_SCENE)
+    return found
+
+
+def _drawn(stored: list[Array], file: Path, settings: dict[str, Any]) -> list[Array]:
+    """The Gaussians that gsplat draws: those of finite means and quaternions, and of scales that are numbers."""
+    means, logs, quats, logits, sh = stored
+    with np.errstate(over="ignore", invalid="ignore"):
+        squares, scales = np.square(quats.astype(np.float64)).sum(axis=1), np.exp(logs.astype(np.float64))
+    drawn = np.isfinite(means).all(1) & np.isfinite(quats).all(1) & ~np.isnan(logs).any(1) & (squares > 0.0)
+    whole = (scales <= np.finfo(np.float32).max * (1.0 - 1e-6)).all(1) & ~np.isnan(logits) & np.isfinite(sh).all((1, 2))
+    if (drawn & ~whole).any() and not settings.get("drop_nan_gaussians"):
         raise BadInput("holds numbers that are not finite", file)
-    if mode != about.get("rasterize_mode") or [float(v) for v in background] != about.get("background"):
-        raise BadInput("the result was made with another mode or background", file, fix="give the run of the result")
-    digest = hashlib.sha256()
-    for array in (*stored, background):
-        digest.update(np.ascontiguousarray(array, np.float32).tobytes())
-    digest.update(repr(("sigmoid" if sigmoid else "sh", degree, mode)).encode())
-    found = activated(
-        *stored,
-        sigmoid=sigmoid,
-        degree=degree,
-        antialiased=mode == "antialiased",
-        background=background,
-        version=version,
-    )
-    return found, digest.hexdigest()
+    return [a[drawn & whole] for a in stored]
 
 
-def _read_run(file: Path, settings: dict[str, Any]) -> tuple[list[Array], str, Any, bool, int]:
+def _read_run(file: Path, settings: dict[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
+    """A run's model configuration and its tensors by their names in the model."""
     try:
-        loader = _Inert(file.read_text(encoding="utf-8"))
-        root = loader.get_single_data()
-        model = root["pipeline"]["model"]
-        target = str(root["relative_model_dir"] if isinstance(root.get("relative_model_dir"), str) else "")
-        parts = root.get("relative_model_dir")
-        folder = file.parent / (target or "/".join(parts) if parts else "nerfstudio_models")
-        step = settings.get("load_step")
-        step = root.get("load_step") if step is None else step
-        degree, interval = int(model.get("sh_degree", 3)), int(model.get("sh_degree_interval", 1000))
-        mode, color = model.get("rasterize_mode", "classic"), model.get("background_color", "random")
-        background = _COLORS[color.lower()] if isinstance(color, str) else [float(v) for v in color]
+        root = _Inert(file.read_text(encoding="utf-8")).get_single_data()
+        model, parts = dict(root["pipeline"]["model"]), root.get("relative_model_dir") or "nerfstudio_models"
+        folder = file.parent / (parts if isinstance(parts, str) else "/".join(parts))
+        step = root.get("load_step") if settings.get("load_step") is None else settings["load_step"]
     except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError, yaml.YAMLError):
-        raise BadInput("cannot be read as a Splatfacto run's configuration", file) from None
-    names = {
-        int(m[1]): p for p in sorted(folder.glob("step-*.ckpt")) if (m := re.fullmatch(r"step-(\d+)\.ckpt", p.name))
-    }
+        raise BadInput("cannot be read as a run's configuration", file) from None
+    found = ((re.fullmatch(r"step-(\d+)\.ckpt", p.name), p) for p in sorted(folder.glob("step-*.ckpt")))
+    names = {int(match[1]): p for match, p in found if match}
     if not names or (step is not None and int(step) not in names):
         raise BadInput("no such checkpoint" if names else "no checkpoints", folder, fix="give the whole run folder")
     checkpoint = names[max(names) if step is None else int(step)]
-    state = _state(checkpoint)
-    prefix = "" if "means" in state else "gauss_params."
-    try:
-        a = {n: state[prefix + n].float().numpy() for n in ("means", "scales", "quats", "opacities", "features_dc")}
-        rest = state[f"{prefix}features_rest"].float().numpy()[:, : (min(30000 // interval, degree) + 1) ** 2 - 1]
-        count = len(a["means"])
-        sh = np.concatenate([a["features_dc"].reshape(count, 1, 3), rest.reshape(count, -1, 3)], axis=1)
-        stored = [a["means"], a["scales"], a["quats"], a["opacities"].reshape(-1), sh]
-    except (KeyError, ValueError, AttributeError):
-        raise BadInput("holds no Gaussians of Splatfacto", checkpoint) from None
-    return stored, mode, background, degree == 0, min(30000 // interval, degree)
-
-
-def _state(checkpoint: Path) -> dict[str, Any]:
-    """The model's tensors by their names in the model."""
-    scalar = np.float64(0.0).__reduce__()[0]
-    kinds = [type(np.dtype(code)) for code in ("f8", "f4", "i8", "i4", "?")]
+    scalar, kinds = np.float64(0.0).__reduce__()[0], [type(np.dtype(code)) for code in ("f8", "f4", "i8", "i4", "?")]
     safe = [(scalar, "numpy.core.multiarray.scalar"), (scalar, "numpy._core.multiarray.scalar"), np.dtype, *kinds]
     try:
         with torch.serialization.safe_globals(safe), warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            root = torch.load(checkpoint, map_location="cpu", weights_only=True)
-        pipeline = root["pipeline"]
-        names = {key.removeprefix("module."): value for key, value in pipeline.items()}
+            state = torch.load(checkpoint, map_location="cpu", weights_only=True)["pipeline"]
+        state = {key.removeprefix("module."): value for key, value in state.items()}
     except Exception:  # torch raises whatever a damaged file makes it run into
         raise BadInput("cannot be read as a checkpoint", checkpoint) from None
-    return {
-        key.removeprefix("_model.").removeprefix("module."): v for key, v in names.items() if key.startswith("_model.")
-    }
+    inside = ((key.removeprefix("_model."), value) for key, value in state.items() if key.startswith("_model."))
+    return model, {key.removeprefix("module."): value for key, value in inside}
 
 
-def _read_ply(file: Path, settings: dict[str, Any]) -> tuple[list[Array], str, Any, bool, int]:
+def _color(value: Any) -> tuple[float, ...]:
+    return _COLORS[value.lower()] if isinstance(value, str) else tuple(float(v) for v in value)
+
+
+def _read_splats(file: Path, settings: dict[str, Any]) -> tuple[Any, ...]:
+    model, state = _read_run(file, settings)
+    prefix = "" if "means" in state else "gauss_params."
+    try:
+        stored, interval = int(model.get("sh_degree", 3)), int(model.get("sh_degree_interval", 1000))
+        degree = min(30000 // interval, stored)
+        a = {n: state[prefix + n].float().numpy() for n in ("means", "scales", "quats", "opacities", "features_dc")}
+        count, rest = len(a["means"]), state.get(f"{prefix}features_rest", torch.zeros(0)).float().numpy()
+        rest = rest.reshape(count, -1, 3)[:, : (degree + 1) ** 2 - 1]
+        sh = np.concatenate([a["features_dc"].reshape(count, 1, 3), rest], axis=1)
+        background = _color(model.get("background_color", "random"))
+        found = a["means"], a["scales"], a["quats"], a["opacities"].reshape(-1), sh
+    except (KeyError, ValueError, TypeError, AttributeError, ZeroDivisionError):
+        raise BadInput("holds no Gaussians of Splatfacto", file) from None
+    return *found, model.get("rasterize_mode", "classic"), background, stored == 0, degree
+
+
+def _read_ply(file: Path, settings: dict[str, Any]) -> tuple[Any, ...]:
     import plyfile
 
     try:
@@ -176,20 +177,48 @@ def _read_ply(file: Path, settings: dict[str, Any]) -> tuple[list[Array], str, A
         sh = np.concatenate([dc, more], axis=1)
         groups = (("x", "y", "z"), [f"scale_{k}" for k in range(3)], [f"rot_{k}" for k in range(4)])
         stored = [np.stack([columns[name] for name in group], axis=1) for group in groups]
-        stored += [columns["opacity"], sh]
+        with file.open("rb") as stream:
+            header = stream.read(1 << 16).partition(b"end_header")[0].decode("latin-1").split("\n")
     except Exception:  # plyfile raises whatever a damaged file makes it run into
         raise BadInput("cannot be read as a 3DGS .ply", file) from None
+    if "filter_3D" in columns:
+        raise BadInput("has a filter, which this program does not apply", file, "filter_3D", "convert the file")
     mode = "classic"
-    for comment in (*data.comments, *data.obj_info):
-        match = re.fullmatch(r"splatrendermode\b[\s:=]*(.*)", comment.strip(), re.IGNORECASE)
+    for line in header:
+        pattern = r"(?:comment|obj_info)\s+(splatrendermode|antialiased)\b[\s:=]*(.*)"
+        match = re.fullmatch(pattern, line.strip(), re.IGNORECASE)
         if match:
-            said = match[1].strip().strip("'\"").lower()
-            if said not in _MODES and not settings.get("rasterize_mode"):
-                raise BadInput(f"found {said!r}", file, "comment SplatRenderMode", "give a scene of 3D Gaussians")
-            mode = _MODES.get(said, mode)
-    degree = math.isqrt(sh.shape[1]) - 1
+            value = match[2].strip().strip("'\"").lower()
+            known = value in _MODES and (value in ("mip", "default")) == (match[1].lower() == "splatrendermode")
+            if not known and not settings.get("rasterize_mode"):
+                raise BadInput(f"found {value!r}", file, f"comment {match[1]}", "give a scene of 3D Gaussians")
+            mode = _MODES[value] if known else "classic"
     # a file of degree 0 holds spherical harmonics, too
-    return stored, mode, (0.0, 0.0, 0.0), False, degree
+    return *stored, columns["opacity"], sh, mode, (0.0, 0.0, 0.0), False, math.isqrt(sh.shape[1]) - 1
+
+
+def _read_field(model: dict[str, Any], state: dict[str, Any], file: Path, settings: Any, renderer: Any) -> Any:
+    """The fine field of vanilla-nerf on equal bins, and the digest of what is drawn."""
+    if settings.get("occupancy_grid"):
+        raise BadInput("is declared empty by a grid, which this program does not read", file, "occupancy_grid")
+    try:
+        params = model.get("collider_params") or {}
+        far, near = float(params.get("far_plane", 6.0)), float(settings.get("near_plane") or 0.0)
+        background = settings.get("background") or (0.0,) * 3
+        if not settings.get("background") and model.get("background_color", "white") != "random":
+            background = _color(model.get("background_color", "white"))
+        background = tuple(float(np.float32(v)) for v in background)
+        found = Field.of({k: v.float().numpy() for k, v in state.items() if k.startswith("field_fine.")})
+        found.near, found.far, found.samples, found.background = near, far, int(renderer["samples"]), background
+    except (KeyError, ValueError, TypeError, AttributeError):
+        raise BadInput("holds no field of vanilla-nerf", file) from None
+    digest = hashlib.sha256()
+    for array in found.arrays:
+        digest.update(repr(array.shape).encode() + np.ascontiguousarray(array).tobytes())
+    codes = ", ".join(f"Encoding(count={n}, least=0.0, most={m})" for n, m in found.counts)
+    sampling = f"near={near!r}, far={far!r}, samples={found.samples}, importance=0, background={background!r}"
+    digest.update(f"({codes}, Sampling(kind='uniform', {sampling}))".encode())
+    return found, digest
 
 
 def dataset_scale(config: Path) -> float:
@@ -198,9 +227,7 @@ def dataset_scale(config: Path) -> float:
     return float(read_json(file, "dataparser transform")["scale"]) if file.is_file() else 1.0
 
 
-def read_poses(
-    path: Path, given: dict[str, Any] | None, frame: int, settings: dict[str, Any], scale: float
-) -> tuple[Poses, Any]:
+def read_poses(path: Path, given: dict[str, Any] | None, frame: int, settings: dict[str, Any], scale: float) -> Any:
     """The poses of a frame, and its box of parameters as [(name, lower, upper)].
 
     Args:
@@ -212,47 +239,34 @@ def read_poses(
     """
     root = read_json(path, "camera path", "say with --camera-path-filename where it lies now")
     try:
-        entries = root["camera_path"]
-        own = entries[frame].get("perturbation") or root.get("perturbation") or {}
-        spec = own if given is None else given
+        entries, angle = root["camera_path"], math.pi / 180.0
+        spec = (entries[frame].get("perturbation") or root.get("perturbation") or {}) if given is None else given
         camera = _camera(root, entries[frame], float(settings.get("downscale_factor") or 1.0))
-        after = entries[(frame + 1) % len(entries)]
-        following = np.array(after["camera_to_world"], np.float64).reshape(4, 4)[:3]
-        turn = math.pi / 180.0 if spec.get("angle_units", "radians") == "degrees" else 1.0
+        cycle = frame + 1 < len(entries) or (root.get("is_cycle") is True and len(entries) > 1)
+        swept = spec.get("sweep", "keyframes") == "segments" and cycle
+        following = np.array(entries[(frame + 1) % len(entries)]["camera_to_world"], np.float64).reshape(4, 4)[:3]
+        turn = angle if spec.get("angle_units", "radians") == "degrees" else 1.0
         length = scale if spec.get("units", "normalised") == "dataset" else 1.0
-        ranges = {}
+        orbit, ends = spec.get("orbit"), {}
         for key, names, factor in (("translation", SHIFTS, length), ("rotation", tuple(TURNS), turn)):
-            for name in names:
-                ends = spec.get(key, {}).get(name, 0.0)
-                low, high = (-ends, ends) if isinstance(ends, (int, float)) else ends
-                ranges[name] = (factor * low, factor * high) if factor != 1.0 else (float(low), float(high))
-        if spec.get("sweep", "keyframes") == "segments":
-            ranges["segment"] = (0.0, 1.0)
-        orbit = spec.get("orbit")
+            ends |= {name: (spec.get(key, {}).get(name, 0.0), factor) for name in names}
+        ends |= {"segment": ((0.0, 1.0), 1.0)} if swept else {}
         if orbit is not None:
-            ends = orbit["azimuth"]
-            low, high = (-ends, ends) if isinstance(ends, (int, float)) else ends
-            ranges["azimuth"] = (turn * low, turn * high)
+            ends["azimuth"] = (orbit["azimuth"], turn)
             orbit = (np.array(orbit["target"], np.float64), np.array(orbit["axis"], np.float64))
+        ranges = {}
+        for name, (value, factor) in ends.items():
+            low, high = (-value, value) if isinstance(value, (int, float)) else value
+            ranges[name] = (factor * low, factor * high) if factor != 1.0 else (float(low), float(high))
     except (KeyError, IndexError, TypeError, ValueError, AttributeError):
         raise BadInput(f"frame {frame} or its set of poses cannot be read", path) from None
     for name in ("scene", "hue", "saturation"):
         if spec.get(name) is not None:
             raise BadInput(f"the set varies {name}, which this program does not check", path, f"perturbation.{name}")
     free = [(name, low, high) for name, (low, high) in ranges.items() if low < high]
-    poses = Poses(
-        camera,
-        tuple(name for name, _, _ in free),
-        {
-            name: low
-            for name, (low, high) in ranges.items()
-            if low == high and (low != 0.0 or name in ("segment", "azimuth"))
-        },
-        spec.get("frame", "camera") == "world",
-        orbit,
-        following if "segment" in ranges else None,
-    )
-    return poses, free
+    point = {n: a for n, (a, b) in ranges.items() if a == b and (a != 0.0 or n in ("segment", "azimuth"))}
+    world, names = spec.get("frame", "camera") == "world", tuple(name for name, _, _ in free)
+    return Poses(camera, names, point, world, orbit, following if swept else None), free
 
 
 def given_set(settings: dict[str, Any], moved: Path | None) -> dict[str, Any] | None:
@@ -260,11 +274,8 @@ def given_set(settings: dict[str, Any], moved: Path | None) -> dict[str, Any] | 
     axes = {"translation": SHIFTS, "rotation": tuple(TURNS)}
     if any(settings.get(name) is not None for name in axes):
         found: dict[str, Any] = {name: settings.get(name) for name in ("units", "angle_units") if settings.get(name)}
-        for name, keys in axes.items():
-            radii = settings.get(name)
-            if radii is not None:
-                found[name] = dict(zip(keys, radii if len(radii) == 3 else list(radii) * 3, strict=True))
-        return found
+        radii = {name: settings[name] for name in axes if settings.get(name) is not None}
+        return found | {n: dict(zip(axes[n], v if len(v) == 3 else list(v) * 3, strict=True)) for n, v in radii.items()}
     file = moved or settings.get("perturbation_filename")
     if file is None:
         return None
@@ -275,8 +286,7 @@ def given_set(settings: dict[str, Any], moved: Path | None) -> dict[str, Any] | 
 def _camera(root: dict[str, Any], entry: dict[str, Any], down: float) -> Camera:
     pose = np.array(entry["camera_to_world"], np.float64).reshape(4, 4)[:3]
     width, height = int(root["render_width"]), int(root["render_height"])
-    fov = entry.get("fov")
-    fov = root["default_fov"] if fov is None else fov
+    fov = root["default_fov"] if entry.get("fov") is None else entry["fov"]
     focal = float(height / 2.0 / np.tan(float(fov) * (np.pi / 180.0) / 2.0))
     if down == 1.0:
         return Camera(pose, focal, focal, width / 2.0, height / 2.0, width, height)
@@ -285,6 +295,3 @@ def _camera(root: dict[str, Any], entry: dict[str, Any], down: float) -> Camera:
     cx, cy = (float(np.float32(side / 2.0) * scale) for side in (width, height))
     wide, tall = (int(np.float32(side) * scale) for side in (width, height))
     return Camera(pose, focal * float(scale), focal * float(scale), cx, cy, wide, tall)
-
-
-__all__ = ["RULES", "BadInput", "dataset_scale", "given_set", "read_json", "read_poses", "read_scene"]

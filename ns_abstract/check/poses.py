@@ -49,70 +49,61 @@ class Poses:
     orbit: tuple[Array, Array] | None = None
     following: Array | None = None
 
-    def _posed(self, low: Array, high: Array) -> tuple[list[list[Form]], list[Form]]:
-        """Camera-to-world rotation and position over every box [B, d]."""
+    def given(self, low: Array, high: Array) -> dict[str, Form]:
+        """The parameters by name over the boxes [B, d]."""
         middle = 0.5 * (low + high)
-        half = np.maximum(high - middle, middle - low) * (1.0 + 4.0 * U)
-        # a set of one pose has no parameters; one that nothing depends on stands in
-        given = (
-            parameters(middle, half)
-            if low.shape[1]
-            else [Form(np.zeros(len(low)), np.zeros((0, len(low))), np.zeros(len(low)))]
-        )
-        like = given[0]
-        p = dict(zip(self.names, given, strict=False))
-        p |= {name: Form.constant(v, like) for name, v in self.values.items()}
-        zero = Form.constant(0.0, like)
-        pose = self.camera.pose
+        free = parameters(middle, np.maximum(high - middle, middle - low) * (1.0 + 4.0 * U))
+        found = {"": Form.constant(0.0, free[0])} | dict(zip(self.names, free, strict=False))
+        return found | {name: Form.constant(v, free[0]) for name, v in self.values.items()}
+
+    def view(self, low: Array, high: Array) -> View:
+        """The cameras over the boxes [B, d]."""
+        return View(*self.posed(self.given(low, high)), self.camera.pose)
+
+    def posed(self, p: dict[str, Form]) -> tuple[list[list[Form]], list[Form]]:
+        """Camera-to-world rotation and position at the parameters."""
+        zero, pose = p[""], self.camera.pose
         if self.following is None:
-            turn, place = fixed(pose[:, :3], like), [Form.constant(v, like) for v in pose[:, 3]]
+            turn, place = fixed(pose[:, :3], zero), [Form.constant(v, zero) for v in pose[:, 3]]
         else:
             first, last = _nearest_rotation(pose[:, :3]), _nearest_rotation(self.following[:, :3])
             axis, angle = _axis_angle(first.T @ last)
-            way = p["segment"]
-            turn = product(fixed(first, like, _BASE), rotation(axis, way * angle))
-            place = [way * float(b - a) + float(a) for a, b in zip(pose[:, 3], self.following[:, 3], strict=True)]
-            for entry in (*place, *(e for row in turn for e in row)):
-                entry.r = entry.r + _BASE * (1.0 + np.abs(entry.c))
+            turn = product(fixed(first, zero, _BASE), rotation(axis, p["segment"] * angle, _BASE))
+            ends = zip(pose[:, 3], self.following[:, 3], strict=True)
+            place = [p["segment"] * float(b - a) + float(a) for a, b in ends]
+            turn = [[e.wider(_BASE * (1.0 + np.abs(e.c))) for e in row] for row in turn]
+            place = [e.wider(_BASE * (1.0 + np.abs(e.c))) for e in place]
         if self.orbit is not None:
             target, axis = self.orbit
-            swing = rotation(axis / np.linalg.norm(axis), p.get("azimuth", zero))
-            for row in swing:
-                for entry in row:
-                    entry.r = entry.r + _BASE
-            turn = product(swing, turn)
-            arm = [[place[k] - float(target[k])] for k in range(3)]
+            swing = rotation(axis / np.linalg.norm(axis), p.get("azimuth", zero), _BASE)
+            turn, arm = product(swing, turn), [[place[k] - float(target[k])] for k in range(3)]
             place = [row[0] + float(target[k]) for k, row in enumerate(product(swing, arm))]
         shift = [[p.get(name, zero)] for name in SHIFTS]
-        moved = shift if self.world else product(turn, shift)
-        place = [a + b[0] for a, b in zip(place, moved, strict=True)]
+        place = [a + b[0] for a, b in zip(place, shift if self.world else product(turn, shift), strict=True)]
         for name, axis in TURNS.items():
             if name in p:
                 turn = product(turn, rotation(np.array(axis), p[name]))
         return turn, place
 
-    def view(self, low: Array, high: Array) -> tuple[list[list[Form]], list[Form], Array]:
-        """World-to-camera rotation, shift and origin: x_camera = rotation (x_world - origin) + shift, OpenCV axes."""
-        turn, place = self._posed(low, high)
+
+class View:
+    """Where cameras stand over boxes of parameters, all forms [B].
+
+    Attributes:
+        turn: Camera-to-world rotation, OpenGL axes.
+        rotation, shift, origin: x_camera = rotation (x_world - origin) + shift, OpenCV axes; ``origin`` [B, 3] numbers.
+        position: The camera's place less ``origin``.
+        stretch: By how much the keyframe's matrix is no rotation.
+    """
+
+    def __init__(self, turn: list[list[Form]], place: list[Form], keyframe: Array) -> None:
+        square = keyframe[:, :3] @ keyframe[:, :3].T
+        self.stretch = np.full(len(place[0].c), float(np.linalg.norm(square - np.eye(3))) + _BASE)
         # OpenGL to OpenCV: y and z change their sign
-        signs = (1.0, -1.0, -1.0)
-        back = [[turn[s][r] * signs[r] for s in range(3)] for r in range(3)]
-        origin = np.stack([e.c for e in place], axis=1)
-        rest = [[-(e - e.c)] for e in place]
-        return back, [row[0] for row in product(back, rest)], origin
-
-    def position(self, low: Array, high: Array) -> list[Form]:
-        """The camera's position relative to the origin of `view`, for all versions of gsplat.
-
-        Version 1.6.0 takes -R^T t with the view matrix, which differs where a keyframe's rotation R is not orthonormal.
-        """
-        place, r = self._posed(low, high)[1], self.camera.pose[:, :3]
-        stretch = float(np.linalg.norm(r @ r.T - np.eye(3))) + _BASE
-        far = sum(np.abs(e.c) + e.width for e in place)
-        found = [e - e.c for e in place]
-        for entry in found:
-            entry.r = entry.r + stretch * far
-        return found
+        self.turn, self.position = turn, [e - e.c for e in place]
+        self.rotation = [[turn[s][r] * (1.0, -1.0, -1.0)[r] for s in range(3)] for r in range(3)]
+        self.shift = [row[0] for row in product(self.rotation, [[-e] for e in self.position])]
+        self.origin = np.stack([e.c for e in place], axis=-1)
 
 
 def _nearest_rotation(matrix: Array) -> Array:
@@ -121,23 +112,12 @@ def _nearest_rotation(matrix: Array) -> Array:
 
 
 def _axis_angle(turn: Array) -> tuple[Array, float]:
-    """Axis and angle of a rotation, by way of the quaternion's largest component."""
-    k = np.array(
-        [
-            [
-                turn[0, 0] - turn[1, 1] - turn[2, 2],
-                turn[1, 0] + turn[0, 1],
-                turn[2, 0] + turn[0, 2],
-                turn[2, 1] - turn[1, 2],
-            ],
-            [0.0, turn[1, 1] - turn[0, 0] - turn[2, 2], turn[2, 1] + turn[1, 2], turn[0, 2] - turn[2, 0]],
-            [0.0, 0.0, turn[2, 2] - turn[0, 0] - turn[1, 1], turn[1, 0] - turn[0, 1]],
-            [0.0, 0.0, 0.0, np.trace(turn)],
-        ]
-    )
-    # the quaternion is the eigenvector of the largest eigenvalue
-    x, y, z, w = np.linalg.eigh(k, UPLO="U")[1][:, -1]
-    vector = np.array([x, y, z]) * (1.0 if w >= 0.0 else -1.0)
+    """Axis and angle of a rotation, by way of its quaternion: the eigenvector of a symmetric matrix."""
+    a, t = turn, np.trace(turn)
+    rest = np.array([a[2, 1] - a[1, 2], a[0, 2] - a[2, 0], a[1, 0] - a[0, 1]])
+    k = np.block([[a + a.T - t * np.eye(3), rest[:, None]], [rest[None], np.full((1, 1), t)]])
+    *vector, w = np.linalg.eigh(k)[1][:, -1]
+    vector = np.array(vector) * (1.0 if w >= 0.0 else -1.0)
     length = float(np.linalg.norm(vector))
     if length == 0.0:
         return np.array([0.0, 0.0, 1.0]), 0.0

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import hashlib
+import json
 import math
+import sqlite3
 import zipfile
 from dataclasses import dataclass
 from fractions import Fraction
@@ -16,19 +18,21 @@ from ns_abstract.check.inputs import BadInput, read_json
 
 Array = Any
 
-_KEEP = "run ns-abstract-render with --save-cells"
-#: Bytes of arrays of one frame that are read at most.
-_MOST = 32 << 30
+#: Bytes of arrays of one frame, and rows of a table, that are read at most.
+_MOST, _ROWS = 32 << 30, 10_000_000
+_AGAIN = "make the result again"
+_WHERE = "give the output folder of ns-abstract-render, ns-abstract-certify or ns-abstract-reach"
 
 
 @dataclass(frozen=True)
 class Cells:
-    """A frame's bounds and linear sets; arrays as docs/results.md describes them.
+    """Cells of a frame, or of a question about a loop; arrays as docs/results.md describes them.
 
     Attributes:
-        index: Number of the frame.
+        index: Number of the frame or question.
         names, lower, upper: Parameters of the set and their ranges.
-        arrays: By name; ``lower`` and ``upper`` [H, W, 3], ``box_lower`` [n, d] and so on.
+        arrays: ``box_lower`` and ``box_upper`` [n, d]; of pictures, those of the frame file by name.
+        verdicts: Of a certificate or loop, by cell: verdict, margin, counterexample.
     """
 
     index: int
@@ -36,23 +40,20 @@ class Cells:
     lower: Array
     upper: Array
     arrays: dict[str, Array]
+    verdicts: list[tuple[str, float | None, list[float] | None]] | None = None
 
 
 def read_report(folder: Path) -> dict[str, Any]:
     """The report of a finished result."""
     if not folder.is_dir():
-        raise BadInput("no such folder", folder, fix="give the output folder of ns-abstract-render")
-    if (folder / "cells.sqlite").exists():
-        problem = "holds the cells of a certificate, and this program checks results of ns-abstract-render"
-        raise BadInput(problem, folder, fix="render the set with --save-cells and check that")
-    report = read_json(folder / "report.json", "report", "give the output folder of ns-abstract-render")
+        raise BadInput("no such folder", folder, fix=_WHERE)
+    file = folder / "report.json"
+    report = read_json(file, "report", _WHERE)
     if report.get("version") != 1:
-        raise BadInput(
-            f"found {report.get('version')!r}", folder / "report.json", "version", "this program reads version 1"
-        )
-    for name, kind in (("settings", dict), ("sha256", dict), ("fingerprint", dict), ("frames", list), ("scene", dict)):
-        if not isinstance(report.get(name), kind):
-            raise BadInput("missing", folder / "report.json", name, "give the output folder of ns-abstract-render")
+        raise BadInput(f"found {report.get('version')!r}", file, "version", "this program reads version 1")
+    for name in ("settings", "fingerprint", "scene", "renderer"):
+        if not isinstance(report.get(name), dict):
+            raise BadInput("missing", file, name, _WHERE)
     return report
 
 
@@ -65,41 +66,33 @@ def read_cells(folder: Path, name: str, index: int, digest: object) -> Cells:
             while block := stream.read(1 << 24):
                 content.update(block)
         if content.hexdigest() != digest:
-            raise BadInput("is not the file that the report names (sha256)", file, fix="render the frame again")
+            raise BadInput("is not the file that the report names (sha256)", file, fix=_AGAIN)
         with zipfile.ZipFile(file) as archive:
             declared = {entry.filename.removesuffix(".npy"): _header(archive, entry) for entry in archive.infolist()}
-    except (OSError, zipfile.BadZipFile, ValueError, KeyError) as error:
+        if "box_lower" not in declared:
+            raise BadInput("keeps no cells", file, fix="run ns-abstract-render with --save-cells")
+        (n, d), (h, w, _), side = *(declared[k][0] for k in ("box_lower", "lower")), declared["b_lower"][0][1]
+        tiles, single = (n, side, side, 3), np.dtype("<f4")
+        wanted = {"lower": ((h, w, 3), single), "upper": ((h, w, 3), single), "tile": ((n, 2), np.dtype("<i4"))}
+        wanted |= dict.fromkeys(("box_lower", "box_upper"), ((n, d), np.dtype("<f8")))
+        wanted |= dict.fromkeys(("b_lower", "b_upper"), (tiles, single))
+        wanted |= dict.fromkeys(("A_lower", "A_upper"), ((*tiles, d), single))
+        for name_, (shape, kind) in wanted.items():
+            if declared.get(name_) != (shape, kind):
+                raise BadInput(f"{name_} is not {kind} {list(shape)}", file, fix=_AGAIN)
+        shape, kind = declared["parameters"]
+        if shape != (d,) or kind.names != ("name", "unit", "lower", "upper") or kind.itemsize > 1 << 16:
+            raise BadInput("parameters are no table of names and ranges", file, fix=_AGAIN)
+        if sum(math.prod(s) * k.itemsize for s, k in wanted.values()) > _MOST:
+            raise BadInput("is too large", file)
+        with np.load(file, allow_pickle=False) as archive:
+            arrays, table = {name_: archive[name_] for name_ in wanted}, archive["parameters"]
+    except (OSError, zipfile.BadZipFile, zipfile.LargeZipFile, ValueError, KeyError, IndexError) as error:
         if isinstance(error, BadInput):
             raise
-        raise BadInput("cannot be read as a frame file", file, fix="render the frame again") from None
-    if "box_lower" not in declared:
-        raise BadInput("keeps no cells", file, fix=_KEEP)
-    try:
-        n, d = declared["box_lower"][0]
-        (h, w, _), side = declared["lower"][0], declared["b_lower"][0][1]
-    except (KeyError, ValueError, IndexError):
-        raise BadInput("is not a frame file", file, fix="render the frame again") from None
-    tiles, single, double = (n, side, side, 3), np.dtype("<f4"), np.dtype("<f8")
-    wanted = {"lower": ((h, w, 3), single), "upper": ((h, w, 3), single), "tile": ((n, 2), np.dtype("<i4"))}
-    wanted |= dict.fromkeys(("box_lower", "box_upper"), ((n, d), double))
-    wanted |= dict.fromkeys(("b_lower", "b_upper"), (tiles, single))
-    wanted |= dict.fromkeys(("A_lower", "A_upper"), ((*tiles, d), single))
-    for name_, (shape, kind) in wanted.items():
-        if declared.get(name_) != (shape, kind):
-            raise BadInput(f"{name_} is not {kind} {list(shape)}", file, fix="render the frame again")
-    shape, kind = declared.get("parameters", ((), None))
-    if shape != (d,) or kind is None or kind.names != ("name", "unit", "lower", "upper") or kind.itemsize > 1 << 16:
-        raise BadInput("parameters are no table of names and ranges", file, fix="render the frame again")
-    if sum(math.prod(s) * k.itemsize for s, k in wanted.values()) > _MOST:
-        raise BadInput("is too large", file)
-    try:
-        with np.load(file, allow_pickle=False) as archive:
-            arrays = {name_: archive[name_] for name_ in wanted}
-            table = archive["parameters"]
-    except (OSError, ValueError, zipfile.BadZipFile, zipfile.LargeZipFile):
-        raise BadInput("cannot be unpacked", file, fix="render the frame again") from None
+        raise BadInput("cannot be read as a frame file", file, fix=_AGAIN) from None
     if not all(np.isfinite(a).all() for a in arrays.values()):
-        raise BadInput("holds numbers that are not finite", file, fix="render the frame again")
+        raise BadInput("holds numbers that are not finite", file, fix=_AGAIN)
     return Cells(index, tuple(map(str, table["name"])), table["lower"], table["upper"], arrays)
 
 
@@ -114,19 +107,59 @@ def _header(archive: zipfile.ZipFile, entry: zipfile.ZipInfo) -> tuple[tuple[int
     return shape, kind
 
 
-def structure(cells: Cells) -> list[str]:
-    """What is wrong with a frame's cells: every tile's cells must be a partition of the set, every pixel bounded."""
+def read_verdicts(folder: Path, report: dict[str, Any]) -> list[Cells]:
+    """The cells of a certificate or a loop: by frame, or by question (0 safe, 1 reaches)."""
+    file, rows, total, found = folder / "cells.sqlite", 0, 0, {}
+    loop = report.get("kind") == "loop"
+    try:
+        sets = dict.fromkeys((0, 1), report["parameters"]) if loop else {}
+        sets |= {} if loop else {int(f["index"]): f["parameters"] for f in report["frames"]}
+        base = sqlite3.connect(f"{file.resolve().as_uri()}?mode=ro&immutable=1", uri=True)
+        # rows that stand for what is still to be examined
+        query = "SELECT value FROM search_state WHERE key = 'open_rows'"
+        left = set(json.loads((base.execute(query).fetchone() or ["[]"])[0]))
+        columns = "rowid, frame, lower, upper, verdict, margin, seconds, counterexample"
+        for number, *row in base.execute(f"SELECT {columns} FROM cells LIMIT {_ROWS}"):
+            verdict, margin, example = row[3], row[4], json.loads(row[6] or "null")
+            entry = (*map(json.loads, row[1:3]), "open" if number in left else verdict, margin, example)
+            found.setdefault(row[0], []).append(entry)
+            if number not in left:
+                total += int.from_bytes(hashlib.sha256(json.dumps(row).encode()).digest(), "big")
+                rows += 1
+        base.close()
+        if [rows, f"{total % (1 << 256):064x}"] != [report["cells_seal"][k] for k in ("rows", "sum")]:
+            raise BadInput("does not hold the cells that the report names (cells_seal)", file, fix=_AGAIN)
+        cells = []
+        for index, entries in sorted(found.items()):
+            names, low, high = ([p[k] for p in sets[index]] for k in ("name", "lower", "upper"))
+            boxes = {
+                f"box_{s}": np.array([e[k] for e in entries], np.float64) for k, s in enumerate(("lower", "upper"))
+            }
+            if any(a.shape != (len(entries), len(names)) or not np.isfinite(a).all() for a in boxes.values()):
+                raise ValueError
+            verdicts = [e[2:] for e in entries]
+            cells.append(Cells(index, tuple(names), np.array(low), np.array(high), boxes, verdicts))
+    except (sqlite3.Error, OSError, ValueError, KeyError, TypeError, IndexError, RecursionError) as error:
+        if isinstance(error, BadInput):
+            raise
+        raise BadInput("cannot be read as the cells of this result", file, fix=_AGAIN) from None
+    return cells
+
+
+def structure(cells: Cells, report: dict[str, Any]) -> list[str]:
+    """What is wrong with a frame's cells: they must be a partition of the set, every pixel bounded, counts right."""
     a, wrong = cells.arrays, []
+    if (a["box_lower"] > a["box_upper"]).any():
+        return ["a cell's range is reversed"]
+    if cells.verdicts is not None:
+        return _tallies(cells, report)
     height, width, _ = a["lower"].shape
     side = a["b_lower"].shape[1]
     if not (a["lower"] <= a["upper"]).all():
         wrong.append("a lower bound exceeds the upper bound")
-    wanted = {(r, c) for r in range(0, height, side) for c in range(0, width, side)}
     tiles = [tuple(map(int, t)) for t in a["tile"]]
-    if set(tiles) != wanted:
+    if set(tiles) != {(r, c) for r in range(0, height, side) for c in range(0, width, side)}:
         wrong.append("the cells' tiles are not those of the picture")
-    if (a["box_lower"] > a["box_upper"]).any():
-        wrong.append("a cell's range is reversed")
     groups: dict[tuple[int, ...], list[int]] = {}
     for k, tile in enumerate(tiles):
         groups.setdefault(tile, []).append(k)
@@ -135,23 +168,53 @@ def structure(cells: Cells) -> list[str]:
         low, high = a["box_lower"][members], a["box_upper"][members]
         key = low.tobytes() + high.tobytes()
         if key not in seen:
-            seen[key] = partition(low, high, cells.lower, cells.upper)
+            seen[key] = partition(low, high, cells.lower, cells.upper) == 1
         if not seen[key]:
             wrong.append(f"the cells of tile {list(tile)} are no partition of the set")
             break
     return wrong
 
 
-def partition(low: Array, high: Array, first: Array, last: Array) -> bool:
-    """Whether boxes [n, d] tile the box [first, last]: within it, disjoint inside, of its volume; in exact numbers."""
+def _tallies(cells: Cells, report: dict[str, Any]) -> list[str]:
+    """Verdicts of a frame or question against the report, whose parts are sums of disjoint cells' volumes."""
+    question = ("safe", "reaches")[min(cells.index, 1)]
+    entry = (report.get("questions") or {}).get(question) or {}
+    frames = [f for f in report.get("frames") or [] if f["index"] == cells.index]
+    entry, part = (frames[0], frames[0]["coverage"]) if frames else (entry, entry)
+    wrong, verdicts = [], np.array([v[0] for v in cells.verdicts or []])
+    low, high, whole = cells.arrays["box_lower"], cells.arrays["box_upper"], (cells.lower, cells.upper)
+    covered = partition(low, high, *whole)
+    if covered is None:
+        return ["cells overlap, or leave the set"]
+    for kind in ("certified", "falsified", "unknown"):
+        # a loop's report counts what is still to be examined as unknown
+        chosen = (verdicts == kind) | ((kind == "unknown") & (not frames) & (verdicts == "open"))
+        if int(chosen.sum()) != entry["cells"][kind]:
+            wrong.append(f"the report counts {entry['cells'][kind]} {kind} cells, the table {int(chosen.sum())}")
+        share = partition(low[chosen], high[chosen], *whole)
+        if kind != "unknown" and (share is None or abs(share - part[kind]) > 1e-9):
+            wrong.append(
+                f"cells that are {kind} are {float(share or 0):.9g} of the set, the report says {part[kind]:.9g}"
+            )
+    if covered != 1:
+        wrong.append("the cells are no partition of the set")
+    return wrong
+
+
+def partition(low: Array, high: Array, first: Array, last: Array) -> Fraction | None:
+    """The part of the box [first, last] that boxes [n, d] fill, exactly; None if they overlap or leave it."""
     if not ((low >= first) & (high <= last) & (low <= high)).all():
-        return False
+        return None
+    order = np.argsort(low[:, 0], kind="stable") if low.shape[1] else np.arange(len(low))
+    low, high = low[order], high[order]
     for k in range(len(low)):
-        apart = ((high[k + 1 :] <= low[k]) | (low[k + 1 :] >= high[k])).any(axis=1)
-        if not apart.all():
-            return False
+        # those that begin behind the end of this one along the first parameter are apart from it
+        stop = np.searchsorted(low[:, 0], high[k, 0], "left") if low.shape[1] else len(low)
+        if not ((high[k + 1 : stop] <= low[k]) | (low[k + 1 : stop] >= high[k])).any(axis=1).all():
+            return None
     # a float64 is a rational number
     rows = (zip(a, b, strict=True) for a, b in zip(low.tolist(), high.tolist(), strict=True))
-    volume = sum(math.prod(Fraction(b) - Fraction(a) for a, b in row) for row in rows)
-    whole = math.prod(Fraction(b) - Fraction(a) for a, b in zip(first.tolist(), last.tolist(), strict=True))
-    return volume == whole
+    volume = sum(
+        (math.prod((Fraction(b) - Fraction(a) for a, b in row), start=Fraction(1)) for row in rows), Fraction(0)
+    )
+    return volume / math.prod(Fraction(b) - Fraction(a) for a, b in zip(first.tolist(), last.tolist(), strict=True))

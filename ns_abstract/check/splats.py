@@ -1,9 +1,8 @@
-"""Enclosures of one pixel of a Splatfacto picture over boxes of camera poses, by gsplat's rules in real numbers.
+"""Enclosures of pixels of Splatfacto's picture over boxes of camera poses, by gsplat's rules.
 
-The picture is a function ``F`` of the alphas and colours of the Gaussians in depth order, linear in each of them. Its
-form is that of the mean value theorem: ``F`` at the centres, plus interval derivatives times the deviations of alphas
-and colours, which are forms in the pose. What depends on decisions that are open within a box (threshold, tile, depth
-order, stop) is enclosed with both outcomes.
+The picture is blended from the back by forms in the pose. What depends on decisions that are open within a box
+(threshold, tile, depth order, stop) is enclosed with both outcomes. With ``unit`` 0 that is the picture in real
+numbers; with ``FLOAT`` every evaluation of gsplat's formulas in float32 lies within the enclosure, too (docs/check.md).
 """
 
 from __future__ import annotations
@@ -14,12 +13,14 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ns_abstract.check.forms import TINY, Form, U, total
-from ns_abstract.check.poses import Poses
+from ns_abstract.check.poses import Camera, View
 
 Array = Any
 
 NEAR, FAR, BLUR, MARGIN, TILE = 0.01, 1e10, 0.3, 0.3, 16
 LEAST_ALPHA, STOP = 1.0 / 255.0, 1e-4
+#: Unit roundoff of float32.
+FLOAT = 2.0**-24
 #: Relative room around decisions, for the rounding of their thresholds.
 ROOM = 1e-12
 #: Most Gaussians that may change their order with one another before a box is given up.
@@ -27,7 +28,7 @@ LONGEST_GROUP = 96
 
 
 class Rules(NamedTuple):
-    """What differs between gsplat's versions in real numbers: alpha's cap, least compensation, tiles that cut."""
+    """What differs between gsplat's versions: alpha's cap, least compensation, tiles that cut."""
 
     cap: float
     least_factor: float
@@ -48,14 +49,14 @@ class Splats:
 
     Attributes:
         means: [N, 3], exact.
-        axes: [N, 3, 3], column k is the k-th axis times its scale; entries are within ``axes_error`` [N, 3] of columns.
+        axes: [N, 3, 3], column k is the k-th axis times its scale; entries are within 96 U ``scales`` [N, 3].
         opacity: [N], within a relative 32 U.
         sh: [N, K, 3] coefficients, or [N, 1, 3] logits where ``sigmoid``.
     """
 
     means: Array
     axes: Array
-    axes_error: Array
+    scales: Array
     opacity: Array
     sh: Array
     sigmoid: bool
@@ -81,63 +82,72 @@ def activated(
         ],
         axis=1,
     ).reshape(-1, 3, 3)  # fmt: skip
-    with np.errstate(over="ignore"):
-        opacity = 1.0 / (1.0 + np.exp(-logits))
+    opacity = 1.0 / (1.0 + np.exp(np.minimum(-logits, 700.0)))
     return Splats(
-        means.astype(np.float64), turn * scales[:, None, :], 96.0 * U * scales, opacity, sh.astype(np.float64),
+        means.astype(np.float64), turn * scales[:, None, :], scales, opacity, sh.astype(np.float64),
         sigmoid, degree, antialiased, np.asarray(background, np.float64), RULES[version],
     )  # fmt: skip
 
 
-def candidates(splats: Splats, poses: Poses, low: Array, high: Array, pixel: tuple[int, int]) -> Array:
-    """Numbers of all Gaussians that may show at the pixel for some pose of a box; [d] ends of the box."""
-    view = poses.view(low[None], high[None])
-    x, y, z = _points(splats, view, np.arange(len(splats.means)))
+def reaches(splats: Splats, cam: Camera, view: View, unit: float) -> Array:
+    """Ends [N, 4] in pixels (left, right, top, bottom) of where each Gaussian may show for some pose of one box.
+
+    A Gaussian that shows nowhere has crossed ends.
+    """
+    x, y, z = _points(splats, view, np.arange(len(splats.means))[None], unit)
     zl, zh = (v[0] for v in z.range())
-    open_ = ~(zl > 0.5 * NEAR)
-    zl = np.where(open_, 1.0, zl)
-    cam, found = poses.camera, (zh >= NEAR * (1.0 - ROOM)) & ~(zl > FAR * (1.0 + ROOM))
-    with np.errstate(all="ignore"):
-        reach = np.sqrt(2.0 * np.log(np.maximum(splats.opacity * (1.0 + ROOM) * 255.0, 1.0))) * (1.0 + ROOM)
-        # keyframes' rotations stretch by a hundredth at most
-        size = np.sqrt((splats.axes**2).sum(axis=1).max(axis=1))
-        for t, f, centre, place, side in (
-            (x, cam.fx, cam.cx, pixel[1], cam.width), (y, cam.fy, cam.cy, pixel[0], cam.height)
-        ):  # fmt: skip
-            a, b = (v[0] for v in t.range())
-            least = f * np.minimum(a / zl, a / zh) + centre - (place + 0.5)
-            most = f * np.maximum(b / zl, b / zh) + centre - (place + 0.5)
-            away = np.maximum(np.maximum(least, -most), 0.0) * (1.0 - ROOM) - 1e-9
-            limit = (max(centre, side - centre) + 0.15 * side) / f * (1.0 + ROOM)
-            spread = 1.05 * f / zl * size * np.sqrt(1.0 + limit * limit)
-            found &= open_ | ~(away > reach * np.sqrt(spread * spread + BLUR) * (1.0 + ROOM))
-    found &= splats.opacity * (1.0 + ROOM) >= LEAST_ALPHA
-    return np.flatnonzero(found)
-
-
-def _points(splats: Splats, view: Any, index: Array) -> list[Form]:
-    """Camera coordinates [B, n] of the means."""
-    rotation, shift, origin = view
-    near = splats.means[index][None] - origin[:, None, :]
-    error = 2.0 * U * (np.abs(splats.means[index])[None] + np.abs(origin)[:, None, :])
+    near = ~(zl > 0.5 * NEAR)
+    zl = np.where(near, 1.0, zl)
+    hidden = ~((zh >= NEAR * (1.0 - ROOM)) & ~(zl > FAR * (1.0 + ROOM)))
     found = []
-    for row, move in zip(rotation, shift, strict=True):
-        parts = []
-        for s, entry in enumerate(row):
-            part = wide(entry) * near[..., s]
-            part.r = part.r + 1.5 * error[..., s]
-            parts.append(part)
-        found.append(total(parts) + wide(move))
-    return found
+    with np.errstate(all="ignore"):
+        reach = np.sqrt(2.0 * np.log(np.maximum(splats.opacity * (1.0 + ROOM + 64.0 * unit) * 255.0, 1.0)))
+        for t, f, centre, side in ((x, cam.fx, cam.cx, cam.width), (y, cam.fy, cam.cy, cam.height)):
+            a, b = (v[0] for v in t.range())
+            least, most = np.minimum(a / zl, a / zh), np.maximum(b / zl, b / zh)
+            limit = (max(centre, side - centre) + 0.15 * side) / f * (1.0 + ROOM)
+            # keyframes' rotations stretch by a hundredth at most
+            spread = 1.05 * f / zl * splats.scales.max(axis=1) * np.sqrt(1.0 + limit * limit)
+            room = reach * np.sqrt(spread * spread + BLUR) * (1.0 + 1e-9) + 1e-9 * (np.abs(least) + np.abs(most)) * f
+            if unit:
+                # exponents of small ones err by less than a tenth; those of large ones may be anything in their tiles
+                room = np.where(spread < 4.0, 1.06 * room, np.maximum(1.06 * room, 3.3 * spread)) + 2.0 * TILE
+            open_ = near | ~np.isfinite(room)
+            found += [np.where(open_, -np.inf, f * least + centre - room - 1e-9)]
+            found += [np.where(open_, np.inf, f * most + centre + room + 1e-9)]
+    hidden |= splats.opacity * (1.0 + ROOM + 64.0 * unit) < LEAST_ALPHA
+    found[0] = np.where(hidden, np.inf, found[0])
+    return np.stack(found, axis=1)
+
+
+def meeting(ends: Array, row: int, column: int) -> Array:
+    """Numbers of the Gaussians whose `reaches` hold the pixel's centre."""
+    x, y = column + 0.5, row + 0.5
+    return np.flatnonzero((ends[:, 0] <= x) & (ends[:, 1] >= x) & (ends[:, 2] <= y) & (ends[:, 3] >= y))
 
 
 def wide(form: Form) -> Form:
     """Forms [B] as forms [B, 1]."""
-    return Form(form.c[:, None], form.g[:, :, None], form.r[:, None])
+    return form.of(lambda a: a[..., None])
+
+
+def _points(splats: Splats, view: View, index: Array, unit: float) -> list[Form]:
+    """Camera coordinates [B, n] of the means.
+
+    In float32 the pose is rounded, R C and R mu are sums of three: less than 8 units of |R| (|mu| + |C|).
+    """
+    means, origin = splats.means[index], view.origin[:, None, :]
+    far = np.abs(means) + np.abs(origin) + sum(e.size() for e in view.position)[:, None, None]
+    found = []
+    for row, move in zip(view.rotation, view.shift, strict=True):
+        parts = [wide(e) * (means - origin)[..., s] for s, e in enumerate(row)]
+        error = sum(wide(e).size() * far[..., s] for s, e in enumerate(row))
+        found.append((total(parts) + wide(move)).wider((4.0 * U + 8.0 * unit) * error))
+    return found
 
 
 class _Fragments(NamedTuple):
-    """Alphas, colours and depths of Gaussians, forms [B, n], and which may show at all."""
+    """Alphas and depths [B, n] and colours [B, n, 3] of Gaussians, and which may show at all."""
 
     alpha: Form
     color: Form
@@ -146,181 +156,268 @@ class _Fragments(NamedTuple):
     motion: Array
 
 
-def _fragments(
-    splats: Splats, poses: Poses, low: Array, high: Array, index: Array, pixel: tuple[int, int], channel: int
-) -> _Fragments:
-    view = poses.view(low, high)
-    cam, rules = poses.camera, splats.rules
-    x, y, z = _points(splats, view, index)
+class Projected(NamedTuple):
+    """Gaussians on the image plane, forms [B, n]: all that does not depend on the pixel.
+
+    ``axes`` are the three columns of the covariance's root, ``errors`` those of the covariance's entries in float32,
+    ``kappa`` the exponent's relative error there; ``color`` [B, n, 3].
+    """
+
+    centre: list[Form]
+    axes: list[list[Form]]
+    squares: list[Form]
+    inverse: Form
+    opacity: Form
+    color: Form
+    depth: Form
+    errors: list[Array]
+    kappa: Array
+
+    def among(self, index: Array) -> Projected:
+        """Rows of Gaussians ``index`` [W, n] out of one row of all [1, N]."""
+
+        def pick(part: Any) -> Any:
+            if isinstance(part, list):
+                return [pick(e) for e in part]
+            return part.of(lambda a: a[..., 0, index]) if isinstance(part, Form) else part[0, index]
+
+        rest = {name: pick(getattr(self, name)) for name in self._fields if name != "color"}
+        return Projected(**rest, color=self.color.of(lambda a: a[..., 0, index, :]))
+
+
+def projected(splats: Splats, cam: Camera, view: View, at: Array, unit: float) -> Projected:
+    """The Gaussians ``at`` [B, n] for cameras over B boxes."""
+    x, y, z = _points(splats, view, at, unit)
     iz = z.reciprocal()
-    u, v = x * iz, y * iz
-    mx, my = u * cam.fx + cam.cx, v * cam.fy + cam.cy
-    dx, dy = mx - (pixel[1] + 0.5), my - (pixel[0] + 0.5)
-    tx, ty = MARGIN * 0.5 * cam.width / cam.fx, MARGIN * 0.5 * cam.height / cam.fy
-    uc = u.clamped(-(cam.cx / cam.fx + tx), (cam.width - cam.cx) / cam.fx + tx)
-    vc = v.clamped(-(cam.cy / cam.fy + ty), (cam.height - cam.cy) / cam.fy + ty)
-    axes, rotation = splats.axes[index], view[0]
-    sizes = splats.axes_error[index]
-    rows = []
-    for k in range(3):
-        turned = []
-        for r in range(3):
-            one = total(wide(rotation[r][s]) * axes[None, :, s, k] for s in range(3))
-            one.r = one.r + 4.0 * sizes[None, :, k]
-            turned.append(one)
-        rows.append(turned)
-    across, down = iz * cam.fx, iz * cam.fy
-    m = [across * (rows[k][0] - uc * rows[k][2]) for k in range(3)]
-    n = [down * (rows[k][1] - vc * rows[k][2]) for k in range(3)]
-    mm, nn = total(e.square() for e in m), total(e.square() for e in n)
-    minors = [m[a] * n[b] - m[b] * n[a] for a, b in ((0, 1), (0, 2), (1, 2))]
-    flat = total(e.square() for e in minors)
+    iz = iz.wider(6.0 * unit * iz.size())
+    u, v = ((e * iz).wider(4.0 * unit * e.size() * iz.size()) for e in (x, y))
+    ends = ((u, cam.fx, cam.cx, cam.width), (v, cam.fy, cam.cy, cam.height))
+    centre = [(e * f + c).wider(4.0 * unit * (f * e.size() + c)) for e, f, c, _ in ends]
+    slopes, roots, axes, sizes = [], [], splats.axes[at], splats.scales[at]
+    turned = [
+        [
+            total(wide(view.rotation[r][s]) * axes[..., s, k] for s in range(3)).wider(4.0 * 96.0 * U * sizes[..., k])
+            for r in range(3)
+        ]
+        for k in range(3)
+    ]
+    for row, (e, f, c, side) in enumerate(ends):
+        spare = MARGIN * 0.5 * side / f
+        slopes.append(e.clamped(-(c / f + spare), (side - c) / f + spare))
+        roots.append([(iz * f) * (t[row] - slopes[-1] * t[2]) for t in turned])
+    m, n = roots
+    pairs = zip(m, n, strict=True)
+    mm, nn, mn = total(a.square() for a in m), total(b.square() for b in n), total(a * b for a, b in pairs)
+    flat = total((m[a] * n[b] - m[b] * n[a]).square() for a, b in ((0, 1), (0, 2), (1, 2)))
     det = flat + (mm + nn) * BLUR + BLUR * BLUR
-    near = total((n[k] * dx - m[k] * dy).square() for k in range(3))
-    exponent = (near + (dx.square() + dy.square()) * BLUR) * 0.5 * det.reciprocal()
-    opacity = Form.constant(splats.opacity[index][None], dx, 32.0 * U * splats.opacity[index][None])
+    inverse, errors, kappa = det.reciprocal(), [np.zeros(at.shape)] * 3, np.zeros(at.shape)
+    if unit:
+        h = [(iz * f).size() * (1.0 + e.size()) for e, f in zip(slopes, (cam.fx, cam.fy), strict=True)]
+        errors, kappa, error = _rounded(det, (mm, nn), h, sizes)
+        flat, det = flat.wider(error), det.wider(error)
+    opacity = Form.constant(splats.opacity[at], z, 32.0 * U * splats.opacity[at])
     if splats.antialiased:
-        opacity = opacity * _factor(flat, det, rules.least_factor)
-    elow = np.maximum(exponent.range()[0], 0.0)
-    ehigh = exponent.range()[1]
+        opacity = opacity * _factor(flat, det, splats.rules.least_factor, unit)
+    color = _colors(splats, view, at, z, unit)
+    return Projected(centre, roots, [mm, nn, mn], inverse, opacity, color, z, errors, kappa)
+
+
+def _fragments(
+    splats: Splats, cam: Camera, p: Projected, index: Array, pixel: tuple[Array, Array], unit: float
+) -> _Fragments:
+    rules, (mx, my), (m, n), opacity, z = splats.rules, p.centre, p.axes, p.opacity, p.depth
+    dx, dy = (e + -(place[:, None] + 0.5) for e, place in ((mx, pixel[1]), (my, pixel[0])))
+    near = total((n[k] * dx - m[k] * dy).square() for k in range(3))
+    exponent = (near + (dx.square() + dy.square()) * BLUR) * 0.5 * p.inverse
+    wild = ~((p.kappa < 0.125) & np.isfinite(exponent.r)) & (unit > 0.0)
+    exponent = exponent.wider(np.where(wild, 0.0, 1.2 * p.kappa) * exponent.size() + 1e-30 * (unit > 0.0))
+    elow, ehigh = exponent.range()
     olow, ohigh = opacity.range()
-    plain = np.exp(-np.minimum(np.stack([elow, ehigh]), 700.0)) * np.array([1 + ROOM, 1 - ROOM])[:, None, None]
-    most = np.where(np.isfinite(elow), np.maximum(ohigh, 0.0) * plain[0], np.minimum(1.0, splats.opacity[index])[None])
+    room = ROOM + 80.0 * unit
+    plain = np.exp(-np.clip(np.stack([elow, ehigh]), 0.0, 700.0)) * np.array([1 + room, 1 - room])[:, None, None]
+    # where the exponent is not known the opacity is; an exponent that is no number is drawn with the largest alpha
+    anything = np.ones_like(ohigh) if unit else np.minimum(ohigh, 1.0)
+    most = np.where(np.isfinite(elow) & ~wild, np.maximum(ohigh, 0.0) * plain[0], anything)
     most = np.where(np.isfinite(most), most, 1.0)
-    least = np.where(np.isfinite(ehigh) & np.isfinite(olow), np.maximum(olow, 0.0) * plain[1], 0.0)
+    least = np.where(np.isfinite(ehigh) & np.isfinite(olow) & ~wild, np.maximum(olow, 0.0) * plain[1], 0.0)
     alpha = (-exponent).exp() * opacity
+    alpha = alpha.wider(80.0 * unit * most)
     zl, zh = z.range()
-    shows = (most >= LEAST_ALPHA * (1.0 - ROOM)) & ~(zh < NEAR * (1.0 - ROOM)) & ~(zl > FAR)
-    surely = (least >= LEAST_ALPHA * (1.0 + ROOM)) & (zl >= NEAR * (1.0 + ROOM)) & (zh <= FAR)
+    shows = (most >= LEAST_ALPHA * (1.0 - room)) & ~(zh < NEAR * (1.0 - ROOM)) & ~(zl > FAR) & (index >= 0)
+    surely = (least >= LEAST_ALPHA * (1.0 + room)) & (zl >= NEAR * (1.0 + ROOM)) & (zh <= FAR)
     if rules.tiles:
-        maybe, certain = _tiles(cam, pixel, (mx, my), (mm, nn), total(m[k] * n[k] for k in range(3)))
-        shows, surely = shows & maybe, surely & certain
+        squares = [e.wider(error) for e, error in zip(p.squares, p.errors, strict=True)]
+        maybe, certain = _tiles(cam, pixel, (mx, my), squares, unit)
+        shows, surely = shows & maybe, surely & certain & ~wild
     alow, ahigh = alpha.range()
     # the form must say no less than the interval, and stay below the cap
     rough = ~((ahigh - alow) <= 1.5 * (most - least)) | ~(ahigh <= rules.cap) | ~(alow >= 0.0) | ~surely
-    top = np.minimum(most, rules.cap)
-    bottom = np.where(surely, np.minimum(least, rules.cap), 0.0)
-    alpha = alpha.boxed(rough, bottom, np.maximum(top, bottom))
+    bottom, top = np.where(surely, np.minimum(least, rules.cap), 0.0), np.minimum(most, rules.cap)
     gone = np.where(shows, 1.0, 0.0)
-    alpha = Form(alpha.c * gone, alpha.g * gone, alpha.r * gone)
+    alpha = alpha.boxed(rough, bottom, np.maximum(top, bottom)).of(lambda a: a * gone)
     motion = np.where(shows[None], np.abs(mx.g) + np.abs(my.g), 0.0).max(axis=2, initial=0.0)
-    color = _colors(splats, poses, view, low, high, index, channel, dx)
-    return _Fragments(alpha, color, z, shows, motion)
+    return _Fragments(alpha, p.color, z, shows, motion)
 
 
-def _factor(flat: Form, det: Form, least: float) -> Form:
+def _rounded(det: Form, squares: Any, h: list[Array], sizes: Array) -> tuple[list[Array], Array, Array]:
+    """Errors in float32 of the covariance's entries (xx, yy, xy), of the exponent (relative) and of determinants.
+
+    The covariance J R M M^T R^T J^T is a sum of products of factors that err by 12 (J), 2 (R) and 64 units of a scale
+    (M: 46 of a quaternion's rotation, 18 of scale and product), in 15 products and sums of three: below 165 units a
+    side of h h^T, h = |J| |R| |M|. What the entries do to the exponent is bounded by eta, their size against the
+    covariance; conic and exponent carry 48 units of their terms, whose sum is 4 ac / det times the exponent at most.
+    Where kappa is not below 1/8 nothing is known of the exponent.
+    """
+    square, (hx, hy) = (sizes * sizes).sum(axis=-1) * (1.0 + 1e-9), h
+    a, c = (e.size() + BLUR for e in squares)
+    ends = ((hx, hx, a), (hy, hy, c), (hx, hy, 0.0))
+    ea, ec, eb = (FLOAT * (330.0 * p * q * square + 3.0 * d) for p, q, d in ends)
+    low = np.maximum(det.range()[0], BLUR * BLUR)
+    eta = (c * ea + 2.0 * np.sqrt(a * c) * eb + a * ec) / low
+    kappa = np.where(a * c < 1e30, 1.05 * (eta + 48.0 * FLOAT * a * c / low), np.inf)
+    error = a * ec + c * ea + 2.0 * np.sqrt(a * c) * eb + ea * ec + eb * eb + 8.0 * FLOAT * a * c + 1e-30
+    return [ea, ec, eb], kappa, error
+
+
+def _factor(flat: Form, det: Form, least: float, unit: float) -> Form:
     """The opacity's factor sqrt(max(0, det before / det after the blur)), not below ``least``."""
-    ratio = flat * det.reciprocal()
-    low, high = flat.range()
-    dlow, dhigh = det.range()
+    (low, high), (dlow, dhigh) = flat.range(), det.range()
+    room, limit = ROOM + 16.0 * unit, 1.0 if not unit else 1e3
     with np.errstate(all="ignore"):
-        bottom = np.sqrt(np.maximum(low, 0.0) / dhigh) * (1.0 - ROOM)
-        top = np.sqrt(np.maximum(high, 0.0) / np.maximum(dlow, BLUR * BLUR)) * (1.0 + ROOM)
+        bottom = np.sqrt(np.maximum(low, 0.0) / dhigh) * (1.0 - room)
+        top = np.sqrt(np.maximum(high, 0.0) / np.maximum(dlow, BLUR * BLUR * (1.0 - 1e-3))) * (1.0 + room)
     bottom = np.where(np.isfinite(bottom), bottom, 0.0)
-    top = np.minimum(np.where(np.isfinite(top), top, 1.0), 1.0)
-    root = ratio.root()
-    rlow, rhigh = root.range()
-    rough = ~((rhigh - rlow) <= 1.5 * (top - bottom))
-    return root.boxed(rough, bottom, np.maximum(top, bottom)).clamped(least, 1.0 + ROOM)
+    top = np.minimum(np.where(np.isfinite(top), top, limit), limit)
+    root = (flat * det.reciprocal()).root()
+    root = root.wider(16.0 * unit * np.minimum(root.size(), limit))
+    rough = ~(2.0 * root.width <= 1.5 * (top - bottom))
+    return root.boxed(rough, bottom, np.maximum(top, bottom)).clamped(least, limit + ROOM)
 
 
-def _tiles(cam: Any, pixel: tuple[int, int], centre: tuple[Form, Form], squares: tuple[Form, Form], mixed: Form) -> Any:
+def _tiles(cam: Camera, pixel: Any, centre: Any, squares: Any, unit: float) -> tuple[Array, Array]:
     """Whether gsplat 1.4.0 may, and surely does, list a Gaussian for the pixel's tile."""
-    (al, ah), (bl, bh), (ml, mh) = squares[0].range(), squares[1].range(), mixed.range()
+    (al, ah), (bl, bh), (ml, mh) = (e.range() for e in squares)
     al, bl = np.maximum(al, 0.0), np.maximum(bl, 0.0)
-    dh = np.maximum(np.abs(ah - bl), np.abs(bh - al))
-    dl = np.maximum(np.maximum(al - bh, bl - ah), 0.0)
+    dh, dl = np.maximum(np.abs(ah - bl), np.abs(bh - al)), np.maximum(np.maximum(al - bh, bl - ah), 0.0)
     xl = np.where((ml <= 0.0) & (mh >= 0.0), 0.0, np.minimum(np.abs(ml), np.abs(mh)))
-    xh = np.maximum(np.abs(ml), np.abs(mh))
-    small = np.maximum(0.25 * dl * dl + xl * xl, 0.01) * (1.0 - ROOM)
-    large = np.maximum(0.25 * dh * dh + xh * xh, 0.01) * (1.0 + ROOM)
-    rl = np.ceil(3.0 * np.sqrt(0.5 * (al + bl) + BLUR + np.sqrt(small)) * (1.0 - ROOM))
-    rh = np.ceil(3.0 * np.sqrt(0.5 * (ah + bh) + BLUR + np.sqrt(large)) * (1.0 + ROOM))
+    xh, room = np.maximum(np.abs(ml), np.abs(mh)), ROOM + 16.0 * unit
+    # in float32 the smaller root is of a difference of squares
+    lost = 8.0 * unit * (ah + bh + 2.0 * BLUR) ** 2
+    small = np.maximum(0.25 * dl * dl + xl * xl - lost, 0.01) * (1.0 - room)
+    large = np.maximum(0.25 * dh * dh + xh * xh + lost, 0.01) * (1.0 + room)
+    rl = np.ceil(3.0 * np.sqrt((0.5 * (al + bl) + BLUR + np.sqrt(small)) * (1.0 - room)) * (1.0 - room))
+    rh = np.ceil(3.0 * np.sqrt((0.5 * (ah + bh) + BLUR + np.sqrt(large)) * (1.0 + room)) * (1.0 + room))
     maybe = certain = True
     for form, place, side in ((centre[0], pixel[1], cam.width), (centre[1], pixel[0], cam.height)):
         low, high = form.range()
-        first = TILE * (place // TILE)
-        last = min(first + TILE, side)
-        certain = certain & (high - rl < last - 1e-9) & (low + rl > first + 1e-9)
+        first = TILE * (place[:, None] // TILE)
+        last = np.minimum(first + TILE, side)
+        slack = 1e-9 + 16.0 * unit * (np.abs(low) + np.abs(high) + rh)
+        certain = certain & (high - rl < last - slack) & (low + rl > first + slack)
         # the negations keep what is not a number
-        maybe = maybe & ~(low - rh > last + 1e-9) & ~(high + rh < first - 1e-9)
+        maybe = maybe & ~(low - rh > last + slack) & ~(high + rh < first - slack)
     return maybe, certain
 
 
-def _colors(
-    splats: Splats, poses: Poses, view: Any, low: Array, high: Array, index: Array, channel: int, like: Form
-) -> Form:
-    sh = splats.sh[index][None, :, :, channel]
+def _colors(splats: Splats, view: View, at: Array, like: Form, unit: float) -> Form:
+    """Colours [B, n, 3]."""
+    sh = splats.sh[at]
+    flat = like.of(lambda a: np.broadcast_to(a[..., None], (*a.shape, 3)))
     if splats.sigmoid:
-        value = 1.0 / (1.0 + np.exp(-sh[..., 0]))
-        return Form.constant(value, like, 32.0 * U * value)
-    found = Form.constant(0.28209479177387814 * sh[..., 0] + 0.5, like, 8.0 * U * (np.abs(sh[..., 0]) + 1.0))
-    if splats.degree and np.any(sh[..., 1:]):
-        x, y, z = _directions(splats, poses, low, high, index, view)
+        value = 1.0 / (1.0 + np.exp(-sh[..., 0, :]))
+        return Form.constant(value, flat, (32.0 * U + 16.0 * unit) * value)
+    size = np.abs(sh[..., 0, :]) + 1.0
+    found = Form.constant(0.28209479177387814 * sh[..., 0, :] + 0.5, flat, (8.0 * U + 4.0 * unit) * size)
+    if splats.degree and np.any(sh[..., 1:, :]):
+        (x, y, z), error = _directions(splats, view, at, unit)
         bands = [y * -0.4886025119029199, z * 0.4886025119029199, x * -0.4886025119029199]
-        if splats.degree >= 2 and np.any(sh[..., 4:]):
-            xx, yy, zz = x.square(), y.square(), z.square()
+        xx, yy, zz = x.square(), y.square(), z.square()
+        if splats.degree >= 2:
             bands += [
                 x * y * 1.0925484305920792, y * z * -1.0925484305920792,
                 (zz * 2.0 - xx - yy) * 0.31539156525252005,
                 x * z * -1.0925484305920792, (xx - yy) * 0.5462742152960396,
             ]  # fmt: skip
-            if splats.degree >= 3 and np.any(sh[..., 9:]):
-                bands += [
-                    y * (xx * 3.0 - yy) * -0.5900435899266435, x * y * z * 2.890611442640554,
-                    y * (zz * 4.0 - xx - yy) * -0.4570457994644658,
-                    z * (zz * 2.0 - xx * 3.0 - yy * 3.0) * 0.3731763325901154,
-                    x * (zz * 4.0 - xx - yy) * -0.4570457994644658,
-                    z * (xx - yy) * 1.445305721320277, x * (xx - yy * 3.0) * -0.5900435899266435,
-                ]  # fmt: skip
+        if splats.degree >= 3:
+            bands += [
+                y * (xx * 3.0 - yy) * -0.5900435899266435, x * y * z * 2.890611442640554,
+                y * (zz * 4.0 - xx - yy) * -0.4570457994644658,
+                z * (zz * 2.0 - xx * 3.0 - yy * 3.0) * 0.3731763325901154,
+                x * (zz * 4.0 - xx - yy) * -0.4570457994644658,
+                z * (xx - yy) * 1.445305721320277, x * (xx - yy * 3.0) * -0.5900435899266435,
+            ]  # fmt: skip
         for k, band in enumerate(bands):
-            found = found + band * sh[..., k + 1]
+            # slopes of bands are below 8, and 16 roundings of sums of terms below 8 together
+            band = band.wider(8.0 * error + 128.0 * unit)
+            found = found + wide(band) * sh[..., k + 1, :]
     return found.clamped(0.0, np.inf)
 
 
-def _directions(splats: Splats, poses: Poses, low: Array, high: Array, index: Array, view: Any) -> list[Form]:
-    """Unit vectors from the camera to the means, world axes."""
-    position, origin = poses.position(low, high), view[2]
-    near = splats.means[index][None] - origin[:, None, :]
-    error = 2.0 * U * (np.abs(splats.means[index])[None] + np.abs(origin)[:, None, :])
-    parts = []
-    for k in range(3):
-        part = -wide(position[k]) + near[..., k]
-        part.r = part.r + error[..., k]
-        parts.append(part)
-    length = total(e.square() for e in parts).root().reciprocal()
-    return [e * length for e in parts]
+def _directions(splats: Splats, view: View, at: Array, unit: float) -> tuple[list[Form], Array]:
+    """Unit vectors from the camera to the means, world axes, and how far those in float32 may be from them.
 
-
-def pixel_form(
-    splats: Splats, poses: Poses, low: Array, high: Array, index: Array, pixel: tuple[int, int], channel: int
-) -> tuple[Form, Array, Array]:
-    """The pixel's channel before the clamp over every box, a form [B]; which Gaussians may matter [B, n]; their motion.
-
-    The motion [d, B], in pixels, is what each parameter moves a Gaussian by at most, about.
-
-    Args:
-        low, high: [B, d] ends of the boxes.
-        index: [n] numbers of the Gaussians that may show (`candidates`).
-        pixel: Row and column.
+    Version 1.6.0 takes -R^T t with the view matrix, which differs where a keyframe's rotation is not orthonormal.
     """
-    background = float(splats.background[channel])
-    with np.errstate(all="ignore"):
-        f = _fragments(splats, poses, low, high, index, pixel, channel)
-        used = np.flatnonzero(f.shows.any(axis=0))
-        if not len(used):
-            zero = np.zeros(len(low))
-            return Form(zero + background, np.zeros((low.shape[1], len(low))), zero), f.shows, f.motion
-        alpha, color, depth, shows = f.alpha.among(used), f.color.among(used), f.depth.among(used), f.shows[:, used]
-        # those that do not show stand behind all others
-        key = np.where(shows, depth.c, np.inf)
-        order = np.argsort(key, axis=1, kind="stable")
-        alpha, color, depth = alpha.take(order), color.take(order), depth.take(order)
-        shows = np.take_along_axis(shows, order, 1)
-        form, matters = _blended(alpha, color, depth, shows, background)
-        keep = np.zeros(f.shows.shape, bool)
-        np.put_along_axis(keep, used[order], matters & shows, 1)
-        return form, keep, f.motion
+    far = np.abs(view.origin).sum(axis=1) + sum(e.width for e in view.position)
+    means, origin, parts = splats.means[at], view.origin[:, None, :], []
+    for k, entry in enumerate(view.position):
+        part = -wide(entry) + (means - origin)[..., k]
+        parts.append(part.wider(2.0 * U * (np.abs(means) + np.abs(origin))[..., k] + (view.stretch * far)[:, None]))
+    inverse = total(e.square() for e in parts).root().reciprocal()
+    error = 128.0 * unit * (1.0 + np.abs(means).sum(axis=-1) + far[:, None]) * inverse.size()
+    return [e * inverse for e in parts], np.where(np.isfinite(error), error, np.inf if unit else 0.0)
+
+
+def blended(f: _Fragments, background: Array, unit: float) -> tuple[Form, Array]:
+    """The blended colours [B, 3] before the clamp, and which of the fragments [B, n] matter."""
+    # those that do not show stand behind all others
+    order = np.argsort(np.where(f.shows, f.depth.c, np.inf), axis=1, kind="stable")
+    shows = np.take_along_axis(f.shows, order, 1)
+
+    def sort(a: Array) -> Array:
+        return np.take_along_axis(a, np.broadcast_to(order, a.shape), -1)
+
+    def sort_colors(a: Array) -> Array:
+        return np.take_along_axis(a, np.broadcast_to(order[..., None], a.shape), -2)
+
+    alpha, depth, color = f.alpha.of(sort), f.depth.of(sort), f.color.of(sort_colors)
+    count, n = shows.shape
+    al, ah = (np.clip(a, 0.0, 1.0) for a in alpha.range())
+    cl, ch = color.range()
+    clean, dlow, dhigh = _groups(depth, shows)
+    step = 1.0 + 8.0 * n * U + 4.0 * n * unit
+    most, least = (
+        np.concatenate([np.ones((count, 1)), np.cumprod(1.0 - a, axis=1)], axis=1) * s
+        for a, s in ((al, step), (ah, 1.0 / step))
+    )
+    most[:, 0] = least[:, 0] = 1.0
+    place = np.arange(n + 1)[None]
+    # the first fragment at which the rasteriser may stop, and the first at which it surely has stopped
+    may, sure = least[:, 1:] <= STOP * (1.0 + ROOM + 4.0 * unit), most[:, 1:] <= STOP * (1.0 - ROOM - 4.0 * unit)
+    first, last = (np.where(a.any(axis=1), a.argmax(axis=1), n)[:, None] for a in (may, sure))
+    begin = np.where(clean & (place <= first), place, 0).max(axis=1)[:, None]
+    plain = np.take_along_axis(clean, last, 1) & np.take_along_axis(clean, np.minimum(last + 1, n), 1)
+    end = np.where(plain, last, np.where(clean & (place > last), place, n).min(axis=1)[:, None])
+    inside = place[:, :-1] < end
+    form = _from_the_back(alpha, color, inside, background, unit)
+    # other orders than that of the centres, and earlier stops
+    lower, upper = _swaps(clean, dlow, dhigh, inside, most, ah, cl, ch)
+    at = ((place[:, :-1] >= begin) & (place[:, :-1] < end))[..., None]
+    room = 1.0 + ROOM + 8.0 * n * unit
+    light = np.where(at[..., 0], STOP * room / np.maximum(1.0 - ah, 1e-3), 0.0).max(axis=1, initial=0.0)
+    light = np.minimum(light, np.take_along_axis(most, begin, 1)[:, 0])[:, None] * (begin < end) * room
+    darkest = np.minimum(np.where(at, cl, np.inf).min(axis=1, initial=np.inf), background)
+    brightest = np.maximum(np.where(at, ch, -np.inf).max(axis=1, initial=-np.inf), background)
+    with np.errstate(invalid="ignore"):
+        lower = lower - np.where(light > 0.0, light * (brightest - background), 0.0)
+        upper = upper + np.where(light > 0.0, light * (background - darkest), 0.0)
+        rest = 0.5 * (upper - lower) * (1.0 + ROOM) + 8.0 * U * (np.abs(form.c) + 1.0)
+        middle = 0.5 * (lower + upper)
+    bad = ~np.isfinite(rest)
+    form = Form(form.c + np.where(bad, 0.0, middle), form.g, form.r + np.where(bad, np.inf, rest))
+    keep = np.zeros((count, n), bool)
+    np.put_along_axis(keep, order, (place[:, :-1] < end + 1) & shows, 1)
+    return form, keep
 
 
 def _groups(depth: Form, shows: Array) -> tuple[Array, Array, Array]:
@@ -329,103 +426,41 @@ def _groups(depth: Form, shows: Array) -> tuple[Array, Array, Array]:
     weight = shows / np.maximum(shows.sum(axis=1, keepdims=True), 1)
     # a slope that all share changes no order
     common = (depth.g * weight).sum(axis=2, keepdims=True)
-    room = (np.abs(depth.g - common).sum(axis=0) + depth.r) * (1.0 + 64.0 * U) + 64.0 * U * (
-        np.abs(depth.c) + depth.slope
-    )
-    low = np.where(shows, depth.c - room, np.inf)
-    high = np.where(shows, depth.c + room, -np.inf)
+    room = (np.abs(depth.g - common).sum(axis=0) + depth.r) * (1.0 + 64.0 * U) + 64.0 * U * depth.size()
+    low, high = (np.where(shows, depth.c + s * room, -s * np.inf) for s in (-1.0, 1.0))
     low, high = np.where(np.isnan(low), -np.inf, low), np.where(np.isnan(high), np.inf, high)
     clean = np.ones((len(shows), n + 1), bool)
-    front = np.maximum.accumulate(high, axis=1)
-    back = np.minimum.accumulate(low[:, ::-1], axis=1)[:, ::-1]
+    front, back = np.maximum.accumulate(high, axis=1), np.minimum.accumulate(low[:, ::-1], axis=1)[:, ::-1]
     clean[:, 1:n] = front[:, :-1] < back[:, 1:]
     return clean, low, high
 
 
-def _blended(alpha: Form, color: Form, depth: Form, shows: Array, background: float) -> tuple[Form, Array]:
-    """The form of the blended colour [B] of fragments in the order of their centres, and which of them matter."""
-    count, n = shows.shape
-    al, ah = alpha.range()
-    al, ah = np.clip(al, 0.0, 1.0), np.clip(ah, 0.0, 1.0)
-    cl, ch = color.range()
-    clean, dlow, dhigh = _groups(depth, shows)
-    step = 1.0 + 8.0 * n * U
-    most, least = (
-        np.concatenate([np.ones((count, 1)), np.cumprod(1.0 - a, axis=1)], axis=1) * s
-        for a, s in ((al, step), (ah, 1 / step))
-    )
-    most[:, 0] = least[:, 0] = 1.0
-    place = np.arange(n + 1)[None]
-    # the first fragment at which the rasteriser may stop, and the first at which it surely has stopped
-    may = least[:, 1:] <= STOP * (1.0 + ROOM)
-    sure = most[:, 1:] <= STOP * (1.0 - ROOM)
-    first = np.where(may.any(axis=1), may.argmax(axis=1), n)[:, None]
-    last = np.where(sure.any(axis=1), sure.argmax(axis=1), n)[:, None]
-    begin = np.where(clean & (place <= first), place, 0).max(axis=1)[:, None]
-    plain = np.take_along_axis(clean, last, 1) & np.take_along_axis(clean, np.minimum(last + 1, n), 1)
-    beyond = np.where(clean & (place > last), place, n).min(axis=1)[:, None]
-    end = np.where(plain, last, beyond)
-    inside = np.arange(n)[None] < end
-    blank = np.where(inside, 1.0, 0.0)
-    ac, al, ah = alpha.c * blank, al * blank, ah * blank
-    most, least = (np.take_along_axis(t, np.minimum(place, end), 1) for t in (most, least))
-    # colours behind each place, as intervals, and at the centres
-    low, high, centre = (np.full((count, n + 1), background) for _ in range(3))
-    for k in range(n - 1, -1, -1):
-        for s, c, pick in ((low, cl, np.minimum), (high, ch, np.maximum)):
-            a, b = s[:, k + 1], c[:, k]
-            s[:, k] = pick(a + al[:, k] * (b - a), a + ah[:, k] * (b - a))
-        centre[:, k] = centre[:, k + 1] + ac[:, k] * (color.c[:, k] - centre[:, k + 1])
-    span = np.maximum(np.abs(low), np.abs(high)).max(axis=1) + np.where(
-        inside, np.maximum(np.abs(cl), np.abs(ch)), 0.0
-    ).max(axis=1)
-    slack = 8.0 * (n + 2) * U * span
-    low, high = low - slack[:, None], high + slack[:, None]
-    total_form = _mean_value(alpha, color, blank, (most, least), (al, ah), (cl, ch), (low, high))
-    form = Form(centre[:, 0], total_form.g, total_form.r + slack)
-    # another order
-    swap = _swaps(clean, dlow, dhigh, inside, most[:, :-1], ah, cl, ch)
-    # an earlier stop
-    open_ = begin < end
-    at = (place[:, :-1] >= begin) & (place[:, :-1] < end)
-    light = np.where(at, STOP * (1.0 + 4.0 * ROOM) / np.maximum(1.0 - np.where(at, ah, 0.0), 1e-3), 0.0).max(axis=1)
-    light = np.minimum(light, np.take_along_axis(most, begin, 1)[:, 0])
-    darkest = np.minimum(np.where(at, cl, np.inf).min(axis=1), background)
-    brightest = np.maximum(np.where(at, ch, -np.inf).max(axis=1), background)
-    stops = open_[:, 0]
-    fall = np.where(stops, light * (brightest - background), 0.0) * (1.0 + ROOM)
-    rise = np.where(stops, light * (background - darkest), 0.0) * (1.0 + ROOM)
-    lower, upper = swap[0] - fall, swap[1] + rise
-    form = Form(
-        form.c + 0.5 * (lower + upper),
-        form.g,
-        form.r + 0.5 * (upper - lower) * (1.0 + ROOM) + 8.0 * U * (np.abs(form.c) + 1.0),
-    )
-    return form, inside | (np.arange(n)[None] < end + 1)
+def _from_the_back(alpha: Form, color: Form, inside: Array, background: Array, unit: float) -> Form:
+    """The colours [B, 3] of fragments that are blended in the order of their centres.
 
-
-def _mean_value(alpha: Form, color: Form, blank: Array, light: Any, alphas: Any, colors: Any, behind: Any) -> Form:
-    """Deviation of the picture from that of the centres: derivatives times deviations of alphas and colours."""
-    (most, least), (al, ah), (cl, ch), (low, high) = light, alphas, colors, behind
-    dlow, dhigh = cl - high[:, 1:], ch - low[:, 1:]
-    t, b = most[:, :-1], least[:, :-1]
-    by_alpha = np.minimum(dlow * t, dlow * b), np.maximum(dhigh * t, dhigh * b)
-    by_color = b * al, t * ah
-    g, r = 0.0, 0.0
-    for (lowest, highest), form in ((by_alpha, alpha), (by_color, color)):
-        middle, radius = 0.5 * (lowest + highest) * blank, 0.5 * (highest - lowest) * blank
-        wide_ = form.width
-        radius = radius * (1.0 + 8.0 * U) + 8.0 * U * np.abs(middle) + TINY
-        g = g + (middle[None] * form.g).sum(axis=2)
-        part = np.abs(middle) * form.r * blank + radius * wide_
-        part = part + 16.0 * U * np.abs(middle) * wide_
-        r = r + np.where(blank > 0.0, part, 0.0).sum(axis=1) * (1.0 + 4.0 * (blank.shape[1] + 8) * U)
-        r = r + 4.0 * (blank.shape[1] + 8) * U * (np.abs(middle) * form.slope).sum(axis=1)
-    return Form(np.zeros(len(blank)), g, r)
+    S' = S + alpha (C - S): errors of S are met by 1 - alpha, those of C by alpha. In float32 a fragment's light errs by
+    2 units for each in front of it, sums by one for each.
+    """
+    count, n = inside.shape
+    size = np.maximum(color.size().max(axis=(1, 2), initial=0.0), np.abs(background).max(initial=1.0))[:, None]
+    c, r = np.broadcast_to(background, (count, 3)), np.zeros((count, 3))
+    g = np.zeros((len(alpha.g), count, 3))
+    al, ah = (np.clip(a, 0.0, 1.0) for a in alpha.range())
+    slope = alpha.slope
+    for k in np.flatnonzero((inside & (ah > 0.0)).any(axis=0))[::-1]:
+        used = inside[:, k, None] * 1.0
+        a, da, ra, s = (v[..., k, None] * used for v in (alpha.c, alpha.g, alpha.r, slope))
+        d, dg = color.c[:, k] - c, color.g[:, :, k] - g
+        tilt = np.abs(dg).sum(axis=0)
+        r = (1.0 - al[:, k, None] * used) * r + ah[:, k, None] * used * color.r[:, k]
+        r = (r + ra * (np.abs(d) + tilt) + s * tilt) * (1.0 + 16.0 * U) + 32.0 * U * size + TINY
+        c, g = c + a * d, g + a * dg + da * d
+    # what is outside of the colours is not known better than that
+    return Form(c, g, np.where(np.isfinite(r), r, np.inf)).wider((4.0 * n + 16.0) * unit * size)
 
 
 def _swaps(clean: Array, dlow: Array, dhigh: Array, inside: Array, most: Array, ah: Array, cl: Array, ch: Array) -> Any:
-    """What other orders than that of the centres may change: [B] least and largest.
+    """What other orders than that of the centres may change: [B, 3] least and largest.
 
     Sorting by exchanges of neighbours exchanges each inverted pair once; an exchange changes the colour by the
     transmittance in front times both alphas times the difference of colours. What is surely in front of a group of
@@ -435,18 +470,66 @@ def _swaps(clean: Array, dlow: Array, dhigh: Array, inside: Array, most: Array, 
     place = np.arange(n)[None]
     begin = np.maximum.accumulate(np.where(clean[:, :n], place, 0), axis=1)
     light = np.take_along_axis(most, begin, 1)
-    lower, upper = np.zeros(count), np.zeros(count)
-    longest = int((np.where(inside, place - begin, 0)).max(initial=0))
-    if longest > LONGEST_GROUP:
-        return lower - np.inf, upper + np.inf
-    for k in range(1, longest + 1):
+    lower, upper = np.zeros((count, 3)), np.zeros((count, 3))
+    longest = (np.where(inside, place - begin, 0)).max(axis=1, initial=0)
+    for k in range(1, int(np.where(longest > LONGEST_GROUP, 0, longest).max(initial=0)) + 1):
         pair = inside[:, :-k] & inside[:, k:] & (begin[:, k:] <= place[:, :-k]) & ~(dhigh[:, :-k] < dlow[:, k:])
-        if not pair.any():
-            continue
-        weight = np.where(pair, light[:, :-k] * ah[:, :-k] * ah[:, k:], 0.0)
-        weight = np.where(weight > 0.0, weight, 0.0)
-        with np.errstate(all="ignore"):
-            down = np.where(weight > 0.0, weight * np.minimum(cl[:, k:] - ch[:, :-k], 0.0), 0.0)
-            up = np.where(weight > 0.0, weight * np.maximum(ch[:, k:] - cl[:, :-k], 0.0), 0.0)
-        lower, upper = lower + down.sum(axis=1), upper + up.sum(axis=1)
-    return lower * (1.0 + ROOM), upper * (1.0 + ROOM)
+        if pair.any():
+            weight = np.where(pair, light[:, :-k] * ah[:, :-k] * ah[:, k:], 0.0)[..., None]
+            with np.errstate(invalid="ignore"):
+                lower += np.where(weight > 0.0, weight * np.minimum(cl[:, k:] - ch[:, :-k], 0.0), 0.0).sum(axis=1)
+                upper += np.where(weight > 0.0, weight * np.maximum(ch[:, k:] - cl[:, :-k], 0.0), 0.0).sum(axis=1)
+    lost = np.where(longest > LONGEST_GROUP, np.inf, 0.0)[:, None]
+    return lower * (1.0 + ROOM) - lost, upper * (1.0 + ROOM) + lost
+
+
+def pixels(
+    splats: Splats, cam: Camera, view: View | Projected, index: Array, pixel: tuple[Array, Array], unit: float = 0.0
+) -> tuple[Form, Array, Array]:
+    """Colours [B, 3] before the clamp of one pixel over each of B boxes; which Gaussians matter [B, n]; their motion.
+
+    The motion [d, B], in pixels, is what each parameter moves a Gaussian by at most, about.
+
+    Args:
+        splats, cam: The scene, and the camera's intrinsics.
+        view: Cameras over B boxes, or what `projected` makes of them.
+        index: [B, n] numbers of the Gaussians that may show (`reaches`); negative ones stand for none.
+        pixel: Rows [B] and columns [B].
+        unit: 0 for the picture in real numbers, `FLOAT` for all those in float32.
+    """
+    with np.errstate(all="ignore"):
+        if not isinstance(view, Projected):
+            view = projected(splats, cam, view, np.maximum(index, 0), unit)
+        f = _fragments(splats, cam, view, index, pixel, unit)
+        used = np.flatnonzero(f.shows.any(axis=0))
+        if not len(used):
+            plain = np.zeros((len(index), 3))
+            form = Form(plain + splats.background, np.zeros((len(f.alpha.g), *plain.shape)), plain + 16.0 * unit)
+            return form, f.shows, f.motion
+        some = _Fragments(
+            f.alpha.of(lambda a: a[..., used]), f.color.of(lambda a: a[..., used, :]),
+            f.depth.of(lambda a: a[..., used]), f.shows[:, used], f.motion,
+        )  # fmt: skip
+        form, keep = blended(some, splats.background, unit)
+        kept = np.zeros(f.shows.shape, bool)
+        kept[:, used] = keep
+        return form, kept, f.motion
+
+
+def picture(splats: Splats, cam: Camera, view: View, unit: float) -> Form:
+    """The picture [H, W, 3] over one box of poses."""
+    ends, columns, parts = reaches(splats, cam, view, unit), np.arange(cam.width), []
+    inside = (ends[:, 0] <= cam.width) & (ends[:, 1] >= 0.0) & (ends[:, 2] <= cam.height) & (ends[:, 3] >= 0.0)
+    # one more, so that there is one
+    some = np.append(np.flatnonzero(inside), 0)
+    ends = np.concatenate([ends[some[:-1]], [[np.inf, -np.inf] * 2]])
+    with np.errstate(all="ignore"):
+        whole = projected(splats, cam, view, some[None], unit)
+    for row in range(cam.height):
+        lists = [meeting(ends, row, column) for column in columns]
+        index = np.full((cam.width, max(1, *map(len, lists))), -1)
+        for place, numbers in zip(index, lists, strict=True):
+            place[: len(numbers)] = numbers
+        part, pixel = whole.among(index), (np.full(cam.width, row), columns)
+        parts.append(pixels(splats, cam, part, index, pixel, unit)[0].clamped(0.0, 1.0))
+    return Form(*(np.stack([getattr(p, name) for p in parts], axis=-3) for name in ("c", "g", "r")))

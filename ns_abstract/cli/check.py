@@ -21,7 +21,7 @@ class Check:
     """
 
     output_dir: Annotated[Path, tyro.conf.Positional]
-    """Output folder of ns-abstract-render --save-cells."""
+    """Output folder of ns-abstract-render --save-cells, ns-abstract-certify or ns-abstract-reach."""
     claims: int = 200
     """Number of claims to draw."""
     seconds: float = 600.0
@@ -34,6 +34,10 @@ class Check:
     """The camera path, if it has been moved since."""
     perturbation_filename: Path | None = None
     """The perturbation file, if it has been moved since."""
+    model: Path | None = None
+    """The network's .onnx file, if it has been moved since."""
+    loop: Path | None = None
+    """LOOP.json, if it has been moved since."""
 
 
 def check(options: Check) -> int:
@@ -52,21 +56,30 @@ def check(options: Check) -> int:
         load_config=options.load_config,
         camera_path=options.camera_path_filename,
         perturbation=options.perturbation_filename,
+        model=options.model,
+        loop=options.loop,
     )
     for text in found.structure:
         print(f"refuted: {text}")
     for entry in found.refutations[:10]:
-        row, column = entry["pixel"]
-        print(
-            f"refuted: frame {entry['frame']}, pixel ({row}, {column}), channel {entry['channel']}: "
-            f"{entry['value']:.6f} is beyond the {entry['bound']} bound by {entry['excess']:.2g} at {entry['pose']}"
-        )
+        where = f"frame {entry['frame']}, cell {entry['cell']}"
+        if "pixel" in entry:
+            row, column = entry["pixel"]
+            what = f"{entry['value']:.6f} is beyond the {entry['bound']} bound by {entry['excess']:.2g}"
+            where = f"{where}, pixel ({row}, {column}), channel {entry['channel']}"
+        else:
+            what = f"the margin is {entry['margin']:.6g} at most, {entry['excess']:.2g} below what is claimed"
+        print(f"refuted: {where}: {what} at {entry['pose']}")
     print(
-        f"{found.claims} claims about the picture in {found.picture}: {found.proved} proved, {found.refuted} refuted, "
-        f"{found.unsettled} not settled; {found.median_seconds:.2g} s a claim"
+        f"{found.claims} claims: {found.proved} proved ({found.float32} of every float32 evaluation, the others of the "
+        f"picture in real numbers), {found.refuted} refuted, {found.unsettled} not settled; "
+        f"{found.median_seconds:.2g} s a claim"
     )
     share, count = found.uniform["holds_at_least"], found.uniform["claims"]
-    print(f"at least {100.0 * share:.1f} % of all claims hold (95 % confidence, {count} drawn uniformly)")
+    print(
+        f"at least {100.0 * share:.1f} % of all claims hold in real numbers, and "
+        f"{100.0 * found.uniform['float32_at_least']:.1f} % in float32 (95 % confidence, {count} drawn uniformly)"
+    )
     print(f"details: {options.output_dir / 'check.json'}")
     return found.exit_code
 

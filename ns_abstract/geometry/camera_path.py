@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -12,14 +12,13 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from ns_abstract.geometry.camera_files import FileCamera, RunFrame, inria_cameras, is_inria, transforms_cameras
 from ns_abstract.geometry.path_keys import ENTRY, KEYFRAME, PATH
 from ns_abstract.io.errors import InputError
-from ns_abstract.io.jsonio import is_number, load_json, parse_json, show
+from ns_abstract.io.jsonio import InputTuning, is_moderate, is_number, load_json, parse_json, show
 from ns_abstract.io.keys import sentence
 
 SIDE_LIMIT = 16384
-_ROTATION_TOLERANCE = 1e-3
-_LAST_ROW_TOLERANCE = 1e-6
 _FIX_FILE = "give the camera path that Nerfstudio's viewer saved"
 
 
@@ -154,15 +153,19 @@ class CameraPath:
         return self.cameras[0] if self.is_cycle and len(self.cameras) > 1 else None
 
 
-def load_camera_path(path: str | os.PathLike[str], downscale_factor: float = 1) -> CameraPath:
-    """Read the JSON that Nerfstudio's viewer writes.
+def load_camera_path(
+    path: str | os.PathLike[str], downscale_factor: float = 1, run_frame: RunFrame | None = None
+) -> CameraPath:
+    """Read the JSON that Nerfstudio's viewer writes, Inria's ``cameras.json`` or a data set's ``transforms.json``.
 
-    Focal lengths are ``(height / 2) / tan(fov / 2)`` in both directions (fov is vertical) and
-    the principal point is the image centre, as in ``nerfstudio.cameras.camera_paths``.
+    In the viewer's paths, focal lengths are ``(height / 2) / tan(fov / 2)`` in both directions (fov is vertical) and
+    the principal point is the image centre, as in ``nerfstudio.cameras.camera_paths``, unless an entry has fx, fy, cx
+    or cy.
 
     Args:
         path: The file.
         downscale_factor: Images become this many times smaller.
+        run_frame: From the data set's frame to the run's; without it a ``transforms.json`` is refused.
 
     Raises:
         InputError: The file or a field in it cannot be used.
@@ -170,10 +173,44 @@ def load_camera_path(path: str | os.PathLike[str], downscale_factor: float = 1) 
     path = Path(path)
     root = load_json(path, "camera path")
     try:
+        if is_inria(root):
+            return _photo_path(inria_cameras(root), str(path), downscale_factor)
+        if isinstance(root, dict) and "camera_path" not in root and "frames" in root:
+            return _photo_path(transforms_cameras(root, run_frame), str(path), downscale_factor)
         _refuse_others(root)
         return _parse(root, str(path), downscale_factor)
     except InputError as error:
         raise error.within(path) from None
+
+
+def _photo_path(found: Iterable[FileCamera], source: str, downscale_factor: float) -> CameraPath:
+    """The path of the cameras of photos."""
+    cameras = []
+    for entry in found:
+        camera = Camera(
+            camera_to_world=checked_pose([*entry.camera_to_world, [0, 0, 0, 1]], entry.field),
+            fx=_pixels(entry.fx, f"{entry.field}: focal length"),
+            fy=_pixels(entry.fy, f"{entry.field}: focal length"),
+            cx=entry.cx,
+            cy=entry.cy,
+            width=checked_side(entry.width, f"{entry.field}: width"),
+            height=checked_side(entry.height, f"{entry.field}: height"),
+        )
+        cameras.append(camera.rescaled(downscale_factor))
+    return CameraPath(tuple(cameras), None, (None,) * len(cameras), None, False, source)
+
+
+def _pixels(value: Any, field: str) -> float:
+    if not is_moderate(value) or not value > 0:
+        raise InputError(f"found {show(value)}", field=field, fix="write a number of pixels above 0")
+    return float(value)
+
+
+def _place(value: Any, side: int, field: str) -> float:
+    """A coordinate of the principal point; without it the middle of a side."""
+    if value is not None and not is_moderate(value):
+        raise InputError(f"found {show(value)}", field=field, fix="write a number of pixels")
+    return side / 2 if value is None else float(value)
 
 
 def _parse(root: dict[str, Any], source: str, downscale_factor: float) -> CameraPath:
@@ -183,13 +220,14 @@ def _parse(root: dict[str, Any], source: str, downscale_factor: float) -> Camera
     cameras = []
     overrides = []
     for field, entry in _entries(root, unknown):
-        focal = _focal(entry, root, field, height)
+        own = {key: entry.get(key, root.get(key)) for key in ("fx", "fy", "cx", "cy")}
+        focal = _focal(entry, root, field, height) if own["fx"] is None else _pixels(own["fx"], f"{field}.fx")
         camera = Camera(
             camera_to_world=checked_pose(entry.get("camera_to_world"), f"{field}.camera_to_world"),
             fx=focal,
-            fy=focal,
-            cx=width / 2,
-            cy=height / 2,
+            fy=focal if own["fy"] is None else _pixels(own["fy"], f"{field}.fy"),
+            cx=_place(own["cx"], width, f"{field}.cx"),
+            cy=_place(own["cy"], height, f"{field}.cy"),
             width=width,
             height=height,
         )
@@ -213,12 +251,7 @@ def _parse(root: dict[str, Any], source: str, downscale_factor: float) -> Camera
 
 
 #: Files of Nerfstudio and of this program that are taken for camera paths, by a key that these lack.
-_OTHERS = {
-    "frames": (
-        "a data set's transforms.json, not a camera path",
-        "make a path in Nerfstudio's viewer, or write one whose camera_to_world are the transform_matrix entries, "
-        "taken to the run's frame by dataparser_transforms.json",
-    ),
+_OTHERS: dict[str, tuple[str, str]] = {
     "transform": ("a run's dataparser_transforms.json, not a camera path", _FIX_FILE),
     "dynamics": ("a loop, not a camera path", "give it to ns-abstract-reach as --loop"),
     **dict.fromkeys(
@@ -360,12 +393,12 @@ def checked_pose(value: Any, field: str) -> NDArray[np.float64]:
     _refuse_scaled(matrix, field)
     with np.errstate(over="ignore", invalid="ignore"):
         distance = float(np.abs(rotation.T @ rotation - np.eye(3)).max())
-    if not distance <= _ROTATION_TOLERANCE:
+    if not distance <= InputTuning.rotation:
         with np.errstate(all="ignore"):
             scale = float(np.cbrt(np.linalg.det(rotation)))
-            whole = scale > 0 and np.abs(rotation.T @ rotation / scale**2 - np.eye(3)).max() <= _ROTATION_TOLERANCE
+            whole = scale > 0 and np.abs(rotation.T @ rotation / scale**2 - np.eye(3)).max() <= InputTuning.rotation
         fix = f"divide its nine numbers by {scale:.6g}" if whole else "remove scale and shear from the matrix"
-        problem = f"the rotation part is {distance:.3g} away from orthonormal (limit {_ROTATION_TOLERANCE:g})"
+        problem = f"the rotation part is {distance:.3g} away from orthonormal (limit {InputTuning.rotation:g})"
         raise InputError(problem, field=field, fix=fix)
     if np.linalg.det(rotation) < 0:
         raise InputError(
@@ -383,14 +416,14 @@ def _refuse_scaled(matrix: NDArray[np.float64], field: str) -> None:
         InputError: The row, and whether the matrix is scaled as a whole.
     """
     row = matrix[3]
-    if np.abs(row - (0, 0, 0, 1)).max() <= _LAST_ROW_TOLERANCE:
+    if np.abs(row - (0, 0, 0, 1)).max() <= InputTuning.last_row:
         return
     shown = f"the last row is ({', '.join(f'{x:.6g}' for x in row)}), not (0, 0, 0, 1)"
     scale = float(row[3])
     if not row[:3].any() and scale != 0.0:
         with np.errstate(all="ignore"):
             square = matrix[:3, :3].T @ matrix[:3, :3]
-            whole = np.abs(square / scale**2 - np.eye(3)).max() <= _ROTATION_TOLERANCE
+            whole = np.abs(square / scale**2 - np.eye(3)).max() <= InputTuning.rotation
         fix = (
             f"divide all 16 numbers by {scale:.6g}" if whole else "write 1 at its end; the rotation is not scaled by it"
         )

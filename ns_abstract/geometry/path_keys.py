@@ -15,6 +15,12 @@ _TYPE = "only perspective cameras are bounded"
 _TIME = "time of a scene that moves; such runs are refused"
 _EDITOR = "how the viewer makes its path from keyframes; the path itself is in camera_path"
 _EXTRA = Key("perturbation", "used", "the set of poses (ns-abstract)")
+_INTRINSICS = (
+    Key("fx", "used", "focal length in pixels, in place of fov (ns-abstract)"),
+    Key("fy", "used", "vertical focal length in pixels; without it fx (ns-abstract)"),
+    Key("cx", "used", "principal point from the left edge in pixels; without it the middle (ns-abstract)"),
+    Key("cy", "used", "principal point from the top edge in pixels; without it the middle (ns-abstract)"),
+)
 
 PATH = KeyTable(
     "The camera path",
@@ -33,6 +39,7 @@ PATH = KeyTable(
         Key("default_transition_sec", "irrelevant", _EDITOR, f"{_PANEL}:1085"),
         Key("smoothness_value", "irrelevant", _EDITOR, f"{_PANEL}:1093"),
         _EXTRA,
+        *_INTRINSICS,
         Key("$schema", "irrelevant", "of editors"),
     ),
 )
@@ -47,6 +54,7 @@ ENTRY = KeyTable(
         Key("camera_type", "refused", _TYPE, "", ("perspective",), fix=_SAVE_AGAIN),
         Key("crop", "refused", _CROP, "", (None,), fix=_NO_CROP),
         _EXTRA,
+        *_INTRINSICS,
     ),
 )
 
@@ -55,6 +63,7 @@ KEYFRAME = KeyTable(
     (
         Key("matrix", "used", "the pose, where camera_path is empty and this is the one keyframe", f"{_PANEL}:1070"),
         Key("fov", "used", "its vertical field of view", f"{_PANEL}:1071"),
+        *_INTRINSICS,
         Key("aspect", "irrelevant", "the picture has render_width and render_height", f"{_PANEL}:1072"),
         Key("override_transition_enabled", "irrelevant", _EDITOR, f"{_PANEL}:1073"),
         Key("override_transition_sec", "irrelevant", _EDITOR, f"{_PANEL}:1074"),

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from ns_abstract.arithmetic.forms import Basis, Float64Array, FormArray
-from ns_abstract.arithmetic.rounding import POSE_ROUNDING, UNIT64
+from ns_abstract.arithmetic.rounding import HALF_UP, POSE_ROUNDING, STILL_ROOM, TURNED_POSITION, TURNED_ROTATION
 from ns_abstract.arithmetic.taylor import TaylorArray, TaylorBasis, taylor_cos_sin
 from ns_abstract.arithmetic.trigonometry import cos_sin
 from ns_abstract.geometry.box import ParameterBox
@@ -29,8 +29,6 @@ COLOR_SHIFTS = ("hue", "saturation")
 #: Where the scene as a whole stands: shifts along the world axes, or turns (radians) about those through the origin.
 SCENE_SHIFTS = ("scene_x", "scene_y", "scene_z")
 SCENE_TURNS = ("scene_turn_x", "scene_turn_y", "scene_turn_z")
-#: What three more turns make of the rounding of a rotation and of a position.
-_TURNED_ROTATION, _TURNED_POSITION = 4.0, 8.0
 #: OpenGL to OpenCV camera axes.
 _FLIP = np.array([1.0, -1.0, -1.0])
 
@@ -309,7 +307,7 @@ class PoseSet:
         if self.perturbation.orbit is not None:
             shift += POSE_ROUNDING * (1.0 + 2.0 * np.abs(self.perturbation.orbit.target).max())
         if any(name in limits for name in SCENE_TURNS):
-            return _TURNED_ROTATION * POSE_ROUNDING, _TURNED_POSITION * shift
+            return TURNED_ROTATION * POSE_ROUNDING, TURNED_POSITION * shift
         return POSE_ROUNDING, shift
 
     def _enclosed(self, box: ParameterBox, basis: Any, kind: Any, trigonometry: Callable[[Any], tuple]) -> tuple:
@@ -327,7 +325,7 @@ class PoseSet:
             index = box.names.index(name)
             low, high = box.lower[index], box.upper[index]
             middle = 0.5 * (low + high)
-            half = max(high - middle, middle - low) * (1.0 + 4.0 * UNIT64)
+            half = max(high - middle, middle - low) * HALF_UP
             return kind.parameter(basis, index, middle, half)
 
         def turned(axis: Float64Array, angle: Any) -> Any:
@@ -375,4 +373,4 @@ class PoseSet:
 def translation_only(forms: PoseForms) -> bool:
     """Whether the depth direction is the same for every pose, up to rounding: no depth order changes."""
     row = forms.rotation[2]
-    return bool(np.all(row.linear == 0.0) and np.all(row.radius < 1e-12))
+    return bool(np.all(row.linear == 0.0) and np.all(row.radius < STILL_ROOM))

@@ -9,6 +9,7 @@ import json
 import math
 import re
 import stat
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeGuard
 
@@ -18,8 +19,24 @@ JSON_BYTES_LIMIT = 32 * 2**20
 JSON_DEPTH_LIMIT = 64
 # float() of an integer with this many digits cannot overflow.
 INTEGER_DIGITS_LIMIT = 308
-#: Least and largest size of numbers whose products and squares are to keep clear of overflow and underflow.
-MODERATE = 1e-15, 1e15
+
+
+@dataclass(frozen=True)
+class InputTuning:
+    """What numbers in files may be; others are refused, so that no bound rests on these."""
+
+    #: Least and largest size of numbers whose products and squares are to keep clear of overflow and underflow.
+    least: float = 1e-15
+    largest: float = 1e15
+    #: A length or determinant below is taken for 0.
+    nothing: float = 1e-12
+    #: By how much a rotation may miss an orthonormal one (bounds take it as it is written), and a last row (0, 0, 0,
+    #: 1).
+    rotation: float = 1e-3
+    last_row: float = 1e-6
+
+
+MODERATE = InputTuning.least, InputTuning.largest
 FIX_MODERATE = f"0, or between {MODERATE[0]:g} and {MODERATE[1]:g} in size"
 FIX_ACCESS = "check the path, the links on the way and the permissions"
 

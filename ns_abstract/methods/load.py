@@ -11,6 +11,7 @@ from ns_abstract.methods import runs
 from ns_abstract.methods.nerf.opening import NERF
 from ns_abstract.methods.overrides import Overrides
 from ns_abstract.methods.representation import Representation
+from ns_abstract.methods.splat.formats.readers import scene_file
 from ns_abstract.methods.splat.method import SPLAT
 
 #: What is asked in turn; the last one explains what it cannot read.
@@ -31,7 +32,8 @@ def open_scene(path: str | os.PathLike[str], overrides: Overrides | None = None)
         InputError: For any content of the files that cannot be used.
     """
     source: runs.RunConfig | Path = Path(path)
-    if os.path.isdir(path) or Path(path).suffix.lower() in (".yml", ".yaml"):
+    folder = os.path.isdir(path) and scene_file(Path(path), None) is None
+    if folder or Path(path).suffix.lower() in (".yml", ".yaml"):
         source = runs.read_config(path)
     for found in REPRESENTATIONS:
         if found.reads(source):

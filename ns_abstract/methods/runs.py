@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 import os
 import re
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath, PureWindowsPath
 from typing import Any, cast
@@ -22,7 +23,7 @@ from numpy.typing import NDArray
 
 from ns_abstract.io.assumptions import Assumption
 from ns_abstract.io.errors import InputError, first_line, visible
-from ns_abstract.io.jsonio import FIX_ACCESS, file_size, is_number, load_json, read_text, show
+from ns_abstract.io.jsonio import FIX_ACCESS, InputTuning, file_size, is_number, load_json, read_text, show
 from ns_abstract.io.kinds import refuse_other_kind
 from ns_abstract.methods.checkpoint import RECOPY, read_checkpoint
 from ns_abstract.methods.overrides import chosen
@@ -44,14 +45,6 @@ _NUMBER_TAGS = {f"tag:yaml.org,2002:{python}{kind}" for python in ("", "python/"
 #: Steps that an error lists.
 _STEPS_SHOWN = 12
 _CHECKPOINT_NAME = re.compile(r"step-(\d{1,18})\.ckpt")
-# nerfstudio/utils/colors.py; "random" is what Splatfacto shows outside training.
-_COLORS = {
-    "white": (1.0, 1.0, 1.0),
-    "black": (0.0, 0.0, 0.0),
-    "red": (1.0, 0.0, 0.0),
-    "green": (0.0, 1.0, 0.0),
-    "blue": (0.0, 0.0, 1.0),
-}
 
 
 @dataclass(frozen=True)
@@ -100,24 +93,22 @@ class RunConfig:
             raise self._error(name, value, f"one of {', '.join(options)}")
         return value
 
-    def color(self, name: str, default: str, extra: dict[str, tuple[float, float, float]]) -> NDArray[np.float32]:
+    def color(self, name: str, default: str, names: Mapping[str, tuple[float, float, float]]) -> NDArray[np.float32]:
         """RGB field of ``pipeline.model`` as float32 [3] in [0, 1]; ``default`` if absent.
 
         Args:
             name: Field name.
             default: Colour name used if the field is absent.
-            extra: Names beyond Nerfstudio's own, with their colours.
+            names: Colours of the names that the model shows, letter by letter; it stops at others.
         """
         value = self.model.get(name, default)
         if isinstance(value, str):
-            found = extra.get(value) or _COLORS.get(value.lower())
-            if found is not None:
-                return np.array(found, np.float32)
+            if value in names:
+                return np.array(names[value], np.float32)
         elif isinstance(value, (list, tuple)) and len(value) == 3 and all(map(is_number, value)):
             if all(0 <= part <= 1 for part in value):
                 return np.array(value, np.float32)
-        names = ", ".join([*extra, *_COLORS])
-        raise self._error(name, value, f"{names} or three numbers from 0 to 1")
+        raise self._error(name, value, f"{', '.join(names)} or three numbers from 0 to 1")
 
     def _error(self, name: str, value: Any, wanted: str) -> InputError:
         return InputError(f"found {show(value)}", file=self.file, field=f"pipeline.model.{name}", fix=f"write {wanted}")
@@ -136,11 +127,7 @@ def read_config(path: str | os.PathLike[str]) -> RunConfig:
     if os.path.isdir(file):
         file = file / CONFIG_NAME
         file_size(file, "run configuration", fix="give a folder that ns-train wrote, or its config.yml")
-    refuse_other_kind(file)
-    text = read_text(file, "run configuration", CONFIG_BYTES_LIMIT)
-    root = as_mapping(_parse_yaml(text, file))
-    if root is None:
-        raise InputError("the top level is not a mapping", file=file, fix="give the config.yml of ns-train")
+    root = read_mapping(file, "run configuration")
     pipeline = _section(root, "pipeline", "pipeline", file)
     model = _section(pipeline, "model", "pipeline.model", file)
     folder = file.parent
@@ -153,6 +140,19 @@ def read_config(path: str | os.PathLike[str]) -> RunConfig:
         model_folder=folder / _model_folder(root, file),
         root=root,
     )
+
+
+def read_mapping(file: Path, what: str) -> dict[str, Any]:
+    """What a YAML file of a mapping holds; Python objects in it are kept as `Tagged`, never built.
+
+    Raises:
+        InputError: The file is absent, not YAML, too large, or no mapping.
+    """
+    refuse_other_kind(file)
+    root = as_mapping(_parse_yaml(read_text(file, what, CONFIG_BYTES_LIMIT), file))
+    if root is None:
+        raise InputError("the top level is not a mapping", file=file, fix="give the configuration that training wrote")
+    return root
 
 
 def as_mapping(value: Any) -> dict[str, Any] | None:
@@ -271,7 +271,7 @@ def read_dataparser_transform(run: RunConfig) -> tuple[DataparserTransform, tupl
     matrix = np.array(rows, np.float64)
     with np.errstate(all="ignore"):
         determinant = float(np.linalg.det(matrix[:, :3]))
-    if not math.isfinite(determinant) or abs(determinant) < 1e-12:
+    if not math.isfinite(determinant) or abs(determinant) < InputTuning.nothing:
         raise InputError(
             f"the 3x3 part cannot be inverted (determinant {determinant:.3g})",
             file=path,

@@ -13,11 +13,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ns_abstract.arithmetic.forms import Basis, Float64Array, FormArray, set_norms
+from ns_abstract.arithmetic.rounding import LARGEST_CUBED, SMALLEST_CUBED
 from ns_abstract.paper import lines
 from ns_abstract.paper.interval import BoolArray, Interval
 
-# `FormArray`'s second-order remainders are third powers; between these sizes none under- or overflows
-_SMALL, _LARGE = 2.0**-200, 2.0**200
 # arguments of exp whose values are between them
 _MODERATE = 100.0
 
@@ -224,7 +223,11 @@ class Enclosure:
         form = self.form * slope + form_of(self.basis, offset)
         if taylor is not None:
             # exp looks after its own argument
-            safe = domain if curve is lines.EXP else domain & (self.range.lower > _SMALL) & (self.range.upper < _LARGE)
+            safe = (
+                domain
+                if curve is lines.EXP
+                else domain & (self.range.lower > SMALLEST_CUBED) & (self.range.upper < LARGEST_CUBED)
+            )
             better = safe & np.isfinite(taylor.data).all(axis=0).reshape(self.shape) & (taylor.radius < form.radius)
             form = _merge(better, taylor, form)
         return Enclosure(_merge(domain, form, form_of(self.basis, whole)), whole)

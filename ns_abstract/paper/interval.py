@@ -16,14 +16,11 @@ import numpy as np
 from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
-from ns_abstract.arithmetic.elementary import EXP_HIGHEST, EXP_RELATIVE_ERROR, exp_kernel
+from ns_abstract.arithmetic.elementary import EXP_HIGHEST, exp_kernel
+from ns_abstract.arithmetic.rounding import EXP_DOWN, EXP_UP
 
 Float64Array = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
-
-# the kernel's error and the rounding of one product with a factor next to 1
-_EXP_DOWN = 1.0 - 2.0 * EXP_RELATIVE_ERROR
-_EXP_UP = 1.0 + 2.0 * EXP_RELATIVE_ERROR
 
 
 def round_down(values: ArrayLike) -> Float64Array:
@@ -79,7 +76,7 @@ def _exp_ends(x: Float64Array) -> tuple[Float64Array, Float64Array]:
     value = np.empty(argument.size)
     _exp_values(np.ascontiguousarray(argument).ravel(), value)
     value = value.reshape(x.shape)
-    down, up = value * _EXP_DOWN, value * _EXP_UP
+    down, up = value * EXP_DOWN, value * EXP_UP
     # exp(x) < exp(-1400) below the clip; the square of its bound is rounded up from 0
     with np.errstate(over="ignore", under="ignore"):
         down = np.where(far, np.maximum(round_down(down * down), 0.0), down)

@@ -12,7 +12,7 @@ import numpy as np
 
 from ns_abstract.io.errors import InputError
 from ns_abstract.io.fields import Fail, Range, interval, known, vector
-from ns_abstract.io.jsonio import load_json, show
+from ns_abstract.io.jsonio import InputTuning, load_json, show
 from ns_abstract.perturbation.variations import KEYS, VARIATIONS, SceneVariation, parse_selection, selection_object
 
 TRANSLATIONS = ("x", "y", "z")
@@ -232,7 +232,7 @@ def _orbit(value: Mapping[str, Any], fail: Fail, turn: float) -> Orbit | None:
     axis = vector(inner["axis"], "orbit.axis", fail)
     with np.errstate(over="ignore"):
         length = float(np.linalg.norm(axis))
-    if not 1e-12 < length < np.inf:
+    if not InputTuning.nothing < length < np.inf:
         raise fail("orbit.axis", f"has length {length:g}", "write a direction, such as [0, 0, 1]")
     low, high = interval(inner["azimuth"], "orbit.azimuth", fail)
     return Orbit(target=vector(inner["target"], "orbit.target", fail), axis=axis, azimuth=(turn * low, turn * high))

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ns_abstract.arithmetic.forms import MAX_DIMENSIONS, Basis, FormArray
-from ns_abstract.arithmetic.rounding import UNDERFLOW64, UNIT64, gamma
+from ns_abstract.arithmetic.rounding import HALF_UP, STEP_ROUNDINGS, STEP_UP, UNDERFLOW64, gamma
 from ns_abstract.arithmetic.trigonometry import cos_sin
 from ns_abstract.io.errors import InputError
 from ns_abstract.io.fields import Fail, known
@@ -26,11 +26,6 @@ Float64 = NDArray[np.float64]
 
 #: Most states and controls together.
 MOST = MAX_DIMENSIONS
-#: Roundings on the longest way through a law: sums of up to `MOST` + 1 products, five more products, and four units of
-#: a library's sine or cosine; twice that, to spare. Slack: the forms charge each of their operations for more than
-#: float64 errs in it (rounding takes at most 0.15 of their radius, 0.45 where a library's sines are 16 units off), and
-#: yet this stands, so that no law needs a proof of that.
-STEP_ROUNDINGS = 40
 
 
 class Floats:
@@ -108,7 +103,7 @@ class Enclosure(NamedTuple):
 def middle_half(lower: Float64, upper: Float64) -> tuple[Float64, Float64]:
     """Middles and half-widths of intervals, so that ``middle - half <= lower`` and ``upper <= middle + half``."""
     middle = 0.5 * (lower + upper)
-    return middle, np.maximum(upper - middle, middle - lower) * (1.0 + 4.0 * UNIT64)
+    return middle, np.maximum(upper - middle, middle - lower) * HALF_UP
 
 
 @dataclass(frozen=True)
@@ -146,7 +141,7 @@ class Dynamics:
             sizes = list(np.maximum(np.abs(lower), np.abs(upper)))
             size = np.array(self.law(sizes[:n], sizes[n:], Sizes), np.float64)
             radius = np.array([float(form.radius) for form in found])
-            radius = (radius + 2.0 * gamma(STEP_ROUNDINGS) * size) * (1.0 + 4.0 * UNIT64) + UNDERFLOW64
+            radius = (radius + 2.0 * gamma(STEP_ROUNDINGS) * size) * STEP_UP + UNDERFLOW64
         center = np.array([float(form.center) for form in found])
         slopes = np.array([form.linear.reshape(-1) for form in found]).reshape(n, n + m)
         return Enclosure(center, slopes, radius, middle, half)

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from ns_abstract.arithmetic.rounding import LARGEST32, STORED_FLUSH, STORED_ROUNDING, STORED_UP
 from ns_abstract.io.errors import InputError
 from ns_abstract.verify.model import parametric
 from ns_abstract.verify.network import ImageSets, OutputBounds, bound_outputs, load_network
@@ -14,10 +15,6 @@ from ns_abstract.verify.network.load import onnx_runner
 
 Float64 = NDArray[np.float64]
 
-#: What rounding to float32 may change, relative to a number and at least; twice a unit, for what is rounded here.
-_ROUNDED, _FLUSHED = 2.0**-23, 2.0**-126
-#: Past this a float32 evaluation may overflow.
-_LARGEST = 2.0**126
 #: Bytes that bounds may take.
 _MEMORY = 1 << 28
 
@@ -79,11 +76,11 @@ class LearnedDynamics:
             Bounds [1, 2 n] with slopes in s; None: a number may leave the range of float32.
         """
         size = np.maximum(np.maximum(np.abs(lower), np.abs(upper)), np.abs(center))
-        if not (size < _LARGEST).all():
+        if not (size < LARGEST32).all():
             return None
         # a program that computes in float32 rounds states and controls first
-        room = _ROUNDED * size + _FLUSHED
-        apart = (radius + room) * (1.0 + 2.0**-50)
+        room = STORED_ROUNDING * size + STORED_FLUSH
+        apart = (radius + room) * STORED_UP
         parts = generators, center - apart, generators, center + apart, lower - room, upper + room
         images = ImageSets(*(part[None] for part in parts))
         unit = np.eye(self.states)

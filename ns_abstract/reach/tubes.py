@@ -9,7 +9,16 @@ from typing import Literal, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from ns_abstract.arithmetic.rounding import UNDERFLOW64, UNIT64, gamma
+from ns_abstract.arithmetic.rounding import (
+    CLIP_ROUNDING,
+    CLIP_UP,
+    NARROWEST,
+    PUSH_ROUNDING,
+    SET_ROUNDINGS,
+    SPREAD_ROUNDINGS,
+    UNDERFLOW64,
+    gamma,
+)
 from ns_abstract.execution.ending import checkpoint
 from ns_abstract.geometry.box import ParameterBox
 from ns_abstract.geometry.poses import PoseSet
@@ -31,10 +40,6 @@ Dependence = Literal["kept", "step", "none"]
 
 #: Symbols beyond which the smallest ones are put together.
 _MOST_SYMBOLS = 64
-#: Half-width below which positions in a box are not told apart.
-_NARROWEST = 2.0**-500
-#: Roundings of a few operations on one number: scaling, shifting, halving.
-_FEW = 16
 
 
 @dataclass(frozen=True)
@@ -69,12 +74,14 @@ class AffineSet:
     def size(self) -> Float64:
         """[n] upper bounds of absolute values."""
         spread = np.abs(self.generators).sum(axis=1) + self.radius
-        return (np.abs(self.center) + spread) * (1.0 + 2.0 * gamma(self.generators.shape[1] + 4)) + UNDERFLOW64
+        return (np.abs(self.center) + spread) * (
+            1.0 + 2.0 * gamma(self.generators.shape[1] + SPREAD_ROUNDINGS)
+        ) + UNDERFLOW64
 
     def hull(self) -> tuple[Float64, Float64]:
         """[n], [n] the smallest box around it, rounded outward; a width of 0 stays one."""
         spread = np.abs(self.generators).sum(axis=1) + self.radius
-        spread = spread * (1.0 + 2.0 * gamma(self.generators.shape[1] + 4))
+        spread = spread * (1.0 + 2.0 * gamma(self.generators.shape[1] + SPREAD_ROUNDINGS))
         still = spread == 0.0
         low, high = self.center - spread, self.center + spread
         low, high = np.nextafter(low, -np.inf), np.nextafter(high, np.inf)
@@ -83,16 +90,16 @@ class AffineSet:
     def mapped(self, matrix: Float64, offset: Float64, radius: Float64 | float = 0.0) -> AffineSet:
         """``matrix x + offset + e`` with |e| <= radius, in the same symbols.
 
-        Entries of ``matrix`` may carry relative errors of `_FEW` units.
+        Entries of ``matrix`` may carry relative errors of `SET_ROUNDINGS` units.
         """
         n, q = self.generators.shape
-        share = 2.0 * gamma(n + _FEW)
+        share = 2.0 * gamma(n + SET_ROUNDINGS)
         with np.errstate(all="ignore"):
             steep = np.abs(matrix)
             size = np.abs(self.center) + np.abs(self.generators).sum(axis=1) + self.radius
             # every entry is a sum of n products and an offset
             spread = steep @ (self.radius + share * size) + share * np.abs(offset) + radius
-            spread = spread * (1.0 + 2.0 * gamma(n + q + _FEW)) + np.where(steep.any(axis=1), UNDERFLOW64, 0.0)
+            spread = spread * (1.0 + 2.0 * gamma(n + q + SET_ROUNDINGS)) + np.where(steep.any(axis=1), UNDERFLOW64, 0.0)
             found = matrix @ self.center + offset, matrix @ self.generators
         return AffineSet(*found, spread, self.first)
 
@@ -132,7 +139,7 @@ class AffineSet:
 def _scaled(values: AffineSet, middle: Float64, half: Float64) -> AffineSet:
     """``(values - middle) / half``: positions in [-1, 1] in boxes; 0 where a box has no width."""
     with np.errstate(all="ignore"):
-        usable = half > _NARROWEST
+        usable = half > NARROWEST
         inverse = np.where(usable, 1.0 / half, 0.0)
     shifted = values.mapped(np.eye(len(middle)), -middle)
     # where a quotient could overflow, all that is known is that the position is in [-1, 1]
@@ -216,11 +223,11 @@ def clipped(raw: Linear, lower: Float64, upper: Float64) -> Linear:
         slope = np.clip((high - low) / (raw.upper - raw.lower), 0.0, 1.0)
     slope = np.where(np.isfinite(slope), slope, 0.0)
     ends = np.stack([raw.lower, raw.upper, np.clip(lower, raw.lower, raw.upper), np.clip(upper, raw.lower, raw.upper)])
-    room = 8.0 * UNIT64 * (np.abs(ends).max(axis=0) + np.maximum(np.abs(low), np.abs(high)))
+    room = CLIP_ROUNDING * (np.abs(ends).max(axis=0) + np.maximum(np.abs(low), np.abs(high)))
     distance = np.clip(ends, lower, upper) - slope * ends
     middle, half = middle_half(distance.min(axis=0) - room, distance.max(axis=0) + room)
     size = np.abs(raw.slopes).sum(axis=1) + np.abs(raw.center) + np.abs(middle)
-    radius = (slope * raw.radius + half + 8.0 * UNIT64 * size) * (1.0 + 8.0 * UNIT64) + UNDERFLOW64
+    radius = (slope * raw.radius + half + CLIP_ROUNDING * size) * CLIP_UP + UNDERFLOW64
     # a relaxation that is wider than the range itself is none
     flat = ~inside & ~(radius < 0.5 * (high - low))
     center, spread = middle_half(low, high)
@@ -268,7 +275,7 @@ class Pilot:
             outputs = np.maximum(-least[2 * m : 2 * m + o], -least[2 * m + o :])
             # K (y - goal) in float64, and K goal
             steep = np.abs(control.gain)
-            room = 2.0 * gamma(2 * o + _FEW) * (steep @ (np.abs(outputs) + np.abs(control.goal)))
+            room = 2.0 * gamma(2 * o + SET_ROUNDINGS) * (steep @ (np.abs(outputs) + np.abs(control.goal)))
             raw = between(found, m, control.gain @ control.goal, room)
             return None if raw is None else clipped(raw, control.lower, control.upper)
 
@@ -299,7 +306,7 @@ def between(found: OutputBounds, count: int, shift: Float64, room: Float64) -> L
         center, half = middle_half(bottom, top)
         low, high = least[:count], -least[count:]
         # the sums above, and the shift
-        wide = room + 2.0 * gamma(a.shape[1] + _FEW) * (size + np.abs(shift))
+        wide = room + 2.0 * gamma(a.shape[1] + SET_ROUNDINGS) * (size + np.abs(shift))
         raw = Linear(slopes, center - shift, half + wide, low - shift - wide, high - shift + wide)
         poor = ~(raw.radius < 0.5 * (raw.upper - raw.lower))
         middle, spread = middle_half(raw.lower, raw.upper)
@@ -428,7 +435,7 @@ class Reacher:
     def poses(self, state: AffineSet) -> AffineSet:
         """Parameters [d] of the camera's poses at the states of a set, and their float64 evaluations."""
         loop, camera = self.loop, self.loop.camera
-        rounding = 2.0 * gamma(len(loop.names) + _FEW)
+        rounding = 2.0 * gamma(len(loop.names) + SET_ROUNDINGS)
         size = np.abs(camera.factors) @ state.size + np.abs(camera.offset) + self.shift
         # a scene elsewhere is a camera elsewhere (V13)
         return state.mapped(camera.factors, camera.offset, self.shift + rounding * size)
@@ -490,8 +497,8 @@ class Reacher:
                 return "the dynamics' bounds are not finite"
             moved = AffineSet(lines.center, lines.slopes, lines.radius, both.first)
             # the sum with the disturbance is rounded where a run is simulated, too
-            return moved.mapped(np.eye(law.states), push, wide + 4.0 * UNIT64 * (moved.size + most))
+            return moved.mapped(np.eye(law.states), push, wide + PUSH_ROUNDING * (moved.size + most))
         step = law.enclose(*ends)
         place = _scaled(both, step.middle, step.half)
-        added = 4.0 * UNIT64 * (np.abs(step.center + push) + most)
+        added = PUSH_ROUNDING * (np.abs(step.center + push) + most)
         return place.mapped(step.slopes, step.center + push, step.radius + wide + added)

@@ -19,6 +19,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from ns_abstract.arithmetic.rounding import MEAN_DOWN
 from ns_abstract.execution.ending import AbandonedError, abandoning
 from ns_abstract.geometry.box import ParameterBox
 from ns_abstract.geometry.tiles import in_tiles
@@ -54,8 +55,19 @@ _HELPS, _CUT_OFF = 0.5, 0.25
 _AIM_PART, _STILL_HELPS, _PATIENCE, _FAR_FROM_AIM = 3.0, 0.8, 2, 1.6
 #: Part of the gap beyond the witnesses that a goal allows which a leaf may leave open at a pixel for good.
 _CLOSED_SHARE = 0.25
-#: Leaves whose box is narrower than this part of the set are not split: rounding rules there.
-_NARROWEST = 2.0**-40
+
+
+@dataclass(frozen=True)
+class EngineTuning:
+    """When leaves stay whole, and how long a cell takes at least. No bound depends on them."""
+
+    #: Leaves whose box is narrower than this part of the set are not split: rounding rules there.
+    narrowest: float = 2.0**-40
+    #: Seconds.
+    least_time: float = 1e-4
+
+
+_NARROWEST = EngineTuning.narrowest
 #: Most corners of the set that are rendered at the start.
 _CORNERS = 64
 #: About as many of them are rendered before the first cover: both of one parameter.
@@ -623,7 +635,7 @@ class Refinement:
         started = time.perf_counter()
         probe = self.frame.bound(part.box, self._numbers_of(everything), None, self.keep_leaves)
         seconds = time.perf_counter() - started
-        allowed = _COVER_SHARE * self.goal.seconds / max(seconds, 1e-4)
+        allowed = _COVER_SHARE * self.goal.seconds / max(seconds, EngineTuning.least_time)
         if self.goal.cells is not None:
             allowed = self.goal.cells / 2
         size = probe.lower.nbytes + probe.upper.nbytes + _context_bytes(probe.context) + _linear_bytes(probe)
@@ -910,7 +922,7 @@ def shared_goal(frame: Frame, index: int, goal: Goal, seed: int) -> Goal:
         return goal
     excess = goal.ratio - 1.0
     # rounding of means must not turn the sum around
-    slack = _SLACK_SHARE * excess * spread(frame, index, seed) * (1.0 - 2.0**-20)
+    slack = _SLACK_SHARE * excess * spread(frame, index, seed) * MEAN_DOWN
     return replace(goal, ratio=1.0 + (1.0 - _SLACK_SHARE) * excess, slack=slack)
 
 

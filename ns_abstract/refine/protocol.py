@@ -249,6 +249,15 @@ class PartsFrame(Protocol):
         ...
 
 
+@runtime_checkable
+class PreciseFrame(Protocol):
+    """What a `Frame` may have beside: pictures that are not rounded."""
+
+    def precise(self, values: np.ndarray, tiles: np.ndarray | None = None) -> np.ndarray:
+        """What `Frame.render` returns, before it is rounded: float64."""
+        ...
+
+
 class RayFrame(Frame, Protocol):
     """A frame whose pictures are made ray by ray (`ns_abstract.methods.representation.Representation.rays`)."""
 

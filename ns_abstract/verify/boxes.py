@@ -27,8 +27,21 @@ _PARAMETERS = 16
 _TOGETHER, _MOST, _WAITING = 1 << 18, 256, 1 << 14
 #: Branches of a box of many inputs, whose halves would hardly be easier.
 _BRANCHES = 1 << 14
-#: Starts and steps of the first attack on a region.
-_STARTS, _STEPS = 12, 25
+
+
+@dataclass(frozen=True)
+class BoxTuning:
+    """Preferences of the search over boxes; a verdict needs a proof or a run."""
+
+    #: Starts and steps of the first attack on a region; what is no further from unsafe, relative to one, is run.
+    starts: int = 12
+    steps: int = 25
+    near: float = 1e-5
+    #: What the width of an input counts beside its slope.
+    width: float = 1e-9
+
+
+_TUNING = BoxTuning()
 
 
 @dataclass(frozen=True)
@@ -172,12 +185,12 @@ class _Search:
         """Gradient descent by signs from the middle, from corners and from random inputs."""
         lower, upper = torch.from_numpy(region.lower), torch.from_numpy(region.upper)
         generator = torch.Generator().manual_seed(0)
-        part = torch.rand((_STARTS, len(lower)), generator=generator, dtype=torch.float64)
+        part = torch.rand((_TUNING.starts, len(lower)), generator=generator, dtype=torch.float64)
         part[0] = 0.5
-        part[1 : _STARTS // 2] = (part[1 : _STARTS // 2] < 0.5).double()
+        part[1 : _TUNING.starts // 2] = (part[1 : _TUNING.starts // 2] < 0.5).double()
         x = lower + part * (upper - lower)
         step = 0.25
-        for _ in range(_STEPS):
+        for _ in range(_TUNING.steps):
             checkpoint()
             x = x.detach().requires_grad_()
             value = self._value(region, x)
@@ -204,7 +217,7 @@ class _Search:
         """Whether one of the inputs that look unsafe is, for the program that counts."""
         order = torch.argsort(value)[:2].tolist()
         for k in order:
-            if not float(value[k]) <= 1e-5 * (1.0 + abs(float(value[k]))):
+            if not float(value[k]) <= _TUNING.near * (1.0 + abs(float(value[k]))):
                 continue
             point = np.clip(x[k].numpy(), region.lower, region.upper)
             y = run_once(self.network, self.run, point)
@@ -218,7 +231,7 @@ def _cut(lower: np.ndarray, upper: np.ndarray, slopes: np.ndarray) -> list[tuple
     """The box in two halves across the input that matters most by ``slopes`` [k, n]; None if it is too small."""
     width = upper - lower
     # slopes are by half widths
-    score = np.abs(slopes).max(0) + 1e-9 * width
+    score = np.abs(slopes).max(0) + _TUNING.width * width
     at = int(np.argmax(np.where(width > 0.0, score, -1.0)))
     middle = 0.5 * (lower[at] + upper[at])
     if not lower[at] < middle < upper[at]:

@@ -21,6 +21,14 @@ _MOST_UNITS = 10**9
 
 
 @dataclass(frozen=True)
+class CutTuning:
+    """How cells are cut. It does not decide whether a bound holds."""
+
+    #: Part of a goal that cuts may miss it by, so that rounding does not cut once more.
+    spare: float = 1e-9
+
+
+@dataclass(frozen=True)
 class Cell:
     """Units ``first[k]`` to ``past[k]`` (exclusive) of the grid along each parameter; empty for a single pose."""
 
@@ -111,7 +119,7 @@ class Grid:
         while True:
             free = np.flatnonzero(sizes > 1)
             count = math.prod(parts)
-            if not free.size or 2 * count > most or (count > 1 and gains.sum() <= goal * (1.0 + 1e-9)):
+            if not free.size or 2 * count > most or (count > 1 and gains.sum() <= goal * (1.0 + CutTuning.spare)):
                 break
             axis = int(free[np.lexsort((-sizes[free], -gains[free]))[0]])
             parts[axis] *= 2

@@ -15,6 +15,7 @@ from functools import cached_property
 import numpy as np
 
 from ns_abstract.arithmetic.network_charges import OWN_MARGIN
+from ns_abstract.arithmetic.rounding import NONZERO
 from ns_abstract.execution.ending import checkpoint
 from ns_abstract.geometry.box import ParameterBox
 from ns_abstract.verify.network import ImageSets, OutputBounds
@@ -23,10 +24,22 @@ from ns_abstract.verify.protocol import Model, Scene, SharedBounds, SharingModel
 
 #: The power of the width that sets cost.
 _POWER = 1.6
-#: What the mean width of pixels costs at most, however little the margin's gradient says: signs of units become open by
-#: it. Networks that bear more are told by boxes about the set's middle, of which the least is so small a part of it.
-_OPENING = 42.0
-_LEAST = 2.0**-9
+
+
+@dataclass(frozen=True)
+class CoverTuning:
+    """Looks about the middle of a set, and slopes of parts together. None of them decides whether a bound holds."""
+
+    #: What the mean width of pixels costs at most, however little the margin's gradient says: signs of units become
+    #: open by it. Networks that bear more are told by boxes about the set's middle, of which the least is so small a
+    #: part of it.
+    opening: float = 42.0
+    least: float = 2.0**-9
+    #: Parts are taken to be no narrower where their slopes are put together, and no nearer to each other.
+    least_share: float = 1e-12
+
+
+_TUNING = CoverTuning()
 #: What a box may cost is foreseen by so small a part of it: wide ones show nothing.
 _PROBE = 4
 #: Looks at a part about the middle of the set before two ways to cover it are compared, and most parts that are told
@@ -241,19 +254,19 @@ class Cover:
 
         Boxes about the set's middle grow until own rows leave a smaller part of its margin than they should.
         """
-        whole, most = self.scene.box, _OPENING
+        whole, most = self.scene.box, _TUNING.opening
         outputs = self.model.outputs(self.scene.image(np.array(whole.middle))[None])
-        query, first, share = self.claim.query(outputs), math.nan, _LEAST
+        query, first, share = self.claim.query(outputs), math.nan, _TUNING.least
         while share <= 1.0:
             sets = self._sets(_about_middle(whole, share))
             if sets is None:
                 break
             rows = self.sharing.family(self._images([sets]))
             margin = float(self._proved(query, rows.first(query), [sets])[0])
-            first = margin if share == _LEAST else first
+            first = margin if share == _TUNING.least else first
             if not (first > 0.0 and margin > _SPARE * first):
                 break
-            most = min(most, self.aim / max(float(sets.widths.mean()), 1e-300))
+            most = min(most, self.aim / max(float(sets.widths.mean()), NONZERO))
             share *= 2.0
         return most
 
@@ -267,7 +280,7 @@ class Cover:
             if found is None:
                 return math.inf
             cost = self.opening * float(found.widths.mean())
-            effects = Weights(np.ones_like(found.widths), 1.0).effects(found) * counts + 1e-300
+            effects = Weights(np.ones_like(found.widths), 1.0).effects(found) * counts + NONZERO
             cost *= float(effects.sum() / (effects / counts).sum()) ** _POWER
             counts = np.array(divisions(effects, cost, self.aim, _MANY), np.float64)
         return float(counts.prod())
@@ -338,7 +351,7 @@ class Cover:
         if work.rows is not None:
             self._lent(work, work.rows, parts, margins)
         middles = np.array([sets.box.middle for sets in parts])
-        size = np.maximum(np.array(parts[0].box.upper) - np.array(parts[0].box.lower), 1e-300)
+        size = np.maximum(np.array(parts[0].box.upper) - np.array(parts[0].box.lower), NONZERO)
         while len(left := np.flatnonzero(~(margins > 0.0))):
             # the middle one serves most
             at = middles[left] / size
@@ -461,7 +474,7 @@ def divisions(effects: np.ndarray, cost: float, aim: float, most: int) -> list[i
 
     There is no use in many more parts than ``most``.
     """
-    gains = np.where(np.isfinite(effects), effects, 0.0) + 1e-300
+    gains = np.where(np.isfinite(effects), effects, 0.0) + NONZERO
     goal = (aim / cost) ** (1.0 / _POWER) * float(gains.sum()) if cost > aim else math.inf
     counts = np.ones(len(gains), np.int64)
     while (gains / counts).sum() > goal and counts.prod() <= most:
@@ -484,7 +497,7 @@ def joined(parts: Sequence[PictureSets]) -> PictureSets:
     place, share = (middle - center) / reach, half / reach
     a_low, b_low, a_high, b_high = (np.array([sets.linear[k] for sets in parts], np.float64) for k in range(4))
     # any slopes will do: these are the least squares' of the parts' middles, each taken by its volume
-    weight = np.maximum(share, 1e-12).prod(axis=1)
+    weight = np.maximum(share, _TUNING.least_share).prod(axis=1)
     weight /= weight.sum()
     d, ones = first.dimensions, (1,) * (b_low.ndim - 1)
     slope, value = 0.5 * (a_low + a_high), 0.5 * (b_low + b_high)
@@ -492,7 +505,9 @@ def joined(parts: Sequence[PictureSets]) -> PictureSets:
     at, by = place.reshape(-1, *ones, d), share.reshape(-1, *ones, d)
     value = value - np.tensordot(weight, value, 1)
     moment = (place**2 + share**2 / 3.0) * weight[:, None]
-    common = np.tensordot(weight, value[..., None] * at + slope * by / 3.0, 1) / np.maximum(moment.sum(axis=0), 1e-12)
+    common = np.tensordot(weight, value[..., None] * at + slope * by / 3.0, 1) / np.maximum(
+        moment.sum(axis=0), _TUNING.least_share
+    )
     moved = (at * common).sum(axis=-1)
     low = b_low - moved - np.abs(a_low - by * common).sum(axis=-1)
     high = b_high - moved + np.abs(a_high - by * common).sum(axis=-1)

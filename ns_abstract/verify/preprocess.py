@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 
-from ns_abstract.arithmetic.rounding import UNIT32, UNIT64
+from ns_abstract.arithmetic.rounding import PREPROCESS_ROUNDING, PREPROCESSED_ROUNDING
 from ns_abstract.io.errors import InputError
 from ns_abstract.io.fields import known
 from ns_abstract.io.jsonio import FIX_MODERATE, is_moderate, show
@@ -22,8 +22,6 @@ if TYPE_CHECKING:
     from ns_abstract.verify.network import ImageSets
 
 _KEYS = ("resize", "mean", "std", "layout", "channels", "range")
-#: Roundings of one float32 evaluation of V1, in units of the largest numbers met, and some to spare.
-_ROUNDINGS = 10.0
 
 
 @dataclass(frozen=True)
@@ -119,9 +117,9 @@ class Preprocess:
         def move(b: np.ndarray, a: np.ndarray | None, sign: float) -> np.ndarray:
             b = self._ordered(b, 0)
             value = (b * scale + low - mean) / std
-            charge = _ROUNDINGS * UNIT32 * size + 8.0 * UNIT64 * np.abs(b * factor)
+            charge = PREPROCESS_ROUNDING * size + PREPROCESSED_ROUNDING * np.abs(b * factor)
             if a is not None:
-                charge = charge + 8.0 * UNIT64 * np.abs(a).sum(axis=-1)
+                charge = charge + PREPROCESSED_ROUNDING * np.abs(a).sum(axis=-1)
             return self._flat(value + sign * charge, 0)
 
         slopes = [self._ordered(a, 1) * factor[:, None] for a in (a_lower, a_upper)]

@@ -10,16 +10,13 @@ from typing import Literal
 import numpy as np
 
 from ns_abstract.arithmetic.outward import outward
-from ns_abstract.arithmetic.rounding import UNIT32
+from ns_abstract.arithmetic.rounding import RESPONSE_ROUNDING, RESPONSE_ROUNDINGS
 from ns_abstract.geometry.box import ParameterBox
 from ns_abstract.geometry.camera_path import Camera
 from ns_abstract.geometry.tiles import assemble
 from ns_abstract.refine.protocol import Bounds, Frame, LinearSets, Score
 
 ResponseName = Literal["brightness", "white balance", "gamma"]
-
-#: Relative error of a power or product, in float32 or better: at most eight of its roundings.
-_ERROR = 8.0 * UNIT32
 
 
 @dataclass(frozen=True)
@@ -73,15 +70,15 @@ class Response:
         else:
             least, most = low * (1.0 - r), np.minimum(high * (1.0 + r), 1.0)
             fall, rise, shrink, grow = 0.0, 0.0, 1.0 - r, 1.0 + r
-        least, most = least * (1.0 - _ERROR), np.minimum(most * (1.0 + _ERROR), 1.0)
+        least, most = least * (1.0 - RESPONSE_ROUNDING), np.minimum(most * (1.0 + RESPONSE_ROUNDING), 1.0)
         # what crosses is no number afterwards, so that it is noticed
         least = np.where(lower <= upper, least, np.nan)
         a_lower, b_lower, a_upper, b_upper = (np.asarray(part, np.float64) for part in linear)
         a_below, a_above = (a_lower * shrink).astype(np.float32), (a_upper * grow).astype(np.float32)
         # slopes rounded to float32, and the relative error of values up to 1
-        slack = np.abs(a_below - a_lower * shrink).sum(axis=-1) + 2.0 * _ERROR
+        slack = np.abs(a_below - a_lower * shrink).sum(axis=-1) + RESPONSE_ROUNDINGS
         below = b_lower * shrink - fall - slack
-        slack = np.abs(a_above - a_upper * grow).sum(axis=-1) + 2.0 * _ERROR
+        slack = np.abs(a_above - a_upper * grow).sum(axis=-1) + RESPONSE_ROUNDINGS
         above = b_upper * grow + rise + slack
         flat_lower, flat_upper = least > below, most < above
         b_lower, b_upper = outward(np.where(flat_lower, least, below), np.where(flat_upper, most, above))

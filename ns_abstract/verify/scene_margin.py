@@ -24,16 +24,27 @@ from ns_abstract.verify.response import ResponseName
 
 Outcome = Literal["holds", "falsified", "unknown"]
 
-#: Bisection ends where the ends are this close, by their quotient; radii tried first grow and shrink by `_STRIDE`.
-_CLOSE, _STRIDE = 1.1, 4.0
-#: A radius below this part of the first one is called 0.
-_LEAST = 2.0**-20
-#: Cuts of a cell one inside the other, parts by cut, and most parts that a cell is examined in.
-_DEPTH, _PARTS, _MOST = 2, 4, 24
-#: Doublings of the radius in search of a scene that breaks what is certified.
-_DOUBLINGS = 6
-#: Trials that a report lists.
-_LISTED = 200
+
+@dataclass(frozen=True)
+class MarginTuning:
+    """How a margin is searched for; what is claimed is what was proved of the last radius that held."""
+
+    #: Bisection ends where the ends are this close, by their quotient; radii tried first grow and shrink by `_STRIDE`.
+    close: float = 1.1
+    stride: float = 4.0
+    #: A radius below this part of the first one is called 0.
+    least: float = 2.0**-20
+    #: Cuts of a cell one inside the other, parts by cut, and most parts that a cell is examined in.
+    depth: int = 2
+    parts: int = 4
+    most: int = 24
+    #: Doublings of the radius in search of a scene that breaks what is certified.
+    doublings: int = 6
+    #: Trials that a report lists.
+    listed: int = 200
+
+
+_TUNING = MarginTuning()
 
 
 @dataclass(frozen=True)
@@ -64,16 +75,16 @@ class Kind:
 
 
 KINDS = (
-    Kind("mean", "every coordinate of every Gaussian's mean", "normalised units", 1e-3, 10.0),
-    Kind("opacity", "every Gaussian's opacity", "of 1", 1e-2, 1.0),
-    Kind("color", "every channel of every Gaussian's colour", "of 1", 1e-2, 1.0),
+    Kind("mean", "every coordinate of every Gaussian's mean", "normalised units", 0.001, 10.0),
+    Kind("opacity", "every Gaussian's opacity", "of 1", 0.01, 1.0),
+    Kind("color", "every channel of every Gaussian's colour", "of 1", 0.01, 1.0),
 )
 
 #: Of the camera, the same all over the picture (V14).
 CAMERA_KINDS: tuple[Kind, ...] = (
-    Kind("brightness", "the factor of the camera's brightness", "of 1", 1e-2, 0.9, "brightness"),
-    Kind("white_balance", "the factor of every channel", "of 1", 1e-2, 0.9, "white balance"),
-    Kind("gamma", "the power of the camera's response", "of 1", 1e-2, 0.9, "gamma"),
+    Kind("brightness", "the factor of the camera's brightness", "of 1", 0.01, 0.9, "brightness"),
+    Kind("white_balance", "the factor of every channel", "of 1", 0.01, 0.9, "white balance"),
+    Kind("gamma", "the power of the camera's response", "of 1", 0.01, 0.9, "gamma"),
 )
 
 #: The scene as a whole, the same for a whole run of a loop.
@@ -81,12 +92,17 @@ REGISTRATION = Kind(
     "registration",
     "the place of the whole scene along every world axis",
     "normalised units",
-    1e-3,
+    0.001,
     10.0,
     place=SCENE_SHIFTS,
 )
 TURN = Kind(
-    "turn", "the turn of the whole scene about every world axis through the origin", "rad", 1e-3, 1.5, place=SCENE_TURNS
+    "turn",
+    "the turn of the whole scene about every world axis through the origin",
+    "rad",
+    0.001,
+    1.5,
+    place=SCENE_TURNS,
 )
 PLACES = (REGISTRATION, TURN)
 
@@ -221,7 +237,7 @@ class SceneMargin:
             "state": self.state,
             "cells": self.cells,
             "runs": len(self.trials),
-            "trials": [vars(trial) for trial in listed[:_LISTED]],
+            "trials": [vars(trial) for trial in listed[: _TUNING.listed]],
             "seconds": self.seconds,
             "text": self.sentence,
         }
@@ -275,24 +291,24 @@ class _Bisection:
         most = self.kind.most if ceiling is None else ceiling
         radius = min(self.kind.first, most) if ceiling is None else ceiling
         low, high = 0.0, math.inf
-        while low < most and not (low > 0.0 and high <= _CLOSE * low):
+        while low < most and not (low > 0.0 and high <= _TUNING.close * low):
             radius = min(most, _told(radius))
-            if radius < _LEAST * self.kind.first:
+            if radius < _TUNING.least * self.kind.first:
                 return 0.0
             if self._try(number, cell, radius):
                 low = radius
             else:
                 high = radius
             if high == math.inf:
-                radius = min(most, _STRIDE * low)
+                radius = min(most, _TUNING.stride * low)
             else:
-                radius = math.sqrt(low * high) if low > 0.0 else high / _STRIDE
+                radius = math.sqrt(low * high) if low > 0.0 else high / _TUNING.stride
         return low
 
     def attack(self, failing: Trial, cell: Certified) -> None:
         """Larger radii, until a scene breaks what is certified."""
         radius = failing.radius
-        for _ in range(_DOUBLINGS):
+        for _ in range(_TUNING.doublings):
             if radius >= self.kind.most:
                 return
             radius = min(_told(2.0 * radius), self.kind.most)
@@ -327,8 +343,12 @@ class _Bisection:
                 return "falsified", found.reason, count, found.example
             if found.outcome == "holds":
                 continue
-            parts = grid.divide(part, found.slopes, 1.0 / _PARTS, _PARTS) if cuts and depth < _DEPTH else []
-            if not parts or count + len(waiting) + len(parts) > _MOST:
+            parts = (
+                grid.divide(part, found.slopes, 1.0 / _TUNING.parts, _TUNING.parts)
+                if cuts and depth < _TUNING.depth
+                else []
+            )
+            if not parts or count + len(waiting) + len(parts) > _TUNING.most:
                 return "unknown", found.reason, count, None
             waiting += [(entry, depth + 1) for entry in parts]
         return "holds", "", count, None

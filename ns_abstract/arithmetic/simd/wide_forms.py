@@ -18,8 +18,16 @@ import numpy as np
 from numba import njit
 
 from ns_abstract.arithmetic.elementary import fma
-from ns_abstract.arithmetic.forms import LARGEST, SMALLEST
-from ns_abstract.arithmetic.rounding import FORM_ROUNDING, UNDERFLOW64, UP
+from ns_abstract.arithmetic.rounding import (
+    ADDED_PRODUCT_ROUNDING,
+    CURVATURE_DOWN,
+    FORM_ROUNDING,
+    LARGEST,
+    RANGE_ROUNDING,
+    SMALLEST,
+    UNDERFLOW64,
+    UP,
+)
 from ns_abstract.arithmetic.simd.lanes import bits, load8, maximum, minimum, root, store, where
 
 
@@ -116,7 +124,7 @@ def _accumulate(w, a, b, sign, out, coefficient, fresh, m):
 @njit(cache=True, error_model="numpy")
 def add_product(w, a, b, sign, out, m):
     """`forms.add_product`; `set_norms` must follow."""
-    _accumulate(w, a, b, sign, out, 4.0 * FORM_ROUNDING, False, m)
+    _accumulate(w, a, b, sign, out, ADDED_PRODUCT_ROUNDING, False, m)
 
 
 @njit(cache=True, error_model="numpy")
@@ -142,7 +150,7 @@ def _accumulate_square(w, a, out, coefficient, fresh, m):
 @njit(cache=True, error_model="numpy")
 def add_square(w, a, out, m):
     """`forms.add_square`; `set_norms` must follow."""
-    _accumulate_square(w, a, out, 4.0 * FORM_ROUNDING, False, m)
+    _accumulate_square(w, a, out, ADDED_PRODUCT_ROUNDING, False, m)
 
 
 @njit(cache=True, error_model="numpy")
@@ -160,7 +168,7 @@ def bounds(w, a, m, order=1, d=0):
     if order == 1:
         spread = (linear + r + FORM_ROUNDING * abs(c)) * UP
         return c - spread, c + spread
-    high = (r + 8.0 * FORM_ROUNDING * (abs(c) + linear + curved)) * UP
+    high = (r + RANGE_ROUNDING * (abs(c) + linear + curved)) * UP
     low = -high
     row = d + 1
     for k in range(1, d + 1):
@@ -220,7 +228,7 @@ def reciprocal_square_root(w, a, out, m):
     low, high, inside = _ends(w, a, m)
     low, high = where(inside, low, 1.0), where(inside, high, 1.0)
     f0 = 1.0 / root(where(inside, load8(w, a), 1.0))
-    least = where(inside, 0.375 / (high * high * root(high)) * (1.0 - 4.0 * FORM_ROUNDING), -np.inf)
+    least = where(inside, 0.375 / (high * high * root(high)) * CURVATURE_DOWN, -np.inf)
     most = where(inside, 0.375 / (low * low * root(low)) * UP, np.inf)
     _compose(w, a, f0, -0.5 * f0 * (f0 * f0), least, most, out, m)
 
@@ -237,7 +245,7 @@ def logarithm(w, a, out, m):
     f0 = load8(w, scratch)
     f1 = 1.0 / center
     least = where(inside, -0.5 / (low * low) * UP, -np.inf)
-    most = where(inside, -0.5 / (high * high) * (1.0 - 4.0 * FORM_ROUNDING), np.inf)
+    most = where(inside, -0.5 / (high * high) * CURVATURE_DOWN, np.inf)
     _compose(w, a, f0, f1, least, most, out, m)
     store(w, out + 8 * m, load8(w, out + 8 * m) + FORM_ROUNDING)
 

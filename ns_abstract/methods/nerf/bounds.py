@@ -17,7 +17,7 @@ from torch import Tensor
 
 from ns_abstract.arithmetic.chebyshev import ChebyshevBasis
 from ns_abstract.arithmetic.outward import outward
-from ns_abstract.arithmetic.rounding import COMPOSITE_ROUNDING, UNIT64
+from ns_abstract.arithmetic.rounding import DENSITY_ROUNDING, DIRECTION_ROUNDING, KEPT_LIGHT_UP, SAMPLE_ROUNDING
 from ns_abstract.execution.ending import checkpoint
 from ns_abstract.geometry.box import ParameterBox
 from ns_abstract.geometry.poses import PoseSet
@@ -49,8 +49,26 @@ _DEEPER_MORE = 6
 _FINER = {2: 1}
 #: Most parts of one box.
 _PARTS = 4096
-#: Light (in [0, 1]) that a skipped sample may add, as a share of the tolerance.
-_QUIET = 0.02
+
+
+@dataclass(frozen=True)
+class RayTuning:
+    """Light and ways from which on samples are worked on. None of them decides whether a bound holds."""
+
+    #: Light (in [0, 1]) that a skipped sample may add, as a share of the tolerance.
+    quiet: float = 0.02
+    #: Opacities of at most this share of the tolerance are not told apart by parts of a cell.
+    alike: float = 2.0**-9
+    #: Light that a sample may leave open before compositing has shown where it matters.
+    coarse: float = 0.1
+    #: Half the way of one that is followed, whose place the coarse pass moves, too.
+    followed: float = 5e-4
+    least_followed: float = 2e-6
+    #: Light from a sample whose colour's shift is not looked at.
+    unseen: float = 1e-5
+
+
+_TUNING = RayTuning()
 #: A cell on which an opacity is open by this much everywhere was far too wide.
 _LOST = 0.5
 #: Shares of the first cells that were far too wide and factors by which later ones begin narrower: the first share that
@@ -58,27 +76,20 @@ _LOST = 0.5
 _LOST_SHARES = ((0.25, 0.6), (0.04, 0.87))
 #: The share below which they begin wider, and the factor: this costs little, as the shares rise steeply with the width.
 _FEW_LOST, _WIDER = 0.01, 1.08
-#: Opacities of at most this share of the tolerance are not told apart by parts of a cell.
-_ALIKE = 2.0**-9
-#: Light that a sample may leave open before compositing has shown where it matters.
-_COARSE = 0.1
 #: A sample is worth halving if it can take away this share of what a part has too much.
 _SHARE = 0.125
 #: Rounds of halving where the colours' bounds are too wide.
 _ROUNDS = 32
-#: Half the way of a sample over a cell to begin with; of one that is followed, whose place the coarse pass moves, too.
-_DISPLACEMENT, _FOLLOWED = 0.02, 5e-4
+#: Half the way of a sample over a cell to begin with.
+_DISPLACEMENT = 0.02
 #: Where samples are followed: halvings below first cells by axis, of the deepest cells into parts, and the least way.
 _FOLLOWED_DEEPER = 3
 _FOLLOWED_FINER, _FOLLOWED_FINER_MORE = {1: 2, 2: 2}, 1
-_LEAST_FOLLOWED = 2e-6
 #: Rays that one cell leaves so open are bounded by bins, too, with a tolerance so many times as large: these bounds are
 #: loose anyhow.
 _LOOSE, _SWEPT = 0.5, 8.0
 #: Numbers (rays, samples, parts) that are worked on together.
 _NUMBERS = 1 << 21
-#: Light from a sample whose colour's shift is not looked at.
-_UNSEEN = 1e-5
 
 
 #: Intervals of hue and saturation.
@@ -200,7 +211,7 @@ class NerfBounds:
         self.distances, self.lengths = sampling.bins
         self.taylor = min(TAYLOR, max(1, self.basis.degree))
         #: Where to begin to look for `RayBounds.displacement`.
-        self.displacement = _DISPLACEMENT if self.paths is None else _FOLLOWED
+        self.displacement = _DISPLACEMENT if self.paths is None else _TUNING.followed
 
     def rays(
         self,
@@ -271,7 +282,7 @@ class NerfBounds:
         low, high = (np.moveaxis(end, 2, 1).reshape(n, shifts, *division.parts, 3) for end in (work.lower, work.upper))
         rays = RayBounds(
             work.lower.min(axis=(1, 2)), work.upper.max(axis=(1, 2)), np.ones((n, self.distances.size), np.float32),
-            work.cells, max(_LEAST_FOLLOWED, self.displacement * work.factor),
+            work.cells, max(_TUNING.least_followed, self.displacement * work.factor),
             None if given is None else np.stack(outward(low, high)),
         )  # fmt: skip
         return rays, start == 0
@@ -364,7 +375,7 @@ class _Work:
         self.start = division.first(moves, displacement)
         self.quiet = np.zeros((n, samples), bool)
         if known is not None:
-            self.quiet = known <= _QUIET * self.tolerance
+            self.quiet = known <= _TUNING.quiet * self.tolerance
             for i, k in np.argwhere(self.quiet):
                 self.alpha_high[k, i] = known[i, k]
         self._levels: dict[int, tuple[Tensor, Tensor, np.ndarray]] = {}
@@ -450,7 +461,7 @@ class _Work:
             again = []
             for start in range(0, len(items), self.owner.batch):
                 batch = items.take(slice(start, start + self.owner.batch))
-                halve, lost, seen = self._bound_batch(level, batch, _COARSE)
+                halve, lost, seen = self._bound_batch(level, batch, _TUNING.coarse)
                 again.append(batch.take(halve))
                 first = self.start[batch.ray, batch.sample] == level
                 self.lost += int((lost & first).sum())
@@ -549,7 +560,7 @@ class _Work:
         high = self._anywhere(np.where(dim[..., None], -np.inf, high), np.maximum, -2)
         rest = self._anywhere(np.where(dim & ~alone[..., 0], weight, 0.0), np.maximum).sum(axis=0)
         # the light before a sample is kept in float32
-        return np.where(alone, 0.0, low), np.where(alone, 1.0, high), (rest * (1.0 + 2.0**-20))[..., None]
+        return np.where(alone, 0.0, low), np.where(alone, 1.0, high), (rest * KEPT_LIGHT_UP)[..., None]
 
     def _background(self, count: int) -> np.ndarray:
         """[count, parts, 3] the colour behind the last sample."""
@@ -645,7 +656,7 @@ class _Work:
         """[k] whether next to nothing is seen of an item: that is all that is found out about it then."""
         length = torch.from_numpy(self.owner.lengths[items.sample]).to(density.poly.device)
         most = opacity(greatest(density)[:, 0], length, up=True)
-        alike = ((most <= _ALIKE * self.tolerance) & ~density.failed).cpu().numpy()
+        alike = ((most <= _TUNING.alike * self.tolerance) & ~density.failed).cpu().numpy()
         gone, high = items.take(alike), most.cpu().numpy()[alike, None]
         rows = self._rows(level, gone)
         self.alpha_high[rows] = np.minimum(self.alpha_high[rows], high)
@@ -658,7 +669,7 @@ class _Work:
         device, field = self.owner.device, self.field
         bernstein = self._level(level)[1]
         direction = there @ torch.from_numpy(self.pencil.direction[items.ray]).to(device)
-        radius = self.pencil.direction_radius[items.ray] + 96.0 * UNIT64
+        radius = self.pencil.direction_radius[items.ray] + DIRECTION_ROUNDING
         encoded = field.encode(direction, torch.from_numpy(radius).to(device), field.direction)
         color = field.color(pieces, *encoded)
         low, high, error = brightness(color, bernstein)
@@ -681,7 +692,7 @@ class _Work:
 
     def _shifted(self, color: tuple[np.ndarray, np.ndarray], shift: Shifts) -> tuple[np.ndarray, np.ndarray]:
         """Bounds of ``color`` (lower, upper) after ``shift``; [0, 1] where next to nothing is seen of it."""
-        seen = self.before * self.alpha_high > _UNSEEN
+        seen = self.before * self.alpha_high > _TUNING.unseen
         low, high = np.zeros_like(color[0]), np.ones_like(color[1])
         low[seen], high[seen] = shifted_bounds(color[0][seen], color[1][seen], *shift)
         return low, high
@@ -708,8 +719,8 @@ class _Work:
             return np.ascontiguousarray(np.moveaxis(apart, 0, 2)).reshape(rows, samples * inner, *values.shape[3:])
 
         with np.errstate(divide="ignore"):
-            density_low = -np.log1p(-self.alpha_low) / owner.lengths[:, None, None] * (1.0 - 2.0**-40)
-            density_high = -np.log1p(-self.alpha_high) / owner.lengths[:, None, None] * (1.0 + 2.0**-40)
+            density_low = -np.log1p(-self.alpha_low) / owner.lengths[:, None, None] * (1.0 - DENSITY_ROUNDING)
+            density_high = -np.log1p(-self.alpha_high) / owner.lengths[:, None, None] * (1.0 + DENSITY_ROUNDING)
         weight = self.before * self.alpha_high
         dim = weight <= self._negligible
         # what is negligible takes the colour of what is not, at the price of its weight
@@ -728,7 +739,7 @@ class _Work:
         low = np.tile(np.array(owner.sampling.background, np.float64), (rows, 1))
         high = low.copy()
         composite(edges_low, edges_high, density, color, low, high)
-        slack = 4.0 * COMPOSITE_ROUNDING * (2 * count + 7) + (price * (1.0 + 2.0**-20))[:, None]
+        slack = SAMPLE_ROUNDING * (2 * count + 7) + (price * KEPT_LIGHT_UP)[:, None]
         ends = np.clip(low - slack, 0.0, 1.0), np.clip(high + slack, 0.0, 1.0)
         low, high = (np.repeat(end.reshape(n, rows // n, 3), inner, axis=1) for end in ends)
         return low, high
@@ -743,6 +754,6 @@ class _Work:
             rise, fall = color_high[k] - high, color_low[k] - low
             high += np.where(rise > 0.0, most, least) * rise
             low += np.where(fall < 0.0, most, least) * fall
-        slack = 4.0 * COMPOSITE_ROUNDING * (self.alpha_low.shape[0] + self.owner.sampling.importance + 5)
+        slack = SAMPLE_ROUNDING * (self.alpha_low.shape[0] + self.owner.sampling.importance + 5)
         low, high = low - rest - slack, high + rest + slack
         return np.clip(low, 0.0, 1.0), np.clip(high, 0.0, 1.0)

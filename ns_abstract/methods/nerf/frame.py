@@ -27,15 +27,28 @@ from ns_abstract.methods.nerf.scene import NerfScene
 from ns_abstract.methods.nerf.strips import Strips
 from ns_abstract.refine.protocol import LinearSets, Member
 
-#: What an open sample may move a pixel by on boxes a quarter as wide as the set, as a part of the pixels' mean
-#: variation over the set; less on narrower boxes.
-_TOLERANCE = 0.12
-_MOST_TOLERANCE, _LEAST_TOLERANCE = 0.03, 5e-4
-#: The least tolerance of sets over which pixels hardly vary, as a part of their mean variation; and of any set: bounds
-#: are kept in float32, where a finer one shows nowhere.
-_LEAST_SHARE, _FINEST_TOLERANCE = 0.02, UNIT32
-#: Rays and poses rendered to estimate that variation.
-_LOOK_RAYS, _LOOK_POSES = 256, 7
+
+@dataclass(frozen=True)
+class FieldTuning:
+    """Tolerances of fields' frames and steps of their estimates. None of them decides whether a bound holds."""
+
+    #: What an open sample may move a pixel by on boxes a quarter as wide as the set, as a part of the pixels' mean
+    #: variation over the set; less on narrower boxes.
+    tolerance: float = 0.12
+    most_tolerance: float = 0.03
+    least_tolerance: float = 5e-4
+    #: The least tolerance of sets over which pixels hardly vary, as a part of their mean variation; and of any set:
+    #: bounds are kept in float32, where a finer one shows nowhere.
+    least_share: float = 0.02
+    finest_tolerance: float = UNIT32
+    #: Step of the difference quotient that tells how far the picture moves, as a part of the parameter's range.
+    motion_step: float = 2.0**-10
+    #: Rays and poses rendered to estimate that variation.
+    look_rays: int = 256
+    look_poses: int = 7
+
+
+_TUNING = FieldTuning()
 #: Poses on the diagonal of a box that are rendered to see which colours it reaches, besides random ones.
 _LOOK_SHARES = np.linspace(0.0, 1.0, 9)
 #: Parts of every range of hues and saturations; pixels that a turn of the whole circle counts for.
@@ -173,10 +186,14 @@ class NerfFrame:
 
     def render(self, values: np.ndarray, tiles: np.ndarray | None = None) -> np.ndarray:
         """Rays [t, 1, 1, 3] float32 of the concrete image at parameter values [d]."""
+        return self.precise(values, tiles).astype(np.float32)
+
+    def precise(self, values: np.ndarray, tiles: np.ndarray | None = None) -> np.ndarray:
+        """What `render` rounds: float64."""
         which = np.arange(self.tile_count) if tiles is None else tiles
         shift = color_shift(self.pose_set, values)
         colors = self.renderer.pixels(self.pose_set.camera, self.pose_set.pose(values), self._pixels(which), shift)
-        return colors.astype(np.float32)[:, None, None, :]
+        return colors[:, None, None, :]
 
     def feasible(self, box: ParameterBox) -> ParameterBox | None:
         """All of ``box``: every parameter in it belongs to a pose of the set."""
@@ -194,8 +211,8 @@ class NerfFrame:
         here = self._point(box.middle, distance)
         for k in range(d):
             step = np.zeros(d)
-            step[k] = 2.0**-10 * (high[k] - low[k])
-            moved = np.linalg.norm(self._point(box.middle + step, distance) - here) * 2.0**10
+            step[k] = _TUNING.motion_step * (high[k] - low[k])
+            moved = np.linalg.norm(self._point(box.middle + step, distance) - here) / _TUNING.motion_step
             found[k] = moved / distance * self.camera.fx
             if box.names[k] in COLOR_SHIFTS:
                 found[k] = _SHIFT_MOTION * (high[k] - low[k])
@@ -408,7 +425,7 @@ class NerfFrame:
         else:
             rng, pixels, box = np.random.default_rng(0), self._pixels(tiles), box.without(COLOR_SHIFTS)
             inside = [box.at(np.full(box.dimensions, 2.0 * share - 1.0)) for share in _LOOK_SHARES]
-            values = [*inside, *box.sample(_LOOK_POSES, rng)] if box.dimensions else [box.middle]
+            values = [*inside, *box.sample(_TUNING.look_poses, rng)] if box.dimensions else [box.middle]
             poses = [self._geometry.pose(v) for v in values]
             pictures = np.stack([self.renderer.pixels(self.pose_set.camera, pose, pixels) for pose in poses])
             low, high = pictures.min(axis=0), pictures.max(axis=0)
@@ -433,19 +450,19 @@ class NerfFrame:
         """Narrower boxes are asked for when the bounds of wider ones are not good enough."""
         box = box.without(COLOR_SHIFTS)
         if not box.dimensions:
-            return _LEAST_TOLERANCE
+            return _TUNING.least_tolerance
         outer = self._geometry.box
         whole = np.array(outer.upper) - np.array(outer.lower)
         width = np.array(box.upper) - np.array(box.lower)
         share = float(np.prod(width / whole)) ** (1.0 / box.dimensions)
-        least = min(_LEAST_TOLERANCE, max(_FINEST_TOLERANCE, _LEAST_SHARE * self._variation))
-        return max(least, min(1.0, 4.0 * share) * min(_MOST_TOLERANCE, _TOLERANCE * self._variation))
+        least = min(_TUNING.least_tolerance, max(_TUNING.finest_tolerance, _TUNING.least_share * self._variation))
+        return max(least, min(1.0, 4.0 * share) * min(_TUNING.most_tolerance, _TUNING.tolerance * self._variation))
 
     @cached_property
     def _variation(self) -> float:
         """Mean over some rays of how far their colours move over the set (an estimate)."""
         rng = np.random.default_rng(0)
-        tiles = np.sort(rng.permutation(self.tile_count)[:_LOOK_RAYS])
-        values = [*self.box.sample(_LOOK_POSES - 2, rng), np.array(self.box.lower), np.array(self.box.upper)]
+        tiles = np.sort(rng.permutation(self.tile_count)[: _TUNING.look_rays])
+        values = [*self.box.sample(_TUNING.look_poses - 2, rng), np.array(self.box.lower), np.array(self.box.upper)]
         pictures = np.stack([self.render(v, tiles) for v in values])
         return float((pictures.max(axis=0) - pictures.min(axis=0)).mean())

@@ -9,7 +9,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ns_abstract.arithmetic.rounding import HUE_ROUNDING
+from ns_abstract.arithmetic.rounding import HUE_ROOM, HUE_ROUNDING
 from ns_abstract.geometry.poses import COLOR_SHIFTS, PoseSet
 
 Float64Array = NDArray[np.float64]
@@ -73,7 +73,7 @@ def _hues(low: Float64Array, high: Float64Array) -> tuple[Float64Array, Float64A
                 starts = [part(c[:, i], low[:, up], high[:, down]) for c in (low, high)]
             first[sure] = centre + np.clip(np.minimum(*starts), -1.0, 1.0)[sure]
             last[sure] = centre + np.clip(np.maximum(*ends), -1.0, 1.0)[sure]
-    return first - 4.0 * HUE_ROUNDING, last + 4.0 * HUE_ROUNDING
+    return first - HUE_ROOM, last + HUE_ROOM
 
 
 def shifted_bounds(
@@ -88,8 +88,8 @@ def shifted_bounds(
     most = np.clip(high.min(axis=1)[:, None] - np.minimum(*given), 0.0, value_high)
     centre = np.array([0.0, 2.0, 4.0])
     start = (first + 6.0 * hue[0])[:, None] - centre
-    width = (last - first + 6.0 * (hue[1] - hue[0]) + 8.0 * HUE_ROUNDING)[:, None]
-    start = np.mod(start - 4.0 * HUE_ROUNDING + 3.0, 6.0) - 3.0
+    width = (last - first + 6.0 * (hue[1] - hue[0]) + 2.0 * HUE_ROOM)[:, None]
+    start = np.mod(start - HUE_ROOM + 3.0, 6.0) - 3.0
     end = start + width
     # where a range goes on beyond half a turn, so does its end, and the share is 0
     far = np.maximum(np.abs(start), np.abs(end))

@@ -11,16 +11,13 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
-from ns_abstract.arithmetic.rounding import FIELD_UP, UNIT64
+from ns_abstract.arithmetic.rounding import BIAS_ROUNDING, FIELD_UP, NARROW_STEPS
 from ns_abstract.arithmetic.simd.intrinsics import pointer
 from ns_abstract.arithmetic.simd.lanes import LINE, load_line
 from ns_abstract.arithmetic.simd.products import ROWS, rows_from, store_rows, sums_of_rows
 
 #: Rows of a product that pass a line of the weight while it stays in a core's first cache; a multiple of `ROWS`.
 BLOCK = 36
-#: Roundings of a column's product in float32 beside one by live input: the column, its slope, their product, and the
-#: sums of a step; 2 to spare.
-NARROW_STEPS = 8
 
 
 @njit(cache=True, error_model="numpy")
@@ -227,5 +224,5 @@ def linear(z, encoded, remainder, weights, out):
                     poly[k, j] += given[k, j]
         for j in range(n):
             poly[0, j] += bias[j]
-            box[j] = (box[j] + 4.0 * UNIT64 * (abs(bias[j]) + abs(poly[0, j]))) * FIELD_UP
+            box[j] = (box[j] + BIAS_ROUNDING * (abs(bias[j]) + abs(poly[0, j]))) * FIELD_UP
     return place

@@ -33,6 +33,16 @@ _FREQUENCIES = {"num_frequencies": 6, "num_direction_frequencies": 2}
 _MAX_EXPONENT, _MAX_EXPONENT_LIMIT = 5.0, 60.0
 _FREQUENCIES_LIMIT = 64
 _STOCK, _OURS = "nerfstudio.models.vanilla_nerf.NeRFModel", "ns_abstract.nerfstudio.nerf.AbstractNerfModel"
+#: nerfstudio/model_components/renderers.py:75-145, utils/colors.py: what it shows outside training; at others, also
+#: of another case, it stops.
+_BACKGROUNDS = {
+    "random": (0.0, 0.0, 0.0),
+    "white": (1.0, 1.0, 1.0),
+    "black": (0.0, 0.0, 0.0),
+    "red": (1.0, 0.0, 0.0),
+    "green": (0.0, 1.0, 0.0),
+    "blue": (0.0, 0.0, 1.0),
+}
 #: Modules of vanilla NeRF that draw nothing in evaluation, and what they are for.
 _IDLE = {
     "device_indicator_param": "no values",
@@ -151,7 +161,9 @@ def _background(run: runs.RunConfig, overrides: Overrides) -> tuple[Assumption, 
             )
         stored: Any = "last_sample"
     else:
-        stored = tuple(float(part) for part in run.color("background_color", "white", {"random": (0.0, 0.0, 0.0)}))
+        stored = tuple(float(part) for part in run.color("background_color", "white", _BACKGROUNDS))
+        if named and not isinstance(run.model["background_color"], str):
+            origin += ", three numbers, at which Nerfstudio's own model stops"
     given = overrides.background
     record = chosen("background", given, "--background", stored, origin if named else "default of nerfstudio 1.1.5")
     return record, np.array(stored if given is None else given, np.float32)

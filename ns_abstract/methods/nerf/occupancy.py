@@ -17,7 +17,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ns_abstract.arithmetic.rounding import UNIT64
+from ns_abstract.arithmetic.rounding import VOXEL_ROUNDING
 from ns_abstract.io.arrays import open_archive
 from ns_abstract.io.atomic import write_atomic
 from ns_abstract.io.errors import InputError
@@ -81,7 +81,7 @@ class OccupancyGrid:
         with np.errstate(invalid="ignore", over="ignore"):
             low, high = (lower - self.lower) * self.scale, (upper - self.lower) * self.scale
             # the difference and the product, here and in `at`; the operands' own sizes count where they cancel
-            room = 8.0 * UNIT64 * (np.maximum(np.abs(lower), np.abs(upper)) + np.abs(self.lower)) * self.scale
+            room = VOXEL_ROUNDING * (np.maximum(np.abs(lower), np.abs(upper)) + np.abs(self.lower)) * self.scale
             first, last = np.floor(low - room), np.floor(high + room)
         first, last = np.where(np.isnan(first), -np.inf, first), np.where(np.isnan(last), np.inf, last)
         within = ((first >= 0) & (last < size)).all(axis=-1)

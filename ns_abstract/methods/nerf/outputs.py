@@ -5,7 +5,13 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from ns_abstract.arithmetic.rounding import CHEBYSHEV_ROUNDING, COMPOSITE_ROUNDING
+from ns_abstract.arithmetic.rounding import (
+    ACTIVATION_FLOOR,
+    ACTIVATION_ROUNDING,
+    CHEBYSHEV_ROUNDING,
+    COMPOSITE_ROUNDING,
+    SOFTPLUS_LINE,
+)
 from ns_abstract.methods.nerf.zonotope import Affine
 
 
@@ -39,16 +45,16 @@ def density(z: Tensor, *, up: bool) -> Tensor:
     """
     found = torch.clamp(z, min=0.0) + torch.log1p(torch.exp(-z.abs()))
     if up:
-        return found * (1.0 + 2.0**-46)
-    return torch.where(z > 19.0, z, found) * (1.0 - 2.0**-46)
+        return found * (1.0 + ACTIVATION_ROUNDING)
+    return torch.where(z > SOFTPLUS_LINE, z, found) * (1.0 - ACTIVATION_ROUNDING)
 
 
 def opacity(z: Tensor, length: Tensor, *, up: bool) -> Tensor:
     """A bound of ``1 - exp(-length softplus(z))``, from above or below (design.md, F7)."""
     found = -torch.expm1(-length * density(z, up=up))
     if up:
-        return (found * (1.0 + 2.0**-46) + 2.0**-1000).clamp(max=1.0)
-    return (found * (1.0 - 2.0**-46)).clamp(min=0.0)
+        return (found * (1.0 + ACTIVATION_ROUNDING) + ACTIVATION_FLOOR).clamp(max=1.0)
+    return (found * (1.0 - ACTIVATION_ROUNDING)).clamp(min=0.0)
 
 
 def brightness(value: Affine, bernstein: Tensor) -> tuple[Tensor, Tensor, Tensor]:

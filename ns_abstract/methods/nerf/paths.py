@@ -16,7 +16,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from ns_abstract.arithmetic.rounding import COMPOSITE_ROUNDING, UNIT64
+from ns_abstract.arithmetic.rounding import DIRECTION_ROUNDING, FOLLOWED_UP, LINE_ROUNDING, NONZERO, SAMPLE_ROUNDING
 from ns_abstract.execution.ending import checkpoint
 from ns_abstract.methods.nerf.division import Division
 from ns_abstract.methods.nerf.hsv import Range, shifted_bounds
@@ -30,19 +30,30 @@ from ns_abstract.methods.nerf.zonotope import Affine, FieldBounds, Pieces
 #: Parts of a cell, by axis and number of parameters: samples are told apart by them at no cost.
 _INNER = {1: 16, 2: 4}
 _INNER_MORE = 2
-#: Rays' cells that are worked on together, and samples of theirs between two looks at the light that is left.
-_CELLS, _BLOCK = 16, 48
-#: Light that does not matter any more, and light from a sample whose colour does not, as shares of the tolerance.
-_DARK, _NEGLIGIBLE = 2.0**-4, 2.0**-9
-#: Shares of first cells that were halved above and below which later ones begin narrower and wider, by these factors;
-#: fewer cells tell nothing.
-_MANY_LOST, _NARROWER = 0.5, 0.6
-_FEW_LOST, _WIDER = 0.15, 1.25
-_FEW = 8
-#: What an open part of a cell may leave without an aim, in tolerances.
-_ENOUGH = 2.0
-#: Rounding of the line that a sample is followed along, in parts of the ray.
-_LINE = 2.0**-44
+
+
+@dataclass(frozen=True)
+class FollowTuning:
+    """Preferences of what follows samples. None of them decides whether a bound holds."""
+
+    #: Rays' cells that are worked on together, and samples of theirs between two looks at the light that is left.
+    cells: int = 16
+    block: int = 48
+    #: Light that does not matter any more, and light from a sample whose colour does not, as shares of the tolerance.
+    dark: float = 2.0**-4
+    negligible: float = 2.0**-9
+    #: Shares of first cells that were halved above and below which later ones begin narrower and wider, by these
+    #: factors; fewer cells tell nothing.
+    many_lost: float = 0.5
+    narrower: float = 0.6
+    few_lost: float = 0.15
+    wider: float = 1.25
+    few: int = 8
+    #: What an open part of a cell may leave without an aim, in tolerances.
+    enough: float = 2.0
+
+
+_TUNING = FollowTuning()
 
 
 @dataclass(frozen=True)
@@ -90,13 +101,13 @@ class Lines:
         slope = np.zeros((low.shape[0], low.shape[2], d))
         if d and not straight:
             size = np.square(middles).sum(axis=0)
-            slope = np.einsum("pj,kps->ksj", middles / np.maximum(size, 1e-300), 0.5 * (low + high))
+            slope = np.einsum("pj,kps->ksj", middles / np.maximum(size, NONZERO), 0.5 * (low + high))
         # a part's places may be those of any of its poses
         room = (np.abs(slope) / np.array(counts)).sum(axis=2)
         along = np.einsum("pj,ksj->kps", middles, slope)
         least, most = (low - along).min(axis=1) - room, (high - along).max(axis=1) + room
         rest = 0.5 * (most - least)
-        return Lines(0.5 * (least + most), slope, rest * (1.0 + 2.0**-40) + _LINE * far)
+        return Lines(0.5 * (least + most), slope, rest * FOLLOWED_UP + LINE_ROUNDING * far)
 
 
 class Paths:
@@ -174,7 +185,7 @@ class Paths:
         kept, rest = field.basis.interpolation
         poly = kept @ nodes
         spread = np.abs(poly[:, 1:]).sum(axis=1) + np.abs(rest @ nodes).sum(axis=1) + radius
-        spread = spread + 2.0**-40 * (np.abs(poly[:, 0]) + spread)
+        spread = spread + field.interpolated * (np.abs(poly[:, 0]) + spread)
         empty, sure = self.occupancy.look(poly[:, 0] - spread, poly[:, 0] + spread)
         return ~empty, sure
 
@@ -241,7 +252,7 @@ class Following:
             parts = waiting.pop(level)
             cells = Cells(*(np.concatenate([getattr(p, name) for p in parts]) for name in ("ray", "cell")))
             below, again = self.division.below[level], []
-            for chunk in cells.chunks(_CELLS):
+            for chunk in cells.chunks(_TUNING.cells):
                 again.append(chunk.take(self._bound(level, chunk)))
             if below < 0:
                 continue
@@ -286,7 +297,7 @@ class Following:
         self.upper[rows] = np.minimum(self.upper[rows], np.stack([high for _, high in found], axis=2)[:, there.part])
         low, high = plain
         if self.aim is None:
-            wide = np.any((high - low) > _ENOUGH * self.tolerance, axis=(1, 2))
+            wide = np.any((high - low) > _TUNING.enough * self.tolerance, axis=(1, 2))
         else:
             least, most = (end[cells.ray, None] for end in self.aim)
             wide = np.any((high > most) | (low < least), axis=(1, 2))
@@ -298,10 +309,10 @@ class Following:
     @property
     def factor(self) -> float:
         """How much wider first cells had better be: a cell that is halved costs three, two narrow ones two."""
-        if self.tried < _FEW:
+        if self.tried < _TUNING.few:
             return 1.0
         share = self.lost / self.tried
-        return _NARROWER if share > _MANY_LOST else _WIDER if share < _FEW_LOST else 1.0
+        return _TUNING.narrower if share > _TUNING.many_lost else _TUNING.wider if share < _TUNING.few_lost else 1.0
 
 
 class Samples:
@@ -325,7 +336,7 @@ class Samples:
         self.lines = Lines.around(least, most, counts, owner.straight, owner.sampling.far)
         k, parts, samples = low.shape[0], low.shape[1], low.shape[2] - 1
         self.bernstein = owner.fine.bernstein((*counts, 1))
-        self.negligible = _NEGLIGIBLE * tolerance
+        self.negligible = _TUNING.negligible * tolerance
         self.density = np.zeros((2, k, parts, samples))
         self.density[1] = np.inf
         self.color = np.zeros((2, k, parts, samples, 3))
@@ -333,14 +344,14 @@ class Samples:
         # bounds of light that samples of which the colours do not count add
         self.price = np.zeros((k, parts))
         light = np.ones((k, parts))
-        for start in range(0, samples, _BLOCK):
-            block = slice(start, min(samples, start + _BLOCK))
-            bright = np.flatnonzero(light.max(axis=1) > _DARK * tolerance)
+        for start in range(0, samples, _TUNING.block):
+            block = slice(start, min(samples, start + _TUNING.block))
+            bright = np.flatnonzero(light.max(axis=1) > _TUNING.dark * tolerance)
             if not bright.size:
                 break
             self._block(block, bright, light)
             length = np.maximum(self.low[..., 1:] - self.high[..., :-1], 0.0)[..., block]
-            light *= np.exp(-(length * self.density[0][..., block]).sum(axis=-1)) * (1.0 + 2.0**-40)
+            light *= np.exp(-(length * self.density[0][..., block]).sum(axis=-1)) * FOLLOWED_UP
 
     def _block(self, block: slice, bright: np.ndarray, light: np.ndarray) -> None:
         """The samples ``block`` of the cells ``bright``, which ``light`` [k, parts] reaches at most."""
@@ -376,7 +387,7 @@ class Samples:
         self.density[0][k, :, i], self.density[1][k, :, i] = least, most
         length = np.maximum(self.high[k, :, i + 1] - self.low[k, :, i], 0.0)
         with np.errstate(invalid="ignore"):
-            weight = light[k] * -np.expm1(-np.nan_to_num(length * most, nan=0.0)) * (1.0 + 2.0**-40)
+            weight = light[k] * -np.expm1(-np.nan_to_num(length * most, nan=0.0)) * FOLLOWED_UP
         dim = weight <= self.negligible
         np.add.at(self.price, k, np.where(dim, weight, 0.0))
         self.color[0][k, :, i] = np.where(dim[..., None], np.inf, 0.0)
@@ -385,7 +396,7 @@ class Samples:
         if not shown.size:
             return
         k, i, dim = k[shown], i[shown], dim[shown][..., None]
-        around = torch.from_numpy(self.radii[1][k] + 96.0 * UNIT64).to(field.device)
+        around = torch.from_numpy(self.radii[1][k] + DIRECTION_ROUNDING).to(field.device)
         encoded = field.encode(torch.from_numpy(direction[k]).to(field.device), around, field.direction)
         which = torch.from_numpy(shown).to(field.device)
         low, high, _ = brightness(field.color(pieces.select(which), *encoded), self.bernstein)
@@ -409,7 +420,7 @@ class Samples:
             self.low.reshape(rows, count), self.high.reshape(rows, count), self.density.reshape(2, rows, count - 1),
             color.reshape(2, rows, count - 1, 3), low, high,
         )  # fmt: skip
-        slack = 4.0 * COMPOSITE_ROUNDING * (2 * count + 5) + self.price.reshape(rows, 1) * (1.0 + 2.0**-40)
+        slack = SAMPLE_ROUNDING * (2 * count + 5) + self.price.reshape(rows, 1) * FOLLOWED_UP
         low, high = np.clip(low - slack, 0.0, 1.0), np.clip(high + slack, 0.0, 1.0)
         # what is not a number says nothing
         low, high = np.where(low <= high, low, 0.0), np.where(low <= high, high, 1.0)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ns_abstract.arithmetic.rounding import UNIT64
+from ns_abstract.arithmetic.rounding import FOLLOWED_ROUNDING, POINT_ROUNDING, RAY_ROUNDING
 from ns_abstract.arithmetic.taylor import TaylorArray
 from ns_abstract.geometry.box import ParameterBox
 from ns_abstract.geometry.poses import PoseSet
@@ -12,8 +12,6 @@ from ns_abstract.methods.nerf.render import camera_rays
 
 #: Most that the degree of the Taylor models of poses may be.
 TAYLOR = 6
-#: Rounding of a point on a ray, in parts of its polynomials' coefficients.
-_POINT = 128.0 * UNIT64
 
 
 class Pencil:
@@ -33,14 +31,14 @@ class Pencil:
         in_camera = camera_rays(pose_set.camera, pixels)
         world = (rotation[None, :, :] * TaylorArray.constant(rotation.basis, in_camera)[:, None, :]).sum(2)
         # pixel rays and their rotation are rounded, and so is the concrete renderer's normalisation
-        world = world.widened(16.0 * UNIT64 * np.abs(in_camera).sum(axis=1)[:, None])
+        world = world.widened(RAY_ROUNDING * np.abs(in_camera).sum(axis=1)[:, None])
         length = (world * world).sum(1)
         direction = world * length.rsqrt()[:, None]
         exponents = rotation.basis.exponents
         self.exponents = np.array(exponents, np.int64).reshape(len(exponents), box.dimensions)
         self.origin, self.origin_radius = position.coefficients, position.radius
         self.direction = np.ascontiguousarray(direction.coefficients.transpose(1, 0, 2))  # [n, M, 3]
-        self.direction_radius = direction.radius + 16.0 * UNIT64
+        self.direction_radius = direction.radius + RAY_ROUNDING
         self.swept = swept
         if swept:
             # the place within a bin is one more parameter: (o + t d) + (h d) tau
@@ -59,8 +57,8 @@ class Pencil:
     def rounded(self) -> tuple[np.ndarray, np.ndarray]:
         """Radii [3] of the origin and [n, 3] of directions, with the rounding of points, here and in a render."""
         return (
-            self.origin_radius + _POINT * np.abs(self.origin).sum(axis=0),
-            self.direction_radius + _POINT * np.abs(self.direction).sum(axis=1),
+            self.origin_radius + FOLLOWED_ROUNDING * np.abs(self.origin).sum(axis=0),
+            self.direction_radius + FOLLOWED_ROUNDING * np.abs(self.direction).sum(axis=1),
         )
 
     def points(self, ray: np.ndarray, distance: np.ndarray, half: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -73,7 +71,7 @@ class Pencil:
         radius = self.origin_radius + far[:, None] * self.direction_radius[ray]
         # rounding of the polynomial's evaluation, and of the concrete renderer's point and distance
         size = np.abs(self.origin).sum(axis=0) + far[:, None] * np.abs(self.direction[ray]).sum(axis=1)
-        return lines, radius + 64.0 * UNIT64 * size
+        return lines, radius + POINT_ROUNDING * size
 
     def ranges(
         self, lines: np.ndarray, radius: np.ndarray, low: np.ndarray, high: np.ndarray
@@ -85,7 +83,7 @@ class Pencil:
         size = np.abs(lines)
         # on [-1, 1]^d no derivative of a monomial exceeds its exponent
         slope = (half @ self.exponents.T)[..., None]
-        spread = (slope * size).sum(axis=1) + radius + 64.0 * UNIT64 * size.sum(axis=1)
+        spread = (slope * size).sum(axis=1) + radius + POINT_ROUNDING * size.sum(axis=1)
         return center - spread, center + spread
 
     def displacement(self, distances: np.ndarray, lengths: np.ndarray) -> np.ndarray:

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ns_abstract.arithmetic.outward import outward
-from ns_abstract.arithmetic.rounding import UNIT32, UNIT64
+from ns_abstract.arithmetic.rounding import PLANE_ROUNDING, UNIT32
 from ns_abstract.refine.protocol import LinearSets
 
 Float64Array = NDArray[np.float64]
@@ -18,8 +18,6 @@ MOST_PARTS = 64
 #: Steps of the search for a slope, and rounds over the axes.
 _STEPS, _ROUNDS = 24, 2
 _GOLDEN = 0.5 * (5.0**0.5 - 1.0)
-#: Relative rounding of the few operations on a part's end, slope and offset.
-_ROUNDING = 64.0 * UNIT64
 
 
 def united(low: np.ndarray, high: np.ndarray, ends: list[Float64Array]) -> tuple[np.ndarray, np.ndarray, list]:
@@ -58,7 +56,7 @@ def fit_planes(
     middles = [0.5 * (edges[1:] + edges[:-1]) for edges in ends]
     wider = list(slack) or [0.0] * d
     halves = [
-        0.5 * (edges[1:] - edges[:-1]) * (1.0 + _ROUNDING) + _ROUNDING + more
+        0.5 * (edges[1:] - edges[:-1]) * (1.0 + PLANE_ROUNDING) + PLANE_ROUNDING + more
         for edges, more in zip(ends, wider, strict=True)
     ]
     centre, half = (
@@ -71,7 +69,7 @@ def fit_planes(
         rows = sign * np.moveaxis(values.reshape(n, count, 3).astype(np.float64), 1, 2).reshape(3 * n, count)
         slope = _slopes(rows, centre, half).astype(np.float32).astype(np.float64)
         offset = _offset(rows, slope, centre, half)
-        offset = offset + _ROUNDING * (1.0 + np.abs(slope).sum(axis=1)) + UNIT32
+        offset = offset + PLANE_ROUNDING * (1.0 + np.abs(slope).sum(axis=1)) + UNIT32
         offset = outward(sign * offset, sign * offset)[0 if sign < 0.0 else 1]
         found += [(sign * slope).reshape(n, 3, d).astype(np.float32), offset.reshape(n, 3)]
     return found[0], found[1], found[2], found[3]

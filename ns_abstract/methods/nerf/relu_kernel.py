@@ -12,15 +12,13 @@ import numpy as np
 from numba import njit
 
 from ns_abstract.arithmetic.chebyshev import ChebyshevBasis
-from ns_abstract.arithmetic.rounding import CHEBYSHEV_ROUNDING, FIELD_UP, UNIT64
+from ns_abstract.arithmetic.rounding import CHEBYSHEV_ROUNDING, FIELD_UP, LEAST_SLOPE, RELU_ROUNDING
 from ns_abstract.arithmetic.simd.intrinsics import pointer
 from ns_abstract.arithmetic.simd.lanes import LINE, load_line, maximum, minimum, store
 from ns_abstract.arithmetic.simd.products import ROWS, rows_from, store_rows, sums_of_rows
 
 #: Neurons side by side.
 LANES = 32
-#: A line may be steeper than need be, and no slope is lost in float32.
-LEAST_SLOPE = 2.0**-60
 
 
 class Grid(NamedTuple):
@@ -357,7 +355,7 @@ def _open(poly, rho, box, failed, grid, slope, size, which, neuron, error):
                     q = factor * odds[k // 2, c]
                     poly[b, k + 1, j] = q
                     total += abs(q)
-            new += 8.0 * UNIT64 * (total + e)
+            new += RELU_ROUNDING * (total + e)
             slope[b, j] = kept
             size[b, j] = (total + kept * e + new) * FIELD_UP
             box[b, j] *= FIELD_UP

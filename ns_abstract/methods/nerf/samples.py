@@ -7,10 +7,8 @@ import math
 import numpy as np
 from numba import njit
 
+from ns_abstract.arithmetic.rounding import EDGE_BINS, EDGE_ROUNDING, PLACE_ROOM
 from ns_abstract.methods.nerf.render import HISTOGRAM_PADDING, Sampling
-
-#: What a place may be off by in parts of a bin, by rounding.
-_PLACE = 2.0**-30
 
 
 def edge_bounds(alpha_low: np.ndarray, alpha_high: np.ndarray, sampling: Sampling) -> tuple[np.ndarray, np.ndarray]:
@@ -21,7 +19,7 @@ def edge_bounds(alpha_low: np.ndarray, alpha_high: np.ndarray, sampling: Samplin
         sampling: Hierarchical; S is its ``samples + importance + 1``.
     """
     rows, bins = alpha_low.shape
-    rounding = 2.0**-46 * (bins + 16)
+    rounding = EDGE_ROUNDING * (bins + EDGE_BINS)
     one = np.ones((rows, 1))
     # light that passes the bins before a knot, and those behind it, least and largest
     before, after = [], []
@@ -66,8 +64,8 @@ def hulls(edges_low, edges_high, start, step, densities, colors, density, color)
         for i in range(edges_low.shape[1] - 1):
             near = 0.5 * (edges_low[r, i] + edges_low[r, i + 1])
             far = 0.5 * (edges_high[r, i] + edges_high[r, i + 1])
-            begin = min(max(math.floor((near - start) / step - _PLACE), 0), parts - 1)
-            stop = min(max(math.floor((far - start) / step + _PLACE), begin), parts - 1)
+            begin = min(max(math.floor((near - start) / step - PLACE_ROOM), 0), parts - 1)
+            stop = min(max(math.floor((far - start) / step + PLACE_ROOM), begin), parts - 1)
             least, most = np.inf, -np.inf
             for k in range(begin, stop + 1):
                 least, most = min(least, densities[0, r, k]), max(most, densities[1, r, k])

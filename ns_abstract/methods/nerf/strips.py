@@ -16,7 +16,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ns_abstract.arithmetic.rounding import UNIT64
+from ns_abstract.arithmetic.rounding import PART_END_ROUNDING
 from ns_abstract.geometry.box import ParameterBox
 from ns_abstract.geometry.poses import COLOR_SHIFTS, PoseSet
 from ns_abstract.methods.nerf.bounds import NerfBounds, RayBounds, Shifts
@@ -303,7 +303,7 @@ class Strips:
         for axis, lines in enumerate(edges):
             low, high = box.lower[axis], box.upper[axis]
             middle, half = 0.5 * (low + high), 0.5 * (high - low)
-            room = 16.0 * UNIT64 * max(abs(low), abs(high), abs(lines[0]), abs(lines[-1]))
+            room = PART_END_ROUNDING * max(abs(low), abs(high), abs(lines[0]), abs(lines[-1]))
             first = max(0, int(np.searchsorted(lines, low - room, side="right")) - 1)
             past = min(len(lines) - 1, int(np.searchsorted(lines, high + room, side="left")))
             values = values.take(np.arange(first, past), axis=axis + 2)

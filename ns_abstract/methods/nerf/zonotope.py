@@ -24,18 +24,24 @@ from torch.nn import functional
 
 from ns_abstract.arithmetic.chebyshev import ChebyshevBasis
 from ns_abstract.arithmetic.rounding import (
+    BIAS_ROUNDING,
     CHEBYSHEV_ROUNDING,
+    ELLIPSE_UP,
     FIELD_UP,
+    INTERPOLATION_ROUNDING,
+    LEAST_SLOPE,
+    NARROW_ROUNDING,
+    RELU_ROUNDING,
     UNDERFLOW_COLUMNS,
-    UNIT32,
-    UNIT64,
+    WAVE_ROUNDING,
     gamma,
 )
 from ns_abstract.arithmetic.simd.lanes import LINE
 from ns_abstract.methods.nerf import layer_kernel
 from ns_abstract.methods.nerf.field_kernel import Layers, Outputs, stacked, through_layers
 from ns_abstract.methods.nerf.layer_kernel import Weights, linear
-from ns_abstract.methods.nerf.relu_kernel import LEAST_SLOPE, Grid, grid_of
+from ns_abstract.methods.nerf.pencil import TAYLOR
+from ns_abstract.methods.nerf.relu_kernel import Grid, grid_of
 from ns_abstract.methods.nerf.scene import Encoding, FieldWeights, Layer, Waves
 
 #: Radii of Bernstein ellipses that are tried for the remainder of an encoding.
@@ -43,10 +49,11 @@ _ELLIPSES = (1.05, 1.15, 1.3, 1.6, 2.0, 2.6, 3.5, 5.0, 8.0, 14.0, 30.0, 80.0, 30
 #: Last layers of the base whose columns are multiplied in float32, as those of the head: the later a radius begins, the
 #: less it grows.
 _NARROW_LAYERS = 4
+#: Most that an encoded vector's degree by variable may be: that of `ns_abstract.methods.nerf.pencil.TAYLOR`, and one of
+#: a place that moves along the ray.
+VECTOR_DEGREE = TAYLOR + 1
 #: Error terms of a piece beyond which it is given up.
 ERROR_TERMS = 400
-#: What one rounding of a column in float32 is charged with, and what is of second order.
-_NARROW = (1.0 + 2.0**-10) * UNIT32
 
 
 #: Polynomials [B, m, k] and remainders [B, k] of an encoded vector.
@@ -212,10 +219,14 @@ class FieldBounds:
         degrees = torch.from_numpy(basis.indices).to(device, torch.float64)
         ellipses = torch.tensor(_ELLIPSES, dtype=torch.float64, device=device)
         # [ellipses, d, m]: bound of |Im T_k| on the ellipse of one variable, rounded up
-        self._imaginary = (0.5 * (ellipses[:, None, None] ** degrees.T - ellipses[:, None, None] ** -degrees.T)) * (
-            1.0 + 2.0**-30
+        self._imaginary = (
+            0.5 * (ellipses[:, None, None] ** degrees.T - ellipses[:, None, None] ** -degrees.T) * ELLIPSE_UP
         )
-        self._decay = 4.0 * ellipses**-basis.degree / (ellipses - 1.0) * (1.0 + 2.0**-30)
+        # [ellipses, d] the same of the highest power that an encoded vector has
+        self._steepest = self._imaginary.masked_fill(degrees.T > VECTOR_DEGREE, 0.0).amax(dim=2)
+        #: What interpolation errs by in all coefficients together, as a part of the largest value at a node.
+        self.interpolated = basis.lebesgue**basis.dimensions * INTERPOLATION_ROUNDING
+        self._decay = 4.0 * ellipses**-basis.degree / (ellipses - 1.0) * ELLIPSE_UP
 
         self._bernstein: dict[tuple[int, ...], Tensor] = {}
 
@@ -243,7 +254,7 @@ class FieldBounds:
 
         Args:
             nodes: [B, nodes, 3] the vector's polynomial at the basis' nodes. Its degree by variable is at most
-                the basis'.
+                the basis' and `VECTOR_DEGREE`.
             radius: [B, 3] distance of the vector from the polynomial.
             seen: ``position`` or ``direction``.
 
@@ -257,21 +268,22 @@ class FieldBounds:
         dropped = torch.matmul(self._rest, values).abs().sum(dim=1) if self._rest.shape[0] else 0.0
         x = poly[..., -3:]
         rest = torch.matmul(self._rest, nodes).abs().sum(dim=1) if self._rest.shape[0] else torch.zeros_like(radius)
-        lebesgue = self.basis.lebesgue
+        lebesgue, largest = self.basis.lebesgue, nodes.abs().amax(dim=1)
         remainder = torch.zeros_like(radius)[..., None].expand(-1, -1, omega.numel())
         for j in range(self.basis.dimensions):
             # the parts of x above the degree belong to the highest power that the basis has
             tops = self._imaginary[:, j].max(dim=1).values
             phase = torch.einsum("em,bmi->bie", self._imaginary[:, j], x.abs()) + rest[..., None] * tops
-            exponent = omega[:, None] * (phase * (1.0 + 2.0**-30) + 2.0**-40)[..., None, :]
+            rounded = self.interpolated * largest[..., None] * self._steepest[:, j]
+            exponent = omega[:, None] * (phase * ELLIPSE_UP + rounded)[..., None, :]
             growth = torch.where(exponent < 600.0, torch.cosh(exponent.clamp(max=600.0)), torch.inf)
             error = (growth * self._decay).amin(dim=-1).clamp(max=1.0 + lebesgue)
             remainder = remainder + lebesgue**j * error
         # the vector's own radius; the argument's and the functions' rounding, seen through the interpolation
-        largest = nodes.abs().amax(dim=1)
-        rounding = lebesgue**self.basis.dimensions * (16.0 * UNIT64 * (omega * (largest[..., None] + 1.0)) + 2.0**-44)
+        argument = lebesgue**self.basis.dimensions * WAVE_ROUNDING * (omega * (largest[..., None] + 1.0))
+        rounding = argument + self.interpolated
         waves = (remainder + omega * radius[..., None] + rounding).flatten(-2)
-        plain = radius + rest + 2.0**-44 * (1.0 + largest) * lebesgue**self.basis.dimensions
+        plain = radius + rest + self.interpolated * (1.0 + largest)
         return poly, (torch.cat([waves, waves, plain], dim=-1) + dropped) * FIELD_UP
 
     # --- layers --------------------------------------------------------------------------------
@@ -293,7 +305,7 @@ class FieldBounds:
             poly += encoded @ layer.weight[:seen]
             box += (remainder + rounding * (encoded.abs().sum(dim=1) + remainder)) @ layer.absolute[:seen]
         poly[:, 0] += layer.bias
-        box += 4.0 * UNIT64 * (layer.bias.abs() + poly[:, 0].abs())
+        box += BIAS_ROUNDING * (layer.bias.abs() + poly[:, 0].abs())
         spread = column_sums(columns, owner, poly.shape[0])
         return Affine(poly, columns, owner, spread, box * FIELD_UP, pieces.failed, pieces.count)
 
@@ -304,7 +316,7 @@ class FieldBounds:
         lines, absolute = layer.lines.numpy(), layer.absolute.numpy()
         return Weights(
             lines[:seen], absolute[:seen], lines[seen:], kind.numpy()[seen:], absolute[seen:], layer.bias.numpy(),
-            _rounding(len(absolute)), _NARROW if narrow else 0.0, UNDERFLOW_COLUMNS if narrow else 0.0,
+            _rounding(len(absolute)), NARROW_ROUNDING if narrow else 0.0, UNDERFLOW_COLUMNS if narrow else 0.0,
         )  # fmt: skip
 
     def _linear_compiled(self, pieces: Pieces, layer: _Linear, first: Encoded) -> Affine:
@@ -390,7 +402,7 @@ class FieldBounds:
         kept = torch.where(use_line, line, 0.5)
         error = torch.where(use_line, line_error, error)
         # the new polynomial's and the slopes' own rounding
-        error = error + 8.0 * UNIT64 * (q.abs().sum(dim=1) + e)
+        error = error + RELU_ROUNDING * (q.abs().sum(dim=1) + e)
         box = box * slope
         box[which, neuron] = r * torch.where(use_line, line, 1.0)
         poly = poly * slope[:, None]

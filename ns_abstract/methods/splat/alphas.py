@@ -11,8 +11,18 @@ from typing import Any, NamedTuple
 
 from numba import njit
 
-from ns_abstract.arithmetic.elementary import EXP_RELATIVE_ERROR, exp_kernel, fma
-from ns_abstract.arithmetic.rounding import FRAGMENT_ROUNDING, UP
+from ns_abstract.arithmetic.elementary import exp_kernel, fma
+from ns_abstract.arithmetic.rounding import (
+    CUBIC_SERIES_REST,
+    EXP_OF_ENDS,
+    EXP_OF_PARTS,
+    FIT_ROUNDING,
+    FRAGMENT_ROUNDING,
+    SECOND_ORDER,
+    SERIES_REST,
+    TURN_DOWN,
+    UP,
+)
 from ns_abstract.arithmetic.simd.intrinsics import signed
 from ns_abstract.arithmetic.simd.lanes import bits, load8, maximum, minimum, store, store_columns, where
 from ns_abstract.methods.splat.block import (
@@ -372,7 +382,7 @@ def _exponent_of_several(record, f, ax, ay, rows, scratch, m, antialiased):
         # the curvature is no less than the square of the linear part over 2 c^2
         room = 2.0 * fma(c1, c1, c2 * c2) * bend
         share = where(room > 0.0, sl * sl / where(room > 0.0, room, 1.0), 0.0)
-        turn = bend * fma(0.5 * (1.0 - 2.0**-40), minimum(share, 1.0), 1.0)
+        turn = bend * fma(0.5 * TURN_DOWN, minimum(share, 1.0), 1.0)
     # half a sum of squares is not negative
     spread = (sl + radius + FRAGMENT_ROUNDING * (center + bend)) * UP
     return _Exponent(
@@ -438,7 +448,7 @@ def _alphas_over_parts(record, begin, n, given, block, limits, inputs):
     charges, half, m = inputs.charges, inputs.parts.half, inputs.shape.monomials
     forms = _affine_forms(record, m, inputs.rules.antialiased)
     kappa, ends = limits.kappa, 8 * exponent_ends(m)
-    slack = charges.exponential + EXPONENT_CUT * charges.exponential_by_argument + 8.0 * EXP_RELATIVE_ERROR
+    slack = charges.exponential + EXPONENT_CUT * charges.exponential_by_argument + EXP_OF_PARTS
     zero = 0.0 * load8(rows, 0)
     least = limits.sure * limits.opacity_low * exp_kernel(-min(forms.k_high * (1.0 + kappa), EXPONENT_CUT))
     most = limits.opacity_high * exp_kernel(-min(forms.k_low * (1.0 - kappa), EXPONENT_CUT))
@@ -501,7 +511,7 @@ def _exponential_range(low, high, radius, limits, charges):
         at_low=at_low,
         fall=fall,
         scale=0.5 * (limits.opacity_low + limits.opacity_high) * (at_low * fall),
-        slack=slack + 4.0 * EXP_RELATIVE_ERROR,
+        slack=slack + EXP_OF_ENDS,
     )
 
 
@@ -529,7 +539,7 @@ def _cubic_exponential(low, high, center, radius, linear, quadratic, limits, cha
     k3 = fma(x, fma(x, fma(x, 1.0 / 4320.0, 1.0 / 240.0), 1.0 / 24.0), 1.0 / 6.0)
     k1 = fma(-3.0 * x, k3, k1)
     fit = (x * x) * (1.0 / 12.0) * fma(x, fma(x, 1.0 / 48.0, 0.2), 1.0) * fma(x, 1.0 / 24.0, fma(h, 0.2, 1.0))
-    fit = fma(1.5e-4 * x, (x * x) * (x * x), fit)
+    fit = fma(CUBIC_SERIES_REST * x, (x * x) * (x * x), fit)
     t0 = center - sigma.middle
     # e0 + e1 u + e2 u^2 - k3 u^3 in u = linear p + quadratic p^2
     e0 = fma(t0, fma(t0, fma(-t0, k3, k2), -k1), k0)
@@ -550,7 +560,7 @@ def _cubic_exponential(low, high, center, radius, linear, quadratic, limits, cha
     steepest = fma(moved, fma(3.0 * k3, moved, 2.0 * abs(e2)), abs(e1))
     size = abs(t0) + moved + 1.0
     size = size * size * fma(2.0, size, 4.0)
-    error = fma(steepest, sigma.radius, fma(FRAGMENT_ROUNDING + 2.0 * EXP_RELATIVE_ERROR, size, dropped + fit))
+    error = fma(steepest, sigma.radius, fma(FIT_ROUNDING, size, dropped + fit))
     alpha = _drawn(middle, error, sigma, limits, charges)
     kept = alpha.keep == 1.0
     return alpha, where(kept, sigma.scale * tilt, 0.0), where(kept, sigma.scale * bend, 0.0)
@@ -566,7 +576,7 @@ def _fitted_exponential(exponent, limits, charges):
     x = h * h
     k0, k1, k2 = _bessel_terms(x)
     fit = (h * x) * (1.0 / 3.0) * fma(x, fma(x, 1.0 / 24.0, 0.25), 1.0) * fma(x, 1.0 / 15.0, fma(h, 0.25, 1.0))
-    fit = fma(1.2e-4 * x, (x * x) * (x * x), fit)
+    fit = fma(SERIES_REST * x, (x * x) * (x * x), fit)
     t0 = exponent.center - sigma.middle
     weight = fma(2.0 * k2, t0, -k1)
     sr = sigma.radius
@@ -575,7 +585,7 @@ def _fitted_exponential(exponent, limits, charges):
     # the linear part times twice what the curvature is off half its turn, and the square of that
     turn = exponent.turn
     bent = fma(l, 2.0 * b - turn, fma(0.125 * turn, turn, sr * fma(2.0, l + b, sr)))
-    error = fma(abs(weight), sr, fma(k2, bent, fma(FRAGMENT_ROUNDING + 2.0 * EXP_RELATIVE_ERROR, size, fit)))
+    error = fma(abs(weight), sr, fma(k2, bent, fma(FIT_ROUNDING, size, fit)))
     middle = fma(t0, fma(k2, t0, -k1), fma(-0.125 * k2, turn * turn, k0))
     weight = fma(k2, turn, weight)
     alpha = _drawn(middle, error, sigma, limits, charges)
@@ -595,7 +605,7 @@ def _drawn(middle, error, sigma, limits, charges):
     a_high = opacity_high * at_low * (1.0 + slack)
     a_low = sigma.fits * (opacity_low * at_low * (sigma.fall * sigma.fall) * (1.0 - slack))
     center = sigma.scale * middle
-    radius = fma(sigma.scale, error, 1.01 * at_low * fma(opacity_high, slack, opacity_spread))
+    radius = fma(sigma.scale, error, SECOND_ORDER * at_low * fma(opacity_high, slack, opacity_spread))
     # alpha_max
     excess = maximum(0.0, a_high - alpha_max)
     a_high = minimum(a_high, alpha_max * (1.0 + charges.threshold))

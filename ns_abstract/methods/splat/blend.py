@@ -5,12 +5,20 @@ SIMD lanes are the three channels, and a fourth one of nothing.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 from numba import njit
 
 from ns_abstract.arithmetic.elementary import fma
-from ns_abstract.arithmetic.rounding import FRAGMENT_ROUNDING, UNIT64, UP
+from ns_abstract.arithmetic.rounding import (
+    CURVE_ROUNDING,
+    FRAGMENT_ROUNDING,
+    LAYER_ROUNDING,
+    PIXEL_RANGE_ROUNDING,
+    SECOND_ORDER,
+    UP,
+)
 from ns_abstract.arithmetic.simd.intrinsics import advanced, lowest_bit, prefetch, signed
 from ns_abstract.arithmetic.simd.lanes import LINE, bits, load4, maximum, minimum, store, where
 from ns_abstract.methods.splat.block import (
@@ -31,8 +39,16 @@ from ns_abstract.methods.splat.jumps import bound_by_parts, gather_jumps, set_bl
 from ns_abstract.methods.splat.lists import BLOCK
 from ns_abstract.methods.splat.reordering import Scratch, sharpened
 
-#: Jumps are looked at together where they may widen a pixel by more than this part.
-_JUMPS_MATTER = 2.0**-4
+
+@dataclass(frozen=True)
+class BlendTuning:
+    """When skipped fragments are looked at together. None of them decides whether a bound holds."""
+
+    #: Jumps are looked at together where they may widen a pixel by more than this part.
+    jumps_matter: float = 2.0**-4
+
+
+_JUMPS_MATTER = BlendTuning.jumps_matter
 
 
 class _Shown(NamedTuple):
@@ -222,7 +238,7 @@ def flattened(t, r, u, m):
     """Put the range of the curvature behind the polynomials ``t`` into their centres and the radii ``r`` (B10)."""
     low, high = _curve_range(t, u, m)
     store(t, 0, load4(t, 0) + 0.5 * (low + high))
-    return r + 0.5 * (high - low) + 2.0 * FRAGMENT_ROUNDING * (abs(load4(t, 0)) + 2.0 * (high - low))
+    return r + 0.5 * (high - low) + CURVE_ROUNDING * (abs(load4(t, 0)) + 2.0 * (high - low))
 
 
 @njit(cache=True, error_model="numpy", forceinline=True)
@@ -283,7 +299,7 @@ def form_range(t, r, order, m):
     else:
         low, high = parabola(abs(load4(t, 4)), load4(t, 8))
         bottom, top = bottom + low, top + high
-    room = 8.0 * FRAGMENT_ROUNDING * (abs(middle) + size) + r * UP
+    room = PIXEL_RANGE_ROUNDING * (abs(middle) + size) + r * UP
     return bottom - room, top + room
 
 
@@ -302,7 +318,7 @@ def _slack(q, ends, block, inputs, u):
     # rounding of the program's own sums and products
     bright = max(1.0, light, -dark)
     rounding = charges.blend_fragment * block.fragments.lengths[q] + charges.blend_pixel
-    slack = rounding * bright * 1.01 + inputs.colors.error + cutoffs.negligible * bright
+    slack = rounding * bright * SECOND_ORDER + inputs.colors.error + cutoffs.negligible * bright
     # a stop that was ignored shows the background in place of what lies behind
     rho = per_pixel[RHO + q] * (1.0 + charges.lost_light)
     fall = rho * maximum(0.0, light - behind)
@@ -332,7 +348,7 @@ def _form_bounds(begin, end, block, inputs, linear):
         blended = blend_several(begin, end, fragments, palette, moves, t, m, jumps, True)
     radius, ends = blended.radius, blended.ends
     # the radius' own rounding: three for every fragment
-    up = UP + 4.0 * UNIT64 * (end - begin)
+    up = UP + LAYER_ROUNDING * (end - begin)
     falls, rises = 0.0 * radius, 0.0 * radius
     if blended.jumps > 0:
         store(u, 0, radius * up)

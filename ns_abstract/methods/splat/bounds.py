@@ -6,17 +6,29 @@ import math
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
-from ns_abstract.arithmetic.rounding import FRAGMENT_ROUNDING, REGION, UNIT64, Arithmetic, Charges, charges
+from ns_abstract.arithmetic.rounding import (
+    FRAGMENT_ROUNDING,
+    GRAM_ROOM,
+    GRAM_UP,
+    REGION,
+    SHIFTED_ROUNDING,
+    STILL_POSITION,
+    TIE_ROUNDING,
+    Arithmetic,
+    Charges,
+    charges,
+)
 from ns_abstract.execution.threads import lane, threads
 from ns_abstract.geometry.camera_path import Camera
 from ns_abstract.geometry.poses import PoseForms
 from ns_abstract.geometry.tiles import tile_grid
 from ns_abstract.methods.splat.activate import Splats
 from ns_abstract.methods.splat.colors import color_magnitudes, fixed_colors, gathered, moving_colors
-from ns_abstract.methods.splat.constants import Rasteriser, raster_rules
+from ns_abstract.methods.splat.constants import Rasteriser, RasterRules, raster_rules
 from ns_abstract.methods.splat.gaussians import covariance_noise, gaussian_stage
 from ns_abstract.methods.splat.lists import TileLists, depth_order, marked, pixel_sets, tile_lists, tile_mask
 from ns_abstract.methods.splat.pixels import pixel_stage
@@ -86,6 +98,58 @@ class CellBounds:
     statistics: np.ndarray
 
 
+class SceneSums:
+    """What bounds need of a scene whatever the poses; each part is made when it is first asked for.
+
+    Args:
+        splats: The activated scene.
+        varied: The set of scenes.
+        rules: The rasteriser's.
+        charges: For the program's rounding.
+    """
+
+    def __init__(self, splats: Splats, varied: VariedSplats, rules: RasterRules, charges: Charges) -> None:
+        self._splats, self._varied, self._rules, self._charges = splats, varied, rules, charges
+
+    @cached_property
+    def gaussians(self) -> SceneGaussians:
+        """What the per-Gaussian stage reads."""
+        axes, varied = self._splats.axes, self._varied
+        return SceneGaussians(
+            means=varied.mean_middle,
+            mean_radius=varied.mean_radius,
+            axes=axes,
+            extents=np.sqrt(np.square(axes).sum(axis=1).max(axis=1, initial=0.0)),
+            noise=covariance_noise(axes, self._charges),
+            opacity_low=varied.opacity_low,
+            opacity_high=varied.opacity_high,
+            exponent_limits=exponent_limits(varied.opacity_high, self._rules.alpha_min, self._charges),
+        )
+
+    @cached_property
+    def color_radius(self) -> float:
+        """Bound of the float error of colours that depend on no direction."""
+        if self._splats.degree > 0:
+            return 0.0
+        return self._charges.plain_color * float(np.abs(self._splats.sh).max(initial=1.0))
+
+    @cached_property
+    def color_magnitudes(self) -> np.ndarray:
+        """[N, 6] see `colors.color_magnitudes`."""
+        return color_magnitudes(self._splats.sh, self._splats.degree)
+
+    @cached_property
+    def plain_colors(self) -> np.ndarray | None:
+        """Colours that depend on no direction, where they vary; see `_shifted_colors`."""
+        return _shifted_colors(self._varied, self._charges)
+
+    @cached_property
+    def least_step(self) -> float:
+        """Least difference other than 0 between two coordinates of means along one axis, world units."""
+        steps = [np.diff(np.unique(column)) for column in self._splats.means.T]
+        return min(float(step.min(initial=np.inf)) for step in steps)
+
+
 class SplatBounds:
     """Bounds the pictures of one scene.
 
@@ -94,10 +158,16 @@ class SplatBounds:
         rasteriser: The rules of the bounded program.
         arithmetic: What that program computes with.
         varied: The set of scenes that is bounded with each pose; None: ``splats`` alone.
+        sums: Those of this scene, where other frames have them, too.
     """
 
     def __init__(
-        self, splats: Splats, rasteriser: Rasteriser, arithmetic: Arithmetic, varied: VariedSplats | None = None
+        self,
+        splats: Splats,
+        rasteriser: Rasteriser,
+        arithmetic: Arithmetic,
+        varied: VariedSplats | None = None,
+        sums: SceneSums | None = None,
     ) -> None:
         self.splats = splats
         self.varied = VariedSplats.fixed(splats) if varied is None else varied
@@ -107,32 +177,14 @@ class SplatBounds:
         self.side = rasteriser.work_tile
         self.charges = charges(arithmetic)
         self._buffers: dict[tuple[int, str], np.ndarray] = {}
-        self._least_step: float | None = None
-        self._scene = SceneGaussians(
-            means=self.varied.mean_middle,
-            mean_radius=self.varied.mean_radius,
-            axes=splats.axes,
-            extents=np.sqrt(np.square(splats.axes).sum(axis=1).max(axis=1, initial=0.0)),
-            noise=covariance_noise(splats.axes, self.charges),
-            opacity_low=self.varied.opacity_low,
-            opacity_high=self.varied.opacity_high,
-            exponent_limits=exponent_limits(self.varied.opacity_high, self.rules.alpha_min, self.charges),
-        )
-        self._color_radius = (
-            self.charges.plain_color * float(np.abs(splats.sh).max(initial=1.0)) if splats.degree == 0 else 0.0
-        )
-        self._color_magnitudes = color_magnitudes(splats.sh, splats.degree) if splats.degree > 0 else None
+        self._sums = SceneSums(splats, self.varied, self.rules, self.charges) if sums is None else sums
         self._seen_from: dict[int, tuple[tuple[float, ...], np.ndarray]] = {}
-        self._plain_colors = _shifted_colors(self.varied, self.charges) if splats.degree == 0 else None
 
     def _tied(self, origin: np.ndarray) -> bool:
         """Whether means are equal where their differences to ``origin`` [3] are, and none varies (design.md, O1)."""
-        if self._least_step is None:
-            steps = [np.diff(np.unique(column)) for column in self.splats.means.T]
-            self._least_step = min(float(step.min(initial=np.inf)) for step in steps)
         largest = float(np.abs(self.splats.means).max(initial=0.0)) + float(np.abs(origin).max())
         # two roundings of the differences
-        return self.varied.mean_radius.shape[0] == 0 and self._least_step > 4.0 * UNIT64 * largest
+        return self.varied.mean_radius.shape[0] == 0 and self._sums.least_step > TIE_ROUNDING * largest
 
     def _buffer(self, name: str, shape: tuple[int, ...], dtype: type = np.float64) -> np.ndarray:
         """Uninitialised memory that begins with a cache line and is kept from call to call of the same lane."""
@@ -196,7 +248,7 @@ class SplatBounds:
         camera_magnitude = np.maximum(np.abs(low), np.abs(high))
         gaussians, state = self._room(n, m), self._buffer("state", (n,), np.uint8)
         poses = CellPoses(rotation, offset, forms.origin, camera_magnitude, rotation_magnitude)
-        gaussian_stage(candidates, self._scene, poses, view, self.rules, self.charges, shape, gaussians, state)
+        gaussian_stage(candidates, self._sums.gaussians, poses, view, self.rules, self.charges, shape, gaussians, state)
         alive = np.flatnonzero(state)
         colors = self._colors(forms, camera_magnitude, candidates, alive, n)
         mask = tile_mask(wanted, across * down)
@@ -221,7 +273,7 @@ class SplatBounds:
             gaussians,
             self._viewing_axes(forms, rotation_magnitude, gaussians),
             view,
-            Colors(colors, splats.background, self._color_radius, 4 if layers else 3, common),
+            Colors(colors, splats.background, self._sums.color_radius, 4 if layers else 3, common),
             self.rules,
             self.charges,
             self._cutoffs(floor),
@@ -294,22 +346,21 @@ class SplatBounds:
         """Colours of the visible Gaussians: [n, 3], [n, 6] (centre, radius) or forms."""
         splats, varied = self.splats, self.varied
         if splats.degree == 0:
-            if self._plain_colors is not None:
-                return self._plain_colors if n == splats.count else self._plain_colors[candidates]
+            if self._sums.plain_colors is not None:
+                return self._sums.plain_colors if n == splats.count else self._sums.plain_colors[candidates]
             if n == splats.count:
                 return np.ascontiguousarray(splats.sh[:, 0])
             return splats.sh[candidates, 0]
-        assert self._color_magnitudes is not None
         # torch.inverse of the view matrix, of 1 + |T| (design.md, C3)
         position_error = self.charges.camera_position * (1.0 + float(camera_magnitude.sum()))
         if self.rasteriser.eye_from_view:
             position_error += _gram_deviation(forms) * float(camera_magnitude.sum())
         scene = SceneColors(
             varied.mean_middle, varied.mean_radius, varied.color_low, varied.color_high, splats.sh,
-            self._color_magnitudes, splats.degree,
+            self._sums.color_magnitudes, splats.degree,
         )  # fmt: skip
         position = forms.position
-        if not np.any(position.linear) and float(position.radius.max()) < 1e-9:
+        if not np.any(position.linear) and float(position.radius.max()) < STILL_POSITION:
             position_error += 2.0 * float(position.radius.max())
             view = (*position.center.tolist(), position_error)
             seen = self._seen_from.get(lane())
@@ -350,7 +401,7 @@ def _gram_deviation(forms: PoseForms) -> float:
     matrix = forms.rotation.data[0].reshape(3, 3)
     radius = float(np.linalg.norm(forms.rotation.data[forms.rotation.basis.monomials]))
     middle = float(np.linalg.norm(matrix.T @ matrix - np.eye(3)))
-    return (middle + 2.0 * float(np.linalg.norm(matrix)) * radius + radius * radius) * (1.0 + 2.0**-30) + 2.0**-46
+    return (middle + 2.0 * float(np.linalg.norm(matrix)) * radius + radius * radius) * GRAM_UP + GRAM_ROOM
 
 
 def _shifted_colors(varied: VariedSplats, charges: Charges) -> np.ndarray | None:
@@ -362,6 +413,6 @@ def _shifted_colors(varied: VariedSplats, charges: Charges) -> np.ndarray | None
     moved = (varied.color_low != 0.0) | (varied.color_high != 0.0)
     size = color + np.maximum(np.abs(varied.color_low), np.abs(varied.color_high))
     # one addition and the ends' own rounding
-    radius = 0.5 * (high - low) + (charges.shifted_color + 8.0 * UNIT64) * size
+    radius = 0.5 * (high - low) + (charges.shifted_color + SHIFTED_ROUNDING) * size
     found = np.stack([np.where(moved, 0.5 * (low + high), color), np.where(moved, radius, 0.0)], axis=-1)
     return np.ascontiguousarray(found.reshape(-1, 6))

@@ -6,7 +6,7 @@ Their bounds hold of another program or scene than the one asked for. They expla
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -21,11 +21,20 @@ from ns_abstract.methods.splat.scene import SplatScene
 from ns_abstract.methods.splat.stage_data import ProjectedGaussians, ViewingAxes
 from ns_abstract.methods.splat.variations import VariedSplats, vary
 
-#: The threshold that stands for none: a jump by this part of it is not seen.
-_THRESHOLD_PART = 2.0**-5
+
+@dataclass(frozen=True)
+class CauseTuning:
+    """What stands for the absence of a rule, and how many Gaussians are looked at; no bound of a picture uses them."""
+
+    #: The threshold that stands for none: a jump by this part of it is not seen.
+    threshold_part: float = 2.0**-5
+    #: Groups of Gaussians that are left out in turn, and of them what is looked at closer.
+    groups: int = 12
+    closer: int = 3
+
+
+_TUNING = CauseTuning()
 _WITH_TILES = "the alpha threshold and tiles"
-#: Groups of Gaussians that are left out in turn, and of them what is looked at closer.
-_GROUPS, _CLOSER = 12, 3
 
 
 class _OrderedBounds(SplatBounds):
@@ -67,7 +76,9 @@ def easier(
     if rasteriser.transmittance_min > 0.0:
         yield "the stop where little light is left", frame(replace(rasteriser, transmittance_min=-1.0))
     if rasteriser.tile_size and rasteriser.alpha_min > 0.0:
-        smaller = replace(rasteriser, tile_size=0, axis_sigmas=0.0, alpha_min=_THRESHOLD_PART * rasteriser.alpha_min)
+        smaller = replace(
+            rasteriser, tile_size=0, axis_sigmas=0.0, alpha_min=_TUNING.threshold_part * rasteriser.alpha_min
+        )
         # later versions miss no tile in which alpha reaches the threshold
         names = "the alpha threshold" if rasteriser.axis_sigmas or rasteriser.ellipse_tiles else _WITH_TILES
         yield names, frame(smaller)
@@ -98,9 +109,11 @@ def holders(frame: SplatFrame, box: ParameterBox, tile: int, count: int) -> list
     whole, visible = gap(None)
     groups = [visible.astype(np.int32)]
     while True:
-        pieces = [piece for group in groups for piece in np.array_split(group, min(_GROUPS, group.size)) if piece.size]
+        pieces = [
+            piece for group in groups for piece in np.array_split(group, min(_TUNING.groups, group.size)) if piece.size
+        ]
         gains = [whole - gap(np.setdiff1d(visible, piece).astype(np.int32))[0] for piece in pieces]
-        best = np.argsort(gains)[::-1][: max(_CLOSER, count)]
+        best = np.argsort(gains)[::-1][: max(_TUNING.closer, count)]
         groups = [pieces[k] for k in best]
         if all(group.size <= 1 for group in groups):
             return [(int(pieces[k][0]), gains[k]) for k in best[:count] if gains[k] > 0.0]

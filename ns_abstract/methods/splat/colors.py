@@ -9,7 +9,7 @@ import numpy as np
 from numba import njit
 
 from ns_abstract.arithmetic.forms import bounds, clamp_below, set_norms
-from ns_abstract.arithmetic.rounding import SUM_ROUNDING, UP, Charges
+from ns_abstract.arithmetic.rounding import ARC_UP, MAGNITUDE_UP, SECOND_ORDER, SUM_ROUNDING, UP, Charges
 from ns_abstract.arithmetic.simd.intrinsics import advanced, borrowed, pointer, taken
 from ns_abstract.arithmetic.simd.wide_forms import size
 from ns_abstract.methods.splat.form_colors import WORKSPACE, form_colors
@@ -53,7 +53,7 @@ def color_magnitudes(sh: np.ndarray, degree: int) -> np.ndarray:
         found[:, :3] += _SIZE[k] * sizes
         found[:, 3:] += _SLOPE[k] * sizes
     # rounding of the sums
-    return found * (1.0 + 2.0**-40)
+    return found * MAGNITUDE_UP
 
 
 @njit(cache=True, error_model="numpy")
@@ -124,7 +124,7 @@ def _direction_error(length, position_error, means, mean_radius, i, charges):
     error = (position_error + spread + charges.direction_mean * size) / distance + charges.direction
     if spread > 0.0:
         # from a chord to the arc, along which the basis functions' slopes hold (design.md, S4)
-        error = 2.0 * math.asin(min(1.0, 0.5 * error)) * (1.0 + 2.0**-40)
+        error = 2.0 * math.asin(min(1.0, 0.5 * error)) * ARC_UP
     return min(error, 2.0)
 
 
@@ -256,7 +256,7 @@ def _clamp_channel(form, channel, numbers, filled, scratch, scene, charges, shap
             for r in range(1, m + 3):
                 form[r, q] = 0.0
             form[0, q] = 0.5
-            form[m, q] = most * 1.01 + _color_error(most, change, charges, 2.0)
+            form[m, q] = most * SECOND_ORDER + _color_error(most, change, charges, 2.0)
     _clamp_at_zero(form, low, high, shape)
     if least_of.shape[0] == 0:
         return

@@ -8,8 +8,13 @@ from typing import NamedTuple
 
 import numpy as np
 
+from ns_abstract.arithmetic.rounding import BOX_ROOM, ELLIPSE_ROOM, NEGLIGIBLE_ALPHA
+
 #: Tile side where the rasteriser itself has no tiles.
 WORK_TILE = 16
+
+#: The least accumulation that an expected depth is divided by (rendering.py of gsplat, RGB+ED).
+ACCUMULATION_MIN = 1e-10
 
 
 @dataclass(frozen=True)
@@ -73,7 +78,7 @@ class Rasteriser:
         """Roundings, in units, by which an alpha may exceed ``alpha_min`` and yet miss its tile (design.md, G12)."""
         if not self.axis_sigmas:
             return 0.0
-        return 2.0**18 if self.ellipse_tiles else 2.0**9
+        return ELLIPSE_ROOM if self.ellipse_tiles else BOX_ROOM
 
 
 #: What nerfstudio 1.1.5 pins (pyproject.toml, ``gsplat==1.4.0``).
@@ -108,7 +113,7 @@ PAPER = Rasteriser(
     transmittance_min=-1.0,
     background=False,
     view_dependent=False,
-    alpha_negligible=2.0**-40,
+    alpha_negligible=NEGLIGIBLE_ALPHA,
 )
 
 RASTERISERS = {"gsplat": GSPLAT_1_4_0, "paper": PAPER}

@@ -12,7 +12,14 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
-from ns_abstract.arithmetic.rounding import FRAGMENT_ROUNDING, UNIT64, UP
+from ns_abstract.arithmetic.rounding import (
+    DEPTH_ROUNDING,
+    FRAGMENT_ROUNDING,
+    LAYER_ROUNDING,
+    PIXEL_RANGE_ROUNDING,
+    SECOND_ORDER,
+    UP,
+)
 from ns_abstract.arithmetic.simd.intrinsics import advanced, lowest_bit, signed
 from ns_abstract.arithmetic.simd.lanes import maximum, minimum, store
 from ns_abstract.methods.splat.blend import blend_quadratic, blend_several, flattened, form_range
@@ -114,7 +121,7 @@ def _range(polynomial, order, m):
         if slope < 2.0 * abs(bend):
             vertex = middle - 0.25 * slope * slope / bend
             low, high = min(low, vertex), max(high, vertex)
-    room = 8.0 * FRAGMENT_ROUNDING * (abs(middle) + size)
+    room = PIXEL_RANGE_ROUNDING * (abs(middle) + size)
     return low - room, high + room
 
 
@@ -171,12 +178,12 @@ def shade_layers(pixels, left, above, block, inputs, bounds):
             blended = blend_several(begin, end, fragments, block.shifted, moves, t, m, block.jumps, False)
             r = flattened(t, blended.radius, advanced(t, 4 * (m + fragments.bends)), m)
         ends = blended.ends
-        r = r * (UP + 4.0 * UNIT64 * n)
+        r = r * (UP + LAYER_ROUNDING * n)
         bottom, top = form_range(t, r, order, m)
         store(by_lane, 0, maximum(ends.low, bottom))
         store(by_lane, 4, minimum(ends.high, top))
         store(by_lane, 8, r)
-        rounding = 1.01 * (charges.blend_fragment * n + charges.blend_pixel)
+        rounding = SECOND_ORDER * (charges.blend_fragment * n + charges.blend_pixel)
         # light that is lost to a stop that was ignored, and that comes to what is missing (B6)
         lost = per_pixel[RHO + q] * (1.0 + charges.lost_light)
         passed = per_pixel[OPEN + q] * (1.0 + charges.lost_light)
@@ -186,7 +193,7 @@ def shade_layers(pixels, left, above, block, inputs, bounds):
             nearest = min(nearest, unseen[DEPTH] - shift_high)
             farthest = max(farthest, unseen[4 + DEPTH] - shift_low)
             largest = max(largest, abs(unseen[DEPTH]), abs(unseen[4 + DEPTH]))
-            rounding += 1.01 * cutoffs.fade
+            rounding += SECOND_ORDER * cutoffs.fade
         # the sum: of weights times depths against the reference
         fall = max(lost * max(farthest, 0.0), passed * max(-nearest, 0.0))
         rise = max(lost * max(-nearest, 0.0), passed * max(farthest, 0.0))
@@ -230,7 +237,7 @@ def shade_layers(pixels, left, above, block, inputs, bounds):
         off = error / total_low * UP
         low, high = max(low, shift_low + nearest - off), min(high, shift_high + farthest + off)
         size = max(abs(low), abs(high))
-        off = common[m] + charges.expected_depth * size + 16.0 * FRAGMENT_ROUNDING * (all_of_it + size)
+        off = common[m] + charges.expected_depth * size + DEPTH_ROUNDING * (all_of_it + size)
         low, high = low - off, high + off
         known = low <= high and math.isfinite(high - low)
         layers[DEPTH_LOW], layers[DEPTH_HIGH] = max(low if known else 0.0, 0.0), high if known else np.inf

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
-from ns_abstract.arithmetic.rounding import FRAGMENT_ROUNDING, REGION, UP
+from ns_abstract.arithmetic.rounding import ORDER_ROUNDING, REGION, TURN_ROOM, UP, WINDOW_ROUNDING
 from ns_abstract.arithmetic.simd.intrinsics import advanced, lowest_bit, pointer, prefetch, signed
 from ns_abstract.arithmetic.simd.lanes import load8, maximum, minimum, root, spans, store, where
 from ns_abstract.methods.splat.alphas import alphas
@@ -119,9 +119,24 @@ def _uncertain(i, j, listed):
         spread += abs(slope[3 * k] * x + slope[3 * k + 1] * y + slope[3 * k + 2] * z)
     size = abs(delta[3 * i]) + abs(delta[3 * j]) + abs(delta[3 * i + 1]) + abs(delta[3 * j + 1])
     size += abs(delta[3 * i + 2]) + abs(delta[3 * j + 2])
-    rounding = FRAGMENT_ROUNDING * size * 2.0
+    rounding = ORDER_ROUNDING * size
     radius = slope[3 * m] * abs(x) + slope[3 * m + 1] * abs(y) + slope[3 * m + 2] * abs(z)
     return not (abs(center) > (spread + radius) * UP + rounding + depth_error[i] + depth_error[j])
+
+
+@njit(cache=True, error_model="numpy", forceinline=True)
+def _turn(slope, ray, m):
+    """By how much the depth of a point of unit depth on ``ray`` [3] changes over the cell, at most (design.md, O1)."""
+    along = 0.0
+    for k in range(1, m):
+        along += abs(slope[k, 0] * ray[0] + slope[k, 1] * ray[1] + slope[k, 2] * ray[2])
+    return along + (slope[m, 0] * abs(ray[0]) + slope[m, 1] * abs(ray[1]) + slope[m, 2] * abs(ray[2]))
+
+
+@njit(cache=True, error_model="numpy", forceinline=True)
+def _steadiness(along):
+    """Lower bound of one less the exact `_turn` (design.md, O1), of which a small one may be nothing but rounding."""
+    return 1.0 - along - TURN_ROOM
 
 
 @njit(cache=True, error_model="numpy")
@@ -133,10 +148,7 @@ def _depth_radii(numbers, gaussians, slope, ray, m, entries):
     depth, delta, depth_error = gaussians.depth, gaussians.delta, gaussians.depth_error
     radii, deep = entries.depth_radius, entries.depth
     count = numbers.size
-    along = 0.0
-    for k in range(1, m):
-        along += abs(slope[k, 0] * ray[0] + slope[k, 1] * ray[1] + slope[k, 2] * ray[2])
-    along += slope[m, 0] * abs(ray[0]) + slope[m, 1] * abs(ray[1]) + slope[m, 2] * abs(ray[2])
+    along = _turn(slope, ray, m)
     total = 0.0
     for k in range(count):
         ahead = numbers[min(k + AHEAD, count - 1)]
@@ -153,9 +165,9 @@ def _depth_radii(numbers, gaussians, slope, ray, m, entries):
         for row in range(1, m):
             e += abs(slope[row, 0] * x + slope[row, 1] * y + slope[row, 2] * z)
         size = abs(delta[i, 0]) + abs(delta[i, 1]) + abs(delta[i, 2]) + abs(depth[i]) * (1.0 + along)
-        radii[k] = e * UP + 4.0 * FRAGMENT_ROUNDING * size + depth_error[i]
+        radii[k] = e * UP + WINDOW_ROUNDING * size + depth_error[i]
         total += radii[k]
-    room = (1.0 - along) * (1.0 - 2.0**-30)
+    room = _steadiness(along)
     if not total < np.inf:
         room = -1.0
     # few entries reach far: they are compared with all, the others within a window

@@ -11,14 +11,14 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ns_abstract.arithmetic.outward import outward
-from ns_abstract.arithmetic.rounding import Arithmetic
+from ns_abstract.arithmetic.rounding import LINEAR_ROUNDING, LINEAR_UP, Arithmetic
 from ns_abstract.execution.ending import checkpoint
 from ns_abstract.execution.threads import each
 from ns_abstract.geometry.box import ParameterBox
 from ns_abstract.geometry.poses import PoseSet, translation_only
 from ns_abstract.geometry.tiles import laid_out, tile_grid
 from ns_abstract.methods.splat.activate import Splats
-from ns_abstract.methods.splat.bounds import STAGES, SplatBounds, alone
+from ns_abstract.methods.splat.bounds import STAGES, SceneSums, SplatBounds, alone
 from ns_abstract.methods.splat.constants import Rasteriser
 from ns_abstract.methods.splat.depths import ACCUMULATION_HIGH, ACCUMULATION_LOW, DEPTH_HIGH, DEPTH_LOW
 from ns_abstract.methods.splat.lists import summed_area, touching
@@ -31,20 +31,31 @@ from ns_abstract.refine.protocol import COLORS, LinearSets, Score
 if TYPE_CHECKING:
     from ns_abstract.methods.splat.reference import Reference
 
-#: Gaussians and poses looked at to estimate how far the picture moves.
-_MOTION_GAUSSIANS = 2000
-_MOTION_POSES = 9
-#: Step of the difference quotient, as a part of the parameter's range.
-_MOTION_STEP = 2.0**-10
-#: A compensation by less than this part of a rotation's range is left out.
-_SHEAR_MATTERS = 2.0**-7
-#: Light that is not followed further: the part of the excess that may be allowed, and at most, and no less than so many
-#: times the rasteriser's stop.
-_FLOOR_SHARE, _BRIGHTEST_FLOOR, _WORTH_IT = 0.2, 2.0**-7, 1.5
-#: Where typical Gaussians move by more pixels, a cell is bounded over so many parts, not by forms (B12).
-_WIDE, _PARTS = 0.35, 32
-#: A context that is larger than this part of the one around it is not kept beside it.
-_WORTH_KEEPING = 0.8
+
+@dataclass(frozen=True)
+class FrameTuning:
+    """Preferences of splats' frames. None of them decides whether a bound holds."""
+
+    #: Gaussians and poses looked at to estimate how far the picture moves.
+    motion_gaussians: int = 2000
+    motion_poses: int = 9
+    #: Step of the difference quotient, as a part of the parameter's range.
+    motion_step: float = 2.0**-10
+    #: A compensation by less than this part of a rotation's range is left out.
+    shear_matters: float = 2.0**-7
+    #: Light that is not followed further: the part of the excess that may be allowed, and at most, and no less than
+    #: so many times the rasteriser's stop.
+    floor_share: float = 0.2
+    brightest_floor: float = 2.0**-7
+    worth_it: float = 1.5
+    #: Where typical Gaussians move by more pixels, a cell is bounded over so many parts, not by forms (B12).
+    wide: float = 0.35
+    parts: int = 32
+    #: A context that is larger than this part of the one around it is not kept beside it.
+    worth_keeping: float = 0.8
+
+
+_TUNING = FrameTuning()
 
 
 @dataclass(frozen=True)
@@ -145,6 +156,7 @@ class SplatFrame:
             parameters are then not those of ``pose_set``.
         layers: Whether accumulation and expected depth stand behind the colours, in renders and bounds.
         reference: Makes the renderer with gradients, for steps of `members`.
+        sums: See `SplatBounds`.
     """
 
     #: What tiles share is most of the work: every call bounds as many as it is given.
@@ -165,6 +177,7 @@ class SplatFrame:
         slanted: bool = False,
         layers: bool = False,
         reference: Callable[[], Reference] | None = None,
+        sums: SceneSums | None = None,
     ) -> None:
         self.channels = 5 if layers else COLORS
         self.pose_set = pose_set
@@ -172,7 +185,7 @@ class SplatFrame:
         self.box = pose_set.box
         self.order = order or (2 if self.box.dimensions == 1 else 1)
         self._reference = reference
-        self.bounds = SplatBounds(splats, rasteriser, arithmetic, varied)
+        self.bounds = SplatBounds(splats, rasteriser, arithmetic, varied, sums)
         self.varied = self.bounds.varied
         self.renderer = Renderer(self.varied.nearest, rasteriser)
         self.side = rasteriser.work_tile
@@ -208,8 +221,12 @@ class SplatFrame:
 
     def drawn(self, values: np.ndarray, tiles: np.ndarray | None, member: Splats | None) -> np.ndarray:
         """What `render` returns, of another scene of the set if one is given."""
+        return self.precise(values, tiles, member).astype(np.float32)
+
+    def precise(self, values: np.ndarray, tiles: np.ndarray | None = None, member: Splats | None = None) -> np.ndarray:
+        """What `drawn` rounds: float64."""
         draw = self.renderer.tiles if self.channels == COLORS else self.renderer.layer_tiles
-        return draw(self.camera, *self.pose_set.world_to_camera(values), tiles, member).astype(np.float32)
+        return draw(self.camera, *self.pose_set.world_to_camera(values), tiles, member)
 
     def members(self, seed: int) -> Iterator[SplatMember]:
         """Other scenes of the set, without end; none where nothing varies."""
@@ -223,8 +240,8 @@ class SplatFrame:
         Returns:
             What no more light comes to is left out; 0: nothing is.
         """
-        floor = min(_FLOOR_SHARE * excess, _BRIGHTEST_FLOOR)
-        self._floor = floor if floor > _WORTH_IT * self._stop > 0.0 else -1.0
+        floor = min(_TUNING.floor_share * excess, _TUNING.brightest_floor)
+        self._floor = floor if floor > _TUNING.worth_it * self._stop > 0.0 else -1.0
         return max(self._floor, 0.0)
 
     def watch(self, tiles: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> None:
@@ -285,7 +302,7 @@ class SplatFrame:
             lower, upper = np.concatenate([lower, low], axis=-1), np.concatenate([upper, high], axis=-1)
         lower, upper = outward(lower, upper)
         # hardly smaller: not worth its memory
-        kept = within is not None and cell.visible.size > _WORTH_KEEPING * within.visible.size
+        kept = within is not None and cell.visible.size > _TUNING.worth_keeping * within.visible.size
         context = within if within is not None and kept else Context(cell.visible, cell.reach)
         linear = None
         if keep_linear:
@@ -311,9 +328,9 @@ class SplatFrame:
         One parameter's forms fit much more, and colours that vary with a parameter ask for them.
         """
         moved = self._moved(box)
-        if box.dimensions < 2 or not np.all(self._pace > 0.0) or np.linalg.norm(moved) <= _WIDE:
+        if box.dimensions < 2 or not np.all(self._pace > 0.0) or np.linalg.norm(moved) <= _TUNING.wide:
             return None
-        return shared_out(moved, _PARTS)
+        return shared_out(moved, _TUNING.parts)
 
     def _all_slopes(self, box: ParameterBox, slopes: np.ndarray, parts: np.ndarray) -> np.ndarray:
         """``slopes`` [d] found over ``parts``, with those of axes that are not divided told by how far things move."""
@@ -344,7 +361,7 @@ class SplatFrame:
 
         def moved(name: str) -> np.ndarray:
             step = np.zeros(box.dimensions)
-            step[box.names.index(name)] = _MOTION_STEP * width[box.names.index(name)]
+            step[box.names.index(name)] = _TUNING.motion_step * width[box.names.index(name)]
             return ((self._project(middle + step, means)[0] - here)[seen] / step.sum()).ravel()
 
         turns, shifts = (np.stack([moved(name) for name in group], axis=1) for group in (names, others))
@@ -354,7 +371,7 @@ class SplatFrame:
         mantissa, exponent = np.frexp(factors)
         factors = np.ldexp(np.round(mantissa * 256.0), exponent - 8)
         for name, row in zip(names, factors.tolist(), strict=True):
-            least = _SHEAR_MATTERS * width[box.names.index(name)]
+            least = _TUNING.shear_matters * width[box.names.index(name)]
             useful = {
                 other: factor
                 for other, factor in zip(others, row, strict=True)
@@ -366,8 +383,8 @@ class SplatFrame:
 
     def _typical_means(self) -> np.ndarray:
         means = self.bounds.splats.means
-        if means.shape[0] > _MOTION_GAUSSIANS:
-            means = means[np.random.default_rng(0).choice(means.shape[0], _MOTION_GAUSSIANS, replace=False)]
+        if means.shape[0] > _TUNING.motion_gaussians:
+            means = means[np.random.default_rng(0).choice(means.shape[0], _TUNING.motion_gaussians, replace=False)]
         return means
 
     def _seen(self, values: np.ndarray, means: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -381,15 +398,15 @@ class SplatFrame:
         d, means = box.dimensions, self._typical_means()
         low, high = np.array(box.lower), np.array(box.upper)
         total = np.zeros(d)
-        for values in (box.middle, *box.sample(_MOTION_POSES - 1, np.random.default_rng(0))):
+        for values in (box.middle, *box.sample(_TUNING.motion_poses - 1, np.random.default_rng(0))):
             here, seen = self._seen(values, means)
             if not seen.any():
                 continue
             for k in range(d):
                 step = np.zeros(d)
-                step[k] = (high[k] - low[k]) * _MOTION_STEP
+                step[k] = (high[k] - low[k]) * _TUNING.motion_step
                 there, _ = self._project(values + step, means)
-                moved = np.linalg.norm(there[seen] - here[seen], axis=1) / _MOTION_STEP
+                moved = np.linalg.norm(there[seen] - here[seen], axis=1) / _TUNING.motion_step
                 total[k] = max(total[k], float(np.quantile(moved, 0.75)))
         return total
 
@@ -423,7 +440,7 @@ def linear_sets(forms: np.ndarray, lower: np.ndarray, upper: np.ndarray, d: int)
     """
     slope = forms[..., 1 : 1 + d]
     steep = np.abs(slope).sum(axis=-1)
-    radius = forms[..., -1] * (1.0 + 2.0**-40)
+    radius = forms[..., -1] * LINEAR_UP
     sink, rise = -radius, radius.copy()
     row = 1 + d
     if forms.shape[-1] > d + 2:
@@ -437,7 +454,7 @@ def linear_sets(forms: np.ndarray, lower: np.ndarray, upper: np.ndarray, d: int)
     center = forms[..., 0]
     # rounding of the sums above and of the slopes to float32
     a = slope.astype(np.float32)
-    slack = np.abs(a.astype(np.float64) - slope).sum(axis=-1) + 2.0**-44 * (np.abs(center) + steep + rise - sink)
+    slack = np.abs(a.astype(np.float64) - slope).sum(axis=-1) + LINEAR_ROUNDING * (np.abs(center) + steep + rise - sink)
     b_lower, b_upper = center + sink - slack, center + rise + slack
     # the clamp lowers values above 1 and raises values below 0
     b_lower = b_lower - np.maximum(0.0, b_upper + steep - 1.0)

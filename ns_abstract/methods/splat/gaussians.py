@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
-from ns_abstract.arithmetic.rounding import SUM_ROUNDING, Charges
+from ns_abstract.arithmetic.rounding import CULL_ROUNDING, WHITENED_ROUNDING, Charges
 from ns_abstract.arithmetic.simd.intrinsics import borrowed, pointer, signed, taken
 from ns_abstract.arithmetic.simd.lanes import bits, load8, scatter_columns, store, where
 from ns_abstract.arithmetic.simd.wide_forms import bounds, magnitude, size
@@ -225,7 +225,7 @@ def _linear_top(w, a, s, b, t, order, m):
     top = s * load8(w, a) + t * load8(w, b) + abs(s) * load8(w, a + 8 * m) + abs(t) * load8(w, b + 8 * m)
     for k in range(1, m):
         top = top + abs(s * load8(w, a + 8 * k) + t * load8(w, b + 8 * k))
-    return top + 8.0 * SUM_ROUNDING * (abs(s) * magnitude(w, a, m, order) + abs(t) * magnitude(w, b, m, order))
+    return top + CULL_ROUNDING * (abs(s) * magnitude(w, a, m, order) + abs(t) * magnitude(w, b, m, order))
 
 
 @njit(cache=True, error_model="numpy")
@@ -322,7 +322,7 @@ def _fill_records(s, cx, cy, count, m):
             start = row.FP + f * stride * LANES + q
             first = abs(load8(s, start))
             # with 16 units for the rounding of what the pixel stage adds up
-            spread = 2.0 * SUM_ROUNDING * first
+            spread = WHITENED_ROUNDING * first
             for k in range(1, stride):
                 spread = spread + abs(load8(s, start + k * LANES))
             if f == 3 or f == 4:

@@ -18,11 +18,20 @@ Rows of `Jumps.rows` hold a number of each fragment, and before them, in the fir
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 
 from numba import njit
 
 from ns_abstract.arithmetic.elementary import fma
-from ns_abstract.arithmetic.rounding import PART_ROUNDING, UNIT64, UP
+from ns_abstract.arithmetic.rounding import (
+    JUMP_ROUNDING,
+    LAYER_ROUNDING,
+    PART_ROUNDING,
+    PLANE_ROUNDINGS,
+    UNIT64,
+    UP,
+    WEIGHT_LAYERS,
+)
 from ns_abstract.arithmetic.simd.intrinsics import advanced, lowest_bit
 from ns_abstract.arithmetic.simd.lanes import lane_sum, load4, load8, maximum, minimum, store, where
 from ns_abstract.methods.splat.block import (
@@ -36,11 +45,18 @@ from ns_abstract.methods.splat.block import (
     jump_of,
 )
 
+
+@dataclass(frozen=True)
+class JumpTuning:
+    """Planes that skipped fragments are bounded by. None of them decides whether a bound holds."""
+
+    #: Planes whose steepness would divide by less than this part of the threshold are left out.
+    steep: float = 2.0**-20
+
+
 #: Parts of a cell, a power of two.
 _PARTS = 8
-#: Planes whose steepness would divide by less than this part of the threshold are left out.
-_STEEP = 2.0**-20
-
+_STEEP = JumpTuning.steep
 _RADIUS, _TOP, _THRESHOLD, _SIZE, _SIZES, _WEIGHTS = range(6)
 # from `_restricted_rows` on: centre, then behind the slopes
 _LOW, _HIGH, _ABOVE, _FAR_ABOVE, _FAR_ABOVE_AT_0, _BELOW, _BELOW_AT_0, _FAR_BELOW, _PRODUCTS = range(1, 10)
@@ -79,7 +95,7 @@ def gather_jumps(begin, end, count, since, fragments, jumps, out, shape):
             rows[row * room + column] = 0.0
         rows[_THRESHOLD * room + column] = 1.0
     least, most = 1.0, 1.0
-    grow = 1.0 + 4.0 * UNIT64 * (end - begin + 8)
+    grow = 1.0 + LAYER_ROUNDING * (end - begin + WEIGHT_LAYERS)
     number = count - 1
     for entry in range(begin, end):
         if number < 0:
@@ -122,8 +138,8 @@ def gather_jumps(begin, end, count, since, fragments, jumps, out, shape):
             number -= 1
         most *= 1.0 - values[at + ALPHA_LOW]
         least *= 1.0 - values[at + ALPHA_HIGH]
-    store(out, 0, falls * (UP + UNIT64 * count))
-    store(out, 4, rises * (UP + UNIT64 * count))
+    store(out, 0, falls * (UP + JUMP_ROUNDING * count))
+    store(out, 4, rises * (UP + JUMP_ROUNDING * count))
 
 
 @njit(cache=True, error_model="numpy")
@@ -281,7 +297,7 @@ def _by_planes(columns, side, place, bounds, jumps, d):
         product, third = _weighted(weight, above, below, above_at_0, below_at_0, third)
         store(rows, products + 2 * room + column, product)
     # rounding of the sums and of what they are of
-    slack = (columns + 64.0) * UNIT64 * lane_sum(sizes)
+    slack = (columns + PLANE_ROUNDINGS) * UNIT64 * lane_sum(sizes)
     bounds[0], bounds[1], bounds[2] = lane_sum(first) + slack, lane_sum(second) + slack, lane_sum(third) + slack
     for channel in range(3):
         bounds[channel] += side * rows[part * room + channel]

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal, cast
 
@@ -21,6 +22,8 @@ from ns_abstract.io.memory import check_memory
 from ns_abstract.methods import config_keys, runs
 from ns_abstract.methods.checkpoint import to_float32
 from ns_abstract.methods.overrides import MODES, Overrides, chosen
+from ns_abstract.methods.splat.formats.decoded import scene_of
+from ns_abstract.methods.splat.formats.readers import decoder_of, scene_file
 from ns_abstract.methods.splat.ply_read import load_ply
 from ns_abstract.methods.splat.rows import StoredRows, coordinates_note, drawable
 from ns_abstract.methods.splat.scene import Float32Array, SplatScene
@@ -29,8 +32,9 @@ from ns_abstract.methods.splat.scene import Float32Array, SplatScene
 _STEP_AFTER_LOADING = 30000
 _MAX_DEGREE_STORED = 4
 _MAX_DEGREE = 3
-# nerfstudio/models/splatfacto.py: colour shown outside training for background "random".
-_RANDOM_BACKGROUND = (0.1490, 0.1647, 0.2157)
+#: nerfstudio/models/splatfacto.py:300-303, 498-509: what it shows outside training; at other names, also of another
+#: case, it stops.
+_BACKGROUNDS = {"random": (0.1490, 0.1647, 0.2157), "white": (1.0, 1.0, 1.0), "black": (0.0, 0.0, 0.0)}
 _MODEL_DEFAULTS: dict[str, Any] = {
     "sh_degree": 3,
     "sh_degree_interval": 1000,
@@ -60,7 +64,8 @@ def load_scene(path: str | os.PathLike[str], overrides: Overrides | None = None)
     """Read a scene.
 
     Args:
-        path: ``config.yml`` of a run, the run folder that holds it, or a 3DGS ``.ply``.
+        path: ``config.yml`` of a run, the run folder that holds it, or a file or folder of another program
+            (docs/formats.md): a .ply, a SOG, SPZ or .splat file, a checkpoint of gsplat's trainer, Inria's folder.
         overrides: What the user says in place of the files.
 
     Returns:
@@ -71,15 +76,25 @@ def load_scene(path: str | os.PathLike[str], overrides: Overrides | None = None)
         InputError: For any content of the files, or an override, that cannot be used.
     """
     path, overrides = Path(path), overrides or Overrides()
-    if not os.path.isdir(path):
+    if os.path.isdir(path):
+        inner = scene_file(path, overrides.load_step)
+        if inner is not None:
+            # the step has chosen the file
+            return load_scene(inner, replace(overrides, load_step=None))
+    else:
         file_size(path, "config.yml or .ply", fix=_FIX)
         if is_ply(path) or path.suffix.lower() == ".ply":
             return load_ply(path, overrides)
+        decode = decoder_of(path)
+        if decode is not None:
+            overrides.refuse(("load_step", "assume_splatfacto"), "is for runs, this is a file")
+            return scene_of(decode(path, overrides), overrides)
         refuse_other_kind(path)
         if path.suffix.lower() == ".json":
-            lod = path.name in ("meta.json", "lod-meta.json")
+            lod = path.name == "lod-meta.json"
             fix = f"convert with: splat-transform {path.name} out.ply" if lod else _FIX
-            raise InputError("the index of a SOG scene" if lod else "a .json file is not a scene", file=path, fix=fix)
+            what = "the index of a scene in levels of detail" if lod else "a .json file is not a scene"
+            raise InputError(what, file=path, fix=fix)
         if path.suffix.lower() in (".ckpt", ".pt", ".pth"):
             raise InputError(f"a {path.suffix} file is not a scene", file=path, fix=_FIX)
     return _load_run(runs.read_config(path), overrides)
@@ -185,8 +200,10 @@ def _picture(run: runs.RunConfig, overrides: Overrides) -> tuple[tuple[Assumptio
     }
     # what is replaced is read first, so that a file that says nonsense is refused either way
     mode = run.choice("rasterize_mode", _MODEL_DEFAULTS["rasterize_mode"], MODES)
-    background = run.color("background_color", _MODEL_DEFAULTS["background_color"], {"random": _RANDOM_BACKGROUND})
+    background = run.color("background_color", _MODEL_DEFAULTS["background_color"], _BACKGROUNDS)
     stored = tuple(float(part) for part in background)
+    if not isinstance(run.model.get("background_color", ""), str):
+        origins["background_color"] += ", three numbers, at which Nerfstudio's own model stops"
     choices = (
         chosen("rasterize_mode", overrides.rasterize_mode, "--rasterize-mode", mode, origins["rasterize_mode"]),
         chosen("background", overrides.background, "--background", stored, origins["background_color"]),

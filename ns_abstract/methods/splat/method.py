@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ns_abstract.arithmetic.rounding import Arithmetic
+from ns_abstract.arithmetic.rounding import Arithmetic, charges
 from ns_abstract.arithmetic.rounding import arithmetic as arithmetic_named
 from ns_abstract.geometry.box import ParameterBox
 from ns_abstract.geometry.poses import COLOR_SHIFTS, PoseSet
@@ -18,7 +18,8 @@ from ns_abstract.methods.overrides import Overrides
 from ns_abstract.methods.representation import ProgramOptions, Representation
 from ns_abstract.methods.runs import RunConfig
 from ns_abstract.methods.splat.activate import SH_C0, Splats, activate
-from ns_abstract.methods.splat.constants import VERSIONS, Rasteriser, rasteriser_named
+from ns_abstract.methods.splat.bounds import SceneSums
+from ns_abstract.methods.splat.constants import VERSIONS, Rasteriser, raster_rules, rasteriser_named
 from ns_abstract.methods.splat.frame import SplatFrame
 from ns_abstract.methods.splat.load import load_scene
 from ns_abstract.methods.splat.scene import SplatScene
@@ -60,6 +61,7 @@ class SplatMethod:
         self.arithmetic: Arithmetic = arithmetic_named(arithmetic or "float32")
         self.splats: Splats = activate(scene, self.rasteriser)
         self._varied: dict[tuple[SceneVariation, ...], VariedSplats] = {}
+        self._sums: dict[tuple[SceneVariation, ...], SceneSums] = {}
         self._reference: Reference | None = None
 
     @property
@@ -101,9 +103,10 @@ class SplatMethod:
         if layers and self.rasteriser.name != "gsplat":
             raise InputError("the paper's renderer has no depth", field="--outputs", fix="leave it out")
         varied = self.varied(poses.perturbation.scene)
+        sums = self._sums[poses.perturbation.scene]
         return SplatFrame(
             self.splats, self.rasteriser, self.arithmetic, poses, varied=varied, slanted=slanted, layers=layers,
-            reference=self._slow,
+            reference=self._slow, sums=sums,
         )  # fmt: skip
 
     def easier(self, poses: PoseSet) -> Iterator[tuple[str, SplatFrame]]:
@@ -136,8 +139,12 @@ class SplatMethod:
         """The scenes of a set."""
         if variations not in self._varied:
             while len(self._varied) >= _KEPT:
-                self._varied.pop(next(iter(self._varied)))
-            self._varied[variations] = vary(self.scene, self.splats, variations)
+                oldest = next(iter(self._varied))
+                del self._varied[oldest], self._sums[oldest]
+            varied = vary(self.scene, self.splats, variations)
+            rules = raster_rules(self.rasteriser, self.splats.antialiased)
+            self._sums[variations] = SceneSums(self.splats, varied, rules, charges(self.arithmetic))
+            self._varied[variations] = varied
         return self._varied[variations]
 
     def memory(self, pixels: int, threads: int) -> int:

@@ -33,11 +33,9 @@ _SIZES = {
     **dict.fromkeys(("double", "float64"), 8),
 }
 _FLOATS = ("float", "float32", "double", "float64")
-_CONVERT = "convert with: splat-transform {name} out.ply"
 _RASTERISER = "render it with the program that trained it, or train Gaussians that gsplat's rasteriser draws"
 #: Beginnings of columns of Gaussians that are drawn in another way, and what they are.
 _FAMILIES = (
-    ("packed_", "a compressed .ply, of packed columns", _CONVERT),
     ("sg_", "Gaussians with lobes of spherical Gaussians", _RASTERISER),
     ("f_asg", "Gaussians with anisotropic spherical Gaussians", _RASTERISER),
     ("sb_", "beta kernels with spherical betas", _RASTERISER),
@@ -97,8 +95,23 @@ class PlyHeader:
     unused: tuple[str, ...]
 
 
-def read_header(path: Path, mode_given: bool) -> PlyHeader:
-    """Check the header of ``path`` against the size of the file.
+@dataclass(frozen=True)
+class PlyDeclaration:
+    """What a header declares, checked against the size of the file.
+
+    Attributes:
+        elements: The elements, each of scalar properties.
+        mode: "classic" or "antialiased" where a comment says it.
+        comment: That comment.
+    """
+
+    elements: list[PlyElement]
+    mode: str | None
+    comment: str
+
+
+def read_declaration(path: Path, mode_given: bool) -> PlyDeclaration:
+    """What the header of ``path`` declares.
 
     Args:
         path: The file.
@@ -106,7 +119,7 @@ def read_header(path: Path, mode_given: bool) -> PlyHeader:
             matter.
 
     Raises:
-        InputError: It is not the header of a standard 3DGS .ply, or the file is cut off.
+        InputError: It is not the header of a .ply of splats, or the file is cut off.
     """
     size = file_size(path, ".ply")
     refuse_other_kind(path)
@@ -137,15 +150,24 @@ def read_header(path: Path, mode_given: bool) -> PlyHeader:
             field="header",
             fix="the file is cut off: copy or export it again",
         )
+    return PlyDeclaration(elements, *_comments(text, path, mode_given))
+
+
+def standard_header(declared: PlyDeclaration, path: Path) -> PlyHeader:
+    """The header of a standard 3DGS .ply.
+
+    Raises:
+        InputError: Its columns are not those of one.
+    """
+    vertex = next((element for element in declared.elements if element.name == "vertex"), None)
     if vertex is None or vertex.count < 1:
         raise InputError("no Gaussians", file=path, field="element vertex", fix=FIX)
     bands = _bands(vertex, path)
     check_memory(2 * 4 * vertex.count * (11 + 3 * bands), path, f"the scene of {vertex.count} Gaussians")
-    mode, comment = _comments(text, path, mode_given)
     used = {*(name for group in GROUPS.values() for name in group), FILTER}
     unused = [name for name in vertex.types if name not in used and not name.startswith("f_rest_")]
-    others = [f"element {element.name}" for element in elements if element is not vertex]
-    return PlyHeader(vertex, bands, mode, comment, (*unused, *others))
+    others = [f"element {element.name}" for element in declared.elements if element is not vertex]
+    return PlyHeader(vertex, bands, declared.mode, declared.comment, (*unused, *others))
 
 
 def _comments(text: str, path: Path, mode_given: bool) -> tuple[str | None, str]:

@@ -1,31 +1,59 @@
-"""Read the Gaussians of a standard 3DGS ``.ply``."""
+"""Read the Gaussians of a 3DGS ``.ply``."""
 
 from __future__ import annotations
 
 import warnings
+from dataclasses import replace
 from pathlib import Path
-from typing import Any, Literal, cast
+from typing import Any
 
 import numpy as np
 
-from ns_abstract.io.assumptions import Assumption
 from ns_abstract.io.errors import InputError, visible
-from ns_abstract.methods.overrides import Overrides, chosen
-from ns_abstract.methods.splat.ply_header import DEGREES, FILTER, FIX, GROUPS, PlyElement, PlyHeader, read_header
-from ns_abstract.methods.splat.rows import StoredRows, coordinates_note, drawable
-from ns_abstract.methods.splat.scene import DataparserTransform, Float32Array, SplatScene
+from ns_abstract.methods.overrides import Overrides
+from ns_abstract.methods.splat.formats import inria
+from ns_abstract.methods.splat.formats.compressed_ply import decode_compressed_ply, is_compressed
+from ns_abstract.methods.splat.formats.decoded import DecodedSplats, float32_rows, scene_of
+from ns_abstract.methods.splat.ply_header import (
+    FILTER,
+    FIX,
+    GROUPS,
+    PlyElement,
+    PlyHeader,
+    read_declaration,
+    standard_header,
+)
+from ns_abstract.methods.splat.scene import Float32Array, SplatScene
 
 _FIELDS = {"scales": "vertex.scale_*", "quats": "vertex.rot_*", "opacities": "vertex.opacity", "colours": "vertex.f_*"}
 
 
 def load_ply(path: Path, overrides: Overrides) -> SplatScene:
-    """The scene of a ``.ply``.
+    """The scene of a standard or compressed ``.ply``.
+
+    A ``cfg_args`` in the folder that the file was trained in says the background.
 
     Raises:
         InputError: For any content of the file, or an override, that cannot be used.
     """
     overrides.refuse(("load_step", "assume_splatfacto"), "is for runs, this file is a .ply")
-    header = read_header(path, overrides.rasterize_mode is not None)
+    declared = read_declaration(path, overrides.rasterize_mode is not None)
+    if is_compressed(declared.elements):
+        decoded = decode_compressed_ply(path, declared.elements, declared.mode, declared.comment)
+    else:
+        decoded = _decode(path, standard_header(declared, path))
+    arguments = inria.arguments_beside(path)
+    if arguments is not None:
+        background = inria.background(inria.read_arguments(arguments), arguments)
+        decoded = replace(
+            decoded,
+            background=background,
+            background_origin=f"{inria.ARGUMENTS}: white_background" if background else "",
+        )
+    return scene_of(decoded, overrides)
+
+
+def _decode(path: Path, header: PlyHeader) -> DecodedSplats:
     vertex = _read_vertex(path, header.vertex)
     arrays = {name: _columns(vertex, columns) for name, columns in GROUPS.items()}
     count, bands = arrays["means"].shape[0], header.bands
@@ -33,35 +61,21 @@ def load_ply(path: Path, overrides: Overrides) -> SplatScene:
     # f_rest is channel-major: f_rest[c * (K - 1) + k].
     rest = rest.reshape(count, 3, bands - 1).transpose(0, 2, 1)
     scales, opacities = arrays["scales"], arrays["opacity"].reshape(count)
-    notes = list(_notes(header, overrides))
+    notes = [f"not used: {visible(', '.join(header.unused))}"] if header.unused else []
     if FILTER in header.vertex.types:
         scales, opacities = filtered(scales, opacities, _columns(vertex, (FILTER,))[:, 0])
         notes.append(
             f"{FILTER} is applied to scales and opacities, as mip-splatting does on export; its own rasteriser blurs "
             "by 0.1 square pixels and compensates opacities, gsplat blurs by 0.3"
         )
-    stored = StoredRows(
-        means=arrays["means"],
-        log_scales=scales,
-        quats=arrays["quats"],
-        opacity_logits=opacities,
-        sh=np.ascontiguousarray(np.concatenate([arrays["f_dc"][:, None, :], rest], axis=1)),
-    )
-    stored, dropped = drawable(stored, path, _FIELDS, overrides.drop_nan_gaussians)
-    assumptions = _assumptions(header, overrides)
-    background = np.array(overrides.background or (0.0, 0.0, 0.0), np.float32)
-    return SplatScene(
-        **vars(stored),
-        color_model="sh",
-        sh_degree=DEGREES[3 * (bands - 1)],
-        rasterize_mode=cast(Literal["classic", "antialiased"], assumptions[0].value),
-        background=background,
-        dataparser=DataparserTransform(),
-        name=visible(path.stem),
-        source=str(path),
-        **dropped,
-        notes=(*notes, *coordinates_note(stored.means, stored.log_scales)),
-        assumptions=assumptions,
+    return DecodedSplats(
+        "a .ply",
+        (path,),
+        float32_rows(arrays["means"], scales, arrays["quats"], opacities, arrays["f_dc"], rest),
+        _FIELDS,
+        mode=header.mode,
+        mode_origin=f"comment in the file: {visible(header.comment)}" if header.mode else "",
+        notes=tuple(notes),
     )
 
 
@@ -87,26 +101,6 @@ def filtered(
         found = (0.5 * np.log(total)).astype(np.float32), (np.log(opacity) - np.log1p(-opacity)).astype(np.float32)
     same = width == 0
     return np.where(same[:, None], log_scales, found[0]), np.where(same, opacity_logits, found[1])
-
-
-def _assumptions(header: PlyHeader, overrides: Overrides) -> tuple[Assumption, ...]:
-    mode, origin = header.mode, f"comment in the file: {visible(header.comment)}"
-    if mode is None:
-        mode, origin = "classic", "default: the file says nothing"
-    return (
-        chosen("rasterize_mode", overrides.rasterize_mode, "--rasterize-mode", mode, origin),
-        chosen("background", overrides.background, "--background", (0.0, 0.0, 0.0), "default: a .ply says nothing"),
-        Assumption("units", "those of the file", "default: a .ply says nothing"),
-    )
-
-
-def _notes(header: PlyHeader, overrides: Overrides) -> list[str]:
-    notes = []
-    if header.mode is None and overrides.rasterize_mode is None:
-        notes.append("assumed classic: nothing in the file says how it was rasterised (--rasterize-mode says it)")
-    if header.unused:
-        notes.append(f"not used: {visible(', '.join(header.unused))}")
-    return notes
 
 
 def _read_vertex(path: Path, element: PlyElement) -> Any:

@@ -18,19 +18,46 @@ so that for a pixel at offset (ax, ay) from the mean
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from numba import njit
 
-from ns_abstract.arithmetic.rounding import REGION, UNIT64, UP, Charges
+from ns_abstract.arithmetic.rounding import (
+    COMPENSATION_ROUNDING,
+    ELLIPSE_ERROR,
+    ELLIPSE_SHARPNESS,
+    ELLIPSE_SPAN,
+    ELLIPSE_TIPS,
+    LOGARITHM_ROOM,
+    REGION,
+    ROOT_ROUNDING,
+    SECOND_ORDER,
+    UP,
+    Charges,
+)
 
 #: Lanes of one block of the compiled stage.
 LANES = 32
-#: The squared compensation from which on its logarithm is used.
-_LEAST_SQUARE = 1e-60
-#: Part of the near plane's depth from which on a Gaussian is projected over all of a cell, also where it is not drawn.
-_IN_FRONT = 2.0**-4
-#: Relative error of a covariance, as its entries' errors tell, beyond which that of its factors is looked at.
-_FACTORS_MATTER = 2.0**-10
+
+
+@dataclass(frozen=True)
+class RecordTuning:
+    """From where on Gaussians are looked at more closely. None of them decides whether a bound holds."""
+
+    #: The squared compensation from which on its logarithm is used.
+    least_square: float = 1e-60
+    #: Part of the near plane's depth from which on a Gaussian is projected over all of a cell, also where it is not
+    #: drawn.
+    in_front: float = 2.0**-4
+    #: Relative error of a covariance, as its entries' errors tell, beyond which that of its factors is looked at.
+    factors_matter: float = 2.0**-10
+
+
+_LEAST_SQUARE = RecordTuning.least_square
+_IN_FRONT = RecordTuning.in_front
+_FACTORS_MATTER = RecordTuning.factors_matter
+
 
 # columns of a record before its forms
 MEAN_X, MEAN_Y, OPACITY_LOW, OPACITY_HIGH, KAPPA, UNBOUNDED, EXPONENT_LIMIT, SPREAD = range(8)
@@ -203,9 +230,9 @@ def float_errors(s, n, rules, camera, charges, rotation_magnitude):
         _factor_errors(s, n, rules, camera, charges, rotation_magnitude)
     for q in range(n):
         a, c, det = s[A + q], s[C + q], s[DET + q]
-        s[ETA + q] = (s[ETA + q] + charges.conic * (a * c) / det) * 1.01
+        s[ETA + q] = (s[ETA + q] + charges.conic * (a * c) / det) * SECOND_ORDER
         # float error of the mean, in units of y
-        s[EW + q] = (np.sqrt(c / det) * s[EMX + q] + np.sqrt(a / det) * s[EMY + q]) * 1.01
+        s[EW + q] = (np.sqrt(c / det) * s[EMX + q] + np.sqrt(a / det) * s[EMY + q]) * SECOND_ORDER
 
 
 @njit(cache=True, error_model="numpy")
@@ -277,7 +304,11 @@ def _covariance_errors(s, n, camera, charges, rotation_magnitude):
         error_a = _dot(g_x, h_x) + 2.0 * jump_x * deep * root_a + jump_x * jump_x * variance + charges.blur * a
         error_c = _dot(g_y, h_y) + 2.0 * jump_y * deep * root_c + jump_y * jump_y * variance + charges.blur * c
         error_b = _dot(g_x, h_y) + deep * (jump_x * root_c + jump_y * root_a) + jump_x * jump_y * variance
-        error_a, error_c, error_b = error_a * 1.01, error_c * 1.01, (error_b + charges.blur * b) * 1.01
+        error_a, error_c, error_b = (
+            error_a * SECOND_ORDER,
+            error_c * SECOND_ORDER,
+            (error_b + charges.blur * b) * SECOND_ORDER,
+        )
         s[A + q], s[B + q], s[C + q] = a, b, c
         s[DET + q] = s[DLO + q] / (z2_high * z2_high)
         s[EA + q], s[EB + q], s[EC + q] = error_a, error_b, error_c
@@ -304,7 +335,7 @@ def _radius_ranges(s, n, rules, charges):
         error_det = (
             c * error_a + a * error_c + 2.0 * b * error_b + error_a * error_c + error_b * error_b
             + charges.determinant * (a * c + b * b)
-        ) * 1.01  # fmt: skip
+        ) * SECOND_ORDER  # fmt: skip
         error_disc = 2.0 * half_high * error_half + error_half * error_half + error_det
         error_disc += charges.discriminant * half_high * half_high
         disc_high = max(rules.discriminant_min, difference * difference + b * b + error_disc)
@@ -342,7 +373,7 @@ def _factor_errors(s, n, rules, camera, charges, rotation_magnitude):
         a, b, c, det = s[A + q], s[B + q], s[C + q], s[DET + q]
         g_x = _scaled_row(camera.fx / z_low, s[RATIOX + q], r0, r2)
         g_y = _scaled_row(camera.fy / z_low, s[RATIOY + q], r1, r2)
-        relative = 1.01 * (s[RELJ + q] + charges.rotation)
+        relative = SECOND_ORDER * (s[RELJ + q] + charges.rotation)
         more = 1.0 + relative
         sum_x = (g_x[0] + g_x[1] + g_x[2] + jump_x * (r2[0] + r2[1] + r2[2])) * more
         sum_y = (g_y[0] + g_y[1] + g_y[2] + jump_y * (r2[0] + r2[1] + r2[2])) * more
@@ -370,9 +401,9 @@ def _factor_errors(s, n, rules, camera, charges, rotation_magnitude):
         moved = np.sqrt(c / det) * move_x + np.sqrt(a / det) * move_y
         gram = c * (gram_a + charges.blur * a) + 2.0 * (np.sqrt(a) * np.sqrt(c)) * gram_b
         gram = gram + a * (gram_c + charges.blur * c)
-        eta = min(s[ETA + q], (moved * (2.0 + moved) + gram / det) * 1.01)
+        eta = min(s[ETA + q], (moved * (2.0 + moved) + gram / det) * SECOND_ORDER)
         products = charges.determinant * (a * c + b * b)
-        error_det = min(s[EDET + q], (eta * (2.0 + eta) * det + products) * 1.01)
+        error_det = min(s[EDET + q], (eta * (2.0 + eta) * det + products) * SECOND_ORDER)
         replaced = s[ETA + q] > enough
         s[EDET + q] = error_det if replaced else s[EDET + q]
         s[ETA + q] = eta if replaced else s[ETA + q]
@@ -387,8 +418,8 @@ def compensations(s, n, rules, charges):
     """
     eps2d, least, flush = rules.eps2d, rules.compensation_min, charges.flush
     # and the rounding below
-    shrink = 1.0 - charges.compensation - 64.0 * UNIT64
-    grow = 1.0 + charges.compensation + 64.0 * UNIT64
+    shrink = 1.0 - charges.compensation - COMPENSATION_ROUNDING
+    grow = 1.0 + charges.compensation + COMPENSATION_ROUNDING
     for q in range(n):
         move_x, move_y = s[MOVEX + q], s[MOVEY + q]
         error_a, error_b, error_c = s[GRAMA + q], s[GRAMB + q], s[GRAMC + q]
@@ -396,17 +427,17 @@ def compensations(s, n, rules, charges):
         a = np.sqrt(min(s[ROWX + q], max(0.0, s[A + q] * REGION - eps2d)))
         c = np.sqrt(min(s[ROWY + q], max(0.0, s[C + q] * REGION - eps2d)))
         det, spread = s[DET + q], s[EDET + q] / s[DET + q]
-        moved = 1.01 * (move_x * c + a * move_y + move_x * move_y) / np.sqrt(det)
+        moved = SECOND_ORDER * (move_x * c + a * move_y + move_x * move_y) / np.sqrt(det)
         a, c = (a + move_x) * (a + move_x), (c + move_y) * (c + move_y)
         error = c * error_a + a * error_c + 2.0 * np.sqrt(a * c) * error_b + error_a * error_c + error_b * error_b
-        error = 1.01 * (error + charges.determinant * (a + error_a) * (c + error_c) + flush) / det
+        error = SECOND_ORDER * (error + charges.determinant * (a + error_a) * (c + error_c) + flush) / det
         # the square of the compensation lies in [0, 1]; bounds that are no numbers say nothing
         low = s[SQLO + q] if s[SQLO + q] > 0.0 else 0.0
         high = s[SQHI + q] if s[SQHI + q] < 1.0 else 1.0
         low_root, high_root = np.sqrt(low), np.sqrt(high)
-        bottom = max(0.0, low_root * (1.0 - 16.0 * UNIT64) - moved)
+        bottom = max(0.0, low_root * (1.0 - ROOT_ROUNDING) - moved)
         bottom = np.sqrt(max(0.0, bottom * bottom - error) / (1.0 + spread)) * shrink
-        top = high_root * (1.0 + 16.0 * UNIT64) + moved
+        top = high_root * (1.0 + ROOT_ROUNDING) + moved
         top = np.sqrt((top * top + error) / (1.0 - spread)) * grow
         change = (moved * (2.0 * low_root + moved) + error) / low
         # 1.6.0 has a least factor
@@ -428,7 +459,7 @@ def exponent_limits(opacity_high: np.ndarray, alpha_min: float, charges: Charges
     with np.errstate(divide="ignore"):
         exponent = np.log(opacity_high * (1.0 + charges.opacity) * (1.0 + charges.exponent_limit) / alpha_min)
     # room for the rounding of the exponential, which grows more slowly than the exponent's own error
-    return exponent * REGION + 2.0**-30
+    return exponent * REGION + LOGARITHM_ROOM
 
 
 @njit(cache=True, error_model="numpy", forceinline=True)
@@ -444,8 +475,10 @@ def ellipse_is_met(sharpness, widest, thinnest, eta, span, charges):
     """
     unit = 0.125 * charges.tile
     steep = 16.0 * unit * span * np.sqrt(widest / thinnest) < 0.25
-    tips = (sharpness * sharpness > 256.0 * unit) & (sharpness * np.sqrt(thinnest) > 512.0 * unit * span)
-    return steep & tips & (eta < 2.0**-9) & (span < 4096.0)
+    tips = (sharpness * sharpness > ELLIPSE_SHARPNESS * unit) & (
+        sharpness * np.sqrt(thinnest) > ELLIPSE_TIPS * unit * span
+    )
+    return steep & tips & (eta < ELLIPSE_ERROR) & (span < ELLIPSE_SPAN)
 
 
 @njit(cache=True, error_model="numpy", forceinline=True)

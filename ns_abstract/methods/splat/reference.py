@@ -18,16 +18,15 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from ns_abstract.arithmetic.rounding import PIXEL_ROOM
 from ns_abstract.geometry.camera_path import Camera
-from ns_abstract.methods.splat.constants import GSPLAT_1_4_0, Rasteriser
+from ns_abstract.methods.splat.constants import ACCUMULATION_MIN, GSPLAT_1_4_0, Rasteriser
 from ns_abstract.methods.splat.scene import SplatScene
 
 #: Gaussians blended at a time: bounds the memory, and is how often a finished region is noticed.
 _LAYERS = 128
 #: Side of the regions that are blended at a time; divides every tile size.
 _REGION = 8
-# Room for rounding around the pixels that a Gaussian can reach, in float64.
-_ROOM = 1e-6
 
 
 @dataclass(frozen=True)
@@ -247,8 +246,8 @@ class Reference:
         if self.rules.alpha_min <= 0.0 or self.dtype != torch.float64:
             return torch.full((len(xx), 2), torch.inf, dtype=self.dtype)
         # alpha >= alpha_min means d^T Sigma^-1 d <= 2 log(opacity / alpha_min); |d_x| <= sqrt(that Sigma_xx)
-        level = (2.0 * torch.log(opacities / self.rules.alpha_min)).clamp(min=0.0) + _ROOM
-        return torch.sqrt(level[:, None] * torch.stack([xx, yy], dim=1)) * (1.0 + _ROOM) + _ROOM
+        level = (2.0 * torch.log(opacities / self.rules.alpha_min)).clamp(min=0.0) + PIXEL_ROOM
+        return torch.sqrt(level[:, None] * torch.stack([xx, yy], dim=1)) * (1.0 + PIXEL_ROOM) + PIXEL_ROOM
 
     def _colors(self, indices: Tensor, position: Tensor) -> Tensor:
         """[n, 3] colours seen from ``position`` [3], world."""
@@ -276,7 +275,7 @@ class Reference:
         """Accumulation and expected depth [k, 2], NaN where nothing is drawn (rendering.py of gsplat, RGB+ED)."""
         depth, light = self._sums(p, layers, centers, p.depths[:, None])
         accumulation = 1.0 - light[:, None]
-        mean = depth / accumulation.clamp(min=1e-10)
+        mean = depth / accumulation.clamp(min=ACCUMULATION_MIN)
         return torch.cat([accumulation, torch.where(accumulation > 0.0, mean, torch.nan)], dim=1)
 
     def _sums(self, p: Projection, layers: Tensor, centers: Tensor, colors: Tensor) -> tuple[Tensor, Tensor]:

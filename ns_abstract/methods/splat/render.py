@@ -13,14 +13,14 @@ import numpy as np
 from numba import njit
 
 from ns_abstract.arithmetic.elementary import exp_kernel
-from ns_abstract.arithmetic.rounding import REGION
+from ns_abstract.arithmetic.rounding import LOGARITHM_ROOM, NONZERO, REGION
 from ns_abstract.arithmetic.simd.intrinsics import borrowed, pointer, taken
 from ns_abstract.execution.threads import threads
 from ns_abstract.geometry.camera_path import Camera
 from ns_abstract.geometry.tiles import assemble, tile_grid
 from ns_abstract.methods.splat.activate import Splats
 from ns_abstract.methods.splat.colors import sh_color
-from ns_abstract.methods.splat.constants import Rasteriser, raster_rules
+from ns_abstract.methods.splat.constants import ACCUMULATION_MIN, Rasteriser, raster_rules
 from ns_abstract.methods.splat.lists import (
     BLOCK,
     PIXELS,
@@ -106,7 +106,7 @@ def _covariance(jx, jy, u, v, r0, r1, r2, axes):
 def _region(mean_x, mean_y, a, b, c, alpha, camera, rules):
     """Pixels x0, x1, y0, y1 where a Gaussian of covariance a, b, c shows, and whether there is one in the image."""
     # pixels where alpha reaches the threshold
-    exponent = 2.0 * math.log(alpha / rules.alpha_min) * REGION + 2.0**-30
+    exponent = 2.0 * math.log(alpha / rules.alpha_min) * REGION + LOGARITHM_ROOM
     extent_x = math.sqrt(exponent * a) * REGION
     extent_y = math.sqrt(exponent * c) * REGION
     x0, x1 = mean_x - extent_x, mean_x + extent_x
@@ -464,12 +464,12 @@ class Renderer:
         image = self._blend(camera, lists, found.record, splats.background)
         # the same weights, with depths as colours; the blending clamps to [0, 1]
         seen = found.visible.astype(bool)
-        farthest = max(float(found.depth[seen].max(initial=0.0)), 1e-300)
+        farthest = max(float(found.depth[seen].max(initial=0.0)), NONZERO)
         record = found.record.copy()
         record[seen, _RED] = 1.0
         record[seen, _RED + 1] = found.depth[seen] / farthest
         record[seen, _RED + 2] = 0.0
         sums = self._blend(camera, lists, record, np.zeros(3))
         accumulation = sums[..., :1]
-        depth = farthest * sums[..., 1:2] / np.maximum(accumulation, 1e-10)
+        depth = farthest * sums[..., 1:2] / np.maximum(accumulation, ACCUMULATION_MIN)
         return np.concatenate([image, accumulation, np.where(accumulation > 0.0, depth, np.nan)], axis=-1)

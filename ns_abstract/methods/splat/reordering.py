@@ -5,12 +5,13 @@ SIMD lanes are the three channels, and a fourth one of nothing.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 from numba import njit
 
 from ns_abstract.arithmetic.elementary import fma
-from ns_abstract.arithmetic.rounding import UNIT64, UP
+from ns_abstract.arithmetic.rounding import SWAP_ROUNDING, UP
 from ns_abstract.arithmetic.simd.intrinsics import lowest_bit
 from ns_abstract.arithmetic.simd.lanes import bits, load4, load8, maximum, minimum, store
 from ns_abstract.methods.splat.block import (
@@ -25,8 +26,16 @@ from ns_abstract.methods.splat.block import (
 from ns_abstract.methods.splat.intervals import Ends, blend_interval
 from ns_abstract.methods.splat.lists import PIXELS
 
-#: Reordering that moves no channel of a pixel by more is not examined beyond the swap bound.
-_REORDERING_MATTERS = 1e-4
+
+@dataclass(frozen=True)
+class OrderTuning:
+    """When reordering is looked at beyond the swap bound. None of them decides whether a bound holds."""
+
+    #: Reordering that moves no channel of a pixel by more is not examined beyond the swap bound.
+    reordering_matters: float = 1e-4
+
+
+_REORDERING_MATTERS = OrderTuning.reordering_matters
 
 
 class Scratch(NamedTuple):
@@ -70,7 +79,7 @@ def swap_bounds(pairs, slots, block):
             store(moves, move + 8, maximum(load4(moves, move + 8), falls))
             store(moves, move + 12, maximum(load4(moves, move + 12), rises))
     # one rounding by pair
-    up = UP + 2.0 * UNIT64 * pairs
+    up = UP + SWAP_ROUNDING * pairs
     for slot in range(slots):
         some = reordering.drawn[slot]
         while some != 0:

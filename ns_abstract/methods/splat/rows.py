@@ -9,12 +9,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ns_abstract.arithmetic.rounding import LEAST_QUATERNION, NORMAL_ROOM
 from ns_abstract.io.errors import InputError
 from ns_abstract.methods.splat.scene import Float32Array
 
-#: Least squared length of a quaternion. Each of its four squares may be flushed, which changes their sum by 2^-24 of it
-#: at most.
-_LEAST_QUATERNION = 2.0**-100
 _NEVER_DRAWN = "a mean or quaternion that is not finite, or a scale that is NaN: gsplat never draws them"
 _ZERO = "zero quaternion"
 _DROPPED = "values that are not finite (--drop-nan-gaussians)"
@@ -66,7 +64,7 @@ def drawable(
         squared = np.square(rows.quats.astype(np.float64)).sum(axis=1)
     limits = np.finfo(np.float32)
     # Strictly inside the normal range, so that any float32 exp stays inside it.
-    low, high = float(limits.tiny) * (1 + 1e-6), float(limits.max) * (1 - 1e-6)
+    low, high = float(limits.tiny) * (1.0 + NORMAL_ROOM), float(limits.max) * (1.0 - NORMAL_ROOM)
     undrawn = ~_all(np.isfinite(rows.means)) | ~_all(np.isfinite(rows.quats)) | ~_all(~np.isnan(rows.log_scales))
     zero = (squared == 0) & ~undrawn
     left_out = {_NEVER_DRAWN: undrawn, _ZERO: zero}
@@ -88,7 +86,7 @@ def drawable(
     # Squares that a device flushes to 0 are then part of the kernel's own rounding (design.md, G6); beyond the largest
     # float32, rsqrt(|q|^2) is 0.
     _require(
-        ~drawn | ((squared >= _LEAST_QUATERNION) & (squared <= high)),
+        ~drawn | ((squared >= LEAST_QUATERNION) & (squared <= high)),
         file,
         fields["quats"],
         "squared length of the quaternion is below 2^-100 or above the largest float32",

@@ -9,7 +9,7 @@ from functools import cached_property
 
 import numpy as np
 
-from ns_abstract.arithmetic.rounding import UNIT64
+from ns_abstract.arithmetic.rounding import HALF_UP
 from ns_abstract.io.errors import InputError
 from ns_abstract.methods.splat.activate import SH_C0, Splats
 from ns_abstract.methods.splat.scene import Float64Array, SplatScene
@@ -56,7 +56,7 @@ class VariedSplats:
         if not self.mean_low.size:
             return _NONE
         middle = self.mean_middle
-        return np.maximum(self.mean_high - middle, middle - self.mean_low) * (1.0 + 4.0 * UNIT64)
+        return np.maximum(self.mean_high - middle, middle - self.mean_low) * HALF_UP
 
     @cached_property
     def counts(self) -> dict[str, int]:

@@ -36,9 +36,18 @@ _ASCENT_STEPS = 16
 _FIRST_STEP = 0.25
 _LINE = 9
 _HALVINGS = 60
-# a continuous function falls by about 2^-16 in so many halvings; what falls less than this jumps
-_SUSPECT_HALVINGS = 16
-_SUSPECT_FALL = 2.0**-11
+
+
+@dataclass(frozen=True)
+class SuspectTuning:
+    """When an attack takes a function for one that jumps; what it reports is rendered again."""
+
+    #: A continuous function falls by about 2^-16 in so many halvings; what falls less than this jumps.
+    suspect_halvings: int = 16
+    suspect_fall: float = 2.0**-11
+
+
+_TUNING = SuspectTuning()
 
 
 @dataclass(frozen=True)
@@ -362,7 +371,9 @@ def _jump(record: _Record, probe: Probe | None, target: _Target, generator: np.r
     a, b, value_a, value_b = places[k], places[k + 1], values[k], values[k + 1]
     difference = abs(value_b - value_a)
     for halving in range(_HALVINGS):
-        if not abs(value_b - value_a) > (_SUSPECT_FALL * difference if halving >= _SUSPECT_HALVINGS else 0.0):
+        if not abs(value_b - value_a) > (
+            _TUNING.suspect_fall * difference if halving >= _TUNING.suspect_halvings else 0.0
+        ):
             return
         middle = 0.5 * (a + b)
         if not (min(a, b) < middle < max(a, b)) or np.array_equal(at(a), at(b)):

@@ -21,8 +21,10 @@ from ns_abstract.verify.network.schedule import Schedule
 from ns_abstract.verify.network.selection import Selection
 from ns_abstract.verify.network.sets import ImageSets, OutputBounds, Signs, Substitution
 from ns_abstract.verify.network.sharing import Sharing
+from ns_abstract.verify.network.subnormals import subnormals_kept
 
 
+@subnormals_kept()
 def bound_outputs(
     network: Network,
     images: ImageSets,

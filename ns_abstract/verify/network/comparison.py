@@ -24,6 +24,8 @@ Run = Callable[[np.ndarray], np.ndarray]
 _DIFFERENCE = 2.0**-10
 #: unless float32 itself differs from float64 by so much: more than this part of it.
 _ROUNDED = 64.0
+#: or, for inputs that are not usual, than that and this.
+_STRANGE = 2.0**-16
 #: times this where values are rounded to steps.
 _STEPPED = 2.0**6
 #: Seconds and steps of the search for inputs that reach other sides of units; steps without a new one.
@@ -74,7 +76,7 @@ def compare(network: Network, run: Run, images: Iterable[np.ndarray], *, usual: 
         with torch.no_grad():
             single = network(torch.from_numpy(image))[0].double().numpy()
         rounded = float(np.abs(single - found).max())
-        if not difference <= _ROUNDED * rounded + (0.0 if usual else 2.0**-16) and np.isfinite(rounded):
+        if not difference <= _ROUNDED * rounded + (0.0 if usual else _STRANGE) and np.isfinite(rounded):
             raise InputError(
                 f"computes something else when run: outputs differ by {difference:.3g}",
                 file=path,

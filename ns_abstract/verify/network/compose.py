@@ -12,9 +12,10 @@ import numpy as np
 import torch
 
 from ns_abstract.arithmetic.network_charges import (
+    ATTENTION,
+    ATTENTION_BLOCKS,
     FOLDING,
     LEAST_DIVISOR,
-    LIBRARY,
     NEAR,
     OVERFLOW,
     POLYNOMIAL,
@@ -575,11 +576,11 @@ class Composer(Builder):
         layer = Differences((shape,), (*shape, count), count + 4, 2 * count, axis % len(shape))
         apart = self._add(layer, x)
         # sums of exponentials one of which is exp(0)
-        least = 1.0 - gamma(2 * count + FOLDING) - 2.0 * LIBRARY
+        least = 1.0 - gamma(2 * count + FOLDING) - ATTENTION - ATTENTION_BLOCKS * count
         if logarithm:
             total = self.reduce(self.curve(apart, curves.Exp), [len(shape)], False, False)
             return self.scale(self.curve(total, curves.Log, floor=least), -np.ones(()), None)
-        powers = self.curve(apart, curves.CappedExp)
+        powers = self.curve(apart, curves.CappedExp, count=count)
         if dropped is not None:
             if bool(dropped.all(axis).any()):
                 raise InputError("a mask takes out all numbers of a row", fix="leave one, at least")

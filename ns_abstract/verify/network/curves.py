@@ -18,6 +18,8 @@ from torch import Tensor
 
 from ns_abstract.arithmetic.network_charges import (
     AFFINE,
+    ATTENTION,
+    ATTENTION_BLOCKS,
     FLUSH,
     FUNCTION_FLUSHES,
     HARD,
@@ -43,6 +45,8 @@ _STEPS = 6
 _FLUSHED = FUNCTION_FLUSHES * FLUSH
 #: A preference: better bounds of the input are asked for where the lines are this part of the width apart.
 _APART = 2.0**-6
+#: A preference: intervals of at most this part of their ends count as points.
+_POINT = 2.0**-36
 
 
 class _Cuts(NamedTuple):
@@ -206,7 +210,7 @@ class Curve(Activation):
         band = self.band(lower, upper)
         width = upper - lower
         # rounding alone keeps the lines of a point apart
-        wide = ~(width <= 2.0**-36 * _size(lower, upper))
+        wide = ~(width <= _POINT * _size(lower, upper))
         return torch.where(wide, (band.upper_offset - band.lower_offset) / width, torch.zeros_like(width))
 
     def open(self, lower: Tensor, upper: Tensor) -> Tensor:
@@ -435,9 +439,15 @@ class Exp(Assumed):
         return torch.where(known, 2.0 * LIBRARY * upper.exp() + _FLUSHED, torch.full_like(upper, math.nan))
 
 
+@dataclass(frozen=True, eq=False)
 class CappedExp(Exp):
-    """``min(exp(z), exp(cap))``: of terms of a softmax, whose sums are as good as infinite past that (N11)."""
+    """``min(exp(z), exp(cap))``: of terms of a softmax, whose sums are as good as infinite past that (N11).
 
+    Attributes:
+        count: Terms of a sum.
+    """
+
+    count: int = 1
     cap: ClassVar[float] = CAP
 
     @property
@@ -457,7 +467,8 @@ class CappedExp(Exp):
     def error(self, lower: Tensor, upper: Tensor) -> Tensor | float:
         # the smaller of a number and the cap is the cap where any evaluation is past it
         known = lower > self.cap + 1.0
-        return torch.where(known, 0.0, 2.0 * LIBRARY * upper.clamp(max=self.cap).exp() + _FLUSHED)
+        relative = ATTENTION + ATTENTION_BLOCKS * self.count
+        return torch.where(known, 0.0, relative * upper.clamp(max=self.cap).exp() + _FLUSHED)
 
 
 @dataclass(frozen=True, eq=False)

@@ -15,21 +15,26 @@ import numpy as np
 import onnx
 from onnx import TensorProto
 
-from ns_abstract.arithmetic.network_charges import DOUBLE_UNIT, FLUSH, LIBRARY, OVERFLOW, UNIT, gamma
+from ns_abstract.arithmetic.network_charges import (
+    CONSTANT_SUMS,
+    DOUBLE_UNIT,
+    DOUBTS_UP,
+    EXACT,
+    FORMATS,
+    LIBRARY,
+    MAGNITUDES_UP,
+    ONCE,
+    ONCE_FLUSHES,
+    OTHER_LIBRARY,
+    OWN_ARGUMENT,
+    OWN_CONSTANT,
+    Format,
+    gamma,
+)
 from ns_abstract.io.errors import InputError
 from ns_abstract.verify.network.onnx_fold import fold
 
 Ends = tuple[np.ndarray, np.ndarray]
-#: Unit roundoff of an evaluation, and its smallest normal number.
-Rounds = tuple[float, float]
-#: Unit roundoff and smallest normal number by type.
-_UNITS = {2: (2.0**-11, 2.0**-14), 4: (UNIT, FLUSH), 8: (DOUBLE_UNIT, 2.0**-1022)}
-#: What float64's own operations and library functions may be off here, relative.
-_OWN = 2.0**-50
-#: What a library's function may be off in float32: relative to the value and 1, each as much as in `curves`.
-_LIBRARY = 2.0 * LIBRARY
-#: Numbers that a type holds no larger ones than; past half of it an order of sums may overflow.
-_OVERFLOW = {2: 2.0**15, 4: OVERFLOW, 8: 2.0**1000}
 _FIX = "fold constants when exporting, in float64"
 #: Arguments may be moved, but no number is computed.
 _MOVES = frozenset(
@@ -70,7 +75,7 @@ class Enclosed(NamedTuple):
     def doubts(self) -> Ends:
         """How far ``real`` and ``single`` may be from `value`; a sixteenth more for products with what is off."""
         value = self.value
-        far = [np.maximum(high - value, value - low) * (1.0 + 2.0**-4) for low, high in (self.real, self.single)]
+        far = [np.maximum(high - value, value - low) * DOUBTS_UP for low, high in (self.real, self.single)]
         return far[0], far[1]
 
     @property
@@ -82,7 +87,10 @@ class Enclosed(NamedTuple):
         """``1 / c``, without what a division in its type rounds."""
         if any(bool((low * high <= 0.0).any()) for low, high in (self.real, self.single)):
             raise InputError("divides by what may be zero", fix="check the constant")
-        ends = [_widened((1.0 / high, 1.0 / low), _OWN * np.abs(1.0 / low)) for low, high in (self.real, self.single)]
+        ends = [
+            _widened((1.0 / high, 1.0 / low), OWN_CONSTANT * np.abs(1.0 / low))
+            for low, high in (self.real, self.single)
+        ]
         return Enclosed(self.kind, ends[0], ends[1])
 
     def turned(self) -> Enclosed:
@@ -93,7 +101,7 @@ class Enclosed(NamedTuple):
     def times(self, factor: np.ndarray | float) -> Enclosed:
         """The constant multiplied by exact numbers."""
         ends = [_product(pair, (np.asarray(factor), np.asarray(factor))) for pair in (self.real, self.single)]
-        wide = [_widened(e, _OWN * np.maximum(np.abs(e[0]), np.abs(e[1]))) for e in ends]
+        wide = [_widened(e, OWN_CONSTANT * np.maximum(np.abs(e[0]), np.abs(e[1]))) for e in ends]
         return Enclosed(self.kind, wide[0], wide[1])
 
 
@@ -102,7 +110,7 @@ def scaled_integers(number: np.ndarray, scale: Enclosed) -> np.ndarray | Enclose
     whole = number.astype(np.float64)
     ends = [
         _elementary("Mul", [(whole, whole), part], rounds)
-        for part, rounds in ((scale.real, (_OWN, 0.0)), (scale.single, _UNITS[scale.kind.itemsize]))
+        for part, rounds in ((scale.real, EXACT), (scale.single, FORMATS[scale.kind.itemsize]))
     ]
     found = Enclosed(scale.kind, ends[0], ends[1])
     return found.value.astype(scale.kind) if found.exact else found
@@ -152,11 +160,10 @@ def fold_enclosed(
     if not kinds:
         raise InputError("is not computed with floats", fix=_FIX)
     kind = kinds[0]
-    unit, tiny = _UNITS[kind.itemsize]
 
     def run(side: str) -> list[Ends]:
         ends = [None if p is None else (p.real if side == "real" else p.single) for p in parts]
-        rounds = (_OWN, 0.0) if side == "real" else (unit, tiny)
+        rounds = EXACT if side == "real" else FORMATS[kind.itemsize]
 
         def put(*numbers: np.ndarray | None) -> list[np.ndarray]:
             """The operator's results where the floats among its inputs are these."""
@@ -172,7 +179,7 @@ def fold_enclosed(
     for real, single in zip(run("real"), run("single"), strict=True):
         found = Enclosed(kind, real, single)
         for end in (*real, *single):
-            if not np.isfinite(end).all() or (end.size and np.abs(end).max() >= _OVERFLOW[kind.itemsize]):
+            if not np.isfinite(end).all() or (end.size and np.abs(end).max() >= FORMATS[kind.itemsize].largest):
                 if name in _MOVES | _GROWS and not np.isnan(end).any():
                     continue
                 raise InputError("makes a constant that may overflow", fix="check its constants")
@@ -180,9 +187,9 @@ def fold_enclosed(
     return results
 
 
-def _computed(name: str, given: list[Ends], put: Callable[[np.ndarray], np.ndarray], rounds: Rounds) -> Ends:
+def _computed(name: str, given: list[Ends], put: Callable[[np.ndarray], np.ndarray], rounds: Format) -> Ends:
     """Ends of one result; ``put`` applies the operator to what takes the place of its first input."""
-    unit, tiny = rounds
+    unit, tiny, _ = rounds
     low, high = given[0]
     if name == "Neg":
         return -high, -low
@@ -200,7 +207,7 @@ def _computed(name: str, given: list[Ends], put: Callable[[np.ndarray], np.ndarr
         return _widened((below, above), _library(unit) * (1.0 + np.maximum(np.abs(below), np.abs(above))) + tiny)
     if name in ("Sin", "Cos"):
         value = (np.sin if name == "Sin" else np.cos)(0.5 * (low + high))
-        own = 2.0**-52 * np.maximum(np.abs(low), np.abs(high))
+        own = OWN_ARGUMENT * np.maximum(np.abs(low), np.abs(high))
         return _widened((value, value), 0.5 * (high - low) + _library(unit) + own + tiny)
     if name == "Pow" and len(given) == 2:
         return _power(given, rounds)
@@ -212,7 +219,8 @@ def _computed(name: str, given: list[Ends], put: Callable[[np.ndarray], np.ndarr
 
 
 def _library(unit: float) -> float:
-    return _OWN if unit == _OWN else max(_LIBRARY, 8.0 * unit)
+    # relative to the value and 1, as in `curves`
+    return OWN_CONSTANT if unit == OWN_CONSTANT else max(2.0 * LIBRARY, OTHER_LIBRARY * unit)
 
 
 def _widened(ends: Ends, by: np.ndarray | float) -> Ends:
@@ -232,9 +240,9 @@ def _product(a: Ends, b: Ends) -> Ends:
     return np.minimum.reduce(corners), np.maximum.reduce(corners)
 
 
-def _elementary(name: str, given: Sequence[Ends], rounds: Rounds) -> Ends:
+def _elementary(name: str, given: Sequence[Ends], rounds: Format) -> Ends:
     """Operations that are rounded once; results that the type can hold are exact."""
-    unit, tiny = rounds
+    unit, tiny, _ = rounds
     if name == "Reciprocal":
         name, given = "Div", [(np.ones(()), np.ones(())), given[0]]
     if name == "Sub":
@@ -264,14 +272,14 @@ def _elementary(name: str, given: Sequence[Ends], rounds: Rounds) -> Ends:
         small = np.maximum(small, ((_size(ends)[0] < tiny) & (_size(ends)[1] > 0.0)).astype(np.float64))
     size = np.maximum(np.abs(low), np.abs(high))
     exact = sure & (_digits(low) <= _held(unit)) & ((size == 0.0) | (size >= 2.0 * tiny)) & (small == 0.0)
-    low, high = _widened((low, high), np.where(exact, 0.0, (2.0 * unit + _OWN) * size + 4.0 * tiny))
+    low, high = _widened((low, high), np.where(exact, 0.0, (ONCE * unit + OWN_CONSTANT) * size + ONCE_FLUSHES * tiny))
     # an operand below the normal numbers may count as zero
     return np.where(small > 0.0, np.minimum(low, 0.0), low), np.where(small > 0.0, np.maximum(high, 0.0), high)
 
 
 def _held(unit: float) -> int:
     """Binary digits that a type holds."""
-    return 53 if unit == _OWN else round(-math.log2(unit))
+    return 53 if unit == OWN_CONSTANT else round(-math.log2(unit))
 
 
 def _digits(value: np.ndarray) -> np.ndarray:
@@ -281,8 +289,8 @@ def _digits(value: np.ndarray) -> np.ndarray:
     return np.where(mantissa == 0, 0, 53 - np.log2(np.where(last > 0.0, last, 1.0))).astype(np.int64)
 
 
-def _power(given: Sequence[Ends], rounds: Rounds) -> Ends:
-    unit, tiny = rounds
+def _power(given: Sequence[Ends], rounds: Format) -> Ends:
+    unit, tiny, _ = rounds
     base, exponent = given
     if not np.array_equal(*exponent):
         raise InputError("has an exponent that is computed", fix=_FIX)
@@ -294,7 +302,9 @@ def _power(given: Sequence[Ends], rounds: Rounds) -> Ends:
         same = [(low, low), (low, low)] if np.array_equal(low, high) else None
         if same:
             return _elementary("Mul", same, rounds)
-        return _widened((low * low, high * high), (2.0 * unit + _OWN) * high * high + tiny)
+        return _widened(
+            (low * low, high * high), (ONCE * unit + OWN_CONSTANT) * high * high + ONCE_FLUSHES * tiny * (1.0 + high)
+        )
     if bool((base[0] <= 0.0).any()):
         raise InputError("raises what may not be positive to a power", fix=_FIX)
     corners = [e**power for e in base]
@@ -302,9 +312,9 @@ def _power(given: Sequence[Ends], rounds: Rounds) -> Ends:
     return _widened((low, high), _library(unit) * high + tiny)
 
 
-def _reduced(name: str, given: Ends, put: Callable[[np.ndarray], np.ndarray], rounds: Rounds) -> Ends:
+def _reduced(name: str, given: Ends, put: Callable[[np.ndarray], np.ndarray], rounds: Format) -> Ends:
     """Sums in any order; small multiples of one number are summed without rounding."""
-    unit, tiny = rounds
+    unit, tiny, largest = rounds
     still, size = np.array_equal(*given), _size(given)
     count = max(1.0, float(given[0].size))
     if name == "ReduceProd":
@@ -313,16 +323,22 @@ def _reduced(name: str, given: Ends, put: Callable[[np.ndarray], np.ndarray], ro
             raise InputError("multiplies constants that are computed", fix=_FIX)
         if bool((given[0] == np.round(given[0])).all()) and bool((put(size[1]) < 2.0 ** _held(unit)).all()):
             return low, low
-        return _widened((low, low), gamma(count + 2.0, unit + _OWN) * np.abs(low) + tiny)
+        # partial products, of the large numbers alone or of the small ones, in any order
+        most = put(np.maximum(size[1], 1.0))
+        _check_bounded(most, largest)
+        lost = ONCE_FLUSHES * count * tiny * most
+        return _widened((low, low), gamma(count + CONSTANT_SUMS, unit + OWN_CONSTANT) * np.abs(low) + lost)
     parts = count / max(1.0, float(put(given[0]).size))
-    reach = gamma(parts + 4.0, unit + _OWN)
+    reach = gamma(parts + CONSTANT_SUMS, unit + OWN_CONSTANT)
     if name == "ReduceL2":
         low, high = put(size[0]), put(size[1])
+        _check_bounded(high * high, largest)
         return _widened((low, high), reach * high + math.sqrt(parts * tiny))
     if name not in ("ReduceSum", "ReduceMean", "ReduceL1"):
         raise InputError("cannot be enclosed on constants that are computed", fix=_FIX)
     low, high = (put(end) for end in (size if name == "ReduceL1" else given))
     mean, total = name == "ReduceMean", put(size[1])
+    _check_bounded(total * (parts if mean else 1.0), largest)
     held = total * (parts if mean else 1.0) <= 2.0 ** _held(unit) * _grain(given[0])
     large = not size[1].any() or float(size[1][size[1] > 0.0].min()) >= 2.0 * tiny * parts
     if still and large and bool(np.all(held)) and (not mean or math.frexp(parts)[0] == 0.5):
@@ -330,12 +346,13 @@ def _reduced(name: str, given: Ends, put: Callable[[np.ndarray], np.ndarray], ro
     return _widened((low, high), reach * total + (parts + 1.0) * tiny)
 
 
-def _matmul(first: Ends, second: Ends, rounds: Rounds) -> Ends:
+def _matmul(first: Ends, second: Ends, rounds: Format) -> Ends:
     """Products of matrices by their middles and radii."""
-    unit, tiny = rounds
+    unit, tiny, largest = rounds
     (a, r), (b, q) = ((0.5 * (low + high), 0.5 * (high - low)) for low, high in (first, second))
     count = float(a.shape[-1])
     value, size = a @ b, (np.abs(a) + r) @ (np.abs(b) + q)
+    _check_bounded(size, largest)
     still = not r.any() and not q.any()
     if (
         still
@@ -347,7 +364,15 @@ def _matmul(first: Ends, second: Ends, rounds: Rounds) -> Ends:
     # flushed operands lose a product with what is beside them
     lost = tiny * (np.abs(a).max(initial=0.0) + np.abs(b).max(initial=0.0) + 2.0) * count
     radius = np.abs(a) @ q + r @ (np.abs(b) + q)
-    return _widened((value, value), (radius + gamma(count + 4.0, unit + _OWN) * size) * (1.0 + 2.0**-40) + lost)
+    return _widened(
+        (value, value), (radius + gamma(count + CONSTANT_SUMS, unit + OWN_CONSTANT) * size) * MAGNITUDES_UP + lost
+    )
+
+
+def _check_bounded(size: np.ndarray, largest: float) -> None:
+    """Refuse partial results that may overflow."""
+    if not bool((size < largest).all()):
+        raise InputError("computes numbers that may overflow", fix="check its constants")
 
 
 def _plain(value: np.ndarray, tiny: float) -> bool:
@@ -368,7 +393,7 @@ def _cast(node: onnx.NodeProto, values: Sequence[np.ndarray | Enclosed | None]) 
             kind = np.dtype(onnx.helper.tensor_dtype_to_np_dtype(to))
         except (KeyError, ValueError, TypeError):
             raise InputError(f"casts to type {to}", fix="use float32") from None
-    if kind.kind not in "fiub" or (kind.kind == "f" and kind.itemsize not in _UNITS):
+    if kind.kind not in "fiub" or (kind.kind == "f" and kind.itemsize not in FORMATS):
         name = TensorProto.DataType.Name(to) if node.op_type == "Cast" else str(kind)
         raise InputError(f"casts a constant to {name}", fix="use float32")
     if isinstance(given, Enclosed):
@@ -384,17 +409,17 @@ def _cast(node: onnx.NodeProto, values: Sequence[np.ndarray | Enclosed | None]) 
             return array.astype(kind)
         number = array.astype(np.float64)
         real = single = (number, number)
-        if array.dtype.kind in "iu" and array.size and bool((np.abs(number) > 2.0**53).any()):
-            real = single = _widened(real, 2.0**-52 * np.abs(number))
-    unit, tiny = _UNITS[kind.itemsize]
+        if array.dtype.kind in "iu" and array.size and bool((np.abs(number) * DOUBLE_UNIT > 1.0).any()):
+            real = single = _widened(real, OWN_CONSTANT * np.abs(number))
+    unit, tiny, _ = FORMATS[kind.itemsize]
     with np.errstate(over="ignore"):
         rounded = [end.astype(kind).astype(np.float64) for end in single]
     same = (single[0] == single[1]) & (rounded[0] == single[0])
     size = np.maximum(np.abs(single[0]), np.abs(single[1]))
     finite = np.where(np.isfinite(size), size, 0.0)
-    if bool((finite >= _OVERFLOW[kind.itemsize]).any()) and not bool(np.all(same)):
+    if bool((finite >= FORMATS[kind.itemsize].largest).any()) and not bool(np.all(same)):
         raise InputError("makes a constant that may overflow", fix="check its constants")
-    single = _widened(single, np.where(same, 0.0, 2.0 * unit * finite + tiny))
+    single = _widened(single, np.where(same, 0.0, ONCE * unit * finite + tiny))
     found = Enclosed(kind, real, single)
     return found.value.astype(kind) if found.exact else found
 

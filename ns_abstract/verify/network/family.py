@@ -22,6 +22,7 @@ from ns_abstract.verify.network.reached import Trace
 from ns_abstract.verify.network.rows import Float64, Int64, grid
 from ns_abstract.verify.network.sets import ImageSets, OutputBounds
 from ns_abstract.verify.network.sharing import Sharing
+from ns_abstract.verify.network.subnormals import subnormals_kept
 
 #: Largest images of which rows are kept: their sums' rounding must stay small. Most numbers of all nodes together for
 #: rows to be kept on the way; bytes of rows that are passed back together.
@@ -59,6 +60,7 @@ class Family:
         arithmetic: As in `ns_abstract.verify.network.bound_outputs`.
     """
 
+    @subnormals_kept()
     def __init__(
         self, network: Network, first: ImageSets, *, memory: int = 1 << 30, arithmetic: NetworkArithmetic = "float32"
     ) -> None:
@@ -68,10 +70,12 @@ class Family:
         self.arithmetic: NetworkArithmetic = arithmetic
         self._first = _First(network, first, memory, arithmetic)
 
+    @subnormals_kept()
     def first(self, rows: Any, offset: Float64) -> OutputBounds:
         """Lower bounds of ``rows @ y + offset`` over the first cell."""
         return self._first.cells.outputs(rows, np.asarray(offset, np.float64))
 
+    @subnormals_kept()
     def others(self, images: ImageSets, rows: Any, offset: Float64, *, fresh: bool = False) -> OutputBounds:
         """Lower bounds of ``rows @ y + offset`` over other cells.
 

@@ -16,8 +16,10 @@ from ns_abstract.verify.network.graph import Network
 from ns_abstract.verify.network.onnx_file import read_onnx
 from ns_abstract.verify.network.onnx_graph import Asked
 from ns_abstract.verify.network.onnx_tensors import PACKED, unpacked_model
+from ns_abstract.verify.network.subnormals import subnormals_kept
 
 
+@subnormals_kept()
 def load_network(
     path: Path,
     *,

@@ -21,6 +21,7 @@ from ns_abstract.arithmetic.network_charges import (
     FOLDING,
     MAGNITUDES_UP,
     OWN_LINE,
+    OWN_POSITIONS,
     UP,
     VARIANCE_PASSES,
     gamma,
@@ -149,6 +150,10 @@ class Resized(Sparse):
     def spare(self, sizes: Sequence[Tensor]) -> Tensor | float:
         (own, off), (across, apart) = self.rows, self.columns
         return off @ sizes[0] @ (across + apart).T + own @ sizes[0] @ apart.T
+
+    def inexact(self, sizes: Sequence[Tensor]) -> Tensor | float:
+        # places and polynomials are rounded by float64 in the same way
+        return OWN_POSITIONS * self.spare(sizes)
 
 
 @dataclass(frozen=True, eq=False)

@@ -373,7 +373,8 @@ class Attributes:
     def get(self, name: str, default: Any = None) -> Any:
         self.asked.add(name)
         if name not in self.found:
-            return default
+            # the format's attributes are float32 numbers, and so are its defaults
+            return float(np.float32(default)) if isinstance(default, float) else default
         value = onnx.helper.get_attribute_value(self.found[name])
         return value.decode() if isinstance(value, bytes) else value
 

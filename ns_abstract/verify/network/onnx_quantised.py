@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import onnx
 
+from ns_abstract.arithmetic.network_charges import LEAST_DIVISOR
 from ns_abstract.io.errors import InputError
 from ns_abstract.verify.network.enclosed import Enclosed, enclosed, scaled_integers
 from ns_abstract.verify.network.onnx_graph import Attributes, Reader
@@ -45,7 +46,7 @@ def quantize(r: Reader, node: onnx.NodeProto, a: Attributes) -> None:
     x, scale, zero = r.value(node), r.weight(node, 1), r.constant(node, 2)
     step = _scalar(scale)
     kind = np.dtype(np.uint8) if zero is None else zero.dtype
-    if kind not in _RANGES or not 0.0 < step < 2.0**60 or (zero is not None and zero.size != 1):
+    if kind not in _RANGES or not LEAST_DIVISOR < step < 1.0 / LEAST_DIVISOR or (zero is not None and zero.size != 1):
         raise InputError(f"scale {step:g} of type {kind}", fix="use 8 or 16 bits and one positive scale")
     offset = 0 if zero is None else int(np.reshape(zero, -1)[0])
     low, high = (step * (end - offset) for end in _RANGES[kind])

@@ -13,10 +13,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from ns_abstract.arithmetic.network_charges import OWN_QUOTIENTS, STEPS, SWITCH
 from ns_abstract.verify.network import curves
-
-#: What the curves' own numbers, quotients of the file's in float64, change relative to the argument.
-_QUOTIENTS = 2.0**-48
 
 
 def _far(lower: Tensor, upper: Tensor) -> Tensor:
@@ -40,7 +38,7 @@ class ScaledGelu(curves.Gelu):
         return super().slope(self.rate * z)
 
     def missing(self, lower: Tensor, upper: Tensor) -> Tensor | float:
-        return _QUOTIENTS * _far(lower, upper)
+        return OWN_QUOTIENTS * _far(lower, upper)
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,7 +59,7 @@ class GatedClip(curves.HardSwish):
         return 2.0 * self.factor * z + self.offset
 
     def missing(self, lower: Tensor, upper: Tensor) -> Tensor | float:
-        return _QUOTIENTS * _far(lower, upper)
+        return OWN_QUOTIENTS * _far(lower, upper)
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,8 +71,8 @@ class SwitchedSoftplus(curves.Softplus):
 
     def missing(self, lower: Tensor, upper: Tensor) -> Tensor | float:
         # softplus is less than exp(-z) above its argument
-        gap = math.exp(-self.limit) * (1.0 + 2.0**-20) + (self.excess + _QUOTIENTS) * _far(lower, upper)
-        return torch.where(upper >= self.limit * (1.0 - 2.0**-20), gap, torch.zeros_like(gap))
+        gap = math.exp(-self.limit) * SWITCH + (self.excess + OWN_QUOTIENTS) * _far(lower, upper)
+        return torch.where(upper >= self.limit * (2.0 - SWITCH), gap, torch.zeros_like(gap))
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,7 +88,7 @@ class Quantised(curves.Clip):
     def missing(self, lower: Tensor, upper: Tensor) -> Tensor | float:
         # places, quotients and products of float32 move a number by less than the second part
         largest = max(abs(self.least), abs(self.most))
-        return 0.5 * self.step * (1.0 + 2.0**-20) + 2.0**-21 * largest
+        return 0.5 * self.step * SWITCH + STEPS * largest
 
     def __call__(self, inputs: Sequence[Tensor]) -> Tensor:
         z = inputs[0]

@@ -17,6 +17,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from ns_abstract.arithmetic.elementary import fma
+from ns_abstract.arithmetic.network_charges import OWN_GATHERED, OWN_ROWS
 from ns_abstract.arithmetic.simd.intrinsics import advanced, pointer
 from ns_abstract.arithmetic.simd.lanes import load8, store, where
 
@@ -422,7 +423,7 @@ def concretize(value, y, x, cell, known, total, plane, box):
             plane[r, 0, k] += sums[k] - apart
             plane[r, 1, k] += sums[k] + apart
         # sums of at most 2^24 products
-        room = 2.0**-28 * sums[d + 4] + 2.0**-48 * (abs(total[r, 0]) + abs(total[r, 1]))
+        room = OWN_ROWS * sums[d + 4] + OWN_GATHERED * (abs(total[r, 0]) + abs(total[r, 1]))
         least, most = total[r, 0] - room, total[r, 1] + room
         plane[r, 0, d], plane[r, 1, d] = least + (sums[d] - sums[d + 2]), most + (sums[d] + sums[d + 2])
         box[r, 0], box[r, 1] = least + (sums[d + 1] - sums[d + 3]), most + (sums[d + 1] + sums[d + 3])

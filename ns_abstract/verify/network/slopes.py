@@ -23,6 +23,8 @@ Int64 = NDArray[np.int64]
 
 #: First step of slopes, what each is of the one before, and Adam's parts of what was known before.
 _STEP, _DECAY, _FIRST, _SECOND = 0.3, 0.88, 0.8, 0.95
+#: A preference: added to divisors that may be zero.
+_NEXT_TO_NOTHING = 1e-30
 
 
 @dataclass(frozen=True)
@@ -131,7 +133,7 @@ class _Adam:
         self._count += 1
         self._mean += (1.0 - _FIRST) * (g - self._mean)
         self._square += (1.0 - _SECOND) * (g * g - self._square)
-        size = np.sqrt(self._square / (1.0 - _SECOND**self._count)) + 1e-30
+        size = np.sqrt(self._square / (1.0 - _SECOND**self._count)) + _NEXT_TO_NOTHING
         return self._mean / (1.0 - _FIRST**self._count) / size
 
 

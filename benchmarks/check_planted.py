@@ -1,0 +1,153 @@
+"""How many planted faults of the splat bounds `ns-abstract-check` finds by itself, on results that it is handed.
+
+Every fault is applied to a copy of the package, which compiles its kernels into a cache of its own and bounds two tiny
+scenes. Where a bound differs from the healthy one by more than 1e-3 the healthy package's checker audits the result.
+
+    python benchmarks/check_planted.py WORK [--faults 40] [--seed 0] [--claims 200] [--seconds 120] [--audit-only]
+
+keeps results in WORK, goes on from what lies there, and prints one line a fault.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import random
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from mutants import copy_package, mutate
+from planted import FAULTS, Fault
+
+ROOT = Path(__file__).resolve().parents[1]
+#: Files of the splat bounds that read scenes, pictures or results and bound nothing.
+_OTHER = ("load", "ply", "write", "scene", "render", "reference", "method", "descent")
+_SPECS: dict[str, dict[str, Any]] = {
+    "shift": {"version": 1, "translation": {"x": 0.02}},
+    "turn": {"version": 1, "translation": {"z": [0.0, 0.01]}, "rotation": {"yaw": 0.01}},
+}
+_LEAST_CHANGE = 1e-3
+
+
+def candidates() -> list[Fault]:
+    """The planted faults that lie in what bounds splats."""
+    folder = "methods/splat/"
+    return [f for f in FAULTS if f.file.startswith(folder) and not f.file[len(folder) :].startswith(_OTHER)]
+
+
+def inputs(folder: Path) -> dict[str, Path]:
+    """Writes the runs, the camera path and the sets; the path of each by its name."""
+    sys.path.insert(0, str(ROOT / "tests"))
+    from dataclasses import replace
+
+    from conftest import blob_scene, path_json, ring, write_json, write_splatfacto_run
+
+    found: dict[str, Path] = {}
+    for name, mode in (("shift", "classic"), ("turn", "antialiased")):
+        where = folder / name
+        where.mkdir(parents=True, exist_ok=True)
+        scene = blob_scene(40, degree=2)
+        scene = replace(scene, rasterize_mode=mode, opacity_logits=2.0 * scene.opacity_logits)
+        config = where / "blobs"
+        found[name] = (
+            next(config.rglob("config.yml"))
+            if config.exists()
+            else write_splatfacto_run(scene, where, timestamp="2026-01-01_120000", experiment_name="blobs")
+        )
+        found[f"{name} set"] = write_json(where / "spec.json", _SPECS[name])
+    found["path"] = write_json(folder / "path.json", path_json(ring(1, 24)))
+    return found
+
+
+def render(package: Path, files: dict[str, Path], out: Path, cache: str) -> bool:
+    """Bounds both scenes with the package in ``package``; whether that ended well."""
+    environment = {k: v for k, v in os.environ.items() if k != "NS_ABSTRACT_DEV_KEY"}
+    environment |= {"PYTHONPATH": str(package), "PYTHONDONTWRITEBYTECODE": "1", "NS_ABSTRACT_CACHE_DIR": cache}
+    for name in _SPECS:
+        if (out / name / "report.json").exists():
+            continue
+        command = [
+            sys.executable, "-W", "ignore", "-m", "ns_abstract.cli.render", "--load-config", str(files[name]),
+            "--camera-path-filename", str(files["path"]), "--perturbation-filename", str(files[f"{name} set"]),
+            "--output-dir", str(out / name), "--save-cells", "--time-budget", "60", "--target-ratio", "1.2",
+        ]  # fmt: skip
+        with (out / f"{name}.log").open("w") as log:
+            done = subprocess.run(command, env=environment, stdout=log, stderr=log, timeout=1500, check=False)
+        if done.returncode != 0:
+            return False
+    return True
+
+
+def change(healthy: Path, faulty: Path) -> tuple[float, float]:
+    """By how much bounds of pictures differ at most, and by how much they lie inside what was really rendered."""
+    most = inside = 0.0
+    for name in _SPECS:
+        with np.load(healthy / name / "frame_00000.npz") as a, np.load(faulty / name / "frame_00000.npz") as b:
+            for side, sign in (("lower", 1.0), ("upper", -1.0)):
+                most = max(most, float(np.abs(a[side] - b[side]).max()))
+                inside = max(inside, float((sign * (b[side] - a[f"witness_{side}"])).max()))
+    return most, inside
+
+
+def audit(folder: Path, claims: int, seconds: float) -> dict[str, Any]:
+    """Numbers of claims by outcome, of both scenes."""
+    sys.path.insert(0, str(ROOT))
+    from ns_abstract.api.checking import check
+
+    total = {"proved": 0, "refuted": 0, "unsettled": 0, "structure": 0}
+    for name in _SPECS:
+        found = check(folder / name, claims=claims, seconds=seconds)
+        for key in ("proved", "refuted", "unsettled"):
+            total[key] += getattr(found, key)
+        total["structure"] += len(found.structure)
+    return total
+
+
+def main() -> None:
+    """Plant, render and audit."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("work", type=Path)
+    parser.add_argument("--faults", type=int, default=40)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--claims", type=int, default=200)
+    parser.add_argument("--seconds", type=float, default=120.0)
+    parser.add_argument("--audit-only", action="store_true", help="audit what has been rendered, and render nothing")
+    options = parser.parse_args()
+    options.work.mkdir(parents=True, exist_ok=True)
+    files = inputs(options.work / "inputs")
+    drawn: list[Fault | None] = [None, *random.Random(options.seed).sample(candidates(), options.faults)]
+    changed = refuted = 0
+    for number, fault in enumerate(drawn):
+        out = options.work / ("healthy" if fault is None else f"{number:02d}")
+        out.mkdir(exist_ok=True)
+        name = "no fault" if fault is None else fault.name
+        if not all((out / s / "report.json").exists() for s in _SPECS):
+            if options.audit_only or (out / "failed").exists():
+                continue
+            with tempfile.TemporaryDirectory() as temporary:
+                package = Path(temporary) / "package"
+                copy_package(package)
+                if fault is not None:
+                    mutate(package, fault)
+                if not render(package, files, out, str(Path(temporary) / "cache")):
+                    (out / "failed").touch()
+                    print(f"{number:2d} {name}: the command failed", flush=True)
+                    continue
+        most, inside = change(options.work / "healthy", out)
+        entry: dict[str, Any] = {"number": number, "fault": name, "change": most, "inside": inside}
+        if fault is None or most > _LEAST_CHANGE:
+            entry |= audit(out, options.claims, options.seconds)
+            if fault is not None:
+                changed += 1
+                refuted += bool(entry["refuted"] or entry["structure"])
+        print(json.dumps(entry), flush=True)
+    print(f"{refuted} of {changed} faults that change a bound by more than {_LEAST_CHANGE:g} were refuted")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,139 @@
+"""Functions that only kernels call are linked into these, without machine code of their own.
+
+numba compiles each function that a kernel calls as if Python called it, too: with a wrapper that unpacks Python's
+objects, optimised by itself and once more in each of its callers, and translated to machine code that nothing runs.
+Here, what is compiled on the way to a kernel of this package stays LLVM code. The kernel is linked from all of it and
+optimised once. A function that Python calls is compiled like any other, also where a kernel called it before.
+
+The arithmetic is the same: without ``fastmath`` no optimisation changes what is rounded.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+from numba.core import codegen, cpu, dispatcher, sigutils
+from numba.core.compiler_lock import global_compiler_lock
+
+_Compiler: Any = dispatcher._FunctionCompiler
+_Dispatcher: Any = dispatcher.Dispatcher
+_Base: Any = dispatcher._DispatcherBase
+_Codegen: Any = codegen.Codegen
+_Library: Any = codegen.CPUCodeLibrary
+_Context: Any = cpu.CPUContext
+
+#: What numba has in all versions that this was tried with (0.62 to 0.68).
+_NEEDED = (
+    (_Compiler, "_compile_core"), (_Compiler, "_customize_flags"), (_Dispatcher, "compile"), (_Base, "add_overload"),
+    (_Codegen, "create_library"), (_Library, "finalize"), (_Context, "get_executable"),
+)  # fmt: skip
+
+
+class LinkedOnly:
+    """Stands for the address of a function that has no machine code: a key of numba's tables."""
+
+
+@dataclass
+class _Compilation:
+    """The compilation under way, which numba's lock lets one thread have at a time.
+
+    Attributes:
+        depth: Functions that are being compiled, each for the one before it; the first is a kernel of this package.
+        done: Called after each function.
+    """
+
+    depth: int = 0
+    done: Callable[[], object] = lambda: None
+
+
+_compilation = _Compilation()
+
+
+def within_kernel() -> bool:
+    """Whether a kernel of this package is being compiled; asked under numba's lock."""
+    return _compilation.depth > 0
+
+
+def _linked_only(result: Any) -> bool:
+    return isinstance(result.entry_point, LinkedOnly)
+
+
+def install(done: Callable[[], object]) -> None:
+    """Have numba compile so, and call ``done`` after each function, where it has the parts that this replaces."""
+    if not all(hasattr(owner, name) for owner, name in _NEEDED):
+        return
+    _compilation.done = done
+    originals = {(owner, name): getattr(owner, name) for owner, name in _NEEDED}
+
+    def compile_core(compiler: Any, args: Any, return_type: Any) -> Any:
+        compiled = originals[_Compiler, "_compile_core"]
+        if _compilation.depth == 0 and not compiler.py_func.__module__.startswith("ns_abstract."):
+            return compiled(compiler, args, return_type)
+        _compilation.depth += 1
+        try:
+            found = compiled(compiler, args, return_type)
+        finally:
+            _compilation.depth -= 1
+        _compilation.done()
+        return found
+
+    def customize_flags(compiler: Any, flags: Any) -> Any:
+        flags = originals[_Compiler, "_customize_flags"](compiler, flags)
+        if _compilation.depth > 1:
+            flags.no_cpython_wrapper = flags.no_cfunc_wrapper = True
+        return flags
+
+    def compile_signature(kernel: Any, signature: Any) -> Any:
+        with global_compiler_lock:
+            args = tuple(sigutils.normalize_signature(signature)[0])
+            known = kernel.overloads.get(args)
+            if known is not None and _linked_only(known) and _compilation.depth == 0:
+                # Python calls it now
+                del kernel.overloads[args]
+            return originals[_Dispatcher, "compile"](kernel, signature)
+
+    def add_overload(kernel: Any, result: Any) -> None:
+        if _linked_only(result):
+            kernel.overloads[tuple(result.signature.args)] = result
+        else:
+            originals[_Base, "add_overload"](kernel, result)
+
+    def create_library(owner: Any, name: str, **options: Any) -> Any:
+        library = originals[_Codegen, "create_library"](owner, name, **options)
+        library.linked_only = _compilation.depth > 1
+        return library
+
+    def finalize(library: Any) -> None:
+        if library.linked_only:
+            library._raise_if_finalized()
+            library._finalized = True
+            return
+        library._linking_libraries = _all_linked(library)
+        originals[_Library, "finalize"](library)
+
+    def get_executable(context: Any, library: Any, *more: Any) -> Any:
+        return LinkedOnly() if library.linked_only else originals[_Context, "get_executable"](context, library, *more)
+
+    replaced = (
+        compile_core, customize_flags, compile_signature, add_overload, create_library, finalize, get_executable
+    )  # fmt: skip
+    _Library.linked_only = False
+    for (owner, name), function in zip(_NEEDED, replaced, strict=True):
+        setattr(owner, name, function)
+
+
+def _all_linked(library: Any) -> list[Any]:
+    """The libraries that ``library`` needs, each before what it needs itself: LLVM takes over only what is called."""
+    found: dict[Any, None] = {}
+
+    def visit(other: Any) -> None:
+        if other not in found:
+            if other.linked_only or other is library:
+                for next_one in reversed(other._linking_libraries):
+                    visit(next_one)
+            found[other] = None
+
+    visit(library)
+    return list(reversed(found))[1:]

@@ -1,0 +1,147 @@
+"""Cameras of other programs' files: Inria's ``cameras.json`` and a data set's ``transforms.json``."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ns_abstract.io.errors import InputError
+from ns_abstract.io.jsonio import is_number, show
+
+#: OpenCV axes (x right, y down, z forward) as OpenGL axes (x right, y up, z back).
+_OPENGL = np.diag([1.0, -1.0, -1.0])
+_DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")
+_MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "PERSPECTIVE")
+_INTRINSICS = ("fl_x", "fl_y", "cx", "cy", "w", "h")
+
+
+@dataclass(frozen=True)
+class FileCamera:
+    """A camera as a file has it.
+
+    Attributes:
+        field: Its entry, for messages.
+        camera_to_world: 3x4 numbers, OpenGL axes.
+        fx, fy, cx, cy: Pixels; numbers as the file has them, not checked but for being numbers.
+        width, height: Pixels, as the file has them.
+    """
+
+    field: str
+    camera_to_world: list[list[float]]
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    width: Any
+    height: Any
+
+
+@dataclass(frozen=True)
+class RunFrame:
+    """From a data set's frame to a run's: ``x_run = scale * (matrix[:, :3] @ x + matrix[:, 3])``."""
+
+    matrix: NDArray[np.float64]
+    scale: float
+
+    def pose(self, camera_to_world: NDArray[np.float64]) -> NDArray[np.float64]:
+        """A pose [4, 4] of the data set in the run's frame, [3, 4]."""
+        moved = self.matrix @ camera_to_world
+        moved[:, 3] *= self.scale
+        return moved
+
+
+def is_inria(root: Any) -> bool:
+    """Whether a parsed file is Inria's ``cameras.json``."""
+    return isinstance(root, list) and bool(root) and all(isinstance(e, dict) and "rotation" in e for e in root)
+
+
+def inria_cameras(root: list[dict[str, Any]]) -> Iterator[FileCamera]:
+    """The cameras of Inria's ``cameras.json``, in the frame of its .ply.
+
+    Raises:
+        InputError: A field is missing or no number.
+    """
+    for i, entry in enumerate(root):
+        field = f"[{i}]"
+        rotation = _matrix(entry.get("rotation"), 3, 3, f"{field}.rotation")
+        position = _matrix([entry.get("position")], 1, 3, f"{field}.position")[0]
+        width, height = entry.get("width"), entry.get("height")
+        focal = [_number(entry.get(key), f"{field}.{key}") for key in ("fx", "fy")]
+        sides = [_number(side, f"{field}.{key}") for key, side in (("width", width), ("height", height))]
+        pose = np.column_stack([rotation @ _OPENGL, position])
+        yield FileCamera(field, pose.tolist(), focal[0], focal[1], sides[0] / 2, sides[1] / 2, width, height)
+
+
+def transforms_cameras(root: Mapping[str, Any], frame: RunFrame | None) -> Iterator[FileCamera]:
+    """The cameras of a data set's ``transforms.json``, in the frame of a run that was trained on it.
+
+    Args:
+        root: The parsed file.
+        frame: The run's; None: the scene is no run.
+
+    Raises:
+        InputError: There is no run, a camera is not a plain perspective one, or a field is missing.
+    """
+    if frame is None:
+        problem = "is a data set's transforms.json, and the scene is no run whose frame could be told from it"
+        raise InputError(problem, fix="give the config.yml of a run trained on it, or make a camera path")
+    frames = root.get("frames")
+    if not isinstance(frames, list) or not frames:
+        raise InputError(f"found {show(frames)}", field="frames", fix="write a list of at least one camera")
+    # the run's frame is that of the poses here after what was applied to them is undone
+    applied = np.eye(4)
+    if "applied_transform" in root:
+        applied[:3] = _matrix(root["applied_transform"], 3, 4, "applied_transform")
+    if not abs(np.linalg.det(applied)) > 1e-12:
+        raise InputError("a matrix that cannot be inverted", field="applied_transform", fix="write a rotation")
+    applied_scale = _number(root.get("applied_scale", 1.0), "applied_scale")
+    if not applied_scale > 0:
+        raise InputError(f"found {show(applied_scale)}", field="applied_scale", fix="write a number above 0")
+    matrix = frame.matrix @ np.linalg.inv(applied)
+    undone = RunFrame(matrix, frame.scale / applied_scale)
+    for i, entry in enumerate(frames):
+        field = f"frames[{i}]"
+        if not isinstance(entry, dict):
+            raise InputError(f"found {show(entry)}", field=field, fix="write an object")
+        values = {**root, **entry}
+        _refuse_distorted(values, field)
+        numbers = {key: _number(values.get(key), f"{field}.{key}") for key in _INTRINSICS if key not in ("fl_y",)}
+        numbers["fl_y"] = _number(values.get("fl_y", numbers["fl_x"]), f"{field}.fl_y")
+        pose = _matrix(entry.get("transform_matrix"), None, 4, f"{field}.transform_matrix")
+        whole = np.vstack([pose[:3], [0.0, 0.0, 0.0, 1.0]])
+        yield FileCamera(
+            field, undone.pose(whole).tolist(), numbers["fl_x"], numbers["fl_y"], numbers["cx"], numbers["cy"],
+            values.get("w"), values.get("h"),
+        )  # fmt: skip
+
+
+def _refuse_distorted(values: Mapping[str, Any], field: str) -> None:
+    model = values.get("camera_model", "PERSPECTIVE")
+    if model not in _MODELS:
+        problem = f"found {show(model)}: only perspective cameras are bounded"
+        raise InputError(problem, field=f"{field}.camera_model", fix="undistort the pictures and train on them")
+    for key in _DISTORTION:
+        if values.get(key, 0.0) != 0:
+            problem = (
+                "the lens is distorted; Nerfstudio trains on an undistorted, cropped picture, whose camera differs"
+            )
+            raise InputError(problem, field=f"{field}.{key}", fix="make a camera path in Nerfstudio's viewer")
+
+
+def _matrix(value: Any, rows: int | None, columns: int, field: str) -> NDArray[np.float64]:
+    good = isinstance(value, list) and (len(value) == rows if rows else len(value) in (3, 4))
+    good = good and all(isinstance(row, list) and len(row) == columns and all(map(is_number, row)) for row in value)
+    if not good:
+        raise InputError(f"found {show(value)}", field=field, fix=f"write rows of {columns} finite numbers")
+    return np.array(value, np.float64)
+
+
+def _number(value: Any, field: str) -> float:
+    if not is_number(value):
+        problem = "missing" if value is None else f"found {show(value)}"
+        raise InputError(problem, field=field, fix="write a finite number")
+    return float(value)

@@ -1,0 +1,52 @@
+"""Subnormal numbers in the package's own arithmetic, whatever the program that calls it does with them (N2, N21)."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import numpy as np
+import torch
+
+from ns_abstract.arithmetic.network_charges import FLUSH
+from ns_abstract.io.errors import InputError
+
+#: Numbers of an operation that torch gives to one thread.
+_BY_THREAD = 1 << 15
+
+
+def _flushed() -> bool:
+    """Whether this thread replaces subnormal numbers by zero, where it writes or where it reads them."""
+    tiny = np.float32(FLUSH)
+    half = tiny * np.float32(0.5)
+    return bool(half + half != tiny)
+
+
+def _flushed_by_workers() -> bool:
+    """Whether any of the threads that torch gives parts of an operation to does."""
+    count = torch.get_num_threads()
+    return count > 1 and bool((torch.full((count * _BY_THREAD,), FLUSH) * 0.5 == 0.0).any())
+
+
+@contextmanager
+def subnormals_kept() -> Iterator[None]:
+    """Keep subnormal numbers in a block, or in a function that it decorates; afterwards the thread is as before.
+
+    Numbers are moved outward to their neighbours, which flushed ones would not be.
+
+    Raises:
+        InputError: Threads that torch works with flush them.
+    """
+    flushed = _flushed()
+    if flushed:
+        torch.set_flush_denormal(False)
+    try:
+        if _flushed() or _flushed_by_workers():
+            raise InputError(
+                "this process flushes subnormal numbers to zero, and bounds would be wrong",
+                fix="call torch.set_flush_denormal(True) after bounding, or torch.set_num_threads(1) before it",
+            )
+        yield
+    finally:
+        if flushed:
+            torch.set_flush_denormal(True)
