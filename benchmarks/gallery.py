@@ -12,6 +12,7 @@ import argparse
 import base64
 import io
 import json
+import math
 import re
 import shlex
 import sqlite3
@@ -166,8 +167,17 @@ def certificate_picture(work: Path) -> Image.Image:
 
 
 def kept_picture(file: str) -> Callable[[Path], Image.Image]:
-    """A PNG that ns-abstract-certify itself writes."""
-    return lambda work: Image.open(work / file).convert("RGB")
+    """An SVG that ns-abstract-certify itself writes, as Chromium draws it."""
+
+    def drawn(work: Path) -> Image.Image:
+        width, height = re.findall(r'width="([0-9.]+)" height="([0-9.]+)"', (work / file).read_text())[0]
+        size = f"--window-size={math.ceil(float(width))},{math.ceil(float(height))}"
+        picture = (work / file).with_suffix(".png")
+        command = ["chromium", "--headless", "--no-sandbox", size, f"--screenshot={picture}", str(work / file)]
+        subprocess.run(command, check=True, capture_output=True)
+        return Image.open(picture).convert("RGB")
+
+    return drawn
 
 
 def broken_picture(work: Path) -> Image.Image:
@@ -343,7 +353,7 @@ ENTRIES = (
         f"ns-abstract-certify --load-config {GATE} --camera-path-filename gate_path.json "
         "--perturbation-filename three.json --model demo/gate/estimator.onnx --property wide.json "
         "--output-dir out/pairs --time-budget 240",
-        "out/pairs", kept_picture("out/pairs/verdicts_00000.png"),
+        "out/pairs", kept_picture("out/pairs/verdicts_00000.svg"),
         {"gate_path.json": gate_camera(), "three.json": _THREE,
          "wide.json": _NEAR | {"tolerance": {"absolute": 0.15}}},
         {"gate_path.json": "as above"},
@@ -355,7 +365,7 @@ ENTRIES = (
         f"ns-abstract-certify --load-config {GATE} --camera-path-filename route.json "
         "--perturbation-filename segments.json --model demo/gate/estimator.onnx --property close.json "
         "--output-dir out/route --time-budget 60",
-        "out/route", kept_picture("out/route/cameras.png"),
+        "out/route", kept_picture("out/route/cameras.svg"),
         {"route.json": gate_camera(*_ROUTE), "segments.json": _SEGMENTS,
          "close.json": _NEAR | {"tolerance": {"absolute": 0.08}}},
         {"route.json": "a camera path with four such poses, at (0.2, 0.3, 0.1), (0.7, 0.1, 0.25), (1.1, -0.1, 0) and "

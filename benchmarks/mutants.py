@@ -55,14 +55,13 @@ class Outcome:
 
 
 def copy_package(folder: Path) -> None:
-    """The package, its tests and scripts and nothing else, so that the tests import the copy."""
+    """The package, its tests and the scripts that these use, so that the tests import the copy."""
     skip = shutil.ignore_patterns("__pycache__", "*.nbi", "*.nbc")
-    shutil.copytree(ROOT / "ns_abstract", folder / "ns_abstract", ignore=skip)
-    shutil.copytree(ROOT / "tests", folder / "tests", ignore=skip)
-    # ledgers, which tests measure charges with
     (folder / "benchmarks").mkdir()
     for script in (ROOT / "benchmarks").glob("*.py"):
         shutil.copy(script, folder / "benchmarks")
+    shutil.copytree(ROOT / "ns_abstract", folder / "ns_abstract", ignore=skip)
+    shutil.copytree(ROOT / "tests", folder / "tests", ignore=skip)
 
 
 def mutate(folder: Path, mutant: Fault) -> str:

@@ -27,7 +27,7 @@ from ns_abstract.methods.nerf.write import write_nerf_run
 from ns_abstract.methods.overrides import Overrides
 from ns_abstract.methods.program_options import ProgramOptions
 from ns_abstract.methods.splat.ply import write_ply
-from ns_abstract.report.page import reproduce
+from ns_abstract.report.page import render_page
 from ns_abstract.report.record import Report, Run
 
 EVIL = "<script>alert(1)</script>"
@@ -135,7 +135,7 @@ def test_page_escapes(tmp_path: Path) -> None:
     run = Run("real-sound", {"name": "gsplat", "version": "1"}, {}, (0,), {}, {}, assumptions=(entry,))
     document = Report(tmp_path, run).document()
     assert document["assumptions"] == [{"name": EVIL, "value": EVIL, "origin": EVIL}]
-    text = reproduce(document)
+    text = render_page(document, {})
     assert text.count("&lt;script&gt;") == 3 and "<script>" not in text, "markup of a file reaches the page"
 
 

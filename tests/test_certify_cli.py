@@ -814,8 +814,8 @@ def test_pictures_of_a_resumed_command(planted: Case, finished: Path, tmp_path: 
     """They are made again, and are the same; what an interrupted command leaves is none of them."""
     page = (finished / "report.html").read_text()
     assert "Where it fails" in page and "Along the set" in page
-    names = {"verdicts_00000.png", "cameras.png"}
-    assert {file.name for file in finished.glob("*.png")} == names
+    names = {"verdicts_00000.svg", "cameras.svg"}
+    assert {file.name for file in finished.glob("*.svg")} == names
     shutil.copytree(finished, tmp_path / "out")
     for name in names:
         (tmp_path / "out" / name).write_bytes(b"another command's")

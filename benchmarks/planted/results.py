@@ -71,10 +71,21 @@ RESULTS = (
     ),
     Fault(
         "the page shows what files say as markup",
-        "report/page.py",
-        "_assumptions",
-        "escape(entry[key])",
-        "entry[key]",
+        "report/html.py",
+        "_templates",
+        """Environment(
+            loader=FileSystemLoader(_FOLDER / "templates"),
+            autoescape=True,
+            trim_blocks=True,
+            lstrip_blocks=True,
+            undefined=StrictUndefined,
+        )""",
+        """Environment(
+            loader=FileSystemLoader(_FOLDER / "templates"),
+            trim_blocks=True,
+            lstrip_blocks=True,
+            undefined=StrictUndefined,
+        )""",
         "test_assumptions.py::test_page_escapes",
     ),
     Fault(

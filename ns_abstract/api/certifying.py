@@ -29,8 +29,7 @@ from ns_abstract.io.assumptions import Assumption
 from ns_abstract.io.errors import InputError
 from ns_abstract.io.memory import allowed_memory
 from ns_abstract.report.certificate import CertifiedRun, coverage, verdict
-from ns_abstract.report.certificate_page import percent
-from ns_abstract.report.figures import short_guarantee
+from ns_abstract.report.figures import percent, short_guarantee
 from ns_abstract.report.notebook import verdicts_html
 from ns_abstract.report.record import file_stamp
 from ns_abstract.report.verdict_picture import clear_pictures

@@ -17,7 +17,7 @@ from ns_abstract.api.job import check_frames
 from ns_abstract.cli.common import Stop, plain_console
 from ns_abstract.cli.options import stated
 from ns_abstract.report.certificate import CertifiedRun, coverage
-from ns_abstract.report.certificate_page import percent
+from ns_abstract.report.figures import percent
 from ns_abstract.verify.store import Store
 
 if TYPE_CHECKING:

@@ -69,7 +69,7 @@ def reach(options: Reach) -> int:
             from ns_abstract.api.compiling import compile_beside
             from ns_abstract.api.reaching import LoopQuestion, ReachProgress, open_loop
             from ns_abstract.api.scenes import SceneSource
-            from ns_abstract.report.certificate_page import percent
+            from ns_abstract.report.figures import percent
 
             scene = SceneSource(options.load_config, options.program, options.overrides).open()
             workers = options.where.processes

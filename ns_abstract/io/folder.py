@@ -17,7 +17,7 @@ from ns_abstract.io.jsonio import load_json
 MARK = ".ns-abstract.lock"
 #: What results are called; see files.py and verdict_picture.py of `ns_abstract.report`, and `ns_abstract.verify.store`.
 _RESULT = re.compile(
-    r"frame_\d{5,}\.(npz|png)|report\.(json|html)|cells\.sqlite(-wal|-shm)?|verdicts_(\d{5,}|path)\.png|cameras\.png"
+    r"frame_\d{5,}\.(npz|png)|report\.(json|html)|cells\.sqlite(-wal|-shm)?|verdicts_(\d{5,}|path)\.(svg|png)|cameras\.(svg|png)"
 )
 #: The same of images of counterexamples, in a folder below.
 _IMAGE = re.compile(r"frame_\d{5,}_(pose|\d[\d_-]*)(_\d+)?\.npz")

@@ -7,11 +7,13 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from markupsafe import Markup
 from numpy.typing import NDArray
 
 from ns_abstract.geometry.camera_path import Camera
 from ns_abstract.geometry.poses import PoseSet
 from ns_abstract.report.figures import number
+from ns_abstract.report.html import fill
 from ns_abstract.report.outside import (
     ABOVE,
     PICTURE_WIDTH,
@@ -23,7 +25,7 @@ from ns_abstract.report.outside import (
     plane_axes,
     sideways,
 )
-from ns_abstract.report.page import counted
+from ns_abstract.report.svg import through
 
 Float64 = NDArray[np.float64]
 
@@ -198,37 +200,31 @@ class Cameras:
             found.append(View(title, nearest, window, shapes))
         return found
 
-    def html(self, numbers: Mapping[tuple[int, int], int]) -> str:
-        """The page's part; cells with numbers, by frame and position, can be chosen."""
-        if not self.cells:
-            return ""
-        low, high = self.ends
-        figures = []
+    def plots(self, numbers: Mapping[tuple[int, int], int]) -> list[tuple[Markup, str, str]]:
+        """From above and from the side: the plot, its title, and what of the scene it shows."""
+        found = []
         for view in self.views(PICTURE_WIDTH):
             x, y = plane_axes(view.window)
             shapes = []
             for camera, corners in view.shapes:
-                drawn = "L".join(f"{x(a):.1f},{y(b):.1f}" for a, b in corners)
                 cell = numbers.get((camera.frame, camera.row))
                 data = "" if cell is None else f' data-cell="{cell}"'
-                shapes.append(f'<path class="{camera.verdict}"{data} d="M{drawn}Z"/>')
+                way = through((x(a), y(b)) for a, b in corners)
+                shapes.append(f'<path class="{camera.verdict}"{data} d="{way}Z"/>')
             marks = f'<g class="frusta">{"".join(shapes)}</g>'
             plot = draw_plane(self.outside, view.window, view.nearest, marks, f"Cameras seen {view.title}")
-            scene = behind(self.outside, view.nearest, "cameras alone")
-            figures.append(f"<figure>{plot}<figcaption><b>{view.title}</b> {scene}</figcaption></figure>")
-        left = ""
-        if self.left_out:
-            left = f" {counted(self.left_out, 'further cell')}, none wider than those of its verdict here, not shown."
+            found.append((plot, view.title, behind(self.outside, view.nearest, "cameras alone")))
+        return found
+
+    def html(self, numbers: Mapping[tuple[int, int], int]) -> Markup:
+        """The page's part; cells with numbers, by frame and position, can be chosen."""
+        if not self.cells:
+            return Markup()
         where = " · ".join(
             f"{name} {number(a, 4)}" if a == b else f"{name} {number(a, 4)} to {number(b, 4)}"
-            for name, a, b in zip("xyz", low.tolist(), high.tolist(), strict=True)
+            for name, a, b in zip("xyz", *(end.tolist() for end in self.ends), strict=True)
         )
-        return (
-            "<h2>Where the cameras stand</h2><p>One frustum for the middle pose of a cell, in the colour of the cell's "
-            f"verdict, in the run's normalised frame ({where}); its tip is the camera's position, it opens as the "
-            f"picture does, its length means nothing. Where frusta overlap, red is over grey, grey over green."
-            f"{left}</p>{''.join(figures)}"
-        )
+        return fill("cameras.html", figures=self.plots(numbers), left_out=self.left_out, where=where)
 
 
 def _hull(points: Sequence[tuple[float, float]]) -> list[tuple[float, float]]:

@@ -7,11 +7,13 @@ from dataclasses import dataclass, field
 from typing import Any, TypeVar
 
 import numpy as np
+from markupsafe import Markup
 from numpy.typing import NDArray
 
 from ns_abstract.refine.protocol import Elements
-from ns_abstract.report.page import Axis, draw_plot, uri
+from ns_abstract.report.html import uri
 from ns_abstract.report.picture import png
+from ns_abstract.report.svg import Axis, draw_plot
 
 Float64 = NDArray[np.float64]
 K = TypeVar("K")
@@ -191,7 +193,7 @@ def plane_axes(window: Window) -> tuple[Axis, Axis]:
     )
 
 
-def draw_plane(outside: Outside | None, window: Window, nearest: float, marks: str, title: str) -> str:
+def draw_plane(outside: Outside | None, window: Window, nearest: float, marks: str, title: str) -> Markup:
     """SVG of a window: the scene, if it has elements, and ``marks`` over it.
 
     Args:

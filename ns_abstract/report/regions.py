@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from html import escape
 from typing import Any
 
 import numpy as np
+from markupsafe import Markup
 from numpy.typing import NDArray
 
-from ns_abstract.report.figures import number, percent, unit_of_axis
-from ns_abstract.report.page import counted, uri
+from ns_abstract.report.figures import number, unit_of_axis
+from ns_abstract.report.html import fill
 
 Float64 = NDArray[np.float64]
 
@@ -164,15 +164,11 @@ def regions_html(
     pictures: Sequence[tuple[Shown, Shown | None]],
     parameters: Mapping[int, Sequence[Mapping[str, Any]]],
     why: str,
-) -> str:
+) -> Markup:
     """The page's part about regions; ``pictures`` are of the first ones, ``why`` there are no more of them."""
     if not regions:
-        return ""
-    parts = [
-        f"<h2>Where it fails</h2><p>Falsified cells that touch make {counted(len(regions), 'region')}. Of the largest, "
-        "the counterexample with the least margin, and the nearest pose where the network was seen to be right, with "
-        "each parameter measured by its range.</p>"
-    ]
+        return Markup()
+    shown = []
     for region, (broken, right) in zip(regions, pictures, strict=False):
         sides = parameters[region.frame]
         box = ", ".join(
@@ -180,32 +176,27 @@ def regions_html(
             for p, a, b in zip(sides, region.lower, region.upper, strict=True)
             if p["lower"] < p["upper"]
         )
-        figures = "".join(_figure(one, other, sides) for one, other in ((broken, right), (right, broken)) if one)
-        none = "" if right else '<p class="soft">No pose of its own set was seen to be right.</p>'
-        outputs = _outputs(broken, right)
-        parts.append(
-            f'<div class="region"><p><b>frame {region.frame}</b>, {escape(percent(region.share))} of its set in '
-            f"{counted(len(region.cells), 'cell')}{escape(': ' + box if box else '')}</p>"
-            f'<div class="below">{figures}{outputs}</div>{none}</div>'
+        told = told_outputs(broken.outputs, right and right.outputs)
+        both = [broken, right] if right else [broken]
+        shown.append(
+            {
+                "region": region,
+                "box": box,
+                "pictures": [(one, _pose(one, other, sides)) for one, other in zip(both, both[::-1], strict=True)],
+                "right": right,
+                "rows": [(k, [_value(one.outputs[k]) for one in both]) for k in told],
+                "more": len(broken.outputs) - len(told),
+            }
         )
-    more = len(regions) - len(pictures)
-    if more > 0:
-        least = "" if len(pictures) < 1 else ", none of them larger"
-        parts.append(f"<p>{counted(more, 'further region')}{least}{escape(why)}.</p>")
-    return "".join(parts)
+    return fill("regions.html", regions=regions, shown=shown, why=why)
 
 
-def _figure(one: Shown, other: Shown | None, sides: Sequence[Mapping[str, Any]]) -> str:
-    kind = "falsified" if one.margin is None or one.margin <= 0.0 else "certified"
-    pose = ", ".join(
-        f"{p['name']} = {number(v, 5)}" + (" (same)" if other is not None and other.values[k] == v else "")
+def _pose(one: Shown, other: Shown, sides: Sequence[Mapping[str, Any]]) -> str:
+    """The parameters that vary, and which are those of the other picture."""
+    return ", ".join(
+        f"{p['name']} = {number(v, 5)}" + (" (same)" if other is not one and other.values[k] == v else "")
         for k, (p, v) in enumerate(zip(sides, one.values, strict=True))
         if p["lower"] < p["upper"]
-    )
-    margin = "not a number" if one.margin is None else number(one.margin)
-    return (
-        f'<figure><img class="pixels" src="{uri(one.png)}" alt="{escape(one.title)}"><figcaption>'
-        f'<b class="{kind}-ink">{escape(one.title)}</b>, margin {margin}<br>{escape(pose)}</figcaption></figure>'
     )
 
 
@@ -215,20 +206,6 @@ def told_outputs(broken: Sequence[float], right: Sequence[float] | None, most: i
     change = np.abs(values if right is None else values - np.asarray(right, np.float64))
     order = np.argsort(-np.where(np.isfinite(change), change, np.inf), kind="stable")[:most]
     return sorted(order.tolist())
-
-
-def _outputs(broken: Shown, right: Shown | None) -> str:
-    told = told_outputs(broken.outputs, right and right.outputs)
-    rows = "".join(
-        f'<tr><td class="left">y[{k}]</td><td>{_value(broken.outputs[k])}</td>'
-        + (f"<td>{_value(right.outputs[k])}</td>" if right else "")
-        + "</tr>"
-        for k in told
-    )
-    more = len(broken.outputs) - len(told)
-    note = f'<p class="soft">{counted(more, "further output")}, which differ less.</p>' if more else ""
-    head = '<th class="left">output</th><th>broken</th>' + ("<th>right</th>" if right else "")
-    return f"<div><table><thead><tr>{head}</tr></thead><tbody>{rows}</tbody></table>{note}</div>"
 
 
 def _value(value: float) -> str:

@@ -9,11 +9,13 @@ from itertools import combinations
 from typing import Any
 
 import numpy as np
+from markupsafe import Markup
 from numpy.typing import NDArray
 
 from ns_abstract.report.figures import number, unit_of_axis
-from ns_abstract.report.page import uri
+from ns_abstract.report.html import uri
 from ns_abstract.report.picture import png
+from ns_abstract.report.svg import draw_svg
 
 Float64 = NDArray[np.float64]
 
@@ -177,7 +179,7 @@ def maps_of(rows: Sequence[Mapping[str, Any]], entry: Mapping[str, Any], bins: i
     return pair_maps(lower, upper, [row["verdict"] for row in rows], (ends[0], ends[1]), complete=complete, bins=bins)
 
 
-def matrix_svg(maps: PairMaps, parameters: Sequence[Mapping[str, Any]]) -> str:
+def matrix_svg(maps: PairMaps, parameters: Sequence[Mapping[str, Any]]) -> Markup:
     """All pairs of parameters as one plot, for those that vary (their names, units and ends)."""
     d = len(parameters)
     panel = min(_PANEL, (_WIDTH - _LEFT - (d - 1) * _GAP) // d)
@@ -208,15 +210,4 @@ def matrix_svg(maps: PairMaps, parameters: Sequence[Mapping[str, Any]]) -> str:
             f'<text x="{_LEFT - 4}" y="{y + 0.5 * panel + 4:.0f}" text-anchor="end">{escape(str(p["name"]))}</text>',
         ]
     width, height = _LEFT + d * step - _GAP + 8, bottom + _BELOW
-    return (
-        f'<svg class="pairs" role="img" viewBox="0 0 {width} {height}" width="{width}" height="{height}">'
-        f"<title>Verdicts over pairs of parameters</title>{''.join(marks)}</svg>"
-    )
-
-
-TEXT = (
-    "Every map is over two parameters, and tells of each of its places what part of the volume over the other "
-    "parameters is certified (green, below the diagonal) or falsified (red, above it): paler is less, the full colour "
-    "is all of it, paper is nothing. On the diagonal the same along one parameter: green from below, red from above, "
-    "grey what is unknown."
-)
+    return draw_svg(width, height, "Verdicts over pairs of parameters", "".join(marks), kind="pairs")

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from html import escape
 from typing import Any
 
 import numpy as np
+from markupsafe import Markup
 
 from ns_abstract.report.figures import number, unit_of_axis
-from ns_abstract.report.page import uri
+from ns_abstract.report.html import fill
 from ns_abstract.report.regions import Shown
 
 #: Pictures of the slider.
@@ -103,25 +103,6 @@ def coarse_first(count: int) -> list[int]:
     return sorted(range(count), key=lambda k: int(f"{k:0{bits}b}"[::-1], 2))
 
 
-def walk_html(found: Sequence[tuple[Stop, Shown]]) -> str:
+def walk_html(found: Sequence[tuple[Stop, Shown]]) -> Markup:
     """The page's part: all pictures; `walk.js` shows one at a time, as the slider stands."""
-    if len(found) < 2:
-        return ""
-    figures, marks = [], []
-    for stop, shown in found:
-        margin = "not a number" if shown.margin is None else number(shown.margin)
-        text = f"margin of this picture {margin}"
-        if stop.proven is not None:
-            text += f"; at least {number(stop.proven)} everywhere in its cell"
-        figures.append(
-            f'<figure data-at="{escape(stop.at)}"><img class="pixels" src="{uri(shown.png)}" alt="{escape(stop.at)}">'
-            f'<figcaption><b class="{stop.verdict}-ink">{stop.verdict}</b> <span>{escape(stop.at)}</span><br>'
-            f"{escape(text)}</figcaption></figure>"
-        )
-        marks.append(f'<i class="{stop.verdict}-back"></i>')
-    return (
-        "<h2>Along the set</h2><p>Pictures on the way through the set, the other parameters in the middle of their "
-        "ranges, with the verdict of the cell around each.</p>"
-        f'<div id="walk"><div id="walk-control"></div><div id="walk-verdicts">{"".join(marks)}</div>'
-        f'<div class="images">{"".join(figures)}</div></div>'
-    )
+    return fill("walk.html", stops=found) if len(found) > 1 else Markup()
