@@ -399,7 +399,7 @@ def blended(f: _Fragments, background: Array, unit: float) -> tuple[Form, Array]
     plain = np.take_along_axis(clean, last, 1) & np.take_along_axis(clean, np.minimum(last + 1, n), 1)
     end = np.where(plain, last, np.where(clean & (place > last), place, n).min(axis=1)[:, None])
     inside = place[:, :-1] < end
-    form = _from_the_back(alpha, color, inside, background, unit)
+    form = from_the_back(alpha, color, inside, background, unit)
     # other orders than that of the centres, and earlier stops
     lower, upper = _swaps(dlow, dhigh, inside, most, ah, cl, ch)
     at = ((place[:, :-1] >= begin) & (place[:, :-1] < end))[..., None]
@@ -435,7 +435,7 @@ def _groups(depth: Form, shows: Array) -> tuple[Array, Array, Array]:
     return clean, low, high
 
 
-def _from_the_back(alpha: Form, color: Form, inside: Array, background: Array, unit: float) -> Form:
+def from_the_back(alpha: Form, color: Form, inside: Array, background: Array, unit: float) -> Form:
     """The colours [B, 3] of fragments that are blended in the order of their centres.
 
     S' = S + alpha (C - S): errors of S are met by 1 - alpha, those of C by alpha. In float32 a fragment's light errs by
