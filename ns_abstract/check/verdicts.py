@@ -202,7 +202,8 @@ class Loop(_Verdicts):
             found += [_outside(area, x, self.names) for area in self.loop.get("unsafe") or []]
             if self.cells.index and goal:
                 inside.append(-_outside(goal, x, self.names, inner=True))
-            if not np.isfinite(np.stack([e.r for e in x])).all():
+            lost = ~np.isfinite(np.stack([e.r for e in x])).all(axis=0)
+            if (lost | (np.min(found, axis=0, initial=np.inf) <= 0.0)).all():
                 return np.full(len(low), -np.inf)
         if inside:
             found.append(inside[-1] if goal["when"] == "end" else np.max(inside, axis=0))
