@@ -137,11 +137,11 @@ def _points(splats: Splats, view: View, index: Array, unit: float) -> list[Form]
     In float32 the pose is rounded, R C and R mu are sums of three: less than 8 units of |R| (|mu| + |C|).
     """
     means, origin = splats.means[index], view.origin[:, None, :]
-    far = np.abs(means) + np.abs(origin) + sum(e.size() for e in view.position)[:, None, None]
+    far = np.abs(means) + np.abs(origin) + np.sum([e.size() for e in view.position], axis=0)[:, None, None]
     found = []
     for row, move in zip(view.rotation, view.shift, strict=True):
         parts = [wide(e) * (means - origin)[..., s] for s, e in enumerate(row)]
-        error = sum(wide(e).size() * far[..., s] for s, e in enumerate(row))
+        error = np.sum([wide(e).size() * far[..., s] for s, e in enumerate(row)], axis=0)
         found.append((total(parts) + wide(move)).wider((4.0 * U + 8.0 * unit) * error))
     return found
 
