@@ -69,9 +69,10 @@ def inputs(folder: Path) -> dict[str, Path]:
 def dependents(package: Path, file: str) -> set[str]:
     """The modules of the copy that import ``file``, directly or not, and itself; without ".py", relative to it."""
     imports: dict[str, set[str]] = {}
-    names = {path.relative_to(package / "ns_abstract").with_suffix("").as_posix() for path in package.rglob("*.py")}
+    root = package / "ns_abstract"
+    names = {path.relative_to(root).with_suffix("").as_posix() for path in root.rglob("*.py")}
     for name in names:
-        tree = ast.parse((package / "ns_abstract" / f"{name}.py").read_text())
+        tree = ast.parse((root / f"{name}.py").read_text())
         nodes = [n for n in ast.walk(tree) if isinstance(n, (ast.Import, ast.ImportFrom))]
         found = {f"{n.module}.{a.name}" for n in nodes if isinstance(n, ast.ImportFrom) for a in n.names}
         found |= {n.module or "" for n in nodes if isinstance(n, ast.ImportFrom)}

@@ -97,8 +97,9 @@ def pooled(file: Path) -> Path:
 def test_networks_are_enclosed(radius: float, tmp_path: Path) -> None:
     file, rng = pooled(tmp_path / "net.onnx"), np.random.default_rng(2)
     session = onnxruntime.InferenceSession(file, providers=["CPUExecutionProvider"])
-    c, g = rng.random((1, 3, 8, 8)), radius * rng.normal(size=(2, 1, 3, 8, 8))
-    form = Form(c, g, np.full(c.shape, 0.1 * radius))
+    c, g = rng.random((1, 3, 8, 8), np.float32).astype(np.float64), radius * rng.normal(size=(2, 1, 3, 8, 8))
+    # what rounding the input to float32 moves it by is part of the set
+    form = Form(c, g, np.full(c.shape, 0.1 * radius + 4e-7))
     network, exact = Network(file, None, FLOAT), Network(file, None, 0.0)
     rows = torch.tensor([[1.0, -1.0, 0.0], [0.0, 0.5, 2.0]], dtype=torch.float64)
     outputs, least, most = network.outputs(form), network.least(form, rows), -network.least(form, -rows)
@@ -106,17 +107,13 @@ def test_networks_are_enclosed(radius: float, tmp_path: Path) -> None:
     for _ in range(50):
         s, e = rng.uniform(-1.0, 1.0, 2), 0.1 * radius * rng.uniform(-1.0, 1.0, c.shape)
         x = (c + s[0] * g[0] + s[1] * g[1] + e).astype(np.float32)
-        # what rounding the input to float32 moves it by is part of the set
-        y = session.run(None, {"image": x})[0][0].astype(np.float64) if radius else None
-        y = session.run(None, {"image": c.astype(np.float32)})[0][0].astype(np.float64) if y is None else y
-        plane = outputs.c[0] + s @ outputs.g[:, 0]
-        room = outputs.r[0] + 1e-4 * (1.0 if radius else 1e-1)
-        assert (np.abs(y - plane) <= room).all()
+        y = session.run(None, {"image": x})[0][0].astype(np.float64)
+        assert (np.abs(y - outputs.c[0] - s @ outputs.g[:, 0]) <= outputs.r[0]).all()
         value = rows.numpy() @ y
-        assert (least[0].numpy() <= value + 1e-4).all() and (value - 1e-4 <= most[0].numpy()).all()
+        assert (least[0].numpy() <= value).all() and (value <= most[0].numpy()).all()
         found.append(value)
     # rows that go back keep what the picture's slopes cancel
-    assert (most - least).max() < 8.0 * max(np.ptp(found, axis=0).max(), 1e-4)
+    assert (most - least).max() < 8.0 * max(np.ptp(found, axis=0).max(), 1e-3)
     assert (exact.least(form, rows) >= least).all() and (exact.least(form, rows) > least).any()
 
 
