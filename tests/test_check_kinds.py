@@ -314,6 +314,20 @@ def test_rays_contain_pictures_of_another_renderer(half: float) -> None:
     assert max(widths) < {0.0: 1e-9, 1e-5: 1e-4, 1e-3: np.inf}[half]
 
 
+def test_neurons_that_bend_are_enclosed() -> None:
+    from ns_abstract.check.fields import _Zonotope
+
+    rng = np.random.default_rng(0)
+    form = Form(rng.normal(size=(1, 2, 5)), 0.3 * rng.normal(size=(2, 1, 2, 5)), 0.1 * rng.random((1, 2, 5)))
+    weight, bias = rng.normal(size=(6, 5)), rng.normal(size=6)
+    found = _Zonotope.of(form).layer(weight, bias).bent().layer(weight[:, :5].T @ np.eye(6)[:6, :6], bias[:5]).form(2)
+    for _ in range(200):
+        s, e = rng.uniform(-1.0, 1.0, 2), rng.choice([-1.0, 1.0], form.c.shape)
+        x = form.c + s[0] * form.g[0] + s[1] * form.g[1] + e * form.r
+        y = np.maximum(x @ weight.T + bias, 0.0) @ weight + bias[:5]
+        assert (np.abs(y - found.c - s[0] * found.g[0] - s[1] * found.g[1]) <= found.r + 1e-12).all()
+
+
 # ---------------------------------------------------------------- files
 
 
