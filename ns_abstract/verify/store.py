@@ -1,4 +1,4 @@
-"""``cells.sqlite``: what a search has found, as it comes (design.md, V8).
+"""The store ``cells.sqlite`` of a search's finished cells (design.md, V8).
 
 A block's findings are one transaction, which also takes the block off the list of open ones and puts its
 children there. So a kill at any moment loses at most the blocks that were being examined, and what arrives
@@ -76,7 +76,7 @@ _SETTLED = "kind, radius, frame, lower, upper, outcome, reason, slopes"
 
 @dataclass
 class Seal:
-    """Number and sum of the hashes of a table's rows: rows come and go in any order, and no other rows fit.
+    """The count and the sum of the hashes of a table's rows: independent of their order.
 
     It finds what was damaged or edited; who also writes the seal anew is not found out.
     """
@@ -98,7 +98,7 @@ class Seal:
 
 @dataclass
 class _Seals:
-    """Of the cells that have a verdict, the open blocks, the frames, and what is known of margins."""
+    """Checksums of the finished cells, the open blocks, the frames, and the settled margins."""
 
     cells: Seal = field(default_factory=Seal)
     blocks: Seal = field(default_factory=Seal)
@@ -664,7 +664,7 @@ def _parts_of(base: sqlite3.Connection) -> set[tuple[str, str, str]]:
 
 
 def _passes(error: sqlite3.DatabaseError) -> bool:
-    """Whether the file is whole, but cannot be used now."""
+    """Return whether an error leaves the file intact (locked, disk full, ...)."""
     return isinstance(error, sqlite3.OperationalError) and any(word in str(error) for word in _PASSING)
 
 

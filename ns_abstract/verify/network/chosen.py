@@ -1,4 +1,4 @@
-"""Which of a network's outputs is read."""
+"""Choose which of a network's outputs is read."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _NAMED = 8
 def chosen_output(
     path: Path, shapes: Mapping[str, Sequence[object]], asked: str | None, beside: Sequence[str] = ()
 ) -> str:
-    """The name of the output that is read: the one asked for, or the only one.
+    """Return the name of the output to read: the requested one, or the only one.
 
     Outputs are never joined: a label would count through all of them.
 

@@ -1,4 +1,4 @@
-"""Functions of one number that are convex, concave or straight between known points (docs/design.md, N10, N21).
+"""Activations that are convex, concave or linear between known points (docs/design.md, N10, N21).
 
 One relaxation serves them all. The interval is cut at evenly spaced points and at the known ones, so that every
 part has one curvature. A line with any slope becomes a sound one by the greatest or least distance of the function
@@ -46,7 +46,7 @@ _APART = 2.0**-6
 
 
 class _Cuts(NamedTuple):
-    """A function at points [K, ...] that grow along the first axis.
+    """Samples of a function at ascending points [K, ...].
 
     Attributes:
         z, value, slope: [K, ...].
@@ -63,7 +63,7 @@ class _Cuts(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Curve(Activation):
-    """A function with parts of one curvature each."""
+    """An activation that is piecewise convex, concave or linear."""
 
     @property
     def breaks(self) -> tuple[float, ...]:
@@ -214,7 +214,7 @@ class Curve(Activation):
 
 
 class Assumed(Curve):
-    """A curve whose float32 evaluation uses a library's exponential, logarithm or error function."""
+    """An activation whose float32 evaluation calls a library's exponential, logarithm or error function."""
 
 
 def _fields(lines: Lines) -> tuple[Tensor, Tensor, Tensor, Tensor]:
@@ -370,7 +370,7 @@ class Reciprocal(Curve):
 
 
 class Share(Reciprocal):
-    """The reciprocal of a sum of capped exponentials: a softmax (N11)."""
+    """The reciprocal in a softmax: of a sum of capped exponentials (N11)."""
 
     def missing(self, lower: Tensor, upper: Tensor) -> Tensor | float:
         # the share and this are both less than exp(-CAP) and its roundings there; sums keep half their size
@@ -378,7 +378,7 @@ class Share(Reciprocal):
 
 
 def _unknown(lower: Tensor, upper: Tensor, where: Tensor) -> tuple[Tensor, Tensor]:
-    """Intervals where nothing is known are not numbers: such a cell is given up."""
+    """Return NaN where the function has no bound; the cell is then given up."""
     nan = torch.full_like(lower, math.nan)
     return torch.where(where, nan, lower), torch.where(where, nan, upper)
 
@@ -436,7 +436,7 @@ class Exp(Assumed):
 
 
 class CappedExp(Exp):
-    """``min(exp(z), exp(cap))``: of terms of a softmax, whose sums are as good as infinite past that (N11)."""
+    """``min(exp(z), exp(cap))``: a term of a softmax; larger terms have no finite bound (N11)."""
 
     cap: ClassVar[float] = CAP
 

@@ -1,4 +1,4 @@
-"""Loading a network from a file, and comparing it with another program that reads the same file."""
+"""Load a network from a file and compare it with the runtime of that file format."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def load_network(
     layout: str = "NCHW",
     shown: Callable[[tuple[int, ...]], Iterable[np.ndarray]] | None = None,
 ) -> Network:
-    """The network in an .onnx, .onnx.gz or .pt2 file, compared with the program that usually runs such a file.
+    """Return the network in an .onnx, .onnx.gz or .pt2 file, after comparing it with the file's usual runtime.
 
     Args:
         path: The file.
