@@ -1,4 +1,4 @@
-"""What opens a scene: one `Representation` by folder of `ns_abstract.methods`."""
+"""The entry point of a scene representation: one `Representation` per folder of `ns_abstract.methods`."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from ns_abstract.refine.protocol import Method
 
 @dataclass(frozen=True)
 class ProgramOptions:
-    """Which program draws the scene; None: the representation's own choice.
+    """Options of the program that renders the scene; None: the representation's default.
 
     Attributes:
         renderer: "gsplat" or "paper".

@@ -78,7 +78,7 @@ _PLENTY = 1 << 60
 
 @dataclass(frozen=True)
 class Goal:
-    """When to stop.
+    """The criterion at which refinement stops.
 
     Attributes:
         ratio: MPG over witness MPG that is good enough.
@@ -104,7 +104,7 @@ class Goal:
 
 
 class _Part(NamedTuple):
-    """A part of the set, and whether its lower and upper ends along each axis [d] are ends of the set."""
+    """A sub-box of the set, and whether its ends along each axis [d] are ends of the set."""
 
     box: ParameterBox
     first: np.ndarray
@@ -112,7 +112,7 @@ class _Part(NamedTuple):
 
 
 class _Cell:
-    """A part of the set, the context for parts of it, and how much the picture varies along each axis [d]."""
+    """A leaf cell: its box, the context for its sub-boxes, and how much the picture varies along each axis [d]."""
 
     __slots__ = ("context", "narrow", "number", "part", "slopes")
 
@@ -128,7 +128,7 @@ class _Cell:
 
 @dataclass
 class _Change:
-    """What a round does to the leaves of one tile: rows that go, and what comes in their place."""
+    """The change of one tile's leaves in a round: removed rows and their replacements."""
 
     gone: list[int] = field(default_factory=list)
     cells: list[_Cell] = field(default_factory=list)
@@ -915,7 +915,7 @@ def shared_goal(frame: Frame, index: int, goal: Goal, seed: int) -> Goal:
 
 
 def spread(frame: Frame, index: int, seed: int) -> float:
-    """MPG of the pictures at the middle and at two opposite ends of the set: no more than the witnesses'."""
+    """Return the MPG between pictures at the middle and two opposite ends of the set: at most the inner gap."""
     corners = _first_corners(frame.box, np.random.default_rng([seed, index]))
     pictures = [frame.render(values) for values in (frame.box.middle, *corners[[0, -1]])]
     least, most = np.minimum.reduce(pictures), np.maximum.reduce(pictures)
@@ -923,7 +923,7 @@ def spread(frame: Frame, index: int, seed: int) -> float:
 
 
 def _across(box: ParameterBox) -> Iterator[np.ndarray]:
-    """Poses [d] across a set: evenly along one parameter; along each of several, the others at their middles."""
+    """Return poses [d] across a set: evenly along each parameter, the others at their middles."""
     count = _VIEWS if box.dimensions == 1 else _AXIS_VIEWS + 1
     for axis in range(box.dimensions):
         for step in np.linspace(-1.0, 1.0, count):
@@ -943,7 +943,7 @@ def _first_corners(box: ParameterBox, random: np.random.Generator) -> np.ndarray
 
 
 def _usable(lower: np.ndarray, upper: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Bounds within [0, 1]; where they are not finite, cross or miss [0, 1], nothing is known.
+    """Return the bounds clipped to [0, 1]; [0, 1] itself where they are not finite, cross, or miss [0, 1].
 
     Depths are at least 0, and may be unknown above or nowhere (see `Frame`).
     """
@@ -958,7 +958,7 @@ def _usable(lower: np.ndarray, upper: np.ndarray) -> tuple[np.ndarray, np.ndarra
 
 
 def _usable_linear(linear: tuple[np.ndarray, ...]) -> tuple[np.ndarray, ...]:
-    """Linear sets (A_lower, b_lower, A_upper, b_upper) with 0 and 1 where a number is not finite."""
+    """Return the linear sets (A_lower, b_lower, A_upper, b_upper), replaced by 0 and 1 where not finite."""
     found: list[np.ndarray] = []
     for slope, offset, trivial in ((linear[0], linear[1], 0.0), (linear[2], linear[3], 1.0)):
         good = np.isfinite(slope).all(axis=-1) & np.isfinite(offset)
@@ -976,18 +976,18 @@ def _linear_bytes(bounds: Bounds) -> int:
 
 
 def _narrow_axes(box: ParameterBox, root: ParameterBox) -> np.ndarray:
-    """[d] whether an axis cannot be halved sensibly."""
+    """Return [d] whether an axis is too narrow to be halved."""
     width, whole = np.array(box.upper) - np.array(box.lower), np.array(root.upper) - np.array(root.lower)
     return width <= _NARROWEST * whole
 
 
 def _narrow(box: ParameterBox, root: ParameterBox) -> bool:
-    """Whether no axis can be halved sensibly; true of a single pose."""
+    """Return whether every axis is too narrow to be halved; true of a single pose."""
     return bool(_narrow_axes(box, root).all())
 
 
 def _pixels_inside(frame: Frame) -> np.ndarray:
-    """[T, side, side] whether a tile's pixel belongs to the image."""
+    """Return [T, side, side] whether a tile's pixel lies inside the image."""
     rows = np.arange(frame.down * frame.side) < frame.camera.height
     columns = np.arange(frame.across * frame.side) < frame.camera.width
     grid = (rows[:, None] & columns[None, :]).reshape(frame.down, frame.side, frame.across, frame.side)
