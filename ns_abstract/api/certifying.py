@@ -532,7 +532,7 @@ class CertificateRun:
 
 
 def _image_at(file: Path, pose: np.ndarray) -> np.ndarray | None:
-    """The image of a stored counterexample, if it is that of ``pose``; None also where others have changed the file."""
+    """Return a stored counterexample's image if it is that of ``pose``; None also if the file was changed."""
     try:
         with np.load(file, allow_pickle=False) as stored:
             image = stored["image"] if np.array_equal(stored["values"], pose) else None
@@ -542,7 +542,7 @@ def _image_at(file: Path, pose: np.ndarray) -> np.ndarray | None:
 
 
 def _volume(whole: ParameterBox, part: ParameterBox) -> float:
-    """The part of a set that a cell is."""
+    """Return the share of a set's volume that a cell takes."""
     sides = zip(part.lower, part.upper, whole.lower, whole.upper, strict=True)
     return float(np.prod([(high - low) / (most - least) for low, high, least, most in sides]))
 
@@ -584,12 +584,12 @@ def substitution_entry(
 
 
 def _depth(row: Mapping[str, Any]) -> float:
-    """The margin of a counterexample; what is no number is worse than all."""
+    """Return the margin of a counterexample; NaN sorts before all numbers."""
     return -np.inf if row["margin"] is None else row["margin"]
 
 
 def _worst(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Falsified cells, worst first; neighbours may share their counterexample, which counts once."""
+    """Return the falsified cells, worst first, one for each counterexample."""
     found = sorted((row for row in rows if row["verdict"] == "falsified"), key=_depth)
     return list({tuple(row["counterexample"]): row for row in reversed(found)}.values())[::-1]
 
@@ -616,7 +616,7 @@ class CertifiedCell:
 
 @dataclass(frozen=True)
 class Certificate:
-    """What a network does on every picture of a set of poses.
+    """A certificate: what was proved and falsified of a network over a set of poses.
 
     Attributes:
         certified, falsified, unknown: Fractions of the parameter volume, mean over the sets; they add up to 1.

@@ -572,7 +572,7 @@ class ReachRun:
 
 
 def verdict(entries: Mapping[str, Mapping[str, Any]]) -> str:
-    """Of the whole initial box: falsified, reaches, safe or unknown."""
+    """Return the verdict over the whole initial box: falsified, reaches, safe or unknown."""
     if any(entry["cells"]["falsified"] for entry in entries.values()):
         return "falsified"
     done = [name for name, entry in entries.items() if entry["unknown"] == 0.0 and entry["cells"]["certified"]]
@@ -613,7 +613,7 @@ def shown_tube(job: LoopJob, lower: list[float], upper: list[float], runs: int) 
 
 
 def widths(tube: Tube) -> list[float]:
-    """By step, the mean over the states of a tube's width; as far as the tube goes."""
+    """Return the mean width over the states of a tube, step by step, as far as the tube goes."""
     return [float(np.mean(np.subtract(*entry.hull()[::-1]))) for entry in tube.sets]
 
 
@@ -639,7 +639,7 @@ class ReachCell:
 
 @dataclass(frozen=True)
 class ReachResult:
-    """What holds of the runs of a loop.
+    """The result of a loop: what was proved and falsified of its runs.
 
     Attributes:
         safe, reaches: Fractions of the initial box's volume that are certified to be so; None where it was not asked.

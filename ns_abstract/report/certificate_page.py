@@ -61,7 +61,7 @@ _RING = 1.0
 
 @dataclass(frozen=True)
 class Closer:
-    """What was looked at more closely when a search ended.
+    """Details that were computed when a search ended: regions of failure, poses with pictures.
 
     Attributes:
         regions: Where the property fails.
@@ -140,7 +140,7 @@ def _cell_data(
     numbers: Mapping[tuple[int, int], int],
     seen: Mapping[tuple[int, int], Mapping[str, Any]],
 ) -> str:
-    """What the script needs to tell about a cell, as JSON that ends no tag."""
+    """Return the data of cells that the page's script shows, as JSON that cannot end a tag."""
     pictures: list[tuple[str, str]] = []
     rows = []
     for frame, position in numbers:
@@ -549,7 +549,7 @@ def _time(document: Mapping[str, Any]) -> str:
 
 
 def _substitution(document: Mapping[str, Any]) -> str:
-    """What the correlation of the pixels is worth: margins and certified half-widths by way of bounding."""
+    """Return the section on substitution: margins and certified half-widths by mode of bounding."""
     entry = document["substitution"]
     title = "<h2>What the shared parameters are worth</h2>"
     if entry["skipped"]:

@@ -53,7 +53,7 @@ class Sharing:
         apart: Tensor | None,
         layer: Activation | None,
     ) -> tuple[Form, Tensor, Tensor | None]:
-        """What is known of node ``index``, what of it is open, and how far its lines are apart (see `Selection`)."""
+        """Return bounds of node ``index``, its unstable neurons, and their relaxation gaps (see `Selection`)."""
         return form, open_, apart
 
     def trace(self, count: int) -> Trace | None:
