@@ -1,4 +1,4 @@
-"""From a scene, sets of poses, a network and a property to examined cells."""
+"""A certification: scene, sets of poses, network and property, and the examination of cells."""
 
 from __future__ import annotations
 
@@ -75,7 +75,7 @@ MEMORY = 1 << 30
 
 @dataclass(frozen=True)
 class PropertySource:
-    """What is to hold, and where that is written.
+    """A property and the file that states it.
 
     Attributes:
         value: Content of PROP.json.
@@ -184,7 +184,7 @@ class FramePictures:
 
 
 class Question:
-    """A network and what is to hold of it.
+    """A network and the property to prove of it.
 
     Args:
         model: Network, .onnx.

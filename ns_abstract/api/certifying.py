@@ -209,7 +209,7 @@ class CertifiedCell:
 
 @dataclass(frozen=True)
 class Certificate:
-    """What a network does on every picture of a set of poses.
+    """A certificate: what was proved and falsified of a network over a set of poses.
 
     Attributes:
         certified, falsified, unknown: Fractions of the parameter volume, mean over the sets; they add up to 1.

@@ -1,4 +1,4 @@
-"""From the files that a command line names to a job."""
+"""Open the files that a command line names as a job."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from ns_abstract.perturbation.specification import Perturbation, load_perturbati
 
 @dataclass(frozen=True)
 class Settings:
-    """What to bound, as the command line says it.
+    """The options of a command line that say what to bound.
 
     Attributes:
         load_config: config.yml of a run, or a standard 3DGS .ply.

@@ -1,4 +1,4 @@
-"""How far the scene may vary before a certificate or a loop is lost (docs/design.md, V13)."""
+"""Scene margins of certificates and loops (docs/design.md, V13)."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ NOT_ASKED = "not asked for (--scene-margin)"
 
 
 class Margins:
-    """Margins of what a search has certified, kind by kind.
+    """Finds the scene margins of a search's certified cells, kind by kind.
 
     Args:
         cells: What is certified.

@@ -132,7 +132,7 @@ class ReachCell:
 
 @dataclass(frozen=True)
 class ReachResult:
-    """What holds of the runs of a loop.
+    """The result of a loop: what was proved and falsified of its runs.
 
     Attributes:
         safe, reaches: Fractions of the initial box's volume that are certified to be so; None where it was not asked.

@@ -1,4 +1,4 @@
-"""The search for verdicts on cells, whatever is asked about them."""
+"""The search over open cells, for every kind of question."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ Examine = Callable[[int, Grid, tuple[Cell, ...]], Findings]
 def paced(
     store: Store, told: Callable[[], object], report: Callable[[], object] = lambda: None
 ) -> Callable[[float], None]:
-    """What a search does between results, by the clock: a point of the trace and ``told``, rarely ``report``."""
+    """Return what a search does between results: now and then a point of the trace and ``told``, rarely ``report``."""
     traced = reported = time.perf_counter()
 
     def between(instant: float) -> None:

@@ -1,4 +1,4 @@
-"""How work ends before it is finished: by a request that long loops look at, or with the process that asked for it."""
+"""Cancellation: long work checks whether it was cancelled, and worker processes end with their parent."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from multiprocessing.connection import wait
 
 
 class AbandonedError(Exception):
-    """Work was given up at a `checkpoint`."""
+    """Raised by `checkpoint` when the work was cancelled."""
 
 
 def _never() -> bool:
@@ -73,7 +73,7 @@ class Deadline:
 
 @contextmanager
 def abandoning(over: Callable[[], bool]) -> Iterator[None]:
-    """Inside the block, work that asks `checkpoint` is given up once ``over`` says so."""
+    """Cancel work inside the block, at its next `checkpoint`, once ``over`` returns True."""
     token = _over.set(over)
     try:
         yield
@@ -82,12 +82,12 @@ def abandoning(over: Callable[[], bool]) -> Iterator[None]:
 
 
 def is_over() -> bool:
-    """Whether the work in hand is to be given up."""
+    """Return whether the current work is cancelled."""
     return _over.get()()
 
 
 def checkpoint() -> None:
-    """Called about once a second by work that can be given up.
+    """Raise `AbandonedError` if the current work is cancelled; long loops call it about once a second.
 
     Raises:
         AbandonedError: It is given up.

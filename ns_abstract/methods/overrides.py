@@ -1,4 +1,4 @@
-"""What the user says of a scene in place of its files, and where each choice came from."""
+"""Options that override what a scene's files say, and the origin of each choice."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ class Overrides:
 
 
 def chosen(name: str, given: object, flag: str, stored: object, origin: str) -> Assumption:
-    """The record of a choice: what is given wins, and the record then names what it replaces.
+    """Return the record of a choice: an option wins, and the record names what it replaces.
 
     Args:
         name: Of the choice.

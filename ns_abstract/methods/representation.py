@@ -1,4 +1,4 @@
-"""What opens a scene: one `Representation` by folder of `ns_abstract.methods`."""
+"""The entry point of a scene representation: one `Representation` per folder of `ns_abstract.methods`."""
 
 from __future__ import annotations
 

@@ -75,7 +75,7 @@ _LIMITS = {
 
 
 def guarantee_text(guarantee: str, renderer: str = "gsplat", bounded: str | None = None) -> str:
-    """What a guarantee says, as the end of a sentence about an abstract image.
+    """Return the text of a guarantee, as the end of a sentence about an abstract image.
 
     Args:
         guarantee: "float32-sound", "real-sound" or "sampled".
@@ -147,7 +147,7 @@ def frame_digests(document: Any) -> dict[str, str]:
 
 
 def explanations(document: Any) -> dict[int, tuple[str, ...]]:
-    """What a report.json, which others may have written, tells of why frames are loose."""
+    """Return the explanations of frames in a report.json, which others may have written."""
     frames = document.get("frames") if isinstance(document, dict) else None
     found = {}
     for entry in frames if isinstance(frames, list) else ():
@@ -177,7 +177,7 @@ def failed_self_check(problem: str) -> str:
 
 @dataclass(frozen=True)
 class Run:
-    """What a command is about to compute; all mappings must have a JSON form (see `plain`).
+    """The record of a command's run; all mappings must have a JSON form (see `plain`).
 
     Attributes:
         guarantee: "float32-sound", "real-sound" or "sampled".
@@ -227,7 +227,7 @@ def differences(old: Mapping[str, Any], new: Mapping[str, Any]) -> list[str]:
 
 
 def merged(older: FrameResult, newer: FrameResult) -> FrameResult:
-    """One frame from two computations of the same set: both enclose it, so their intersection does.
+    """Return the intersection of two results for one frame; both enclose the set, so it does.
 
     Times and cells add up; the trace of ``newer`` follows that of ``older`` and never gets worse.
 

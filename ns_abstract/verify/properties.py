@@ -1,4 +1,4 @@
-"""What a network is to do on every image of a set: the property file, its concrete check, and its proof.
+"""Properties of a network on every image of a set: their file, their concrete check, and their proof.
 
 A property is a margin, a function of the network's outputs and the pose: it holds where the margin is
 above 0 (docs/design.md, V2-V5). ``Property`` is what the file says; ``bind`` makes it a ``Claim`` about
@@ -43,7 +43,7 @@ _COMPONENTS = ("camera.x", "camera.y", "camera.z", "object.x", "object.y", "obje
 
 @dataclass(frozen=True)
 class Query:
-    """Linear functions ``rows @ y + offset`` of the outputs whose lower bounds a proof needs.
+    """The linear functions ``rows @ y + offset`` of the outputs whose lower bounds a proof needs.
 
     Attributes:
         rows: [k, output_size].
@@ -57,7 +57,7 @@ class Query:
 
 
 class Claim(ABC):
-    """A property of one frame's set of poses."""
+    """A property that is bound to one frame's set of poses."""
 
     @abstractmethod
     def margin(self, outputs: torch.Tensor, values: torch.Tensor) -> torch.Tensor:
@@ -73,7 +73,7 @@ class Claim(ABC):
 
 
 class Property(ABC):
-    """What a property file says."""
+    """A property as its file states it."""
 
     preprocess: Preprocess
     partitions: tuple[int, ...] | None
@@ -218,7 +218,7 @@ class Truth:
 
 @dataclass(frozen=True, eq=False)
 class RegressionClaim(Claim):
-    """Outputs are close to the truth (V3)."""
+    """The claim that outputs are close to the true values (V3)."""
 
     truth: Truth
     absolute: tuple[float, ...] | None
@@ -326,7 +326,7 @@ def decode(outputs: torch.Tensor, stride: float) -> tuple[torch.Tensor, torch.Te
 
 @dataclass(frozen=True)
 class DetectionClaim(Claim):
-    """Some box has score and overlap above their thresholds (V4).
+    """The claim that some detected box has score and overlap above their thresholds (V4).
 
     Attributes:
         label: Class, or None: objectness alone.
@@ -512,7 +512,7 @@ def _fail(name: str, found: Any, fix: str) -> InputError:
 
 
 def loading(root: Any) -> dict[str, Any]:
-    """Keywords of `load_network` that a parsed PROP.json says: the output, and the size of the pictures.
+    """Return the keywords of `load_network` in a parsed PROP.json: the output, and the size of the pictures.
 
     Raises:
         InputError: A field cannot be used.
@@ -526,7 +526,7 @@ def loading(root: Any) -> dict[str, Any]:
 
 
 def parse_property(root: Any, folder: Path, input_shape: tuple[int, ...], output_shape: tuple[int, ...]) -> Property:
-    """The property that a parsed PROP.json describes; files that it names lie in ``folder``.
+    """Return the property that a parsed PROP.json describes; files that it names lie in ``folder``.
 
     Raises:
         InputError: A field cannot be used.

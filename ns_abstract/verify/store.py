@@ -1,4 +1,4 @@
-"""``cells.sqlite``: what a search has found, as it comes (design.md, V8).
+"""The store ``cells.sqlite`` of a search's finished cells (design.md, V8).
 
 A block's findings are one transaction, which also takes the block off the list of open ones and puts its
 children there. So a kill at any moment loses at most the blocks that were being examined, and what arrives

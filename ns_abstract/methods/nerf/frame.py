@@ -66,7 +66,7 @@ _PATIENCE, _GRACE = 0.2, 3.0
 
 @dataclass(frozen=True)
 class RayContext:
-    """What a cell has shown of some rays, for the same rays of the cells inside it.
+    """Opacities of rays over a cell, reused for the same rays in the cells inside it.
 
     Attributes:
         tiles: [t] numbers of the rays, ascending.

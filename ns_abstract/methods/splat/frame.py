@@ -60,7 +60,7 @@ _TUNING = FrameTuning()
 
 @dataclass(frozen=True)
 class Context:
-    """What a cell may show on the pixels that were wanted, for these pixels of the cells inside it.
+    """The Gaussians that a cell may show on the requested pixels, reused for the cells inside it.
 
     Attributes:
         visible: [n] scene indices.
