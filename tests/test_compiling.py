@@ -145,7 +145,7 @@ def test_what_is_compiled_is_told_where_there_is_no_terminal(
     """A line with two counts and the seconds left, at once and every few seconds."""
     job = open_job(Settings(blobs.config, blobs.path, blobs.spec))
     popen, told = subprocess.Popen, logging.getLogger("ns_abstract.kernels")
-    wanted = "compiling kernels (first use only): 14 of 273, about "
+    wanted = "compiling kernels (first use only): 14 of 386 functions, about "
 
     def seen(record: logging.LogRecord) -> bool:
         # both processes work until it was said
@@ -171,10 +171,11 @@ def test_what_is_compiled_is_told_where_there_is_no_terminal(
         told.setLevel(level)
     said = capsys.readouterr().err.splitlines()
     assert all(
-        re.fullmatch(r"compiling kernels \(first use only\): \d+ of 273, about \d+ s left", line) for line in said
+        re.fullmatch(r"compiling kernels \(first use only\): \d+ of 386 functions, about \d+ s left", line)
+        for line in said
     )
     # before anything is done, too
-    assert said[0].startswith("compiling kernels (first use only): 0 of 273, about ")
+    assert said[0].startswith("compiling kernels (first use only): 0 of 386 functions, about ")
     assert any(line.startswith(wanted) for line in said)
 
 
