@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from conftest import Inputs
+from conftest import Inputs, command_options
 from nerfs import UNIFORM, images, poses, tiny_scene
 
 from ns_abstract.api import bounding
@@ -263,7 +263,7 @@ class Machines:
 
 
 def options(blobs: Inputs, folder: Path, **more: Any) -> Render:
-    return Render(blobs.config, blobs.path, folder, perturbation_filename=blobs.spec, **more)
+    return command_options(Render, blobs.config, blobs.path, folder, perturbation_filename=blobs.spec, **more)
 
 
 def test_frames_are_divided_where_threads_are_many(blobs: Inputs, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -22,7 +22,6 @@ from ns_abstract.api.bounding import bound_frames
 from ns_abstract.api.cell_search import examine_block
 from ns_abstract.api.files import Settings, open_job
 from ns_abstract.arithmetic import selfcheck
-from ns_abstract.cli import rendering
 from ns_abstract.cli.render import Render, render
 from ns_abstract.execution.engines import Here
 from ns_abstract.execution.opening import forget
@@ -80,7 +79,7 @@ def test_a_report_with_a_faulty_worker_is_sampled(
         return json.loads((tmp_path / "report.json").read_text())
 
     with monkeypatch.context() as patch:
-        patch.setattr(rendering, "started", lambda *_: nullcontext(FaultyWorker()))
+        patch.setattr("ns_abstract.execution.engines.started", lambda *_: nullcontext(FaultyWorker()))
         report = command()
     assert report["guarantee"] == "sampled"
     assert any("self-check" in limit and "exp(" in limit for limit in report["limits"])
