@@ -230,6 +230,7 @@ def run(request: pytest.FixtureRequest, tmp_path: Path) -> tuple[Path, Path]:
     return config, RUNS / request.param / "camera_path.json"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("run", ["playbot_lod3", "plant"], indirect=True)
 def test_runs(run: tuple[Path, Path]) -> None:
     """A trained scene: one pose, and a set that moves the camera by 0.02."""
@@ -253,6 +254,7 @@ def test_runs(run: tuple[Path, Path]) -> None:
     assert gaps["float32", "x"] < 1.02 * gaps["real", "x"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("run", ["playbot_lod3"], indirect=True)
 def test_attack(run: tuple[Path, Path]) -> None:
     """Refined float32 bounds against both renderers."""

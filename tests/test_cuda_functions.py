@@ -92,6 +92,7 @@ def test_planted_charges_are_exceeded(program: ModuleType, binary: Path, tmp_pat
     assert sum(row["verdict"] == "EXCEEDED" for row in rows) > 25
 
 
+@pytest.mark.slow
 @compiled
 def test_one_wrong_result_is_found(program: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """One input in some hundred thousand: no number in one build, off by eight ulps in the other."""

@@ -70,6 +70,7 @@ def cells(box: ParameterBox) -> list[ParameterBox]:
     return found if box.dimensions else found[:1]
 
 
+@pytest.mark.slow_cases
 @pytest.mark.parametrize("name", SETS)
 def test_renders_lie_between_the_planes(name: str) -> None:
     frame = NerfFrame(tiny_scene(3), UNIFORM, poses(SETS[name]))
@@ -186,6 +187,7 @@ def a_quarter_strip_on(self: Any, axis: int, count: int, first: int, past: int, 
 original_ends = strips_module.Strips._part_ends
 
 
+@pytest.mark.slow_cases
 @pytest.mark.parametrize(
     ("target", "name", "fault"),
     [
@@ -254,6 +256,7 @@ def claim_above(level: float, folder: Path) -> Path:
     return file
 
 
+@pytest.mark.slow
 def test_an_orbit_is_certified_and_attacked(run: Path, net: Path, tmp_path: Path) -> None:
     scene, poses = opened(run), small_set()
     truth = differences(scene, poses, np.linspace(0.3, 0.33, 200))
@@ -265,6 +268,7 @@ def test_an_orbit_is_certified_and_attacked(run: Path, net: Path, tmp_path: Path
         assert cell.margin is not None and (differences(scene, poses, angles) - level > cell.margin - 1e-4).all()
 
 
+@pytest.mark.slow
 def test_where_it_fails_is_falsified(run: Path, net: Path, tmp_path: Path) -> None:
     scene, poses = opened(run), small_set()
     angles = np.linspace(0.3, 0.33, 400)
@@ -283,6 +287,7 @@ def test_where_it_fails_is_falsified(run: Path, net: Path, tmp_path: Path) -> No
     assert list((tmp_path / "out").glob("*/frame_00000_*.npz")), "no counterexample was kept"
 
 
+@pytest.mark.slow
 def test_colours_and_several_parameters_are_certified(run: Path, net: Path, tmp_path: Path) -> None:
     scene = opened(run)
     camera = nsa.Camera(EYE, width=SIDE, height=SIDE)

@@ -34,6 +34,7 @@ def by_bins(scene: NerfScene, pose_set: PoseSet) -> RayBounds:
     return bounds._apart(asked, None, False, bounds_module._DISPLACEMENT)
 
 
+@pytest.mark.slow_cases
 @pytest.mark.parametrize("name", SETS)
 def test_every_choice_of_samples_is_enclosed(name: str) -> None:
     for seed, changes in ((3, {}), (1, {"density": 1e3})):
@@ -131,6 +132,7 @@ def only_middles(self, values, end, axis=-1):
     return np.repeat(values.reshape(shape).take(inner // 2, axis=axis + 1), inner, axis=axis)
 
 
+@pytest.mark.slow
 def test_planted_faults_are_found(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(bounds_module._Work, "_anywhere", only_middles)
     scene, pose_set = tiny_scene(3, density=30.0), poses(SETS["yaw"])

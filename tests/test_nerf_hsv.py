@@ -110,6 +110,7 @@ def attacked(spec: dict, cells: int) -> tuple[int, int, float]:
     return found.comparisons, found.violations, last.mpg / last.mpg_witness
 
 
+@pytest.mark.slow_cases
 @pytest.mark.parametrize("name", SETS)
 def test_sets_of_colours_are_enclosed(name: str) -> None:
     compared, violations, ratio = attacked(SETS[name], 40)
@@ -117,6 +118,7 @@ def test_sets_of_colours_are_enclosed(name: str) -> None:
     assert ratio < 2.5
 
 
+@pytest.mark.slow
 def test_forgotten_shifts_are_found(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(frame_module.NerfFrame, "_shifts", lambda self, box: [])
     assert attacked(SETS["hue"], 8)[1] > 0

@@ -36,6 +36,7 @@ def test_importing_torch_changes_no_import(tmp_path: Path) -> None:
     assert done.returncode == 0, done.stderr
 
 
+@pytest.mark.slow
 @needs_nerfstudio
 def test_torchvision_imports_once_the_operators_are_declared(tmp_path: Path) -> None:
     code = (
@@ -46,6 +47,7 @@ def test_torchvision_imports_once_the_operators_are_declared(tmp_path: Path) -> 
     assert done.returncode == 0, done.stderr
 
 
+@pytest.mark.slow_cases
 @pytest.mark.parametrize("name", [(), ("ns-trian",), ("python",), ("--help",)])
 def test_wrapper_refuses_what_is_no_command_in_one_line(tmp_path: Path, name: tuple[str, ...]) -> None:
     done = run("-m", "ns_abstract.nerfstudio", *name, folder=tmp_path)
