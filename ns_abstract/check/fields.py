@@ -62,7 +62,8 @@ class Field:
         parts = []
         for k in range(0, len(ray[0]), TOGETHER):
             some = [[e.of(lambda a, k=k: a[..., k : k + TOGETHER, :]) for e in es] for es in (places, along)]
-            parts.append(self._ray(some[0], some[1], lengths))
+            with np.errstate(all="ignore"):
+                parts.append(self._ray(some[0], some[1], lengths))
         return Form(*(np.concatenate([getattr(p, name) for p in parts], axis=-2) for name in ("c", "g", "r")))
 
     def _ray(self, places: list[Form], along: list[Form], lengths: Array) -> Form:
