@@ -44,7 +44,7 @@ def candidates() -> list[Fault]:
 
 
 def inputs(folder: Path, tiny: bool) -> dict[str, Path]:
-    """Writes the runs, the camera path and the sets; the path of each by its name. ``tiny``: for interpreted kernels."""
+    """Writes the runs, the path and the sets; the path of each by its name. ``tiny``: for interpreted kernels."""
     sys.path.insert(0, str(ROOT / "tests"))
     from dataclasses import replace
 
