@@ -92,7 +92,8 @@ def warm(package: Path, file: str, kept: Path, cache: Path) -> None:
         return
     environment = {k: v for k, v in os.environ.items() if k != "NS_ABSTRACT_DEV_KEY"} | {"PYTHONPATH": str(package)}
     program = "from ns_abstract.arithmetic.kernel_cache import source_key; print(source_key())"
-    done = subprocess.run([sys.executable, "-c", program], env=environment, capture_output=True, text=True, check=True)
+    command = [sys.executable, "-c", program]
+    done = subprocess.run(command, env=environment, cwd=package, capture_output=True, text=True, check=True)
     (old,) = (path.parent for path in kept.glob("*/manifest.json"))
     new = cache / done.stdout.split()[-1]
     shutil.copytree(old, new, ignore=shutil.ignore_patterns("session-*"))
@@ -113,10 +114,13 @@ def render(package: Path, files: dict[str, Path], out: Path, cache: str, tiny: b
         command = [
             sys.executable, "-W", "ignore", "-m", "ns_abstract.cli.render", "--load-config", str(files[name]),
             "--camera-path-filename", str(files["path"]), "--perturbation-filename", str(files[f"{name} set"]),
-            "--output-dir", str(out / name), "--save-cells", "--time-budget", "60", "--target-ratio", "1.2",
+            "--output-dir", str((out / name).absolute()), "--save-cells", "--time-budget", "60", "--target-ratio", "1.2",
         ]  # fmt: skip
         with (out / f"{name}.log").open("w") as log:
-            done = subprocess.run(command, env=environment, stdout=log, stderr=log, timeout=1500, check=False)
+            # Python looks into the folder it is started in first
+            done = subprocess.run(
+                command, env=environment, cwd=package, stdout=log, stderr=log, timeout=1500, check=False
+            )
         if done.returncode != 0:
             return False
     return True
