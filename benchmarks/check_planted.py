@@ -11,9 +11,11 @@ keeps results in WORK, goes on from what lies there, and prints one line a fault
 from __future__ import annotations
 
 import argparse
+import ast
 import json
 import os
 import random
+import shutil
 import subprocess
 import sys
 import tempfile
@@ -62,6 +64,40 @@ def inputs(folder: Path) -> dict[str, Path]:
         found[f"{name} set"] = write_json(where / "spec.json", _SPECS[name])
     found["path"] = write_json(folder / "path.json", path_json(ring(1, 24)))
     return found
+
+
+def dependents(package: Path, file: str) -> set[str]:
+    """The modules of the copy that import ``file``, directly or not, and itself; without ".py", relative to it."""
+    imports: dict[str, set[str]] = {}
+    root = package / "ns_abstract"
+    names = {path.relative_to(root).with_suffix("").as_posix() for path in root.rglob("*.py")}
+    for name in names:
+        tree = ast.parse((root / f"{name}.py").read_text())
+        nodes = [n for n in ast.walk(tree) if isinstance(n, (ast.Import, ast.ImportFrom))]
+        found = {f"{n.module}.{a.name}" for n in nodes if isinstance(n, ast.ImportFrom) for a in n.names}
+        found |= {n.module or "" for n in nodes if isinstance(n, ast.ImportFrom)}
+        found |= {a.name for n in nodes if isinstance(n, ast.Import) for a in n.names}
+        imports[name] = {f.removeprefix("ns_abstract.").replace(".", "/") for f in found}
+    closed = {file.removesuffix(".py")}
+    while more := {name for name, used in imports.items() if name not in closed and used & closed}:
+        closed |= more
+    return closed
+
+
+def warm(package: Path, file: str, kept: Path, cache: Path) -> None:
+    """Fills the copy's cache with the healthy kernels that nothing in ``file`` can have gone into."""
+    if not kept.exists():
+        return
+    environment = {k: v for k, v in os.environ.items() if k != "NS_ABSTRACT_DEV_KEY"} | {"PYTHONPATH": str(package)}
+    program = "from ns_abstract.arithmetic.kernel_cache import source_key; print(source_key())"
+    done = subprocess.run([sys.executable, "-c", program], env=environment, capture_output=True, text=True, check=True)
+    (old,) = (path.parent for path in kept.glob("*/manifest.json"))
+    new = cache / done.stdout.split()[-1]
+    shutil.copytree(old, new, ignore=shutil.ignore_patterns("session-*"))
+    manifest, gone = json.loads((new / "manifest.json").read_text()), dependents(package, file)
+    left = {kernel: entry for kernel, entry in manifest.items() if str(Path(kernel).parent) not in gone}
+    print(f"  {len(manifest) - len(left)} of {len(manifest)} kernels are compiled again", flush=True)
+    (new / "manifest.json").write_text(json.dumps(left))
 
 
 def render(package: Path, files: dict[str, Path], out: Path, cache: str) -> bool:
@@ -129,12 +165,18 @@ def main() -> None:
         if not all((out / s / "report.json").exists() for s in _SPECS):
             if options.audit_only or (out / "failed").exists():
                 continue
-            with tempfile.TemporaryDirectory() as temporary:
+            with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as temporary:
                 package = Path(temporary) / "package"
                 copy_package(package)
                 if fault is not None:
                     mutate(package, fault)
-                if not render(package, files, out, str(Path(temporary) / "cache")):
+                cache, kept = Path(temporary) / "cache", options.work / "kernels"
+                if fault is not None:
+                    warm(package, fault.file, kept, cache)
+                ended = render(package, files, out, str(cache))
+                if fault is None:
+                    shutil.copytree(cache, kept)
+                if not ended:
                     (out / "failed").touch()
                     print(f"{number:2d} {name}: the command failed", flush=True)
                     continue

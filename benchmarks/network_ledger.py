@@ -238,14 +238,26 @@ EXACT: dict[str, Callable[[dict[str, Any], Vector], Vector]] = {
 }  # fmt: skip
 
 
-def exact(genome: attack.Genome, image: Array) -> Vector:
-    """[n] the network's outputs with `BITS` bits."""
-    x = [mpmath.mpf(float(v)) for v in image]
+def exact(genome: attack.Genome, images: Array) -> list[Vector]:
+    """[m][n] the network's outputs with `BITS` bits."""
+    steps = []
     for gene in genome.genes:
-        values = {k: np.vectorize(lambda z: mpmath.mpf(float(z)), otypes=[object])(v) for k, v in gene.values.items()}
-        values = {k: v.item() if v.ndim == 0 else v.tolist() for k, v in values.items()}
-        x = EXACT[gene.kind](values, x)
-    return x
+        values = {name: _exactly(value) for name, value in gene.values.items()}
+        steps.append((EXACT[gene.kind], values))
+    found = []
+    for image in images:
+        x = _exactly(image)
+        for step, values in steps:
+            x = step(values, x)
+        found.append(x)
+    return found
+
+
+def _exactly(value: Array) -> Any:
+    """Numbers, or lists of them, with all their digits."""
+    if value.ndim:
+        return [_exactly(part) for part in value]
+    return mpmath.mpf(float(value))
 
 
 # ---------------------------------------------------------------- inputs and programs
@@ -259,13 +271,13 @@ class Case:
     images: Array
 
 
-def case(kinds: tuple[str, ...], flavour: str, seed: int, count: int) -> Case:
+def case(kinds: tuple[str, ...], flavour: str, seed: int, count: int, sizes: tuple[int, ...] = (8, 16, 24)) -> Case:
     """A network of layers of these kinds, with constants and images of a flavour."""
     rng = np.random.default_rng([seed, FLAVOURS.index(flavour), *map(ord, "".join(kinds))])
-    n = 5 if "attention" in kinds else int(rng.choice([8, 16, 24]))
-    sizes = {"plain": 0, "subnormal": int(rng.choice([-140, -127, -100])), "huge": int(rng.choice([24, 40, 60]))}
+    n = 5 if "attention" in kinds else int(rng.choice(sizes))
+    grown = {"plain": 0, "subnormal": int(rng.choice([-140, -127, -100])), "huge": int(rng.choice([24, 40, 60]))}
     # products of sizes that are ordinary in the end
-    powers = rng.permutation([sizes.get(flavour, 0), *[0] * len(kinds)]) if rng.random() < 0.5 else [0] * 9
+    powers = rng.permutation([grown.get(flavour, 0), *[0] * len(kinds)]) if rng.random() < 0.5 else [0] * 9
     genes = []
     for kind, power in zip(kinds, powers, strict=False):
         gene = attack.Gene(kind) if kind.endswith(" map") else attack.random_gene(rng, n, (kind,))
@@ -282,7 +294,7 @@ def case(kinds: tuple[str, ...], flavour: str, seed: int, count: int) -> Case:
         genes.append(attack.Gene(kind, values))
     images = np.ldexp(rng.normal(size=(count, n)), int(powers[-1]) if len(powers) <= len(kinds) + 1 else 0)
     if flavour in ("subnormal", "huge"):
-        images = np.ldexp(images, rng.choice([0, sizes[flavour] // 2, sizes[flavour]], (count, 1)))
+        images = np.ldexp(images, rng.choice([0, grown[flavour] // 2, grown[flavour]], (count, 1)))
     if flavour == "constant":
         images = rng.normal(size=(count, 1)) * 10.0 + np.ldexp(images, -rng.integers(2, 22, (count, 1)))
     if kinds[0] in ("root", "inverse root", "Log"):
@@ -389,7 +401,8 @@ def measure(given: Case, entry: Entry, folder: Path, everything: bool = False, c
     if not finite.any():
         return
     with mpmath.workprec(BITS):
-        centre = [exact(genome, image) if ok.any() else None for image, ok in zip(given.images, finite, strict=True)]
+        kept = finite.any(1)
+        centre = dict(zip(np.flatnonzero(kept).tolist(), exact(genome, given.images[kept]), strict=True))
         # how far the ends are from the exact value, and where the value lies
         places = [(i, j) for i, j in zip(*np.nonzero(finite), strict=True)]
         # the value as two numbers, from which differences are right to 2^-50
@@ -411,7 +424,12 @@ def measure(given: Case, entry: Entry, folder: Path, everything: bool = False, c
 
 
 def ratios(
-    count: int, images: int = 6, names: tuple[str, ...] = (), everything: bool = False, compiled: bool = False
+    count: int,
+    images: int = 6,
+    names: tuple[str, ...] = (),
+    everything: bool = False,
+    compiled: bool = False,
+    sizes: tuple[int, ...] = (8, 16, 24),
 ) -> dict[str, Entry]:
     """The entry of every row, or of ``names``, from ``count`` networks of each kind and flavour."""
     found = {}
@@ -419,7 +437,7 @@ def ratios(
         for name in names or MEASURED:
             entry = found[name] = Entry()
             for kinds, flavour, seed in itertools.product(MEASURED[name], FLAVOURS, range(count)):
-                measure(case(kinds, flavour, seed, images), entry, Path(folder), everything, compiled)
+                measure(case(kinds, flavour, seed, images, sizes), entry, Path(folder), everything, compiled)
     return found
 
 

@@ -15,7 +15,7 @@ from nerfs import tiny_scene, view
 
 import ns_abstract as nsa
 from ns_abstract.api.certification import CertifySettings, open_certification
-from ns_abstract.api.certifying import CertificateRun
+from ns_abstract.api.certifying import CertificateQuestion
 from ns_abstract.api.files import Settings, open_job
 from ns_abstract.api.reaching import open_loop
 from ns_abstract.cli import render as render_command
@@ -25,6 +25,7 @@ from ns_abstract.io.assumptions import Assumption
 from ns_abstract.io.atomic import write_json
 from ns_abstract.methods.nerf.write import write_nerf_run
 from ns_abstract.methods.overrides import Overrides
+from ns_abstract.methods.program_options import ProgramOptions
 from ns_abstract.methods.splat.ply import write_ply
 from ns_abstract.report.page import render_page
 from ns_abstract.report.record import Report, Run
@@ -47,7 +48,7 @@ def test_defaults_and_options_of_a_run(blobs: Inputs) -> None:
     assert found["varied"][1] == "spec.json" and {"rasterize_mode", "background", "load_step", "units"} <= set(found)
     assert found["rasterize_mode"] == ("classic", "config.yml: pipeline.model.rasterize_mode")
     given = Settings(
-        blobs.config, blobs.path, None, 2.0, "gsplat", "1.5.3", "real",
+        blobs.config, blobs.path, None, 2.0, "real", program=ProgramOptions("gsplat", "1.5.3"),
         given_set={"version": 1, "rotation": {"yaw": 0.1}},
         overrides=Overrides("antialiased", (0.0, 0.5, 1.0)),
     )  # fmt: skip
@@ -61,7 +62,7 @@ def test_defaults_and_options_of_a_run(blobs: Inputs) -> None:
 
 
 def test_paper_renderer_draws_on_black(blobs: Inputs) -> None:
-    found = table(open_job(Settings(blobs.config, blobs.path, blobs.spec, renderer="paper")).assumptions)
+    found = table(open_job(Settings(blobs.config, blobs.path, blobs.spec, program=ProgramOptions("paper"))).assumptions)
     assert found["renderer"] == ("paper", "--renderer") and found["background"][0] == "0 0 0"
     assert found["background"][1].startswith("--renderer paper")
 
@@ -104,7 +105,7 @@ def test_certificate(blobs: Inputs, tmp_path: Path) -> None:
         "--network-arithmetic",
     )
     assert found["varied"] == ("nothing", "default: single poses")
-    assert CertificateRun(job, [0], tmp_path / "out", {}, ()).about.assumptions == job.assumptions
+    assert CertificateQuestion(job, [0], {}, ()).about.assumptions == job.assumptions
 
 
 def test_loop(tmp_path: Path) -> None:
@@ -145,7 +146,7 @@ def test_nerf(sampling: str | None, tmp_path: Path) -> None:
     pose[:3] = view().camera_to_world
     path = write_json(tmp_path / "path.json", path_json([View(pose, 40.0, 3, 4)]))
     spec = write_json(tmp_path / "spec.json", {"version": 1, "rotation": {"yaw": 0.002}})
-    found = table(open_job(Settings(config, path, spec, sampling=sampling)).assumptions)
+    found = table(open_job(Settings(config, path, spec, program=ProgramOptions(sampling=sampling))).assumptions)
     samples = ("num_samples", "default") if sampling is None else (
         "num_coarse_samples", "the run: pipeline.model.num_coarse_samples"
     )  # fmt: skip

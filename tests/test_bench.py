@@ -21,6 +21,7 @@ from ns_abstract.bench.sets import open_jobs, pose_set, splat_of
 from ns_abstract.cli.bench import Certificates, Plan, Rules, Scale, Tightness, bench
 from ns_abstract.cli.common import DONE
 from ns_abstract.io.errors import InputError
+from ns_abstract.methods.program_options import ProgramOptions
 from ns_abstract.methods.splat.activate import activate
 from ns_abstract.methods.splat.constants import PAPER
 from ns_abstract.methods.splat.frame import SplatFrame
@@ -28,7 +29,7 @@ from ns_abstract.paper import splat as paper
 
 
 def test_version_of_gsplat(blobs) -> None:
-    (job,) = open_jobs((blobs.config,), blobs.path, 1.0, gsplat_version="1.6.0")
+    (job,) = open_jobs((blobs.config,), blobs.path, 1.0, program=ProgramOptions(gsplat_version="1.6.0"))
     assert job.method.program["version"] == "1.6.0"
     assert open_jobs((blobs.config,), blobs.path, 1.0)[0].method.program["version"] == "1.4.0"
 

@@ -414,7 +414,7 @@ def test_a_frame_leaves_out_what_little_light_comes_to_as_far_as_that_is_allowed
     frame = SplatFrame(case.splats, rasteriser, FLOAT32, case.poses)
     part, tiles, gaps = case.poses.box.split(0, 8)[0], np.arange(frame.tile_count), []
     for excess in (0.0, 1e-6, 0.01, 1.0, 0.0):
-        frame.allow(excess)
+        frame.set_tolerance(excess)
         bounds = frame.bound(part, tiles)
         gaps.append(float((bounds.upper - bounds.lower).mean()))
     assert gaps[0] == gaps[1] == gaps[4]

@@ -29,12 +29,12 @@ from interrupting import check_ended_in_a_library_call, check_interrupted, held_
 from PIL import Image
 from waiting import LONG, until
 
-from ns_abstract.api import certifying, showing
+from ns_abstract.api import showing, substitution
+from ns_abstract.api.cell_search import examine_block
 from ns_abstract.api.certification import (
     Certification,
     CertifySettings,
     FramePictures,
-    examine_block,
     open_certification,
 )
 from ns_abstract.api.showing import look_closer
@@ -506,8 +506,8 @@ def test_interrupt_leaves_what_is_finished(planted: Case, finished: Path, tmp_pa
     [
         "ns_abstract.cli.certifying:open_certification",
         "ns_abstract.cli.certifying:compile_beside",
-        "ns_abstract.api.certifying:preview",
-        "ns_abstract.api.certifying:examine_here",
+        "ns_abstract.api.certificate_report:preview",
+        "ns_abstract.api.cell_search:examine_here",
     ],
 )
 def test_interrupted_before_the_first_block(
@@ -694,7 +694,7 @@ def test_report(planted: Case, finished: Path) -> None:
 @pytest.mark.slow
 def test_substitutions_are_compared(blobs: Inputs, net: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Half-widths that any way certifies hold under attack, and the way of the verdicts gives no smaller ones."""
-    monkeypatch.setattr(certifying, "_COMPARE_LEAST", 120.0)
+    monkeypatch.setattr(substitution, "_LEAST", 120.0)
     spec = {"version": 1, "translation": {"x": 0.02}}
     case = Case(tmp_path / "case", blobs, net, {"type": "classification", "label": 0, "preprocess": PRE}, spec)
     pictures = case.job.pictures(0)
@@ -730,8 +730,8 @@ def test_substitutions_are_not_compared(
     document = Case(tmp_path / "pose", blobs, bright[0], prop, None).run(tmp_path / "one")
     assert "more than one pose" in document["substitution"]["skipped"] and not document["substitution"]["cells"]
     assert "Not compared: no cell of more" in (tmp_path / "one" / "report.html").read_text()
-    monkeypatch.setattr(certifying, "_COMPARE_LEAST", 1e-9)
-    monkeypatch.setattr(certifying, "_COMPARE_SHARE", 1e-9)
+    monkeypatch.setattr(substitution, "_LEAST", 1e-9)
+    monkeypatch.setattr(substitution, "SUBSTITUTION_SHARE", 1e-9)
     document = Case(tmp_path / "set", blobs, bright[0], prop).run(tmp_path / "two")
     assert "bounding one cell in 3 ways takes about" in document["substitution"]["skipped"]
 
@@ -1011,7 +1011,7 @@ def test_scene_margin(blobs: Inputs, bright: tuple[Path, float, float], tmp_path
             pictures = FramePictures(job.job.method, job.job.pose_sets[0], "float", set_)
         else:
             ends: dict[str, Any] = {name: (-radius, radius)}
-            pictures = job.around(SceneVariation(Selection(), **ends)).pictures(0)
+            pictures = FramePictures(job.job.method, job.job.varied(0, SceneVariation(Selection(), **ends)))
         claim = job.claim(job.pictures(0))
 
         def loss(picture: torch.Tensor, values: torch.Tensor, claim: Any = claim) -> torch.Tensor:

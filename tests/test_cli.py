@@ -29,6 +29,7 @@ from ns_abstract.cli.common import complaint
 from ns_abstract.geometry.views import View, path_json
 from ns_abstract.io.atomic import write_json
 from ns_abstract.io.folder import MARK
+from ns_abstract.methods.program_options import ProgramOptions
 from ns_abstract.methods.splat.scene import SplatScene
 from ns_abstract.report.figures import listed
 from ns_abstract.report.files import StoredFrame, load_frame
@@ -83,6 +84,7 @@ def same_pictures(first: StoredFrame, second: StoredFrame) -> None:
 
 def check_samples(inputs: Inputs, folder: Path, index: int, **settings: Any) -> None:
     """Renders at random poses lie in a stored frame's bounds, without any tolerance."""
+    settings["program"] = ProgramOptions(settings.pop("renderer", None))
     job = open_job(Settings(inputs.config, inputs.path, inputs.spec, **settings))
     live, result = job.frame(index), frame(folder, index).result
     for values in live.box.sample(12, np.random.default_rng(5)):

@@ -36,8 +36,9 @@ from conftest import SHIFT, blob_scene, ring
 from corpus import Bench, Row, check, row, rows_by_name
 from nerfs import tiny_scene
 
+from ns_abstract.api.cell_search import CellSearch
 from ns_abstract.api.certification import CertifySettings, open_certification
-from ns_abstract.api.certifying import CertificateRun
+from ns_abstract.api.certifying import CertificateQuestion
 from ns_abstract.api.files import Settings, open_job
 from ns_abstract.geometry.views import path_json
 from ns_abstract.io.atomic import write_json
@@ -131,13 +132,13 @@ def write_search(files: dict[str, Path]) -> None:
     job = open_certification(settings)
     # kernels are compiled here, which no case is charged for
     job.job.warm_up(0)
-    run = CertificateRun(job, [0, 1], files["search"], {}, ("ns-abstract-certify",))
-    store = run.open(resume=False)
+    question = CertificateQuestion(job, [0, 1], {}, ("ns-abstract-certify",))
+    search = CellSearch(question, files["search"])
+    store = search.open(resume=False)
     for block in store.pending(set(), 3):
         leaves = tuple(Leaf(cell, "unknown", None, 0.1, reason="the finest cell") for cell in block.cells)
-        store.close_block(block, Findings(leaves, (), (), 0, 0.1), run.grids[block.frame])
-    run.shown = []
-    document, _ = run.document(store, "interrupted")
+        store.close_block(block, Findings(leaves, (), (), 0, 0.1), search.grids[block.frame])
+    document, _ = question.reports(search).document(store, "interrupted")
     write_certificate(files["search"], document, "<html></html>")
     store.close()
 

@@ -34,7 +34,7 @@ from ns_abstract.api.searching import search_blocks
 from ns_abstract.cli import certify as certify_command
 from ns_abstract.cli import render as render_command
 from ns_abstract.cli.common import Stop, run
-from ns_abstract.execution.ending import AbandonedError, abandoning, checkpoint
+from ns_abstract.execution.ending import AbandonedError, Deadline, abandoning, checkpoint
 from ns_abstract.execution.engines import Here, Machine, Processes
 from ns_abstract.execution.stopping import StopRequest
 from ns_abstract.geometry.views import path_json
@@ -643,7 +643,7 @@ def test_blocks_are_examined_while_workers_start(looks: int, tmp_path: Path) -> 
     kept: list[int] = []
     arguments: Any = (told(there), None)
     search_blocks(
-        store, Starting(looks), {0: search.grid}, told(here), arguments, deadline=time.perf_counter() + LONG,
+        store, Starting(looks), {0: search.grid}, told(here), arguments, deadline=Deadline(LONG),
         stop=StopRequest(), keep=lambda block, findings: kept.append(block.number), between=lambda instant: None,
     )  # fmt: skip
     timeless = [[{**row, "seconds": 0.0} for row in rows] for rows in (store.leaves(0), expected[1])]
@@ -661,7 +661,7 @@ def test_blocks_are_examined_while_workers_start(looks: int, tmp_path: Path) -> 
         stop.ask()
 
     search_blocks(
-        store, Starting(1000), {0: search.grid}, told(here), arguments, deadline=time.perf_counter() + LONG, stop=stop,
+        store, Starting(1000), {0: search.grid}, told(here), arguments, deadline=Deadline(LONG), stop=stop,
         keep=keep, between=lambda instant: None,
     )  # fmt: skip
     assert len(kept) == 1

@@ -15,9 +15,11 @@ from hypothesis import strategies as st
 
 from ns_abstract.geometry.box import ParameterBox
 from ns_abstract.geometry.tiles import assemble
-from ns_abstract.refine import engine
+from ns_abstract.refine import engine, initial
 from ns_abstract.refine.engine import Goal, Refinement
+from ns_abstract.refine.frame_tiles import pixels_inside
 from ns_abstract.refine.result import FrameResult, TracePoint, mean_pixel_gap
+from ns_abstract.refine.tuning import Tuning
 
 SIDE = 4
 FOREVER = 1e9
@@ -147,10 +149,10 @@ class Waves:
     def feasible(self, box: ParameterBox) -> ParameterBox | None:
         return box
 
-    def watch(self, tiles: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> None:
+    def observe(self, tiles: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> None:
         pass
 
-    def allow(self, excess: float) -> float:
+    def set_tolerance(self, excess: float) -> float:
         return 0.0
 
     def motion(self, box: ParameterBox) -> np.ndarray:
@@ -226,7 +228,7 @@ class Watched(Waves):
         self.allowed: list[float] = []
         self.before_splits: tuple[list[float], list[float]] | None = None
 
-    def allow(self, excess: float) -> float:
+    def set_tolerance(self, excess: float) -> float:
         self.allowed.append(excess)
         return 0.5 * excess
 
@@ -395,9 +397,9 @@ def test_no_time_still_gives_a_sound_cover() -> None:
 def test_a_cover_that_takes_too_long_becomes_one_cell(dimensions: int, monkeypatch: pytest.MonkeyPatch) -> None:
     frame, hours = Waves(dimensions, pace=30.0), itertools.count()
     # the first bounds cost nothing, later ones an hour each
-    monkeypatch.setattr(
-        engine, "time", SimpleNamespace(perf_counter=lambda: 0.0 if len(frame.calls) < 2 else 3600.0 * next(hours))
-    )
+    clock = SimpleNamespace(perf_counter=lambda: 0.0 if len(frame.calls) < 2 else 3600.0 * next(hours))
+    for module in (engine, initial):
+        monkeypatch.setattr(module, "time", clock)
     result = refine(frame, Goal(1.0, 100.0), keep_leaves=True)
     check(frame, result)
     assert result.bounded
@@ -440,10 +442,10 @@ def test_the_seed_chooses_corners_only_where_there_are_many() -> None:
     small, large = ParameterBox(("a",), ("",), (0.0,), (1.0,)), Waves(1)
     frame = Waves(6, width=4, height=4)
     assert frame.box.dimensions == 6
-    assert Refinement(large, 0, Goal(), seed=1)._corners().shape == (2, 1)
-    assert Refinement(frame, 0, Goal(), seed=1)._corners().shape == (64, 6)
+    assert Refinement(large, 0, Goal(), seed=1).inner.corners().shape == (2, 1)
+    assert Refinement(frame, 0, Goal(), seed=1).inner.corners().shape == (64, 6)
     frame.box = ParameterBox(tuple("abcdefg"), ("",) * 7, (0.0,) * 7, (1.0,) * 7)
-    chosen = [Refinement(frame, 0, Goal(), seed=k)._corners() for k in (1, 1, 2)]
+    chosen = [Refinement(frame, 0, Goal(), seed=k).inner.corners() for k in (1, 1, 2)]
     assert chosen[0].shape == (64, 7)
     assert np.array_equal(chosen[0], chosen[1]) and not np.array_equal(chosen[0], chosen[2])
     assert small.dimensions == 1
@@ -459,14 +461,14 @@ def test_memory_for_leaves_is_kept_to(dimensions: int) -> None:
     limit = 40 * tile
     refinement = Refinement(frame, 0, Goal(1.0, FOREVER, 400, limit))
     seen: list[int] = []
-    choose = refinement._choose
+    choose = refinement.leaves.next_round
 
-    def watched() -> Any:
-        jobs = choose()
-        seen.append(sum(0 if t.lower is None else 2 * t.lower.nbytes for t in refinement.tiles))
+    def watched(goal: Goal) -> Any:
+        jobs = choose(goal)
+        seen.append(sum(0 if t.lower is None else 2 * t.lower.nbytes for t in refinement.leaves.by_tile))
         return jobs
 
-    refinement._choose = watched  # type: ignore[method-assign]
+    refinement.leaves.next_round = watched  # type: ignore[method-assign]
     check(frame, refinement.run())
     assert seen and max(seen) <= limit
     free = refine(Waves(dimensions, pace=50.0), Goal(1.0, FOREVER, 400))
@@ -557,7 +559,6 @@ def test_axes_without_slope_are_split_by_motion(monkeypatch: pytest.MonkeyPatch)
 
 
 def test_an_axis_that_is_used_up_gives_way(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(engine, "_NARROWEST", 0.3)
     frame = Waves(2, weights=np.array([0.0, 2.0]))
     bound = frame.bound
 
@@ -567,7 +568,7 @@ def test_an_axis_that_is_used_up_gives_way(monkeypatch: pytest.MonkeyPatch) -> N
         return found
 
     monkeypatch.setattr(frame, "bound", misled)
-    check(frame, refine(frame, Goal(1.0, FOREVER, 200)))
+    check(frame, refine(frame, Goal(1.0, FOREVER, 200), tuning=Tuning(narrowest=0.3)))
     widths = {(box.upper[0] - box.lower[0], box.upper[1] - box.lower[1]) for box, _, _ in frame.calls}
     assert min(w for w, _ in widths) == pytest.approx(1.7 / 4)
     assert min(h for _, h in widths) == pytest.approx(2.0 / 4)
@@ -610,7 +611,7 @@ def test_leaves_cover_the_set_and_hold_its_pictures(dimensions: int, leaf_bytes:
         # disjoint but for faces, so equal volumes mean that all of the box is covered
         assert volume[number == t].sum() == pytest.approx(whole, rel=1e-12)
     rng = np.random.default_rng(0)
-    inside = engine._pixels_inside(frame)
+    inside = pixels_inside(frame)
     for values in frame.box.sample(50, rng):
         picture = frame.render(values)
         holds = ((leaves.box_lower <= values) & (values <= leaves.box_upper)).all(axis=1)
@@ -762,20 +763,22 @@ def test_parts_without_poses_take_no_work_and_leave_nothing_open(shrinks: bool, 
 def test_poses_are_rendered_far_out() -> None:
     """A part that touches an end of the set is looked at there, one that touches both at either."""
     refinement = Refinement(Waves(3), 0, Goal())
+    splitter = refinement.splitter
     whole = refinement.frame.box
-    part = refinement._cut(refinement._cut(refinement._whole, 0)[0], 1, 4)[1]
-    seen = np.array([refinement._outlying(part) for _ in range(50)])
+    part = splitter.cut(splitter.cut(splitter.whole, 0)[0], 1, 4)[1]
+    seen = np.array([refinement.inner.outlying(part) for _ in range(50)])
     assert (seen[:, 0] == whole.lower[0]).all() and (seen[:, 1] == part.box.middle[1]).all()
     assert set(seen[:, 2]) == {whole.lower[2], whole.upper[2]}
-    part = refinement._cut(refinement._cut(refinement._whole, 0)[1], 2, 3)[2]
-    assert (refinement._outlying(part)[[0, 2]] == np.array(whole.upper)[[0, 2]]).all()
+    part = splitter.cut(splitter.cut(splitter.whole, 0)[1], 2, 3)[2]
+    assert (refinement.inner.outlying(part)[[0, 2]] == np.array(whole.upper)[[0, 2]]).all()
 
 
 def test_ends_beyond_which_there_are_no_poses_are_far_out() -> None:
     refinement = Refinement(Triangle(2), 0, Goal())
+    splitter = refinement.splitter
     # the upper quarter of u allows v below its lower end only, and no u near its own upper end
-    part = refinement._cut(refinement._whole, 0, 4)[3]
+    part = splitter.cut(splitter.whole, 0, 4)[3]
     assert part.box.upper[1] == -part.box.lower[0] < refinement.frame.box.upper[1]
     assert part.last.all() and not part.first[0] and part.first[1]
-    inner = refinement._cut(part, 1)[0]
+    inner = splitter.cut(part, 1)[0]
     assert not inner.last[1] and inner.first[1]

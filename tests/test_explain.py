@@ -19,6 +19,7 @@ from ns_abstract.api.job import Job
 from ns_abstract.cli import render as render_command
 from ns_abstract.geometry.views import View, look_at
 from ns_abstract.methods.nerf.write import write_nerf_run
+from ns_abstract.methods.program_options import ProgramOptions
 from ns_abstract.methods.splat.bounds import SplatBounds
 from ns_abstract.methods.splat.scene import SplatScene
 from ns_abstract.refine.engine import Goal
@@ -83,7 +84,9 @@ def test_versions_without_tiles_to_miss_are_not_told_of_them(make_blobs: Make) -
     balls = scene([[0.0, 0.0, 0.0]], [0.2], plain([1.0, 0.0, 0.0]))
     inputs = make_blobs(scene=balls, views=FRONT, spec=TURN)
     for version, name in (("1.4.0", "the alpha threshold and tiles"), ("1.5.3", "the alpha threshold")):
-        job = open_job(Settings(inputs.config, inputs.path, inputs.spec, gsplat_version=version))
+        job = open_job(
+            Settings(inputs.config, inputs.path, inputs.spec, program=ProgramOptions(gsplat_version=version))
+        )
         found = explain(job, 0, job.bound(0, Goal(1.0, 300.0, 2), keep_leaves=True))
         assert [cause for cause in found.causes if "threshold" in cause] == [name]
 

@@ -27,8 +27,9 @@ from ns_abstract.io.version import computed_by
 from ns_abstract.report.export import Results
 from ns_abstract.report.files import load_frame, save_frame
 from ns_abstract.report.record import Report
-from ns_abstract.verify import store as store_module
-from ns_abstract.verify.store import IMAGES, Seal, Store
+from ns_abstract.verify import store_file as store_module
+from ns_abstract.verify.store import Store
+from ns_abstract.verify.store_file import IMAGES, Seal
 
 FOREIGN = {
     "notes.txt": b"mine",

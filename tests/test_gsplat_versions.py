@@ -15,13 +15,14 @@ from ns_abstract.api.files import PathJob, Settings, open_job
 from ns_abstract.geometry.camera_path import Camera
 from ns_abstract.geometry.poses import PoseSet
 from ns_abstract.io.errors import InputError
+from ns_abstract.methods.program_options import ProgramOptions
 from ns_abstract.methods.splat.constants import VERSIONS, installed_gsplat, rasteriser_named
 from ns_abstract.perturbation.specification import parse_perturbation
 from ns_abstract.verify.attack.soundness import compiled_renderer
 
 
 def job(inputs: Inputs, **options: Any) -> PathJob:
-    return open_job(Settings(inputs.config, inputs.path, inputs.spec, **options))
+    return open_job(Settings(inputs.config, inputs.path, inputs.spec, program=ProgramOptions(**options)))
 
 
 @pytest.mark.parametrize("version", [None, *VERSIONS])

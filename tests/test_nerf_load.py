@@ -30,6 +30,7 @@ from ns_abstract.methods.nerf.load import load_nerf
 from ns_abstract.methods.nerf.render import NerfRenderer, Sampling
 from ns_abstract.methods.nerf.scene import NerfScene
 from ns_abstract.methods.nerf.write import write_nerf_run
+from ns_abstract.methods.program_options import ProgramOptions
 
 
 @pytest.fixture
@@ -134,7 +135,7 @@ def test_end_to_end_and_resume(inputs: dict[str, Path], tmp_path: Path, monkeypa
     assert any("Algorithm 2" in line for line in report["plan"])
     with np.load(out / "frame_00000.npz", allow_pickle=False) as stored:
         lower, upper = stored["lower"], stored["upper"]
-    job = open_job(Settings(**inputs, num_samples=16))
+    job = open_job(Settings(**inputs, program=ProgramOptions(num_samples=16)))
     frame = job.frame(0)
     for values in frame.box.sample(40, np.random.default_rng(1)):
         picture = frame.renderer.image(frame.camera, frame.pose_set.pose(values))
@@ -178,8 +179,8 @@ def test_a_device_that_is_not_there_is_one_line(inputs, tmp_path: Path, monkeypa
 
 
 def test_the_papers_renderer_is_black_behind(inputs: dict[str, Path]) -> None:
-    assert open_job(Settings(**inputs, renderer="paper")).method.program["name"] == "paper-nerf"
-    frame = open_job(Settings(**inputs, renderer="paper")).frame(0)
+    assert open_job(Settings(**inputs, program=ProgramOptions("paper"))).method.program["name"] == "paper-nerf"
+    frame = open_job(Settings(**inputs, program=ProgramOptions("paper"))).frame(0)
     assert frame.renderer.sampling.background == (0.0, 0.0, 0.0)
     assert open_job(Settings(**inputs)).frame(0).renderer.sampling.background == (1.0, 1.0, 1.0)
 

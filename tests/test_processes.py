@@ -19,9 +19,8 @@ from test_selfcheck import off
 
 import ns_abstract as nsa
 from ns_abstract.api.bounding import bound_frames
-from ns_abstract.api.certification import examine_block
+from ns_abstract.api.cell_search import examine_block
 from ns_abstract.api.files import Settings, open_job
-from ns_abstract.api.reaching import examine_cells
 from ns_abstract.arithmetic import selfcheck
 from ns_abstract.cli import rendering
 from ns_abstract.cli.render import Render, render
@@ -106,7 +105,7 @@ def test_a_faulty_worker_reaches_nothing(course: Any, monkeypatch: pytest.Monkey
     job = course.job
     faulty(monkeypatch)
     with pytest.raises(nsa.InputError, match="self-check"):
-        examine_cells(job.recipe, 0, job.search, ())  # type: ignore[arg-type]
+        examine_block(job.recipe, 0, job.search, ())  # type: ignore[arg-type]
 
 
 def bits(run: Path, folder: Path, blobs: Inputs) -> list[Any]:

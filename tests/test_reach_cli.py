@@ -181,7 +181,7 @@ def test_interrupted_in_a_film(
 ) -> None:
     part = course.changed("cut.json", "goal", initial=SMALL, steps=10)
     with monkeypatch.context() as patched:
-        interrupted_at("ns_abstract.api.reaching:along", patched)
+        interrupted_at("ns_abstract.api.loop_report:along", patched)
         code, _, said = in_process(reach_command.main, part.options(tmp_path / "out", film=True))
     assert code == 3 and "Traceback" not in said
     document = json.loads((tmp_path / "out" / "report.json").read_text())
@@ -258,7 +258,8 @@ def test_scene_margin(course: Course, tmp_path: Path) -> None:
             scenes = [(member, None) for member in itertools.islice(view.members(1), 24)]
         else:
             ends: dict[str, Any] = {name: (-radius, radius)}
-            reacher = job.around(SceneVariation(Selection(), **ends)).reacher()
+            view = Pictures(job.job.method, job.job.varied(0, SceneVariation(Selection(), **ends)))
+            reacher = replace(job.reacher(), view=view)
             scenes = [(member, None) for member in itertools.islice(reacher.view.members(1), 24)]
         tube = reacher.tube(box)
         for number, (member, shift) in enumerate(scenes):
@@ -319,8 +320,8 @@ def test_interrupted_and_resumed(edge: Course, finished: Path, tmp_path: Path) -
     [
         "ns_abstract.api.reaching:open_loop",
         "ns_abstract.api.compiling:compile_beside",
-        "ns_abstract.api.reaching:simulate",
-        "ns_abstract.api.reaching:examine_here",
+        "ns_abstract.api.loop_report:simulate",
+        "ns_abstract.api.cell_search:examine_here",
     ],
 )
 def test_interrupted_before_the_first_block(

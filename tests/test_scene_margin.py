@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 import sqlite3
-import time
 from contextlib import closing
 from pathlib import Path
-from typing import Any, cast
 
 import numpy as np
 import pytest
 
 from ns_abstract.api.margins import Margins
-from ns_abstract.execution.ending import AbandonedError, checkpoint
+from ns_abstract.execution.ending import AbandonedError, Deadline, checkpoint
 from ns_abstract.geometry.box import ParameterBox
 from ns_abstract.io.errors import InputError
 from ns_abstract.verify.scene_margin import Certified, Kind, Settled, check_scenes, widest
@@ -129,7 +127,7 @@ def test_a_resumed_command_settles_nothing_twice(tmp_path: Path) -> None:
             return left < 0
 
         margins = Margins(cells(), lambda kind: counted, store)
-        margins.find(time.perf_counter() + 1e6, cast("Any", stop), [KIND])
+        margins.find(Deadline(1e6, stop), [KIND])
         assert margins.found[0].state == ("done" if stops == 1000 else "ended")
         store.close()
     (found,) = margins.found

@@ -14,7 +14,7 @@ from certifying import classifier
 from conftest import InProcess, Inputs
 
 import ns_abstract as nsa
-from ns_abstract.api import certification, job, reaching
+from ns_abstract.api import certification, job, loop_job
 from ns_abstract.api.bounding import Part, bound_part
 from ns_abstract.api.certification import CertifySettings, open_certification
 from ns_abstract.api.files import Settings, open_job
@@ -84,13 +84,13 @@ def test_fingerprints_name_version_and_rules(blobs: Inputs, tmp_path: Path) -> N
         assert found["ns_abstract"] == nsa.__version__ and found["render_rules"] == version.RENDER_RULES >= 1
     assert "rules" not in rendered
     # 4 and 1 are those of searches that 0.1.0 left
-    assert certified["rules"] == certification._RULES > 4 and reached["rules"] == reaching._RULES > 1
+    assert certified["rules"] == certification._RULES > 4 and reached["rules"] == loop_job._RULES > 1
 
 
 def test_fingerprint_of_images_and_numbers_of_rules(blobs: Inputs) -> None:
     found = open_job(Settings(blobs.config, blobs.path, blobs.spec)).fingerprint
     assert {key: found.get(key) for key in computed_by()} == computed_by()
-    assert certification._RULES > 4 and reaching._RULES > 1
+    assert certification._RULES > 4 and loop_job._RULES > 1
 
 
 @others
@@ -220,7 +220,7 @@ ROOT = Path(__file__).resolve().parents[1]
 @pytest.mark.skipif(not (ROOT / "docs").is_dir(), reason="the documentation is not beside the tests")
 def test_advisories_name_this_version() -> None:
     page = (ROOT / "docs" / "advisories.md").read_text(encoding="utf-8")
-    numbers = version.RENDER_RULES, certification._RULES, reaching._RULES
+    numbers = version.RENDER_RULES, certification._RULES, loop_job._RULES
     assert f"| {nsa.__version__} | {' | '.join(map(str, numbers))} |" in page
     assert "advisories.md" in (ROOT / "mkdocs.yml").read_text(encoding="utf-8")
     assert "(advisories.md)" in (ROOT / "docs" / "guarantee.md").read_text(encoding="utf-8")

@@ -118,10 +118,10 @@ class WallFrame:
     def motion(self, box: ParameterBox) -> np.ndarray:
         return (np.array(box.upper) - np.array(box.lower)) / SCALE
 
-    def watch(self, tiles: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> None:
+    def observe(self, tiles: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> None:
         pass
 
-    def allow(self, excess: float) -> float:
+    def set_tolerance(self, excess: float) -> float:
         return 0.0
 
     def plan(self, shown: int | None, lower: np.ndarray, upper: np.ndarray) -> list[str]:

@@ -379,12 +379,12 @@ CERTIFICATES = (
     ),
     Fault(
         "store: what was changed since is read",
-        _STORE, "Store._verify", "found.plain() != self._get('seals')", "False",
+        "verify/store_file.py", "StoreFile._verify", "found.plain() != self._get('seals')", "False",
         "test_folders.py::test_a_search_that_was_edited_is_not_continued",
     ),
     Fault(
         "store: another search is continued",
-        _STORE, "Store._check", "stored.get(key) != asked.get(key)", "False",
+        "verify/store_file.py", "StoreFile._check", "stored.get(key) != asked.get(key)", "False",
         "test_certify_search.py::test_another_search_is_not_continued",
     ),
 )  # fmt: skip

@@ -9,6 +9,8 @@ _TRIGONOMETRY = "arithmetic/trigonometry.py"
 _SPECIFICATION = "perturbation/specification.py"
 _POSES = "geometry/poses.py"
 _ENGINE = "refine/engine.py"
+_LEAVES = "refine/leaves.py"
+_SUB_BOXES = "refine/sub_boxes.py"
 _BOX = "geometry/box.py"
 _LINE_FORMS = "arithmetic/line_forms.py"
 _WIDE_FORMS = "arithmetic/simd/wide_forms.py"
@@ -241,33 +243,33 @@ FORMS = (
     Fault(
         "bounds of a cell that was tried are taken for a wider one of the first cover",
         _ENGINE,
-        "Refinement._cover",
-        "part.box == first.box",
-        "part is parts[len(parts) // 2]",
+        "Refinement._initial_cell",
+        "part.box == partition.tried.box",
+        "part is partition.parts[len(partition.parts) // 2]",
         "test_engine.py::test_bounds_of_a_cell_that_was_tried_are_not_those_of_a_wider_one[10]",
     ),
     Fault(
         "a part is dropped where some of its poses are none of the set's",
-        _ENGINE,
-        "Refinement._cut",
+        _SUB_BOXES,
+        "BoxSplitter.cut",
         "inside is not None",
         "inside == box",
         "test_engine.py::test_parts_without_poses_take_no_work_and_leave_nothing_open[True-0.0]",
     ),
     Fault(
         "a stricter goal asks for pixels that a cell around was not asked for",
-        _ENGINE,
-        "Refinement._close_excess",
-        "max(self._closed_excess, _CLOSED_SHARE * self.goal.excess(point.mpg_witness))",
-        "_CLOSED_SHARE * self.goal.excess(point.mpg_witness)",
+        _LEAVES,
+        "LeafBounds.close_excess",
+        "max(self._closed_excess, self.tuning.closed_share * allowed)",
+        "self.tuning.closed_share * allowed",
         "test_engine.py::test_a_stricter_goal_asks_for_no_pixel_that_was_left_before",
     ),
     Fault(
         "what is known of a frame is taken for other tiles",
         _ENGINE,
         "Refinement.__init__",
-        "in_tiles(picture, side)[self._numbers_of(None)]",
-        "in_tiles(picture, side)[: self._count]",
+        "in_tiles(picture, frame.side)[self.tiles.numbers(None)]",
+        "in_tiles(picture, frame.side)[: self.tiles.count]",
         "test_nerf_frame.py::test_what_is_known_is_not_begun_anew[2]",
     ),
     Fault(

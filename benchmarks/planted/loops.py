@@ -15,8 +15,8 @@ _MARGIN = "test_reach_cli.py::test_scene_margin"
 LOOPS = (
     Fault(
         "scene margin: tubes of a tenth of the radius",
-        "api/reaching.py",
-        "LoopJob.settle.settle",
+        "api/loop_job.py",
+        "LoopJob._varied",
         "kind.variation(radius)",
         "kind.variation(0.1 * radius)",
         _MARGIN,

@@ -23,8 +23,8 @@ PROCESSES = (
     ),
     Fault(
         "processes: a loop is opened on a worker without the self-check",
-        "api/reaching.py",
-        "_open",
+        "api/loop_job.py",
+        "LoopJob.__init__",
         "require_sound_platform()",
         "pass",
         "test_processes.py::test_a_faulty_worker_reaches_nothing",

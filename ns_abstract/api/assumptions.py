@@ -1,4 +1,4 @@
-"""Choices that bounds rest on: scene, program, pictures and their set, each with where it came from."""
+"""Assumptions of bounds: choices about scene, program, pictures and set, each with its origin."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ DEFAULT = "default"
 
 
 def choice(name: str, value: object, given: object, flag: str, default: str = DEFAULT) -> Assumption:
-    """The record of an option: its origin is ``flag`` where ``given`` is there, else ``default``."""
+    """Return the record of an option: its origin is ``flag`` where ``given`` is set, else ``default``."""
     return Assumption(name, str(value), default if given is None else flag)
 
 
 def scene_choices(scene: Scene, method: Method, arithmetic: str | None) -> tuple[Assumption, ...]:
-    """What was decided of a scene on reading it, and of the program that draws it."""
+    """Return the choices made on reading a scene, and about the program that renders it."""
     options, program = scene.source.options, method.program
     found = list(scene.assumptions)
     if options.renderer == "paper":
@@ -63,7 +63,7 @@ def _ray_choices(scene: Scene, program: dict[str, Any]) -> list[Assumption]:
 
 
 def set_choices(pose_sets: Sequence[PoseSet], size: str, varied: str) -> tuple[Assumption, ...]:
-    """The size of the pictures and the names of what varies in any set.
+    """Return the choices about the pictures' size and the varied parameters of the sets.
 
     Args:
         pose_sets: One by frame.

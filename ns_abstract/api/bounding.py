@@ -26,7 +26,7 @@ from ns_abstract.io.assumptions import Assumption
 from ns_abstract.io.errors import InputError
 from ns_abstract.refine.engine import Goal, groups, shared_goal
 from ns_abstract.refine.result import FrameResult, Layer, Leaves, PartResult, TracePoint
-from ns_abstract.report.figures import interval, metrics, number
+from ns_abstract.report.figures import interval, metrics, number, short_guarantee
 from ns_abstract.report.files import save_frame
 from ns_abstract.report.notebook import frame_html
 
@@ -38,7 +38,7 @@ _GROUPS_BY_THREAD = 2
 
 @dataclass(frozen=True)
 class Progress:
-    """Where the work on a frame stands.
+    """The progress of the work on a frame.
 
     Attributes:
         frame: Number of the frame.
@@ -89,7 +89,7 @@ def bound_part(
     neighbours: int = 1,
     known: FrameResult | None = None,
 ) -> PartResult | None:
-    """One task on a worker, which opens the scene once and keeps it; None if the time was over before there was any.
+    """Bound one part of a frame on a worker, which keeps the scene open; None if the time ended before any result.
 
     Args:
         recipe: Of the job.
@@ -129,7 +129,7 @@ def bound_frames(
     on_progress: Callable[[Progress], object] = lambda progress: None,
     found_before: Callable[[int], FrameResult | None] = lambda index: None,
 ) -> Iterator[FrameResult]:
-    """Frames as they are finished, each once, whatever workers come and go.
+    """Yield the results of frames as they are finished, each once, whatever workers come and go.
 
     Where the engine has more threads than there are frames, each frame is divided into groups of tiles, and is there
     when all its groups are. What a task leaves of the time budget is shared by those that are still to be begun; the
@@ -249,7 +249,7 @@ def _leaf_bytes(job: Job, processes: int) -> int:
 
 @dataclass(frozen=True, eq=False)
 class BoundResult:
-    """An abstract image: what holds for every picture of a set of poses.
+    """An abstract image: bounds of every picture of a set of poses.
 
     Attributes:
         lower, upper: [H, W, 3] float32, rounded outward: every picture of the set lies between them, after background
@@ -258,7 +258,8 @@ class BoundResult:
             really rendered.
         image: [H, W, 3] float32, the picture at the middle of the set.
         parameters: Names, units and ranges of what varies.
-        guarantee: "float32-sound", "real-sound", or "sampled" (this machine's arithmetic failed its self-check).
+        guarantee: "float32-sound", "real-sound", or "sampled" (this machine's arithmetic failed its self-check); with
+            ", of the Gaussians alone" behind it where the run's model may draw more (``assume_splatfacto``).
         seconds: Time spent.
         trace: Error over time.
         cell_count: Cells that were bounded.
@@ -432,8 +433,9 @@ def bound(
         "scene": job.describe(),
         "fingerprint": job.fingerprint,
     }
+    told = short_guarantee(guarantee, about["scene"].get("bounded"))
     return BoundResult.of(
-        frames[0], guarantee=guarantee, interrupted=stop(), target_ratio=target_ratio, about=about,
+        frames[0], guarantee=told, interrupted=stop(), target_ratio=target_ratio, about=about,
         assumptions=job.assumptions,
     )  # fmt: skip
 

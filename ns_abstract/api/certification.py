@@ -1,8 +1,7 @@
-"""From a scene, sets of poses, a network and a property to examined cells."""
+"""A certification: scene, sets of poses, network and property, and the examination of cells."""
 
 from __future__ import annotations
 
-import copy
 import hashlib
 import itertools
 import json
@@ -22,8 +21,7 @@ from ns_abstract.api.files import Settings, path_sets, resized
 from ns_abstract.api.job import Job, require_sound_platform, warm_up
 from ns_abstract.arithmetic.forms import MAX_DIMENSIONS
 from ns_abstract.execution.ending import abandoning
-from ns_abstract.execution.opening import Recipe, opened
-from ns_abstract.execution.threads import use_threads
+from ns_abstract.execution.opening import Recipe
 from ns_abstract.geometry.box import ParameterBox
 from ns_abstract.geometry.camera_path import load_camera_path
 from ns_abstract.geometry.poses import PoseSet
@@ -32,8 +30,8 @@ from ns_abstract.io.assumptions import Assumption
 from ns_abstract.io.errors import InputError
 from ns_abstract.io.jsonio import load_json
 from ns_abstract.methods.overrides import Overrides
+from ns_abstract.methods.program_options import ProgramOptions
 from ns_abstract.perturbation.specification import Perturbation
-from ns_abstract.perturbation.variations import SceneVariation
 from ns_abstract.refine.protocol import Frame, Member, Method, RayFrame
 from ns_abstract.report.record import file_stamp
 from ns_abstract.verify.cells import Cell, Grid, coarse_parts
@@ -77,7 +75,7 @@ MEMORY = 1 << 30
 
 @dataclass(frozen=True)
 class PropertySource:
-    """What is to hold, and where that is written.
+    """A property and the file that states it.
 
     Attributes:
         value: Content of PROP.json.
@@ -186,7 +184,7 @@ class FramePictures:
 
 
 class Question:
-    """A network and what is to hold of it.
+    """A network and the property to prove of it.
 
     Args:
         model: Network, .onnx.
@@ -395,24 +393,27 @@ class Certification:
             every_unit = self.property.partitions is not None
             claim = self.claim(pictures)
             pictures.weigh = partial(pixel_costs, pictures, self.model, claim)
-            cover = self._cover(self.job.method, pictures)
+            cover = self._cover(pictures)
             self._searches[key] = Search(
                 pictures, self.model, claim, grid, every_unit=every_unit, block=self.block, cover=cover
             )
         return self._searches[key]
 
-    def _cover(self, method: Method, pictures: FramePictures, response: Response | None = None) -> Cover | None:
+    def examine(self, number: int, grid: Grid, cells: tuple[Cell, ...]) -> Findings:
+        """What becomes of cells of a frame; see `ns_abstract.api.cell_search.Examiner`."""
+        return self.search(number, grid).examine(cells)
+
+    def _cover(self, pictures: FramePictures, response: Response | None = None) -> Cover | None:
         """What proves cells of a frame part by part; None with one parameter, and where rays cost more than networks.
 
         Args:
-            method: The scene.
             pictures: The frame's pictures.
             response: The cameras that may show them.
         """
         if pictures.box.dimensions < 2 or pictures.frame.tilewise:
             return None
         poses, straight = pictures.pose_set, Cover(pictures, self.model, self.model, self.claim(pictures))
-        slanted = FramePictures(method, poses, self.picture, response, slanted=True)
+        slanted = FramePictures(self.job.method, poses, self.picture, response, slanted=True)
         if not (shear := slanted.pose_set.shear):
             return straight
 
@@ -424,13 +425,6 @@ class Certification:
         return Cover(
             slanted, self.model, self.model, claim, frame, most=_MOST_SLANTED, block=1, aim=_AIM_SLANTED, other=straight
         )
-
-    def around(self, extra: SceneVariation) -> Certification:
-        """The same with more scenes in the sets."""
-        other = copy.copy(self)
-        other.__dict__.pop("_fingerprint", None)
-        other.job, other._searches = self.job.around(extra), {}
-        return other
 
     def places(self, kind: Kind) -> bool:
         """Whether a kind's parameters can be bounded beside those of every set."""
@@ -452,9 +446,8 @@ class Certification:
             response = Response(kind.response, radius)
             pictures = FramePictures(method, poses, self.picture, response)
         else:
-            around = self.around(kind.variation(radius))
-            pictures, method = around.pictures(frame), around.job.method
-        return pictures, pictures, model, self._cover(method, pictures, response)
+            pictures = FramePictures(method, self.job.varied(frame, kind.variation(radius)), self.picture)
+        return pictures, pictures, model, self._cover(pictures, response)
 
     def settle(self, kind: Kind) -> Settle:
         """Bounds and attacks cells for all scenes around the stored one (V13)."""
@@ -575,23 +568,6 @@ def _open(
     return Certification(open_job(), question, memory, network_arithmetic=arithmetic, picture=picture)
 
 
-def examine_block(recipe: Recipe[Certification], index: int, grid: Grid, cells: tuple[Cell, ...]) -> Findings:
-    """Examine one block on a worker, which opens the files once and keeps them.
-
-    Raises:
-        InputError: The worker reads other files under the same names than the command did.
-    """
-    return examine_here(opened(recipe), index, grid, cells)
-
-
-def examine_here(job: Certification, index: int, grid: Grid, cells: tuple[Cell, ...]) -> Findings:
-    """Examine one block in this process."""
-    # as many workers as cores; more threads would only wait for each other
-    use_threads(1)
-    torch.set_num_threads(1)
-    return job.search(index, grid).examine(cells)
-
-
 @dataclass(frozen=True)
 class CertifySettings:
     """What to certify, as the command line says it.
@@ -602,17 +578,13 @@ class CertifySettings:
         model: Network, .onnx.
         property: PROP.json.
         perturbation_filename: Perturbation JSON; None: the camera path holds it.
-        renderer: "gsplat" or "paper"; None: gsplat.
-        gsplat_version: Of gsplat's rules; None: 1.4.0.
-        sampling, num_samples, near_plane: Of the rays of a NeRF; None: the method's own.
-        occupancy_grid: File of a grid that is declared as part of a NeRF.
-        device: Where a NeRF is bounded, "cpu" or "cuda"; None: "cpu".
         workers: Processes that bound the rays of a NeRF.
         arithmetic: "float32" or "real"; None: the strongest that the scene has.
         network_arithmetic: The same of the network.
         picture: Whether the network is shown floats or pictures of 8 bits.
         memory: Bytes for the bounds of one process.
         given_set: The content of a perturbation file, in place of one; errors name its keys as options.
+        program: Which program draws the scene.
         overrides: What the user says of the scene in place of its files.
     """
 
@@ -621,19 +593,13 @@ class CertifySettings:
     model: Path
     property: Path
     perturbation_filename: Path | None = None
-    renderer: str | None = None
-    gsplat_version: str | None = None
     arithmetic: str | None = None
     network_arithmetic: NetworkArithmetic = "float32"
     picture: Picture = "float"
     memory: int = MEMORY
-    sampling: str | None = None
-    num_samples: int | None = None
-    near_plane: float | None = None
-    occupancy_grid: Path | None = None
     workers: int = 1
     given_set: Mapping[str, Any] | None = None
-    device: str | None = None
+    program: ProgramOptions = field(default_factory=ProgramOptions)
     overrides: Overrides = field(default_factory=Overrides)
 
 
@@ -648,15 +614,9 @@ def open_certification(settings: CertifySettings) -> Certification:
         settings.load_config,
         settings.camera_path_filename,
         settings.perturbation_filename,
-        renderer=settings.renderer,
-        gsplat_version=settings.gsplat_version,
         arithmetic=settings.arithmetic,
-        sampling=settings.sampling,
-        num_samples=settings.num_samples,
-        near_plane=settings.near_plane,
-        occupancy_grid=settings.occupancy_grid,
         given_set=settings.given_set,
-        device=settings.device,
+        program=settings.program,
         overrides=settings.overrides,
     )
     scene = files.scene.open()
@@ -664,8 +624,10 @@ def open_certification(settings: CertifySettings) -> Certification:
     sets = [question.drawn(poses) for poses in path_sets(files, scene, path, default=Perturbation())]
     origin = settings.perturbation_filename or settings.camera_path_filename
     try:
-        job = Job(scene, sets, arithmetic=settings.arithmetic, workers=settings.workers, notes=path.notes)
+        job = Job(
+            scene, sets, arithmetic=settings.arithmetic, workers=settings.workers, notes=path.notes,
+            set_choices=files.set_choices(sets, path),
+        )  # fmt: skip
     except InputError as error:
         raise error.within(origin) if error.field and not error.field.startswith("--") else error from None
-    job.set_choices = files.set_choices(sets, path)
     return Certification(job, question, settings.memory, origin, settings.network_arithmetic, settings.picture)

@@ -37,7 +37,7 @@ def shares(stages: Sequence[str], count: int) -> list[list[str]]:
 
 
 def missing(frame: Frame) -> list[str]:
-    """The frame's stages whose kernels are not kept."""
+    """Return the frame's stages whose kernels are not in the cache."""
     found = []
     for stage in frame.stages:
         try:
@@ -49,7 +49,7 @@ def missing(frame: Frame) -> list[str]:
 
 
 class _Progress:
-    """What is said while kernels are compiled."""
+    """Reports the progress of compiling."""
 
     def __init__(self, parts: Sequence[Sequence[str]]) -> None:
         measured = [[_MEASURED.get(stage, _UNMEASURED) for stage in part] for part in parts]
@@ -77,7 +77,7 @@ class _Progress:
 
 
 def compile_beside(job: Job, index: int, processes: int | None = None) -> None:
-    """Compile what frame ``index`` needs and is not kept in several processes, no kernel twice.
+    """Compile the kernels that frame ``index`` needs and the cache lacks, in several processes, each once.
 
     What they cannot compile is left to this process.
 

@@ -1,4 +1,4 @@
-"""What a set of poses means on a scene: units, distances and pixels, before any work is done."""
+"""Describe a set of poses on a scene in units, distances and pixels, before any work is done."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _METRES = "if a unit of the data set is a metre"
 
 
 def describe(job: PathJob, frames: Sequence[int]) -> list[str]:
-    """Lines about the scene, its units, and the cameras and sets of some frames.
+    """Return lines of text about the scene, its units, and the cameras and sets of some frames.
 
     Args:
         job: The scene with its sets.

@@ -1,4 +1,4 @@
-"""Why bounds are loose: what would make them tighter, where, and which scene elements hold most of it."""
+"""Explain why bounds are loose: by causes, regions of the picture, and scene elements."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ _REST = "motion over a cell, and what is loose only together"
 
 @dataclass(frozen=True)
 class Explanation:
-    """Why a frame's bounds are wider than what was rendered.
+    """The explanation of a frame's gap: its causes, regions and scene elements.
 
     Attributes:
         index: Number of the frame.
@@ -74,7 +74,7 @@ class Explanation:
 
 
 def check_explained(job: Job) -> None:
-    """Refuse what is not explained.
+    """Raise InputError where explanations are not supported.
 
     Raises:
         InputError: The scene is a field.
@@ -84,7 +84,7 @@ def check_explained(job: Job) -> None:
 
 
 def explain(job: Job, index: int, result: FrameResult, seed: int = 0) -> Explanation:
-    """Bound some of a frame's leaf cells again, each time with one difficulty less.
+    """Return the explanation of a frame: bounds some leaf cells again without each cause of looseness in turn.
 
     Args:
         job: The scene with its sets.
@@ -146,7 +146,7 @@ def _chosen(
 
 
 def _excess(frame: Frame, box: ParameterBox, tile: int, seed: int) -> float:
-    """Mean gap of a tile over a cell beyond what renders of some of its poses reach."""
+    """Return the mean gap of a tile over a cell in excess of the gap between renders of some poses."""
     tiles = np.array([tile])
     bounds = frame.bound(box, tiles)
     poses = [box.middle, *box.corners()[:_POSES], *box.sample(_POSES, np.random.default_rng(seed))]

@@ -1,4 +1,4 @@
-"""From the files that a command line names to a job."""
+"""Open the files that a command line names as a job."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ from ns_abstract.geometry.poses import PoseSet
 from ns_abstract.io.assumptions import Assumption
 from ns_abstract.io.errors import InputError
 from ns_abstract.methods.overrides import Overrides
-from ns_abstract.methods.representation import ProgramOptions
+from ns_abstract.methods.program_options import ProgramOptions
 from ns_abstract.perturbation.specification import Perturbation, load_perturbation, parse_perturbation
 
 
 @dataclass(frozen=True)
 class Settings:
-    """What to bound, as the command line says it.
+    """The options of a command line that say what to bound.
 
     Attributes:
         load_config: config.yml of a run, or a standard 3DGS .ply.
@@ -29,16 +29,12 @@ class Settings:
         perturbation_filename: Perturbation JSON; None: the camera path holds it.
         given_set: The content of a perturbation file, in place of one; errors name its keys as options.
         downscale_factor: Pictures become this many times smaller.
-        renderer: "gsplat" or "paper"; None: what the method's own renderer is.
-        gsplat_version: Of the splats' rules; None: 1.4.0.
         arithmetic: "float32" or "real"; None: the strongest that the method has.
         seed: Of the random witnesses.
         memory_limit: GiB.
         workers: Processes that bound the rays of a NeRF.
         outputs: "rgb", and what is bounded beside it: "depth", "accumulation".
-        occupancy_grid: File of a grid that is declared as part of a NeRF.
-        sampling, num_samples, near_plane: Of the rays of a NeRF; None: the method's own.
-        device: Where a NeRF is bounded, "cpu" or "cuda"; None: "cpu".
+        program: Which program draws the scene.
         overrides: What the user says of the scene in place of its files.
     """
 
@@ -46,29 +42,19 @@ class Settings:
     camera_path_filename: Path
     perturbation_filename: Path | None = None
     downscale_factor: float = 1.0
-    renderer: str | None = None
-    gsplat_version: str | None = None
     arithmetic: str | None = None
     seed: int = 0
     memory_limit: float | None = None
-    sampling: str | None = None
-    num_samples: int | None = None
-    near_plane: float | None = None
-    occupancy_grid: Path | None = None
     workers: int = 1
     given_set: Mapping[str, Any] | None = None
     outputs: tuple[str, ...] = ("rgb",)
-    device: str | None = None
+    program: ProgramOptions = field(default_factory=ProgramOptions)
     overrides: Overrides = field(default_factory=Overrides)
 
     @property
     def scene(self) -> SceneSource:
         """The scene and the program that draws it."""
-        options = ProgramOptions(
-            self.renderer, self.sampling, self.num_samples, self.near_plane, self.occupancy_grid, self.gsplat_version,
-            self.device,
-        )  # fmt: skip
-        return SceneSource(self.load_config, options, self.overrides)
+        return SceneSource(self.load_config, self.program, self.overrides)
 
     def set_choices(self, pose_sets: Sequence[PoseSet], path: CameraPath) -> tuple[Assumption, ...]:
         """Where the size of the pictures and their sets come from."""
@@ -99,12 +85,12 @@ class PathJob(Job):
                 workers=settings.workers,
                 layers=[name for name in settings.outputs if name != "rgb"],
                 notes=path.notes,
+                set_choices=settings.set_choices(pose_sets, path),
             )
         except InputError as error:
             # options have no file
             named = error.field is not None and not error.field.startswith("--")
             raise error.within(settings.perturbation_filename or path.source) if named else error from None
-        self.set_choices = settings.set_choices(pose_sets, path)
 
     def pose_set(self, index: int, perturbation: Perturbation) -> PoseSet:
         """The poses of ``perturbation`` around entry ``index`` of the path.

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import hashlib
 import socket
 import time
@@ -15,7 +14,8 @@ from typing import Any
 
 import numpy as np
 
-from ns_abstract.api.assumptions import scene_choices, set_choices
+from ns_abstract.api.assumptions import scene_choices
+from ns_abstract.api.assumptions import set_choices as object_choices
 from ns_abstract.api.scenes import Scene, SceneSource
 from ns_abstract.arithmetic.selfcheck import platform_problems
 from ns_abstract.execution.ending import AbandonedError, abandoning
@@ -51,6 +51,7 @@ class Job:
         workers: Processes that one frame may use, where pictures are made ray by ray.
         layers: What is bounded beside the colours, of `ns_abstract.refine.result.LAYERS`.
         notes: What reports say of the files of the sets, one sentence each.
+        set_choices: Where the size of the pictures and their sets come from; None: from the caller's objects.
 
     Raises:
         InputError: The scene has no such layers, does not vary as asked, or the memory does not do.
@@ -67,6 +68,7 @@ class Job:
         workers: int = 1,
         layers: Sequence[str] = (),
         notes: Sequence[str] = (),
+        set_choices: Sequence[Assumption] | None = None,
     ) -> None:
         self.notes = tuple(notes)
         self.layers = tuple(name for name in LAYERS if name in layers)
@@ -77,8 +79,9 @@ class Job:
         self.pose_sets, self.seed, self.memory_limit = tuple(pose_sets), seed, memory_limit
         self.workers = workers if scene.rays else 1
         self._scene_choices = scene_choices(scene, self.method, arithmetic)
-        #: Where the size of the pictures and their sets come from.
-        self.set_choices = set_choices(self.pose_sets, "the camera", "the set of poses")
+        if set_choices is None:
+            set_choices = object_choices(self.pose_sets, "the camera", "the set of poses")
+        self.set_choices = tuple(set_choices)
         self._warm: set[int] = set()
         self.method.prepare([poses.perturbation for poses in self.pose_sets])
         if self.layers:
@@ -112,15 +115,10 @@ class Job:
         pixels = max(poses.camera.width * poses.camera.height for poses in self.pose_sets)
         return self.method.memory(pixels, max(1, most_threads() // processes))
 
-    def around(self, extra: SceneVariation) -> Job:
-        """The same sets with more scenes in them."""
-        other = copy.copy(self)
-        other.__dict__.pop("_fingerprint", None)
-        other.pose_sets = tuple(
-            replace(poses, perturbation=replace(poses.perturbation, scene=(*poses.perturbation.scene, extra)))
-            for poses in self.pose_sets
-        )
-        return other
+    def varied(self, index: int, extra: SceneVariation) -> PoseSet:
+        """The set of frame ``index`` with more scenes in it."""
+        poses = self.pose_sets[index]
+        return replace(poses, perturbation=replace(poses.perturbation, scene=(*poses.perturbation.scene, extra)))
 
     def _check_memory(self) -> None:
         needed = self.base_memory()

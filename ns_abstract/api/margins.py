@@ -1,15 +1,14 @@
-"""How far the scene may vary before a certificate or a loop is lost (docs/design.md, V13)."""
+"""Scene margins of certificates and loops (docs/design.md, V13)."""
 
 from __future__ import annotations
 
 import io
-import time
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
-from ns_abstract.execution.stopping import StopRequest
+from ns_abstract.execution.ending import Deadline
 from ns_abstract.geometry.box import ParameterBox
 from ns_abstract.verify.scene_margin import Certified, Kind, SceneMargin, Settle, Settled, widest
 from ns_abstract.verify.store import Store
@@ -21,7 +20,7 @@ NOT_ASKED = "not asked for (--scene-margin)"
 
 
 class Margins:
-    """Margins of what a search has certified, kind by kind.
+    """Finds the scene margins of a search's certified cells, kind by kind.
 
     Args:
         cells: What is certified.
@@ -40,22 +39,16 @@ class Margins:
         self.cells, self._settle, self._store, self._told = cells, settle, store, told
         self.found: list[SceneMargin] = []
 
-    def find(self, deadline: float, stop: StopRequest, kinds: Sequence[Kind]) -> None:
+    def find(self, deadline: Deadline, kinds: Sequence[Kind]) -> None:
         """Look for them; every kind has the same part of the time that is left then.
 
         Args:
-            deadline: Reading of `time.perf_counter`.
-            stop: Asked about once a second.
+            deadline: When to end.
             kinds: What varies.
         """
         for number, kind in enumerate(kinds if self.cells else ()):
-            now = time.perf_counter()
-            end = now + (deadline - now) / (len(kinds) - number)
-
-            def over(end: float = end) -> bool:
-                return stop() or time.perf_counter() >= end
-
-            self.found.append(widest(kind, self.cells, self._remembered(kind), over))
+            part = deadline.within(deadline.left / (len(kinds) - number))
+            self.found.append(widest(kind, self.cells, self._remembered(kind), part))
             self._told(self.found[-1])
 
     def _remembered(self, kind: Kind) -> Settle:

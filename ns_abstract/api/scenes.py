@@ -17,7 +17,7 @@ from ns_abstract.io.assumptions import Assumption
 from ns_abstract.io.errors import InputError
 from ns_abstract.methods.load import open_scene
 from ns_abstract.methods.overrides import Overrides
-from ns_abstract.methods.representation import ProgramOptions
+from ns_abstract.methods.program_options import ProgramOptions
 from ns_abstract.perturbation.specification import Perturbation
 from ns_abstract.refine.protocol import Method, PreciseFrame
 
@@ -148,7 +148,7 @@ def load_scene(
         InputError: A file or an option cannot be used.
     """
     grid = None if occupancy_grid is None else Path(occupancy_grid)
-    options = ProgramOptions(renderer, sampling, num_samples, near_plane, grid, gsplat_version, device)
+    options = ProgramOptions(renderer, gsplat_version, sampling, num_samples, near_plane, grid, device)  # pyright: ignore[reportArgumentType]
     color = None if background is None else tuple(background)
     overrides = Overrides(rasterize_mode, color, load_step, assume_splatfacto, drop_nan_gaussians)  # pyright: ignore[reportArgumentType]
     scene = SceneSource(Path(path), options, overrides).open()

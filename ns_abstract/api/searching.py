@@ -1,4 +1,4 @@
-"""The search for verdicts on cells, whatever is asked about them."""
+"""The search over open cells, for every kind of question."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator
 from typing import Any
 
 from ns_abstract.arithmetic.kernel_cache import store as kernels
-from ns_abstract.execution.ending import AbandonedError, abandoning
+from ns_abstract.execution.ending import AbandonedError, Deadline, abandoning
 from ns_abstract.execution.engines import Engine
 from ns_abstract.execution.scheduler import Task, work
 from ns_abstract.execution.stopping import StopRequest
@@ -24,7 +24,7 @@ Examine = Callable[[int, Grid, tuple[Cell, ...]], Findings]
 def paced(
     store: Store, told: Callable[[], object], report: Callable[[], object] = lambda: None
 ) -> Callable[[float], None]:
-    """What a search does between results, by the clock: a point of the trace and ``told``, rarely ``report``."""
+    """Return what a search does between results: now and then a point of the trace and ``told``, rarely ``report``."""
     traced = reported = time.perf_counter()
 
     def between(instant: float) -> None:
@@ -47,7 +47,7 @@ def search_blocks(
     here: Examine,
     there: tuple[Callable[..., Findings], Any],
     *,
-    deadline: float,
+    deadline: Deadline,
     stop: StopRequest,
     keep: Callable[[Block, Any], object],
     between: Callable[[float], object],
@@ -63,8 +63,8 @@ def search_blocks(
         grids: By frame.
         here: In this process.
         there: For others: a function of a module, and what it takes before the arguments of ``here``.
-        deadline: Reading of `time.perf_counter`.
-        stop: Asked at least twice a second.
+        deadline: When to end.
+        stop: Asked at least twice a second, and ends a block at once in this process.
         keep: Given every block and its findings before they are stored.
         between: Told the reading of the clock after results, and twice a second where others work.
         waits: Whether one block is waited for however late it is, so that resuming with any budget gets on.
@@ -74,11 +74,8 @@ def search_blocks(
     flying: dict[int, Block] = {}
     finished = 0 if waits else 1
 
-    def late() -> bool:
-        return time.perf_counter() >= deadline
-
     def offer(room: int) -> Iterator[Task]:
-        if late() and (flying or finished):
+        if deadline.late and (flying or finished):
             return
         for block in store.pending(set(flying), room):
             flying[block.number] = block
@@ -89,12 +86,12 @@ def search_blocks(
                 yield Task(block.number, there[0], (there[1], *found))
 
     def over() -> bool:
-        return stop() or (late() and finished > 0)
+        return stop() or (deadline.late and finished > 0)
 
     def examined(index: int, grid: Grid, cells: tuple[Cell, ...]) -> Findings | None:
         # in this process a block is given up at the deadline or a signal
         try:
-            with stop.at_once(), abandoning(lambda: late() and finished > 0):
+            with stop.at_once(), abandoning(lambda: deadline.late and finished > 0):
                 return here(index, grid, cells)
         except (KeyboardInterrupt, AbandonedError):
             return None

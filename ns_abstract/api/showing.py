@@ -1,4 +1,4 @@
-"""Pictures of the poses that a certificate's page looks at more closely, in bounded time."""
+"""Pictures and network outputs of selected poses for a certificate's page, in bounded time."""
 
 from __future__ import annotations
 

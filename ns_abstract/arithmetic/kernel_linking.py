@@ -17,7 +17,7 @@ from typing import Any
 from numba.core import codegen, cpu, dispatcher, sigutils
 from numba.core.compiler_lock import global_compiler_lock
 
-_Compiler: Any = dispatcher._FunctionCompiler
+_Compiler: Any = dispatcher._FunctionCompiler  # pyright: ignore[reportAttributeAccessIssue]
 _Dispatcher: Any = dispatcher.Dispatcher
 _Base: Any = dispatcher._DispatcherBase
 _Codegen: Any = codegen.Codegen

@@ -58,7 +58,7 @@ def cell_cost(job: PathJob, name: str, frame: int, repeats: int) -> dict[str, ob
     around = view.bound(cell, tiles).context
 
     def bounded(allowed: float, within: Context | None) -> TileBounds:
-        view.allow(allowed)
+        view.set_tolerance(allowed)
         return view.bound(cell, tiles, within)
 
     seconds = measure(

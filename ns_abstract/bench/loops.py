@@ -8,7 +8,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ns_abstract.api.reaching import LoopJob, ReachCell, ReachProgress, ReachResult, open_loop, reach, widths
+from ns_abstract.api.loop_job import LoopJob, open_loop
+from ns_abstract.api.loop_report import widths
+from ns_abstract.api.reaching import ReachCell, ReachProgress, ReachResult, reach
 from ns_abstract.api.scenes import Scene
 from ns_abstract.geometry.box import ParameterBox
 from ns_abstract.reach.search import QUESTIONS, Run, first_outside, pushes, simulate

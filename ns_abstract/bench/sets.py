@@ -14,6 +14,7 @@ from ns_abstract.api.files import PathJob, Settings, open_job
 from ns_abstract.geometry.poses import PoseSet
 from ns_abstract.io.errors import InputError
 from ns_abstract.methods.overrides import Overrides
+from ns_abstract.methods.program_options import ProgramOptions
 from ns_abstract.methods.splat.method import SplatMethod
 from ns_abstract.perturbation.specification import Perturbation, parse_perturbation
 
@@ -45,16 +46,14 @@ def open_jobs(
     camera_path: Path | None,
     downscale_factor: float,
     arithmetic: str | None = None,
-    occupancy_grid: Path | None = None,
-    gsplat_version: str | None = None,
-    device: str | None = None,
+    program: ProgramOptions | None = None,
     overrides: Overrides | None = None,
 ) -> list[PathJob]:
     """The runs, or the demo scene where none is named.
 
-    Without ``arithmetic`` it is the strongest that the method has, without ``gsplat_version`` splats have their usual
-    rules; NeRFs are bounded on ``device``; ``overrides`` stand in place of what the files say. Without ``camera_path``
-    each run's own ``camera_path.json``, in the folder that holds the method's folder, is used.
+    Without ``arithmetic`` it is the strongest that the method has; ``program`` draws the scenes, ``overrides`` stand in
+    place of what the files say. Without ``camera_path`` each run's own ``camera_path.json``, in the folder that holds
+    the method's folder, is used.
 
     Raises:
         InputError: A file cannot be used.
@@ -69,8 +68,8 @@ def open_jobs(
     for config in load_config:
         path = camera_path if camera_path is not None else config.resolve().parents[2] / "camera_path.json"
         settings = Settings(
-            config, path, downscale_factor=downscale_factor, arithmetic=arithmetic, occupancy_grid=occupancy_grid,
-            gsplat_version=gsplat_version, device=device, overrides=overrides or Overrides(),
+            config, path, downscale_factor=downscale_factor, arithmetic=arithmetic,
+            program=program or ProgramOptions(), overrides=overrides or Overrides(),
         )  # fmt: skip
         jobs.append(open_job(settings, Perturbation()))
     return jobs

@@ -14,11 +14,11 @@ import numpy as np
 import torch
 import yaml
 
+from ns_abstract.check.fields import Field
 from ns_abstract.check.poses import SHIFTS, TURNS, Camera, Poses
 from ns_abstract.check.splats import Splats, activated
 
 Array = Any
-Field: Any = None
 
 _COLORS = {
     "random": (0.1490, 0.1647, 0.2157), "white": (1.0, 1.0, 1.0), "black": (0.0, 0.0, 0.0),
@@ -208,7 +208,7 @@ def _read_field(model: dict[str, Any], state: dict[str, Any], file: Path, settin
         if not settings.get("background") and model.get("background_color", "white") != "random":
             background = _color(model.get("background_color", "white"))
         background = tuple(float(np.float32(v)) for v in background)
-        found = Field.of({k: v.float().numpy() for k, v in state.items() if k.startswith("field_fine.")})
+        found = Field({k: v.float().numpy() for k, v in state.items() if k.startswith("field_fine.")})
         found.near, found.far, found.samples, found.background = near, far, int(renderer["samples"]), background
     except (KeyError, ValueError, TypeError, AttributeError):
         raise BadInput("holds no field of vanilla-nerf", file) from None

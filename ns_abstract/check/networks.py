@@ -18,7 +18,8 @@ from torch.nn import functional
 
 from ns_abstract.check.forms import Form, U
 
-_MOST_BYTES = 1 << 30
+#: Bytes of a file that are read, and neurons of a layer that are bounded again, at most.
+_MOST_BYTES, MOST_ROWS = 1 << 30, 4096
 
 
 class Layer(NamedTuple):
@@ -33,6 +34,20 @@ class Layer(NamedTuple):
     absolute: Callable[[Tensor], Tensor] | None
     bias: Tensor
     terms: int
+
+
+class Known(NamedTuple):
+    """A tensor over B pictures: centres [B, ...], slopes [d, B, ...], errors, and sizes of the sums that made it."""
+
+    c: Tensor
+    g: Tensor
+    r: Tensor
+    size: Tensor
+
+    def ends(self) -> tuple[Tensor, Tensor]:
+        """Lower and upper bounds."""
+        width = (self.g.abs().sum(0) + self.r) * (1.0 + 32.0 * U) + 4.0 * U * self.c.abs()
+        return self.c - width, self.c + width
 
 
 class Network:
@@ -74,10 +89,15 @@ class Network:
         own = (layer.terms + 4.0) * self.unit if layer.terms else 0.0
         return own + 4.0 * U * (math.prod(shape[1:]) + 2.0 * layer.terms + 32.0)
 
-    def forward(self, picture: Form) -> dict[str, tuple[Tensor, Tensor, Tensor, Tensor]]:
-        """Centres [B, ...], slopes [d, B, ...], errors and sizes by tensor's name, over pictures [B, C, H, W]."""
+    def forward(self, picture: Form, closely: bool = True) -> tuple[dict[str, Known], dict[str, tuple[Tensor, Tensor]]]:
+        """What is known of all tensors over pictures [B, C, H, W], and the ends of ReLUs' inputs.
+
+        Args:
+            picture: Forms.
+            closely: Whether neurons that may bend are bounded again by rows that go back to the picture.
+        """
         c, g, r = (torch.from_numpy(np.ascontiguousarray(a, np.float64)) for a in (picture.c, picture.g, picture.r))
-        known = {self.input: (c, g, r, c.abs() + g.abs().sum(0) + r)}
+        known, ends = {self.input: Known(c, g, r, c.abs() + g.abs().sum(0) + r)}, {}
         for layer in self.layers:
             (c, g, r, size), *others = (known[name] for name in layer.inputs)
             f, absolute = layer.map, layer.absolute
@@ -90,36 +110,39 @@ class Network:
                 (c2, g2, r2, size2), *_ = others
                 c, g, r, size = c + c2, g + g2, r + r2, size + size2
             else:
-                low, high = self.ends((c, g, r, size))
-                slope = torch.where(low >= 0.0, 1.0, torch.where(high <= 0.0, 0.0, high / (high - low)))
-                slope = (slope * (1.0 + 8.0 * U)).clamp(max=1.0)
-                half = torch.where((low < 0.0) & (high > 0.0), -0.5 * slope * low, 0.0)
-                c, g, r, size = slope * c + half, slope * g, slope * r + half, torch.maximum(high, -low)
+                low, high = known[layer.inputs[0]].ends()
+                bends = ((low < 0.0) & (high > 0.0)).flatten(1).any(0).nonzero()[:, 0]
+                if closely and 0 < len(bends) <= MOST_ROWS:
+                    rows = torch.zeros(len(bends), c[0].numel(), dtype=torch.float64)
+                    rows[torch.arange(len(bends)), bends] = 1.0
+                    for values, sign, pick in ((low, 1.0, torch.maximum), (high, -1.0, torch.minimum)):
+                        found = sign * self._back(known, ends, layer.inputs[0], sign * rows)
+                        values.flatten(1)[:, bends] = pick(values.flatten(1)[:, bends], found)
+                ends[layer.output] = low, high
+                above, _, lift = _lines(low, high)
+                half = 0.5 * lift
+                c, g, r, size = above * c + half, above * g, above * r + half, torch.maximum(high, -low).clamp(min=0.0)
             r = (r + self._charge(layer, c.shape) * size) * (1.0 + 8.0 * U)
-            known[layer.output] = c, g, r, size
-        return known
-
-    @staticmethod
-    def ends(form: tuple[Tensor, Tensor, Tensor, Tensor]) -> tuple[Tensor, Tensor]:
-        """Lower and upper bounds of a tensor."""
-        c, g, r, _ = form
-        width = (g.abs().sum(0) + r) * (1.0 + 32.0 * U) + 4.0 * U * c.abs()
-        return c - width, c + width
+            known[layer.output] = Known(c, g, r, size)
+        return known, ends
 
     def outputs(self, picture: Form) -> Form:
         """The outputs [B, n] as forms."""
-        c, g, r, _ = self.forward(picture)[self.output]
+        c, g, r, _ = self.forward(picture)[0][self.output]
         return Form(c.flatten(1).numpy(), g.flatten(2).numpy(), r.flatten(1).numpy())
 
     def least(self, picture: Form, rows: Tensor) -> Tensor:
-        """Lower bounds [B, m] of ``rows`` [m, n] times the outputs over pictures [B, C, H, W].
+        """Lower bounds [B, m] of ``rows`` [m, n] times the outputs over pictures [B, C, H, W]."""
+        return self._back(*self.forward(picture), self.output, rows)
+
+    def _back(self, known: dict[str, Known], ends: dict[str, Any], name: str, rows: Tensor) -> Tensor:
+        """Lower bounds [B, m] of ``rows`` [m, n] times a tensor.
 
         Rows go back through the layers; a ReLU is replaced by a line below or above it, as the row's sign asks.
         """
-        known = self.forward(picture)
-        shape = known[self.output][0].shape
+        shape = known[name].c.shape
         count, m = shape[0], len(rows)
-        back = {self.output: rows.reshape(1, m, *shape[1:]).expand(count, m, *shape[1:])}
+        back = {name: rows.reshape(1, m, *shape[1:]).expand(count, m, *shape[1:])}
         found = torch.zeros(count, m, dtype=torch.float64)
 
         def against(row: Tensor, values: Tensor) -> Tensor:
@@ -129,28 +152,33 @@ class Network:
             row = back.pop(layer.output, None)
             if row is None:
                 continue
-            size = known[layer.output][3]
+            size = known[layer.output].size
             found = found - self._charge(layer, size.shape) * against(row.abs(), size)
-            before, f = known[layer.inputs[0]], layer.map
+            before, f = known[layer.inputs[0]].c.shape[1:], layer.map
             if f is not None:
                 found = found + (row * layer.bias).flatten(2).sum(2)
-                place = torch.zeros(count * m, *before[0].shape[1:], dtype=torch.float64, requires_grad=True)
+                place = torch.zeros(count * m, *before, dtype=torch.float64, requires_grad=True)
                 (row,) = torch.autograd.grad(f(place), place, row.flatten(0, 1))
-                row = row.reshape(count, m, *before[0].shape[1:])
+                row = row.reshape(count, m, *before)
             elif len(layer.inputs) == 1:
-                low, high = (e[:, None] for e in self.ends(before))
-                above = torch.where(low >= 0.0, 1.0, torch.where(high <= 0.0, 0.0, high / (high - low)))
-                above = (above * (1.0 + 8.0 * U)).clamp(max=1.0)
-                below = torch.where((low >= 0.0) | ((high > 0.0) & (high > -low)), 1.0, 0.0)
-                lift = torch.where((low < 0.0) & (high > 0.0), -above * low, 0.0)
-                found = found + (row.clamp(max=0.0) * lift).flatten(2).sum(2)
-                row = row * torch.where(row > 0.0, below, above)
-            for name in layer.inputs:
-                back[name] = back[name] + row if name in back else row
+                above, below, lift = _lines(*ends[layer.output])
+                found = found + against(row.clamp(max=0.0), lift)
+                row = row * torch.where(row > 0.0, below[:, None], above[:, None])
+            for source in layer.inputs:
+                back[source] = back[source] + row if source in back else row
         row, (c, g, r, size) = back[self.input], known[self.input]
         slopes = sum((against(row, part).abs() for part in g), torch.zeros_like(found))
         rounding = 4.0 * U * (math.prod(size.shape[1:]) + len(g) + 32.0)
         return found + against(row, c) - slopes - against(row.abs(), r + rounding * size) - 1e-30
+
+
+def _lines(low: Tensor, high: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Slopes of lines above and below a ReLU of [low, high], and by how much the upper one is lifted."""
+    bends = (low < 0.0) & (high > 0.0)
+    above = torch.where(bends, high / (high - low).clamp(min=1e-300) * (1.0 + 8.0 * U), (low >= 0.0).double())
+    above = above.clamp(max=1.0)
+    below = torch.where(bends, (high > -low).double(), (low >= 0.0).double())
+    return above, below, torch.where(bends, -above * low * (1.0 + 8.0 * U), 0.0)
 
 
 def _layer(kind: str, options: dict[str, Any], constants: list[Tensor], inputs: int, first: bool) -> Any:

@@ -112,9 +112,9 @@ class Picture:
         """What is claimed."""
         a, k = self.cells.arrays, claim.cell
         at = (k, claim.row - int(a["tile"][k, 0]), claim.column - int(a["tile"][k, 1]), claim.channel)
-        ends = (float(a[s][claim.row, claim.column, claim.channel]) for s in ("lower", "upper"))
+        least, most = (float(a[s][claim.row, claim.column, claim.channel]) for s in ("lower", "upper"))
         planes = tuple((a[f"A_{s}"][at].astype(np.float64), float(a[f"b_{s}"][at])) for s in ("lower", "upper"))
-        return Bounds(*ends, a["box_lower"][k], a["box_upper"][k], planes)
+        return Bounds(least, most, a["box_lower"][k], a["box_upper"][k], planes)
 
     def settle(self, claim: Claim, deadline: float) -> Verdict:
         """True: proved; False: refuted, with the pose; None: open when the time was over; and of which picture."""
@@ -162,7 +162,8 @@ class Picture:
         return meeting(reaches(self.scene, self.poses.camera, view, unit), claim.row, claim.column)
 
     def _forms(self, low: Array, high: Array, index: Array, claim: Claim, unit: float) -> tuple[Form, Array, Array]:
-        view, pixel = self.poses.view(low, high), tuple(np.full(len(low), v) for v in claim[1:3])
+        view = self.poses.view(low, high)
+        pixel = np.full(len(low), claim.row), np.full(len(low), claim.column)
         if isinstance(self.scene, Splats):
             at = np.broadcast_to(index, (len(low), len(index)))
             form, kept, motion = pixels(self.scene, self.poses.camera, view, at, pixel, unit)

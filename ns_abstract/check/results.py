@@ -81,7 +81,7 @@ def read_cells(folder: Path, name: str, index: int, digest: object) -> Cells:
             if declared.get(name_) != (shape, kind):
                 raise BadInput(f"{name_} is not {kind} {list(shape)}", file, fix=_AGAIN)
         shape, kind = declared["parameters"]
-        if shape != (d,) or kind.names != ("name", "unit", "lower", "upper") or kind.itemsize > 1 << 16:
+        if shape != (d,) or (kind.names or ()) != ("name", "unit", "lower", "upper") or kind.itemsize > 1 << 16:
             raise BadInput("parameters are no table of names and ranges", file, fix=_AGAIN)
         if sum(math.prod(s) * k.itemsize for s, k in wanted.values()) > _MOST:
             raise BadInput("is too large", file)
@@ -112,7 +112,7 @@ def read_verdicts(folder: Path, report: dict[str, Any]) -> list[Cells]:
     file, rows, total, found = folder / "cells.sqlite", 0, 0, {}
     loop = report.get("kind") == "loop"
     try:
-        sets = dict.fromkeys((0, 1), report["parameters"]) if loop else {}
+        sets: dict[int, Any] = dict.fromkeys((0, 1), report["parameters"]) if loop else {}
         sets |= {} if loop else {int(f["index"]): f["parameters"] for f in report["frames"]}
         base = sqlite3.connect(f"{file.resolve().as_uri()}?mode=ro&immutable=1", uri=True)
         # rows that stand for what is still to be examined

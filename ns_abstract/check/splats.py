@@ -23,8 +23,8 @@ LEAST_ALPHA, STOP = 1.0 / 255.0, 1e-4
 FLOAT = 2.0**-24
 #: Relative room around decisions, for the rounding of their thresholds.
 ROOM = 1e-12
-#: Most Gaussians that may change their order with one another before a box is given up.
-LONGEST_GROUP = 96
+#: Places in the order that a Gaussian may move by before a box is given up.
+LONGEST = 96
 
 
 class Rules(NamedTuple):
@@ -111,7 +111,7 @@ def reaches(splats: Splats, cam: Camera, view: View, unit: float) -> Array:
             room = reach * np.sqrt(spread * spread + BLUR) * (1.0 + 1e-9) + 1e-9 * (np.abs(least) + np.abs(most)) * f
             if unit:
                 # exponents of small ones err by less than a tenth; those of large ones may be anything in their tiles
-                room = np.where(spread < 4.0, 1.06 * room, np.maximum(1.06 * room, 3.3 * spread)) + 2.0 * TILE
+                room = np.where(spread < 4.0, 1.06 * room, np.maximum(1.06 * room, 3.3 * spread) + 2.0 * TILE)
             open_ = near | ~np.isfinite(room)
             found += [np.where(open_, -np.inf, f * least + centre - room - 1e-9)]
             found += [np.where(open_, np.inf, f * most + centre + room + 1e-9)]
@@ -137,11 +137,11 @@ def _points(splats: Splats, view: View, index: Array, unit: float) -> list[Form]
     In float32 the pose is rounded, R C and R mu are sums of three: less than 8 units of |R| (|mu| + |C|).
     """
     means, origin = splats.means[index], view.origin[:, None, :]
-    far = np.abs(means) + np.abs(origin) + sum(e.size() for e in view.position)[:, None, None]
+    far = np.abs(means) + np.abs(origin) + np.sum([e.size() for e in view.position], axis=0)[:, None, None]
     found = []
     for row, move in zip(view.rotation, view.shift, strict=True):
         parts = [wide(e) * (means - origin)[..., s] for s, e in enumerate(row)]
-        error = sum(wide(e).size() * far[..., s] for s, e in enumerate(row))
+        error = np.sum([wide(e).size() * far[..., s] for s, e in enumerate(row)], axis=0)
         found.append((total(parts) + wide(move)).wider((4.0 * U + 8.0 * unit) * error))
     return found
 
@@ -399,9 +399,9 @@ def blended(f: _Fragments, background: Array, unit: float) -> tuple[Form, Array]
     plain = np.take_along_axis(clean, last, 1) & np.take_along_axis(clean, np.minimum(last + 1, n), 1)
     end = np.where(plain, last, np.where(clean & (place > last), place, n).min(axis=1)[:, None])
     inside = place[:, :-1] < end
-    form = _from_the_back(alpha, color, inside, background, unit)
+    form = from_the_back(alpha, color, inside, background, unit)
     # other orders than that of the centres, and earlier stops
-    lower, upper = _swaps(clean, dlow, dhigh, inside, most, ah, cl, ch)
+    lower, upper = _swaps(dlow, dhigh, inside, most, ah, cl, ch)
     at = ((place[:, :-1] >= begin) & (place[:, :-1] < end))[..., None]
     room = 1.0 + ROOM + 8.0 * n * unit
     light = np.where(at[..., 0], STOP * room / np.maximum(1.0 - ah, 1e-3), 0.0).max(axis=1, initial=0.0)
@@ -435,7 +435,7 @@ def _groups(depth: Form, shows: Array) -> tuple[Array, Array, Array]:
     return clean, low, high
 
 
-def _from_the_back(alpha: Form, color: Form, inside: Array, background: Array, unit: float) -> Form:
+def from_the_back(alpha: Form, color: Form, inside: Array, background: Array, unit: float) -> Form:
     """The colours [B, 3] of fragments that are blended in the order of their centres.
 
     S' = S + alpha (C - S): errors of S are met by 1 - alpha, those of C by alpha. In float32 a fragment's light errs by
@@ -459,28 +459,30 @@ def _from_the_back(alpha: Form, color: Form, inside: Array, background: Array, u
     return Form(c, g, np.where(np.isfinite(r), r, np.inf)).wider((4.0 * n + 16.0) * unit * size)
 
 
-def _swaps(clean: Array, dlow: Array, dhigh: Array, inside: Array, most: Array, ah: Array, cl: Array, ch: Array) -> Any:
+def _swaps(dlow: Array, dhigh: Array, inside: Array, most: Array, ah: Array, cl: Array, ch: Array) -> Any:
     """What other orders than that of the centres may change: [B, 3] least and largest.
 
     Sorting by exchanges of neighbours exchanges each inverted pair once; an exchange changes the colour by the
-    transmittance in front times both alphas times the difference of colours. What is surely in front of a group of
-    fragments is in front of it in every order.
+    transmittance in front times both alphas times the difference of colours. What is surely in front of both is in
+    front of them throughout.
     """
     count, n = inside.shape
-    place = np.arange(n)[None]
-    begin = np.maximum.accumulate(np.where(clean[:, :n], place, 0), axis=1)
-    light = np.take_along_axis(most, begin, 1)
-    lower, upper = np.zeros((count, 3)), np.zeros((count, 3))
-    longest = (np.where(inside, place - begin, 0)).max(axis=1, initial=0)
-    for k in range(1, int(np.where(longest > LONGEST_GROUP, 0, longest).max(initial=0)) + 1):
-        pair = inside[:, :-k] & inside[:, k:] & (begin[:, k:] <= place[:, :-k]) & ~(dhigh[:, :-k] < dlow[:, k:])
-        if pair.any():
-            weight = np.where(pair, light[:, :-k] * ah[:, :-k] * ah[:, k:], 0.0)[..., None]
-            with np.errstate(invalid="ignore"):
-                lower += np.where(weight > 0.0, weight * np.minimum(cl[:, k:] - ch[:, :-k], 0.0), 0.0).sum(axis=1)
-                upper += np.where(weight > 0.0, weight * np.maximum(ch[:, k:] - cl[:, :-k], 0.0), 0.0).sum(axis=1)
-    lost = np.where(longest > LONGEST_GROUP, np.inf, 0.0)[:, None]
-    return lower * (1.0 + ROOM) - lost, upper * (1.0 + ROOM) + lost
+    front, back = np.maximum.accumulate(dhigh, axis=1), np.minimum.accumulate(dlow[:, ::-1], axis=1)[:, ::-1]
+    begin = np.stack([np.searchsorted(f, low) for f, low in zip(front, dlow, strict=True)])
+    light, lower, upper = np.take_along_axis(most, begin, 1), np.zeros((count, 3)), np.zeros((count, 3))
+    for k in range(1, n):
+        if not ((back[:, k:] <= dhigh[:, :-k]) & inside[:, k:]).any():
+            break
+        if k > LONGEST:
+            return lower - np.inf, upper + np.inf
+        pair = inside[:, :-k] & inside[:, k:] & ~(dhigh[:, :-k] < dlow[:, k:])
+        rows = np.flatnonzero(pair.any(axis=1))
+        weight = np.where(pair, np.maximum(light[:, :-k], light[:, k:]) * ah[:, :-k] * ah[:, k:], 0.0)[rows, :, None]
+        with np.errstate(invalid="ignore"):
+            down = np.where(weight > 0.0, weight * np.minimum(cl[rows, k:] - ch[rows, :-k], 0.0), 0.0)
+            up = np.where(weight > 0.0, weight * np.maximum(ch[rows, k:] - cl[rows, :-k], 0.0), 0.0)
+        lower[rows], upper[rows] = lower[rows] + down.sum(axis=1), upper[rows] + up.sum(axis=1)
+    return lower * (1.0 + ROOM), upper * (1.0 + ROOM)
 
 
 def pixels(
@@ -526,7 +528,7 @@ def picture(splats: Splats, cam: Camera, view: View, unit: float) -> Form:
     with np.errstate(all="ignore"):
         whole = projected(splats, cam, view, some[None], unit)
     for row in range(cam.height):
-        lists = [meeting(ends, row, column) for column in columns]
+        lists = [meeting(ends, row, int(column)) for column in columns]
         index = np.full((cam.width, max(1, *map(len, lists))), -1)
         for place, numbers in zip(index, lists, strict=True):
             place[: len(numbers)] = numbers

@@ -28,9 +28,11 @@ BATCH = 8
 class _Verdicts:
     """What certificates and loops share: cells that are drawn, and pictures that go through a network."""
 
+    kinds: tuple[str, ...] = ("certified",)
+
     def __init__(self, cells: Cells, scene: Any, report: dict[str, Any], model: Path, about: dict[str, Any]) -> None:
         self.cells, self.scene, self.units = cells, scene, units(scene, report)
-        self.rows = [k for k, v in enumerate(cells.verdicts or []) if v[0] == "certified"]
+        self.rows = [k for k, v in enumerate(cells.verdicts or []) if v[0] in self.kinds]
         self.count = len(self.rows)
         if not isinstance(scene, Splats):
             raise BadInput("is of a NeRF, of which this program checks pictures alone", model, "renderer")
@@ -49,11 +51,11 @@ class _Verdicts:
 
     @classmethod
     def claims(cls, cells: Cells) -> bool:
-        """Whether something is certified."""
-        return any(v[0] == "certified" for v in cells.verdicts or [])
+        """Whether something is claimed."""
+        return any(v[0] in cls.kinds for v in cells.verdicts or [])
 
     def draw(self, rng: Any, hunted: bool) -> int:
-        """A certified cell; one that is hunted has the least margin of four."""
+        """A cell with a verdict; one that is hunted has the least margin of four."""
         found = [self.rows[int(rng.integers(self.count))] for _ in range(4 if hunted else 1)]
         return min(found, key=lambda k: (self.cells.verdicts or [])[k][1] or 0.0)
 
@@ -85,6 +87,13 @@ class _Verdicts:
     def settle(self, claim: int, deadline: float) -> Verdict:
         """True: proved; False: refuted, with the pose; None: open when the time was over; and of which picture."""
         low, high = (self.cells.arrays[f"box_{s}"][claim] for s in ("lower", "upper"))
+        verdict, _, example = (self.cells.verdicts or [])[claim]
+        if verdict == "falsified":
+            point = np.array(example, np.float64)[None]
+            inside = (point >= low).all() and (point <= high).all()
+            if not inside or self.margins(point, point, 0.0)[0] > 0.0:
+                return False, "real", {"pose": point[0].tolist(), "margin": self.most(point), "excess": 0.0}
+            return (True if self.most(point) <= 0.0 else None), "real", {}
         begin, claimed = time.monotonic(), max(0.0, (self.cells.verdicts or [])[claim][1] or 0.0)
         middle = 0.5 * (low + high)[None]
         for unit in self.units:
@@ -114,7 +123,14 @@ class _Verdicts:
 
 
 class Certificate(_Verdicts):
-    """The claims of a frame's cells: a class is the largest output on every picture of a cell."""
+    """The claims of a frame's cells: a class is the largest output on every picture of a cell, or not on one.
+
+    Args:
+        cells, scene, poses, report: As for `Picture`.
+        model: The network's file.
+    """
+
+    kinds = "certified", "falsified"
 
     def __init__(self, cells: Cells, scene: Any, poses: Poses, report: dict[str, Any], model: Path) -> None:
         about = report["property"]
@@ -202,7 +218,8 @@ class Loop(_Verdicts):
             found += [_outside(area, x, self.names) for area in self.loop.get("unsafe") or []]
             if self.cells.index and goal:
                 inside.append(-_outside(goal, x, self.names, inner=True))
-            if not np.isfinite(np.stack([e.r for e in x])).all():
+            lost = ~np.isfinite(np.stack([e.r for e in x])).all(axis=0)
+            if (lost | (np.min(found, axis=0, initial=np.inf) <= 0.0)).all():
                 return np.full(len(low), -np.inf)
         if inside:
             found.append(inside[-1] if goal["when"] == "end" else np.max(inside, axis=0))

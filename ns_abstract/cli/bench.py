@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import faulthandler
 import sys
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 import tyro
 
 from ns_abstract.cli.common import BAD_INPUT, DONE, run
-from ns_abstract.cli.scenes import GivenScene, overrides
+from ns_abstract.cli.options import Overrides, ProgramOptions, SceneOverrides
 from ns_abstract.io.errors import InputError
 
 if TYPE_CHECKING:
@@ -22,6 +22,7 @@ _STUCK = 900.0
 #: Headings of the tables by benchmark.
 _TITLES = {
     "cell": "Cost of a cell",
+    "compile": "Seconds of compiling",
     "tightness": "Error against run time",
     "soundness": "Soundness",
     "plan": "What is left out, taken back",
@@ -33,7 +34,7 @@ _TITLES = {
 
 
 @dataclass
-class Scenes(GivenScene):
+class Scenes:
     """What is measured."""
 
     load_config: tuple[Path, ...] = ()
@@ -48,6 +49,7 @@ class Scenes(GivenScene):
     """Images become this many times smaller."""
     gsplat_version: Literal["1.4.0", "1.5.3", "1.6.0"] | None = None
     """Splats: whose rules are bounded. Default: 1.4.0."""
+    overrides: SceneOverrides = field(default_factory=Overrides)
 
 
 @dataclass
@@ -58,6 +60,14 @@ class Cell(Scenes):
     """Sets of poses: x, yaw, roll, six, segments, orbit, point."""
     repeats: int = 15
     """Times that everything is measured."""
+
+
+@dataclass
+class Compile(Scenes):
+    """What compiling costs at first use, by kernel: seconds by the clock, of the processor, and inside LLVM."""
+
+    sets: tuple[str, ...] = ("x",)
+    """Sets of poses: x, yaw, roll, six, segments, orbit, point."""
 
 
 @dataclass
@@ -185,7 +195,7 @@ class Certificates(Scenes):
 
 
 @dataclass
-class Loops(GivenScene):
+class Loops:
     """A network in the loop: certified fraction against time, tubes against runs, attacks on tubes."""
 
     load_config: Path
@@ -204,6 +214,7 @@ class Loops(GivenScene):
     """Seconds at which the certified fraction is told, up to the time that there is."""
     seed: int = 0
     """Decides every random choice."""
+    overrides: SceneOverrides = field(default_factory=Overrides)
 
 
 @dataclass
@@ -339,7 +350,7 @@ def scale(options: Scale) -> int:
     for row in curve(
         options.load_config[0], options.camera_path_filename, options.frame, options.set, options.gaussians,
         options.widths, options.repeats, options.seconds, options.memory_limit, options.gsplat_version,
-        overrides(options),
+        options.overrides,
     ):  # fmt: skip
         rows.append(row)
         print("\n".join(markdown([row]).splitlines()[0 if len(rows) == 1 else 2 :]), flush=True)
@@ -361,7 +372,7 @@ def certificates(options: Certificates) -> int:
     file = options.camera_path_filename or options.load_config[0].resolve().parents[2] / "camera_path.json"
     path, scene = (
         load_camera_path(file, options.downscale_factor),
-        SceneSource(options.load_config[0], overrides=overrides(options)).open(),
+        SceneSource(options.load_config[0], overrides=options.overrides).open(),
     )
     known = SETS if path.perturbations[options.frame] is None else {**SETS, "path": path.perturbations[options.frame]}
     for name in options.sets:
@@ -391,7 +402,7 @@ def loops(options: Loops) -> int:
         raise InputError(f"found {options.runs}", field="--runs", fix="give a number of at least 1")
     marks = [mark for mark in options.marks if mark <= options.seconds]
     found = measure(
-        SceneSource(options.load_config, overrides=overrides(options)).open(), options.loop, options.seconds,
+        SceneSource(options.load_config, overrides=options.overrides).open(), options.loop, options.seconds,
         options.workers, options.runs, marks,
         options.seed, _said,
     )  # fmt: skip
@@ -402,12 +413,16 @@ def loops(options: Loops) -> int:
     return 1 if found.search[0]["violations"] else DONE
 
 
-def rows_of(options: Cell | Soundness | Plan | Rules | Rays, job: PathJob, name: str) -> list[dict[str, Any]]:
+def rows_of(options: Cell | Compile | Soundness | Plan | Rules | Rays, job: PathJob, name: str) -> list[dict[str, Any]]:
     """What a benchmark without curves finds for one scene and set of poses."""
     if isinstance(options, Cell):
         from ns_abstract.bench.cell import cell_cost
 
         return [cell_cost(job, name, options.frame, options.repeats)]
+    if isinstance(options, Compile):
+        from ns_abstract.bench.compiling import compile_times
+
+        return compile_times(job, name, options.frame)
     if isinstance(options, Soundness):
         from ns_abstract.bench.soundness import attack
 
@@ -440,7 +455,18 @@ def rows_of(options: Cell | Soundness | Plan | Rules | Rays, job: PathJob, name:
 
 
 def bench(
-    options: Cell | Tightness | Soundness | Plan | Rules | Rays | Scale | Certificates | Loops | Stiff | Vnnlib,
+    options: Cell
+    | Compile
+    | Tightness
+    | Soundness
+    | Plan
+    | Rules
+    | Rays
+    | Scale
+    | Certificates
+    | Loops
+    | Stiff
+    | Vnnlib,
 ) -> int:
     """Run one benchmark; the exit code is 1 if a bound was violated."""
     if isinstance(options, Vnnlib):
@@ -457,11 +483,14 @@ def bench(
     from ns_abstract.bench.sets import open_jobs, pose_set
     from ns_abstract.bench.tables import markdown, write
 
-    grid = options.occupancy_grid if isinstance(options, Rays | Tightness) else None
+    program = ProgramOptions(
+        gsplat_version=options.gsplat_version,
+        occupancy_grid=options.occupancy_grid if isinstance(options, Rays | Tightness) else None,
+        device=options.device if isinstance(options, Rays) else None,
+    )
     jobs = open_jobs(
-        options.load_config, options.camera_path_filename, options.downscale_factor, None, grid, options.gsplat_version,
-        options.device if isinstance(options, Rays) else None, overrides(options),
-    )  # fmt: skip
+        options.load_config, options.camera_path_filename, options.downscale_factor, None, program, options.overrides
+    )
     rows: list[dict[str, Any]] = []
     tables: dict[int, list[dict[str, Any]]] = {}
     results = {}
@@ -505,6 +534,7 @@ def main() -> None:
     kinds = tyro.extras.subcommand_type_from_defaults(
         {
             "cell": Cell(),
+            "compile": Compile(),
             "tightness": Tightness(),
             "soundness": Soundness(),
             "plan": Plan(),

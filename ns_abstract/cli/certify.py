@@ -2,25 +2,25 @@
 
 from __future__ import annotations
 
-import os
 import sys
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
 from ns_abstract.cli.common import DONE, INTERRUPTED, Stop, run
-from ns_abstract.cli.scenes import GivenScene, overrides
+from ns_abstract.cli.options import EngineOptions, Overrides, Program, ProgramOptions, SceneOverrides, Where
 from ns_abstract.cli.sets import GivenSet, given_set
 from ns_abstract.io.errors import InputError
 
-#: Seconds where no time budget is given.
-_SECONDS = 1800.0
+if TYPE_CHECKING:
+    from ns_abstract.api.certification import CertifySettings
 
 
 @dataclass
-class Certify(GivenSet, GivenScene):
+class Certify(GivenSet):
     """Prove, or break, a property of a network on every image that a scene shows over a set of poses.
 
     Splits the set into cells until each is certified, falsified or too small. Writes cells.sqlite,
@@ -46,44 +46,14 @@ class Certify(GivenSet, GivenScene):
     """Seconds for all frames together. Default: 1800."""
     frames: tuple[int, ...] | None = None
     """Entries of the camera path, counted from 0. Default: all."""
-    renderer: Literal["gsplat", "paper"] | None = None
-    """gsplat: what Nerfstudio shows of splats (the default for them). paper: Algorithm 1 (splats: no thresholds,
-    RGB) or 2 (NeRF: black behind the last sample) of "Abstract Rendering"."""
-    gsplat_version: Literal["1.4.0", "1.5.3", "1.6.0"] | None = None
-    """Splats: whose rules are bounded. Default: 1.4.0, which nerfstudio 1.1.5 asks for."""
     arithmetic: Literal["float32", "real"] | None = None
     """float32: images of every float32 evaluation (splats, the default for them). real: the real-number renderer and
     its float64 evaluation."""
-    sampling: Literal["uniform", "hierarchical"] | None = None
-    """NeRF. uniform (default): the fine field in the middles of equal bins. hierarchical: Nerfstudio's own picture,
-    its samples followed where the coarse pass puts them."""
-    num_samples: int | None = None
-    """NeRF: bins of every ray. Default: 64."""
-    near_plane: float | None = None
-    """NeRF: distance at which rays start. Default: 0, as in Nerfstudio's evaluation."""
-    occupancy_grid: Path | None = None
-    """NeRF: declare the field empty outside of this grid's occupied voxels (.npz, see ns-abstract-export occupancy).
-    That makes it another scene, for which the certificate holds."""
-    device: Literal["cpu", "cuda"] | None = None
-    """NeRF. cuda: bound the field on a GPU, in float64. Default: cpu."""
     network_arithmetic: Literal["float32", "real"] = "float32"
     """float32: every float32 evaluation of the network (the default). real: the exact function of its weights alone."""
     picture: Literal["float", "8-bit"] = "float"
     """float: the renderer's floats (the default). 8-bit: these rounded to multiples of 1/255, as files and cameras
     have them."""
-    engine: Literal["local", "dask"] = "local"
-    """dask: spread the cells over a Dask cluster (needs the extra "cluster")."""
-    scheduler_address: str | None = None
-    """HOST:PORT of a running Dask scheduler. Default: a cluster on this machine."""
-    tls_ca_file: Path | None = None
-    """Certificate of who signs the scheduler's (PEM), as for `dask scheduler`; with --tls-cert and --tls-key."""
-    tls_cert: Path | None = None
-    """This command's certificate (PEM)."""
-    tls_key: Path | None = None
-    """The certificate's key (PEM)."""
-    workers: int | None = None
-    """Processes on this machine; 1 works in this process. They bound cells of splats, rays of a NeRF. Default: one by
-    core."""
     resume: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
     """Go on with the cells that an interrupted run with the same inputs has stored."""
     scene_margin: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
@@ -91,6 +61,33 @@ class Certify(GivenSet, GivenScene):
     the camera's response and of the place of the whole scene for which everything that is certified holds."""
     memory_limit: float | None = None
     """GiB that may be used. Default: 80 % of what is free."""
+    program: Program = field(default_factory=ProgramOptions)
+    where: Where = field(default_factory=EngineOptions)
+    overrides: SceneOverrides = field(default_factory=Overrides)
+
+    @cached_property
+    def settings(self) -> CertifySettings:
+        """The files, and what is certified.
+
+        Raises:
+            InputError: Options do not go together.
+        """
+        from ns_abstract.api.certification import CertifySettings
+
+        return CertifySettings(
+            self.load_config,
+            self.camera_path_filename,
+            self.model,
+            self.property,
+            self.perturbation_filename,
+            arithmetic=self.arithmetic,
+            network_arithmetic=self.network_arithmetic,
+            picture=self.picture,
+            workers=self.where.ray_processes,
+            given_set=given_set(self),
+            program=self.program,
+            overrides=self.overrides,
+        )
 
 
 def certify(options: Certify) -> int:
@@ -101,29 +98,12 @@ def certify(options: Certify) -> int:
     """
     if options.time_budget is not None and not 0.0 < options.time_budget < float("inf"):
         raise InputError(f"found {options.time_budget}", field="--time-budget", fix="give a positive number")
-    if options.workers is not None and options.workers < 1:
-        raise InputError(f"found {options.workers}", field="--workers", fix="give a number of at least 1")
-    if options.engine == "local" and options.scheduler_address is not None:
-        raise InputError("given without --engine dask", field="--scheduler-address", fix="add --engine dask")
+    options.where.check()
     stop = Stop()
     with stop.installed():
         with stop.at_once():
-            from ns_abstract.api.certification import CertifySettings
-            from ns_abstract.cli.certifying import Order, certify_path
-            from ns_abstract.execution.engines import Tls
-
-        names = {entry.name for entry in fields(CertifySettings)}
-        given = {name: value for name, value in vars(options).items() if name in names}
-        if options.workers is None:
-            given["workers"] = 1 if options.engine == "dask" else len(os.sched_getaffinity(0))
-        given |= {"given_set": given_set(options), "overrides": overrides(options)}
-        tls = Tls.of(options.tls_ca_file, options.tls_cert, options.tls_key, options.scheduler_address)
-        order = Order(
-            CertifySettings(**given), options.frames, options.output_dir, options.time_budget or _SECONDS,
-            options.engine, options.scheduler_address, tls, options.workers, options.resume, options.memory_limit,
-            options.scene_margin, vars(options),
-        )  # fmt: skip
-        complete = certify_path(order, stop)
+            from ns_abstract.cli.certifying import certify_path
+        complete = certify_path(options, stop)
     return DONE if complete and not stop() else INTERRUPTED
 
 

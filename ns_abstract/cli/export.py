@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import json
 import sys
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Literal
 
 import tyro
 
 from ns_abstract.cli.common import DONE, run
-from ns_abstract.cli.scenes import GivenScene, overrides
+from ns_abstract.cli.options import Overrides, ProgramOptions, SceneOverrides
 from ns_abstract.cli.sets import GivenSet, given_set
 from ns_abstract.io.errors import InputError, visible
 
@@ -59,17 +59,18 @@ class Mp4:
 
 
 @dataclass
-class Ply(GivenScene):
+class Ply:
     """The Gaussians of a run as a standard 3DGS .ply, in the run's normalised frame."""
 
     load_config: Path
     """config.yml of a Splatfacto run, or a .ply."""
     output_filename: Path
     """The .ply file; replaced if it exists."""
+    overrides: SceneOverrides = field(default_factory=Overrides)
 
 
 @dataclass
-class VnnLib(GivenSet, GivenScene):
+class VnnLib(GivenSet):
     """Abstract images, a network and a property as ONNX and VNN-LIB, for other verifiers.
 
     Cuts the set of poses of a frame into boxes and writes for each NAME.onnx, whose input is the box's parameters in
@@ -105,10 +106,11 @@ class VnnLib(GivenSet, GivenScene):
     """slice: small files. gemm: no operators in front but Gemm and Reshape, for verifiers that know little."""
     timeout: int = 300
     """Seconds by box in instances.csv."""
+    overrides: SceneOverrides = field(default_factory=Overrides)
 
 
 @dataclass
-class Occupancy(GivenScene):
+class Occupancy:
     """Where a NeRF's field is not empty, by sampling it: a grid for the option --occupancy-grid.
 
     A proposal, not a proof: with the option, the grid is declared to be part of the scene. The npz holds occupied
@@ -125,6 +127,7 @@ class Occupancy(GivenScene):
     """Voxels along each axis."""
     threshold: float = 0.1
     """Densities above it, per normalised unit, are kept, with a margin of one voxel."""
+    overrides: SceneOverrides = field(default_factory=Overrides)
 
 
 Command = (
@@ -156,7 +159,7 @@ def export(options: Npz | Png | Mp4 | Ply | VnnLib | Occupancy) -> int:
             from ns_abstract.methods.splat.load import load_scene
             from ns_abstract.methods.splat.ply import write_ply
 
-            scene = load_scene(options.load_config, overrides(options))
+            scene = load_scene(options.load_config, options.overrides)
             notes = [f"left out: {count:,} Gaussians with {reason}" for reason, count in scene.dropped.items()]
             notes += [f"not in the file: {sentence}" for sentence in write_ply(scene, target)]
         else:
@@ -185,7 +188,7 @@ def _occupancy(options: Occupancy) -> list[str]:
         raise InputError(f"found {options.resolution}", field="--resolution", fix=f"give 1 to {_MOST_VOXELS}")
     if not 0.0 <= options.threshold < float("inf"):
         raise InputError(f"found {options.threshold}", field="--threshold", fix="give 0 or more")
-    scene = load_any(options.load_config, overrides(options))
+    scene = load_any(options.load_config, options.overrides)
     if not isinstance(scene, NerfScene):
         raise InputError("this run is a splat", file=options.load_config, fix="give a run of vanilla-nerf")
     density = Field(scene.fine).density
@@ -211,9 +214,19 @@ def _vnnlib(options: VnnLib) -> list[str]:
         raise InputError(f"found {options.timeout}", field="--timeout", fix="give a number of at least 1")
     if any(n < 1 for n in options.parts):
         raise InputError(f"found {min(options.parts)}", field="--parts", fix="give numbers of at least 1")
-    names = {entry.name for entry in fields(CertifySettings)} & {entry.name for entry in fields(VnnLib)}
-    given = {name: getattr(options, name) for name in names}
-    job = open_certification(CertifySettings(**given, given_set=given_set(options), overrides=overrides(options)))
+    settings = CertifySettings(
+        options.load_config,
+        options.camera_path_filename,
+        options.model,
+        options.property,
+        options.perturbation_filename,
+        arithmetic=options.arithmetic,
+        picture=options.picture,
+        given_set=given_set(options),
+        program=ProgramOptions(options.renderer, options.gsplat_version),
+        overrides=options.overrides,
+    )
+    job = open_certification(settings)
     options.output_dir.mkdir(parents=True, exist_ok=True)
     lines, boxes = [], {}
     for frame in check_frames(options.frames, job.job.frame_count):

@@ -2,29 +2,26 @@
 
 from __future__ import annotations
 
-import os
-import sys
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
 from ns_abstract.cli.common import DONE, INTERRUPTED, Stop, run
-from ns_abstract.cli.scenes import GivenScene, overrides
+from ns_abstract.cli.options import EngineOptions, Overrides, Program, ProgramOptions, SceneOverrides, Where
 from ns_abstract.cli.sets import GivenSet, given_set
 from ns_abstract.io.errors import InputError
 
 if TYPE_CHECKING:
-    from ns_abstract.api.files import PathJob
-    from ns_abstract.perturbation.specification import Perturbation
+    from ns_abstract.api.files import Settings
 
 #: Seconds by frame where --explain is given none.
 _EXPLAINED_S = 30.0
 
 
 @dataclass
-class Render(GivenSet, GivenScene):
+class Render(GivenSet):
     """Bound every image that Nerfstudio would show, for every pose in a set around each keyframe.
 
     Writes frame_00000.npz and .png by keyframe, report.json and report.html. Exit codes: 0 done;
@@ -35,8 +32,8 @@ class Render(GivenSet, GivenScene):
     """config.yml of a Splatfacto or vanilla-nerf run, or a standard 3DGS .ply."""
     camera_path_filename: Path
     """Camera path as Nerfstudio's viewer writes it."""
-    output_dir: Path
-    """Folder for the results; made if missing."""
+    output_dir: Path | None = None
+    """Folder for the results; made if missing. Required, but for --describe and --explain."""
     time_budget: float | None = None
     """Seconds for all frames together. Default: 60 per frame."""
     target_ratio: float = 1.05
@@ -45,43 +42,14 @@ class Render(GivenSet, GivenScene):
     """Entries of the camera path, counted from 0. Default: all."""
     downscale_factor: float = 1.0
     """Images become this many times smaller."""
-    renderer: Literal["gsplat", "paper"] | None = None
-    """gsplat: what Nerfstudio shows of splats (the default for them). paper: Algorithm 1 (splats: no thresholds,
-    RGB) or 2 (NeRF: black behind the last sample) of "Abstract Rendering"."""
-    gsplat_version: Literal["1.4.0", "1.5.3", "1.6.0"] | None = None
-    """Splats: whose rules are bounded. Default: 1.4.0, which nerfstudio 1.1.5 asks for."""
     arithmetic: Literal["float32", "real"] | None = None
     """float32: enclose every float32 evaluation (splats, the default for them). real: the real-number renderer and
     its float64 evaluation."""
-    sampling: Literal["uniform", "hierarchical"] | None = None
-    """NeRF. uniform (default): the fine field in the middles of equal bins. hierarchical: Nerfstudio's own picture,
-    its samples followed where the coarse pass puts them."""
-    num_samples: int | None = None
-    """NeRF: bins of every ray. Default: 64."""
-    near_plane: float | None = None
-    """NeRF: distance at which rays start. Default: 0, as in Nerfstudio's evaluation."""
-    occupancy_grid: Path | None = None
-    """NeRF: declare the field empty outside of this grid's occupied voxels (.npz, see ns-abstract-export occupancy).
-    That makes it another scene, for which the bounds hold."""
-    device: Literal["cpu", "cuda"] | None = None
-    """NeRF. cuda: bound the field on a GPU, in float64. Default: cpu."""
     outputs: tuple[Literal["rgb", "depth", "accumulation"], ...] = ("rgb",)
     """What is bounded. rgb is always; depth: gsplat's expected depth, normalised units (splats). accumulation: the part
     of the light that the scene takes."""
     seed: int = 0
     """Seed of the random witnesses."""
-    engine: Literal["local", "dask"] = "local"
-    """dask: spread the frames, and tiles where frames are few, over a Dask cluster (needs the extra "cluster")."""
-    scheduler_address: str | None = None
-    """HOST:PORT of a running Dask scheduler. Default: a cluster on this machine."""
-    tls_ca_file: Path | None = None
-    """Certificate of who signs the scheduler's (PEM), as for `dask scheduler`; with --tls-cert and --tls-key."""
-    tls_cert: Path | None = None
-    """This command's certificate (PEM)."""
-    tls_key: Path | None = None
-    """The certificate's key (PEM)."""
-    workers: int | None = None
-    """NeRF: processes that bound rays. Default: one for every core."""
     resume: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
     """Keep the frames that an interrupted run with the same inputs has finished."""
     save_cells: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
@@ -94,37 +62,36 @@ class Render(GivenSet, GivenScene):
     explain: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
     """Splats: also tell why bounds are wider than renders, where, and what would help, in words and in the report.
     Without --output-dir nothing is written."""
+    program: Program = field(default_factory=ProgramOptions)
+    where: Where = field(default_factory=EngineOptions)
+    overrides: SceneOverrides = field(default_factory=Overrides)
+
+    @property
+    def settings(self) -> Settings:
+        """The files, and what is bounded.
+
+        Raises:
+            InputError: Options do not go together.
+        """
+        from ns_abstract.api.files import Settings
+
+        return Settings(
+            self.load_config,
+            self.camera_path_filename,
+            self.perturbation_filename,
+            downscale_factor=self.downscale_factor,
+            arithmetic=self.arithmetic,
+            seed=self.seed,
+            memory_limit=self.memory_limit,
+            workers=self.where.ray_processes,
+            given_set=given_set(self),
+            outputs=self.outputs,
+            program=self.program,
+            overrides=self.overrides,
+        )
 
 
-@dataclass
-class Describe(Render):
-    """Tell what cameras, units and set mean, in pixels and distances, and do nothing else."""
-
-    output_dir: Path = Path()
-    """Not used."""
-
-
-@dataclass
-class Explain(Render):
-    """Bound the frames, tell why their bounds are wider than renders, and write nothing."""
-
-    output_dir: Path = Path()
-    """Not used."""
-
-
-def opened(options: Render, default: Perturbation | None = None) -> PathJob:
-    """The job of a command that runs in this process alone; ``default``: see `open_job`."""
-    from ns_abstract.api.files import Settings, open_job
-
-    names = {entry.name for entry in fields(Settings)}
-    given = {name: value for name, value in vars(options).items() if name in names}
-    return open_job(
-        Settings(**given | {"workers": 1, "given_set": given_set(options), "overrides": overrides(options)}),
-        default=default,
-    )
-
-
-def explain(options: Explain) -> int:
+def explain(options: Render) -> int:
     """Bound and explain frame by frame; returns the exit code.
 
     Raises:
@@ -133,10 +100,11 @@ def explain(options: Explain) -> int:
     from ns_abstract.api.bounding import bound_frames
     from ns_abstract.api.explaining import check_explained
     from ns_abstract.api.explaining import explain as explained
+    from ns_abstract.api.files import open_job
     from ns_abstract.api.job import check_frames
     from ns_abstract.execution.engines import Here
 
-    job = opened(options)
+    job = open_job(replace(options.settings, workers=1))
     check_explained(job)
     frames = check_frames(options.frames, job.frame_count)
     stop = Stop()
@@ -151,19 +119,20 @@ def explain(options: Explain) -> int:
     return INTERRUPTED if stop() else DONE
 
 
-def describe(options: Describe) -> int:
+def describe(options: Render) -> int:
     """Print what is about to be bounded; returns the exit code.
 
     Raises:
         InputError: A file, a field or an option cannot be used.
     """
     from ns_abstract.api.describe import describe as described
+    from ns_abstract.api.files import open_job
     from ns_abstract.api.job import check_frames
     from ns_abstract.io.errors import visible
     from ns_abstract.perturbation.specification import Perturbation
 
     # a path that says nothing of a set is looked at all the same
-    job = opened(options, Perturbation())
+    job = open_job(replace(options.settings, workers=1), default=Perturbation())
     for line in described(job, check_frames(options.frames, job.frame_count)):
         print(visible(line))
     return DONE
@@ -175,45 +144,30 @@ def render(options: Render) -> int:
     Raises:
         InputError: A file, a field or an option cannot be used.
     """
+    if options.describe:
+        return describe(options)
+    if options.output_dir is None:
+        if options.explain:
+            return explain(options)
+        raise InputError("missing --output-dir", fix="--help lists the options")
     for name, value in (("--target-ratio", options.target_ratio), ("--time-budget", options.time_budget)):
         if value is not None and not 0.0 < value < float("inf"):
             raise InputError(f"found {value}", field=name, fix="give a positive number")
     if options.target_ratio < 1.0:
         raise InputError(f"found {options.target_ratio}", field="--target-ratio", fix="give a number of at least 1")
-    if options.workers is not None and options.workers < 1:
-        raise InputError(f"found {options.workers}", field="--workers", fix="give at least 1")
     if options.seed < 0:
         raise InputError(f"found {options.seed}", field="--seed", fix="give a number of at least 0")
-    if options.engine == "local" and options.scheduler_address is not None:
-        raise InputError("given without --engine dask", field="--scheduler-address", fix="add --engine dask")
+    options.where.check()
     stop = Stop()
     with stop.installed():
         with stop.at_once():
-            from ns_abstract.api.files import Settings
-            from ns_abstract.cli.rendering import Order, render_path
-            from ns_abstract.execution.engines import Tls
-
-        names = {entry.name for entry in fields(Settings)}
-        given = {name: value for name, value in vars(options).items() if name in names}
-        if options.workers is None:
-            given["workers"] = 1 if options.engine == "dask" else len(os.sched_getaffinity(0))
-        given |= {"given_set": given_set(options), "overrides": overrides(options)}
-        tls = Tls.of(options.tls_ca_file, options.tls_cert, options.tls_key, options.scheduler_address)
-        order = Order(
-            Settings(**given), options.frames, options.output_dir, options.time_budget, options.target_ratio,
-            options.engine, options.scheduler_address, tls, options.resume, options.save_cells, options.explain,
-            vars(options),
-        )  # fmt: skip
-        complete = render_path(order, stop)
+            from ns_abstract.cli.rendering import render_path
+        complete = render_path(options, stop)
     return DONE if complete and not stop() else INTERRUPTED
 
 
 def main() -> None:
     """Entry point of the console script."""
-    if "--describe" in sys.argv[1:]:
-        run(describe, lambda: tyro.cli(Describe, prog="ns-abstract-render"))
-    elif "--explain" in sys.argv[1:] and not any(w.replace("_", "-").startswith("--output-dir") for w in sys.argv[1:]):
-        run(explain, lambda: tyro.cli(Explain, prog="ns-abstract-render"))
     run(render, lambda: tyro.cli(Render, prog="ns-abstract-render"))
 
 

@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Mapping
 from contextlib import ExitStack
-from dataclasses import dataclass, replace
-from pathlib import Path
-from typing import Any
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
@@ -15,50 +13,23 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from ns_abstract.api import bounding
 from ns_abstract.api.compiling import compile_beside
 from ns_abstract.api.explaining import check_explained, explain
-from ns_abstract.api.files import PathJob, Settings, open_job
+from ns_abstract.api.files import PathJob, open_job
 from ns_abstract.api.job import Job, check_frames, platform_problems
 from ns_abstract.cli.common import Stop, plain_console
-from ns_abstract.execution.engines import Engine, EngineName, Tls, started
+from ns_abstract.cli.options import stated
+from ns_abstract.execution.engines import Engine
 from ns_abstract.io.folder import claim
 from ns_abstract.report.figures import listed
 from ns_abstract.report.record import Report, Run, failed_self_check
+
+if TYPE_CHECKING:
+    from ns_abstract.cli.render import Render
 
 #: Seconds by frame where no time budget is given.
 _SECONDS_BY_FRAME = 60.0
 
 
-@dataclass(frozen=True)
-class Order:
-    """What the command line asks for.
-
-    Attributes:
-        settings: The files and what is bounded.
-        frames: Entries of the camera path, or None for all.
-        output_dir: Folder for the results.
-        budget: Seconds for all frames together, or None.
-        target_ratio: Where a frame is good enough.
-        engine, scheduler_address, tls: Where the work is done.
-        resume: Whether to keep finished frames.
-        save_cells: Whether to store leaf cells.
-        explain: Whether the report tells why bounds are loose.
-        options: All options, for the report.
-    """
-
-    settings: Settings
-    frames: tuple[int, ...] | None
-    output_dir: Path
-    budget: float | None
-    target_ratio: float
-    engine: EngineName
-    scheduler_address: str | None
-    tls: Tls | None
-    resume: bool
-    save_cells: bool
-    explain: bool
-    options: Mapping[str, Any]
-
-
-def make_run(job: PathJob, order: Order, frames: tuple[int, ...], problems: tuple[str, ...]) -> Run:
+def make_run(job: PathJob, options: Render, frames: tuple[int, ...], problems: tuple[str, ...]) -> Run:
     """What the report says about the command; ``problems`` of the platform take the guarantee away."""
     return Run(
         guarantee="sampled" if problems else job.method.guarantee,
@@ -67,7 +38,7 @@ def make_run(job: PathJob, order: Order, frames: tuple[int, ...], problems: tupl
         assumptions=job.assumptions,
         frames=frames,
         fingerprint=job.fingerprint,
-        settings=order.options,
+        settings=stated(options),
         plan=job.plan,
         command=("ns-abstract-render", *sys.argv[1:]),
         limits=tuple(map(failed_self_check, problems)),
@@ -75,71 +46,72 @@ def make_run(job: PathJob, order: Order, frames: tuple[int, ...], problems: tupl
     )
 
 
-def render_path(order: Order, stop: Stop) -> bool:
+def render_path(options: Render, stop: Stop) -> bool:
     """Bound the frames and write the results; returns whether every frame has one.
 
     Raises:
         InputError: A file, a field or an option cannot be used.
     """
-    console = plain_console()
+    console, folder = plain_console(), options.output_dir
+    assert folder is not None
     with stop.at_once():
-        job = open_job(order.settings)
-        frames = check_frames(order.frames, job.frame_count)
-        if order.explain:
+        job = open_job(options.settings)
+        frames = check_frames(options.frames, job.frame_count)
+        if options.explain:
             check_explained(job)
         problems = platform_problems()
     with ExitStack() as stack:
         # before the workers: another command may be writing there
-        stack.enter_context(claim(order.output_dir))
+        stack.enter_context(claim(folder))
         # frames follow one another in this process; a NeRF has processes of its own
-        workers = bounding.local_workers(job) if order.engine == "dask" else 1
-        engine = stack.enter_context(started(order.engine, order.scheduler_address, workers, order.tls))
-        run = make_run(job, order, frames, problems)
-        report = (Report.resume if order.resume else Report)(order.output_dir, run)
+        workers = bounding.local_workers(job) if options.where.engine == "dask" else 1
+        engine = stack.enter_context(options.where.started(workers))
+        run = make_run(job, options, frames, problems)
+        report = (Report.resume if options.resume else Report)(folder, run)
         for problem in problems:
             console.print(f"warning: {problem}", markup=False)
         for reason in report.ignored:
             console.print(f"not used: {reason}", markup=False)
         _introduce(console, job, report)
         stack.enter_context(stop.last_words(report.interrupted))
-        _fill(report, job, order, engine, stop, console)
+        _fill(report, job, options, engine, stop, console)
     if report.missing:
         console.print(
             f"no bounds yet for frames {listed(report.missing)}: raise --time-budget, --resume", soft_wrap=True
         )
-    console.print(f"report: {order.output_dir / 'report.html'}", markup=False, soft_wrap=True)
+    console.print(f"report: {folder / 'report.html'}", markup=False, soft_wrap=True)
     return not report.missing
 
 
-def _fill(report: Report, job: Job, order: Order, engine: Engine, stop: Stop, console: Console) -> None:
+def _fill(report: Report, job: Job, options: Render, engine: Engine, stop: Stop, console: Console) -> None:
     """Bound what is pending and write it."""
     # a frame without bounds comes before one that could be tighter
     missing = set(report.missing)
     pending = sorted(report.pending, key=lambda index: index not in missing)
-    budget = order.budget if order.budget is not None else _SECONDS_BY_FRAME * max(1, len(pending))
+    budget = options.time_budget if options.time_budget is not None else _SECONDS_BY_FRAME * max(1, len(pending))
     progress = Progress(
         TextColumn("{task.description}"), BarColumn(), TextColumn("{task.fields[state]}"), TimeElapsedColumn(),
         console=console, disable=not console.is_terminal, transient=True,
     )  # fmt: skip
     try:
-        if pending and order.engine == "local":
+        if pending and options.where.engine == "local":
             with stop.at_once():
                 compile_beside(job, report.pending[0])
         with progress:
-            meter = _Meter(progress, len(pending), order.target_ratio)
+            meter = _Meter(progress, len(pending), options.target_ratio)
             results = bounding.bound_frames(
-                job, pending, engine=engine, budget=budget, target_ratio=order.target_ratio,
-                keep_leaves=order.save_cells or order.explain, stop=stop, on_progress=meter.told,
+                job, pending, engine=engine, budget=budget, target_ratio=options.target_ratio,
+                keep_leaves=options.save_cells or options.explain, stop=stop, on_progress=meter.told,
                 found_before=report.stored,
             )  # fmt: skip
             for done, result in enumerate(results, 1):
                 # first what was asked for: drawing loads matplotlib
-                kept = result if order.save_cells else replace(result, leaves=None)
+                kept = result if options.save_cells else replace(result, leaves=None)
                 _tell(console, report.add(kept, picture=False))
                 report.draw(result.index)
-                if order.explain and result.bounded and not stop():
+                if options.explain and result.bounded and not stop():
                     with stop.at_once():
-                        lines = tuple(explain(job, result.index, result, order.settings.seed).lines())
+                        lines = tuple(explain(job, result.index, result, options.seed).lines())
                     report.explain(result.index, lines)
                     for line in lines[1:]:
                         console.print(line, markup=False, soft_wrap=True)

@@ -10,7 +10,7 @@ from typing import Literal
 import tyro
 
 from ns_abstract.cli.common import DONE, run
-from ns_abstract.cli.scenes import GivenScene, overrides
+from ns_abstract.cli.options import Overrides, SceneOverrides
 from ns_abstract.io.errors import InputError
 
 
@@ -43,7 +43,7 @@ class Viewer:
 
 
 @dataclass
-class View(GivenScene):
+class View:
     """View a trained run with lower and upper bounds of what its camera could show.
 
     nerfstudio's viewer with the output types abstract_lower, abstract_upper, abstract_gap and
@@ -61,6 +61,7 @@ class View(GivenScene):
     """Splats: bound the expected depth, too: output types abstract_depth_lower and abstract_depth_upper."""
     gsplat_version: Literal["1.4.0", "1.5.3", "1.6.0"] | None = None
     """Splats: whose rules are drawn and bounded. Default: the installed version's."""
+    overrides: SceneOverrides = field(default_factory=Overrides)
 
 
 def view(options: View) -> int:
@@ -77,7 +78,7 @@ def view(options: View) -> int:
         from ns_abstract.nerfstudio.viewing import view as serve
 
         abstract = {"depth": options.depth, "gsplat_version": options.gsplat_version}
-        serve(options.load_config, options.vis, vars(options.viewer), abstract, overrides(options))
+        serve(options.load_config, options.vis, vars(options.viewer), abstract, options.overrides)
     except ModuleNotFoundError as error:
         raise InputError(
             f"the package {error.name} is missing", field="nerfstudio", fix="pip install 'ns-abstract[nerfstudio]'"

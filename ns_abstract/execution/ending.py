@@ -1,10 +1,12 @@
-"""How work ends before it is finished: by a request that long loops look at, or with the process that asked for it."""
+"""Cancellation: long work checks whether it was cancelled, and worker processes end with their parent."""
 
 from __future__ import annotations
 
+import math
 import multiprocessing
 import os
 import threading
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
@@ -12,7 +14,7 @@ from multiprocessing.connection import wait
 
 
 class AbandonedError(Exception):
-    """Work was given up at a `checkpoint`."""
+    """Raised by `checkpoint` when the work was cancelled."""
 
 
 def _never() -> bool:
@@ -22,9 +24,56 @@ def _never() -> bool:
 _over: ContextVar[Callable[[], bool]] = ContextVar("over", default=_never)
 
 
+class Deadline:
+    """When work has to end: at a time, or as soon as who asked for it says so. Calling it tells whether that is now.
+
+    Args:
+        seconds: From now on; infinite: at no time.
+        request: Asked whether to end early, a signal's `ns_abstract.execution.stopping.StopRequest` for example.
+    """
+
+    def __init__(self, seconds: float = math.inf, request: Callable[[], bool] = _never) -> None:
+        self.end, self.request = time.perf_counter() + seconds, request
+
+    def __call__(self) -> bool:
+        return self.request() or self.late
+
+    @property
+    def late(self) -> bool:
+        """Whether the time is over."""
+        return time.perf_counter() >= self.end
+
+    @property
+    def left(self) -> float:
+        """Seconds until the time is over; negative afterwards."""
+        return self.end - time.perf_counter()
+
+    def within(self, seconds: float) -> Deadline:
+        """The same request, at most so many seconds from now on."""
+        return Deadline(min(seconds, self.left), self.request)
+
+    def before(self, seconds: float) -> Deadline:
+        """The same request, so many seconds earlier."""
+        return Deadline(self.left - seconds, self.request)
+
+    def extended(self, seconds: float) -> Deadline:
+        """The same request, so many seconds later."""
+        return Deadline(self.left + seconds, self.request)
+
+    @contextmanager
+    def enforced(self) -> Iterator[None]:
+        """Inside the block, work that asks `checkpoint` is given up once the deadline is reached.
+
+        Raises:
+            AbandonedError: At a checkpoint after it.
+        """
+        with abandoning(self):
+            yield
+
+
 @contextmanager
 def abandoning(over: Callable[[], bool]) -> Iterator[None]:
-    """Inside the block, work that asks `checkpoint` is given up once ``over`` says so."""
+    """Cancel work inside the block, at its next `checkpoint`, once ``over`` returns True."""
     token = _over.set(over)
     try:
         yield
@@ -33,12 +82,12 @@ def abandoning(over: Callable[[], bool]) -> Iterator[None]:
 
 
 def is_over() -> bool:
-    """Whether the work in hand is to be given up."""
+    """Return whether the current work is cancelled."""
     return _over.get()()
 
 
 def checkpoint() -> None:
-    """Called about once a second by work that can be given up.
+    """Raise `AbandonedError` if the current work is cancelled; long loops call it about once a second.
 
     Raises:
         AbandonedError: It is given up.

@@ -1,4 +1,4 @@
-"""Where work is done: in this process, in processes of this machine, or on a Dask cluster.
+"""Engines that run tasks: this process, processes of this machine, or a Dask cluster.
 
 An engine takes tasks (a function of a module and picklable arguments) and hands back each one's result
 exactly once, in any order, whatever workers die on the way.
@@ -57,7 +57,7 @@ class Machine(NamedTuple):
 
 
 class Engine(Protocol):
-    """What takes tasks."""
+    """The interface of an engine: it accepts tasks and returns their results."""
 
     @property
     def capacity(self) -> int:
@@ -190,7 +190,7 @@ class Processes:
         self._feed()
 
     def abandon(self) -> None:
-        """Ask the tasks in work to end early; `collect` then gives `AbandonedError` as the result of those that do."""
+        """Ask running tasks to end early; `collect` gives `AbandonedError` as the result of those that do."""
         self._waiting.clear()
         for worker, _, _ in self._busy.values():
             if worker.process.is_alive():
@@ -275,7 +275,7 @@ def _needs_guard(script: Path) -> InputError:
 
 
 def _serve(connection: Connection) -> None:
-    """A worker's life: tasks in, (good, result or exception) out, until the connection ends."""
+    """Run a worker: receive tasks, send (good, result or exception), until the connection ends."""
     end_with_parent()
     asked = threading.Event()
 

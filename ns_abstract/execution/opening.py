@@ -1,4 +1,4 @@
-"""What worker processes keep open between tasks."""
+"""The cache of a worker process: the scene or network that its tasks use."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from ns_abstract.io.version import VERSION, stale
 
 
 class Fingerprinted(Protocol):
-    """What is opened from files."""
+    """An object that is loaded from files and identified by a fingerprint."""
 
     @property
     def fingerprint(self) -> Mapping[str, Any]:
@@ -29,7 +29,7 @@ F = TypeVar("F", bound=Fingerprinted)
 
 
 class Kept(Generic[T]):
-    """The thing that was made last, for as long as the same one is asked for."""
+    """A cache of one value: the latest, until another key is requested."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
@@ -51,7 +51,7 @@ class Kept(Generic[T]):
 
 @dataclass(frozen=True)
 class Recipe(Generic[F]):
-    """How another process opens what this one has opened.
+    """A recipe with which another process loads the same object.
 
     Attributes:
         open: Opens it again; can be pickled.
@@ -73,7 +73,7 @@ _kept: Kept[Any] = Kept()
 
 
 def opened(recipe: Recipe[F]) -> F:
-    """What the recipe describes, opened once in this process.
+    """Return the object of the recipe, loaded once in this process.
 
     Raises:
         InputError: This process runs another version of the package than the one that asks, or reads other files
@@ -108,5 +108,5 @@ def opened(recipe: Recipe[F]) -> F:
 
 
 def forget() -> None:
-    """Close what this process keeps open."""
+    """Drop the cached object of this process."""
     _kept.clear()

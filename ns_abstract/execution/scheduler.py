@@ -1,4 +1,4 @@
-"""The loop that keeps an engine busy, whatever the work is."""
+"""The scheduler: keeps an engine busy with tasks of any kind."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ class Task(NamedTuple):
 def work(
     engine: Engine, offer: Callable[[int], Iterable[Task]], stop: Callable[[], bool]
 ) -> Iterator[list[tuple[Any, Any]]]:
-    """Names and results as they come, each once, in any order.
+    """Yield names and results as they arrive, each once, in any order.
 
     Ends when nothing is under way after an offer, or when ``stop`` says so; what is not finished is then given up, and
     the engine is closed.

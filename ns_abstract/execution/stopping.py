@@ -1,4 +1,4 @@
-"""Requests to stop: by a signal, or by whoever started the work."""
+"""Requests to stop, made by a signal or by the caller."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ from types import FrameType
 
 
 def is_interruption(error: BaseException) -> bool:
-    """Whether a signal ended the work: compiled functions that its exception reaches raise SystemError."""
+    """Return whether an error means that a signal interrupted the work (compiled functions raise SystemError then)."""
     if isinstance(error, SystemError):
         return isinstance(error.__cause__, KeyboardInterrupt)
     return isinstance(error, KeyboardInterrupt)
 
 
 class StopRequest:
-    """A request to stop that is asked for between pieces of work; a second signal stops at once."""
+    """A request to stop that is checked between pieces of work; a second signal stops at once."""
 
     def __init__(self) -> None:
         self.signal: int | None = None
@@ -88,7 +88,7 @@ class StopRequest:
 
 @contextmanager
 def interruptible() -> Iterator[StopRequest]:
-    """A request that Ctrl-C makes where Python's own handler would raise KeyboardInterrupt.
+    """Yield a request that Ctrl-C sets, where Python's own handler would raise KeyboardInterrupt.
 
     So the work ends between two cells, with results that are whole. Elsewhere (other threads, programs that handle the
     signal themselves) signals are left alone.

@@ -1,4 +1,4 @@
-"""Threads of this process that share a cell or a picture; compiled kernels let go of the interpreter meanwhile.
+"""Threads of this process that work on one cell or picture; compiled kernels release the interpreter's lock.
 
 numba's own parallel loops would have each kernel compiled four times: for the type that they count by, in the loop's
 body and around it.

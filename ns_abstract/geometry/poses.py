@@ -106,7 +106,7 @@ class PoseForms:
 
 @dataclass(frozen=True, eq=False)
 class PoseSet:
-    """The poses of one frame: a camera and a box of parameters around it.
+    """The set of poses of one frame: a camera and a box of pose parameters around it.
 
     Attributes:
         camera: Intrinsics and image size; the pose of the first keyframe.

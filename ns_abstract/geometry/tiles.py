@@ -1,4 +1,4 @@
-"""Pictures in square tiles, row by row; tiles may reach past the right and lower edge."""
+"""Pictures divided into square tiles, row by row; tiles may extend past the right and lower edge."""
 
 from __future__ import annotations
 

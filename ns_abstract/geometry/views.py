@@ -1,4 +1,4 @@
-"""Cameras that look at something, and camera paths as the Nerfstudio viewer writes them."""
+"""Keyframe cameras that look at a target, and camera paths as the Nerfstudio viewer writes them."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ FOV = 45.0  # vertical, degrees
 
 @dataclass(frozen=True)
 class View:
-    """A pinhole camera with square pixels and the principal point in the middle.
+    """A keyframe's camera: square pixels, principal point in the middle.
 
     Attributes:
         camera_to_world: [4, 4] float64, OpenGL axes (x right, y up, z back), normalised frame.

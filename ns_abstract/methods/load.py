@@ -42,5 +42,5 @@ def open_scene(path: str | os.PathLike[str], overrides: Overrides | None = None)
 
 
 def load_any(path: str | os.PathLike[str], overrides: Overrides | None = None) -> Any:
-    """The scene alone; see `open_scene`."""
+    """Return the scene alone; see `open_scene`."""
     return open_scene(path, overrides)[1]

@@ -1,9 +1,10 @@
-"""What the user says of a scene in place of its files, and where each choice came from."""
+"""Options that override what a scene's files say, and the origin of each choice."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
+from typing import Literal
 
 from ns_abstract.io.assumptions import Assumption
 from ns_abstract.io.errors import InputError
@@ -18,23 +19,20 @@ _STEP_LIMIT = 10**15
 class Overrides:
     """What the user says of a scene; None and False leave it to the scene's files.
 
-    Attributes:
-        rasterize_mode: "classic" or "antialiased" (splats).
-        background: RGB in [0, 1] behind the scene.
-        load_step: Training step whose checkpoint is read (runs).
-        assume_splatfacto: Read the Gaussians of a run whose class or modules are not Splatfacto's; bounds then hold of
-            the Gaussians alone.
-        drop_nan_gaussians: Leave out Gaussians whose values are not finite.
-
     Raises:
         InputError: A value cannot be used.
     """
 
-    rasterize_mode: str | None = None
+    rasterize_mode: Literal["classic", "antialiased"] | None = None
+    """Splats: how they are rasterised, in place of what config.yml or a comment of the .ply says."""
     background: tuple[float, float, float] | None = None
+    """Red, green and blue from 0 to 1 behind the scene, in place of what config.yml says; for a .ply, of black."""
     load_step: int | None = None
+    """Training step of the checkpoint. Default: what config.yml says, or else the highest."""
     assume_splatfacto: bool = False
+    """Bound the Gaussians alone of a run whose class or modules are not Splatfacto's, and which may draw more."""
     drop_nan_gaussians: bool = False
+    """Leave out Gaussians whose values are not finite; the report counts them."""
 
     def __post_init__(self) -> None:
         mode, color, step = self.rasterize_mode, self.background, self.load_step
@@ -60,7 +58,7 @@ class Overrides:
 
 
 def chosen(name: str, given: object, flag: str, stored: object, origin: str) -> Assumption:
-    """The record of a choice: what is given wins, and the record then names what it replaces.
+    """Return the record of a choice: an option wins, and the record names what it replaces.
 
     Args:
         name: Of the choice.

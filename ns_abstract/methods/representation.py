@@ -1,4 +1,4 @@
-"""What opens a scene: one `Representation` by folder of `ns_abstract.methods`."""
+"""The entry point of a scene representation: one `Representation` per folder of `ns_abstract.methods`."""
 
 from __future__ import annotations
 
@@ -7,43 +7,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from ns_abstract.io.errors import InputError
 from ns_abstract.methods.overrides import Overrides
+from ns_abstract.methods.program_options import ProgramOptions
 from ns_abstract.methods.runs import RunConfig
 from ns_abstract.refine.protocol import Method
-
-
-@dataclass(frozen=True)
-class ProgramOptions:
-    """Which program draws the scene; None: the representation's own choice.
-
-    Attributes:
-        renderer: "gsplat" or "paper".
-        sampling: "uniform" or "hierarchical" (NeRF).
-        num_samples: Bins of every ray (NeRF).
-        near_plane: Start of the rays, normalised units (NeRF).
-        occupancy_grid: File of a grid that is declared as part of the scene (NeRF).
-        gsplat_version: Whose rules draw splats, of `VERSIONS`; None: 1.4.0.
-        device: Where the field is bounded, "cpu" or "cuda" (NeRF); None: "cpu".
-    """
-
-    renderer: str | None = None
-    sampling: str | None = None
-    num_samples: int | None = None
-    near_plane: float | None = None
-    occupancy_grid: Path | None = None
-    gsplat_version: str | None = None
-    device: str | None = None
-
-    def refuse(self, names: tuple[str, ...], problem: str) -> None:
-        """Refuse options of other representations.
-
-        Raises:
-            InputError: One of ``names`` is given.
-        """
-        for name in names:
-            if getattr(self, name) is not None:
-                raise InputError(problem, field="--" + name.replace("_", "-"), fix="leave it out")
 
 
 @dataclass(frozen=True)

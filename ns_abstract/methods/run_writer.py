@@ -32,7 +32,7 @@ _LPIPS_HEADS = (64, 192, 384, 256, 256)
 
 
 class Shown(Protocol):
-    """What a data set beside a run needs to know of its scene."""
+    """The properties of a scene that a data set beside its run needs."""
 
     @property
     def background(self) -> NDArray[np.float32]: ...

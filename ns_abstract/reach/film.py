@@ -1,4 +1,4 @@
-"""The abstract image along a tube, step by step: what a certificate of a loop is made of, for people to look at."""
+"""The film of a tube: abstract images of all pictures that the camera may take, step by step."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""LOOP.json: a camera, a network and a law of motion in a closed loop, and what is to be shown of it."""
+"""LOOP.json: a camera, a network and a law of motion in a closed loop, and the property to prove."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ class Face:
 
 @dataclass(frozen=True)
 class Goal:
-    """The open box to be in.
+    """The goal: the open box that the state has to be in.
 
     Attributes:
         faces: All above 0 inside.
@@ -145,7 +145,7 @@ class Control:
 
 @dataclass(frozen=True)
 class Loop:
-    """What LOOP.json says.
+    """A closed loop as LOOP.json describes it.
 
     Attributes:
         names, units: Of the states [n].

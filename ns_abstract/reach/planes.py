@@ -1,4 +1,4 @@
-"""A loop seen from outside: cells, tubes, runs and sets in planes of camera positions, for pages and figures."""
+"""Plots of a loop: cells, tubes, runs and sets in planes of camera positions."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _MOST_CELLS = 4000
 
 @dataclass(frozen=True)
 class Marks:
-    """What is drawn in a plane, in the plane's coordinates.
+    """The boxes and lines of a plot, in the plane's coordinates.
 
     Attributes:
         boxes: Class of the style sheet, and ends [2], [2].
@@ -136,7 +136,7 @@ def _clipped(corners: list[tuple[float, float]], a: float, b: float, level: floa
 
 @dataclass(frozen=True)
 class View:
-    """A loop seen from outside.
+    """A plot of a loop in a plane.
 
     Attributes:
         title: In words.

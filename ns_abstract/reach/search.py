@@ -1,4 +1,4 @@
-"""The search for what holds of every run from a box of initial states (docs/design.md, L5).
+"""The search for proofs and counterexamples over a box of initial states (docs/design.md, L5).
 
 Two questions, each with its own cells: do all runs stay out of the unsafe sets ("safe"), and do they reach the goal as
 well ("reaches")? What becomes of a cell depends on the cell alone.
@@ -127,7 +127,7 @@ def pushes(loop: Loop, generator: np.random.Generator, kind: Literal["middle", "
 
 @dataclass(frozen=True)
 class LoopFindings(Findings):
-    """What became of a block.
+    """The result of a block of cells.
 
     Attributes:
         runs: The runs behind falsified cells.
@@ -138,7 +138,7 @@ class LoopFindings(Findings):
 
 @dataclass
 class _Seen:
-    """Runs from one cell."""
+    """Simulated runs from one cell, with their margins."""
 
     cell: Cell
     box: ParameterBox

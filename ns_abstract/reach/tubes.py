@@ -1,4 +1,4 @@
-"""Sets of states over time: affine functions of the initial state and of what came in since (docs/design.md, L2-L4)."""
+"""Tubes: sets of states over time as affine functions of initial state and disturbances (docs/design.md, L2-L4)."""
 
 from __future__ import annotations
 
@@ -150,7 +150,7 @@ def _scaled(values: AffineSet, middle: Float64, half: Float64) -> AffineSet:
 
 
 class View(Protocol):
-    """Pictures from all poses that a camera may have."""
+    """The interface of the pictures that the camera may take."""
 
     pose_set: PoseSet
 
@@ -163,7 +163,7 @@ class View(Protocol):
         ...
 
     def sets(self, box: ParameterBox) -> tuple[tuple[np.ndarray, ...], np.ndarray, np.ndarray, np.ndarray]:
-        """Linear sets, lower, upper and slopes of a box of poses, as `ns_abstract.verify.protocol.Scene` has them."""
+        """Return linear sets, bounds and slopes over a box of poses; see `ns_abstract.verify.protocol.Scene`."""
         ...
 
 
@@ -246,7 +246,7 @@ def clipped(raw: Linear, lower: Float64, upper: Float64) -> Linear:
 
 
 class Pilot:
-    """From sets of pictures to sets of controls.
+    """Bounds the controls that the network gives for a set of pictures.
 
     Args:
         model: The network with its preprocessing.
@@ -281,7 +281,7 @@ class Pilot:
 
 
 def between(found: OutputBounds, count: int, shift: Float64, room: Float64) -> Linear | None:
-    """What lies between planes: the first ``count`` rows of one cell, the next as many their negatives (L3).
+    """Return the affine set between planes: the first ``count`` rows and their negatives, of one cell (L3).
 
     Args:
         found: Lower bounds [1, 2 count or more]; places are the parameters.

@@ -1,4 +1,4 @@
-"""What refinement, certificates and the Python interface know about a representation of scenes.
+"""The interfaces of scene representations that refinement, certificates and the Python API use.
 
 A representation (`ns_abstract.methods.splat`, `ns_abstract.methods.nerf`) is a folder whose `Method` makes a `Frame` of
 every set of poses. Nothing above `ns_abstract.methods.load` asks which one it is.
@@ -32,7 +32,7 @@ Score = Callable[["torch.Tensor", "torch.Tensor"], "torch.Tensor"]
 
 
 class Elements(NamedTuple):
-    """Scene elements that have a place, for drawings of the scene as it is seen from outside.
+    """Positions, sizes and colours of scene elements, for drawings of the scene from outside.
 
     Attributes:
         places: [n, 3] normalised frame.
@@ -48,7 +48,7 @@ class Elements(NamedTuple):
 
 
 class Member(Protocol):
-    """One scene of a set of scenes."""
+    """A sample of a set of scenes."""
 
     def __call__(self, values: np.ndarray, tiles: np.ndarray | None = None) -> np.ndarray:
         """Tiles [t, side, side, 3] float32 of the concrete image at parameter values [d]; all tiles if None."""
@@ -77,7 +77,7 @@ class Member(Protocol):
 
 
 class Context(Protocol):
-    """What a bounded cell hands on to the cells inside it."""
+    """Results of a bounded cell that speed up the cells inside it."""
 
     @property
     def nbytes(self) -> int:
@@ -206,12 +206,12 @@ class Frame(Protocol):
         """
         ...
 
-    def watch(self, tiles: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> None:
-        """Take notice of the inner bounds [t, side, side, 3] of ``tiles`` [t], which a refinement changes meanwhile."""
+    def observe(self, tiles: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> None:
+        """Take the inner bounds [t, side, side, 3] of ``tiles`` [t] so far; a refinement calls it at every change."""
         ...
 
-    def allow(self, excess: float) -> float:
-        """Save time from now on where that loosens gaps by no more than a small part of ``excess`` on average.
+    def set_tolerance(self, excess: float) -> float:
+        """Let later bounds be looser by a small part of ``excess`` on average, where that saves time.
 
         Returns:
             What no more light comes to is left out; 0: nothing is.
@@ -231,7 +231,7 @@ class Frame(Protocol):
 
 @runtime_checkable
 class PartsFrame(Protocol):
-    """What a `Frame` may have beside: the parts of a cell are bounded together, at some pixels only."""
+    """An optional interface of a `Frame`: bounds of several sub-boxes together, at chosen pixels only."""
 
     def bound_parts(
         self, boxes: Sequence[ParameterBox], tiles: np.ndarray, within: Any, keep_linear: bool,

@@ -1,4 +1,4 @@
-"""What refinement knows about one frame: an abstract image, its witnesses, and how it got there (design.md, R6)."""
+"""The result of refining one frame: abstract image, inner (sampled) bounds, and trace (design.md, R6)."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ class Leaves:
 
 @dataclass(frozen=True)
 class Layer:
-    """One number by pixel beside the colours: bounds, what was rendered, and one render; [H, W] float32 all.
+    """A further output (depth, accumulation): bounds, sampled bounds and one render, [H, W] float32 each.
 
     The accumulation is the part of the light that the scene takes, in [0, 1]. The expected depth is the mean of the
     depths along the viewing axis, in units of the normalised frame, weighted as the colours are (gsplat's RGB+ED);
@@ -178,7 +178,7 @@ _NOTHING = TracePoint(0.0, 0, math.sqrt(3.0), 0.0, 0.0)
 
 
 def joined(parts: Sequence[PartResult], camera: Any) -> FrameResult:
-    """The frame whose tiles stand in ``parts``, each tile in one of them.
+    """Return the frame whose tiles are divided among ``parts``.
 
     Its cells are those of all parts, its time is the longest of a part.
 

@@ -1,4 +1,4 @@
-"""Where the cameras of a certificate stand: frusta over the scene, from above and from the side."""
+"""Drawings of a certificate's cameras as frusta over the scene, from above and from the side."""
 
 from __future__ import annotations
 
@@ -101,7 +101,7 @@ def cell_cameras(
 
 
 def _shares(box: Any, rows: Sequence[Mapping[str, Any]], names: Sequence[str]) -> Float64:
-    """[n] parts of the set that cells are."""
+    """Return [n] the shares of the set's volume that cells take."""
     sides = np.ones((len(rows), 0))
     if rows and box.names:
         columns = [list(names).index(name) for name in box.names]
@@ -146,7 +146,7 @@ def cameras_entry(cameras: Sequence[CellCamera], left_out: int) -> dict[str, Any
 
 @dataclass(frozen=True)
 class View:
-    """Cameras in a plane.
+    """A drawing of cameras in a plane.
 
     Attributes:
         title: From where one looks.
@@ -163,7 +163,7 @@ class View:
 
 @dataclass(frozen=True)
 class Cameras:
-    """What the page shows of the cameras.
+    """The drawings of cameras on a page.
 
     Attributes:
         cells: Cameras of cells.

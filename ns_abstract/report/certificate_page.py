@@ -38,7 +38,7 @@ _RING = 1.0
 
 @dataclass(frozen=True)
 class Closer:
-    """What was looked at more closely when a search ended.
+    """Details that were computed when a search ended: regions of failure, poses with pictures.
 
     Attributes:
         regions: Where the property fails.

@@ -19,7 +19,7 @@ from ns_abstract.io.errors import InputError
 from ns_abstract.io.jsonio import load_json
 from ns_abstract.io.version import ADVISORY, computed_by, stale
 from ns_abstract.refine.result import FrameResult, gap
-from ns_abstract.report.figures import metrics, number
+from ns_abstract.report.figures import metrics, number, short_guarantee
 from ns_abstract.report.files import IMAGES, frame_index, load_frame
 from ns_abstract.report.picture import heat, to_bytes
 from ns_abstract.report.record import file_stamp, frame_digests
@@ -89,7 +89,8 @@ class Results:
                 )
             self.size = size
             self.largest = max(self.largest, float(gap(result.lower, result.upper).max()))
-            self.guarantees.add(str(stored.about.get("guarantee", "unknown")))
+            bounded = stored.about.get("scene", {}).get("bounded")
+            self.guarantees.add(short_guarantee(str(stored.about.get("guarantee", "unknown")), bounded))
             if not result.bounded:
                 self.unbounded.append(index)
             box = result.box

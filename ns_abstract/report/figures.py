@@ -102,3 +102,13 @@ def listed(numbers: Sequence[int]) -> str:
             runs.append([number, number])
     told = [f"{a} to {b}" if b > a + 1 else ", ".join(map(str, dict.fromkeys((a, b)))) for a, b in runs[:_RUNS]]
     return ", ".join(told) + (f" and others, {len(numbers):,} together" if len(runs) > _RUNS else "")
+
+
+def short_guarantee(guarantee: str, bounded: str | None) -> str:
+    """The name of a guarantee with what of the scene it holds, as "float32-sound, of the Gaussians alone".
+
+    Args:
+        guarantee: "float32-sound", "real-sound" or "sampled".
+        bounded: What of the scene is bounded, such as "of the Gaussians alone"; None: all of it.
+    """
+    return guarantee if bounded is None or guarantee == "sampled" else f"{guarantee}, {bounded}"

@@ -13,7 +13,7 @@ from typing import Any
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup
 
-from ns_abstract.report.figures import interval, number, percent
+from ns_abstract.report.figures import interval, number, percent, short_guarantee
 
 _FOLDER = Path(__file__).parent
 
@@ -47,6 +47,10 @@ def plain_text(value: Any) -> str:
     return str(value)
 
 
+def _guarantee_of(document: Mapping[str, Any]) -> str:
+    return short_guarantee(document["guarantee"], document["scene"].get("bounded"))
+
+
 def _command(parts: Sequence[Any]) -> str:
     return " ".join(shlex.quote(str(part)) for part in parts)
 
@@ -69,6 +73,7 @@ def _templates() -> Environment:
         "repr": repr,
         "uri": uri,
     }
+    found.globals["guarantee_of"] = _guarantee_of
     return found
 
 

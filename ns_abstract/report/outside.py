@@ -1,4 +1,4 @@
-"""A scene as it is seen from outside: its elements from above and from the side, as one small picture, and plots."""
+"""Drawings of a scene from above and from the side, as one small picture, with plots over them."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ ABOVE = (0, 1)
 
 @dataclass(frozen=True)
 class Window:
-    """What part of a plane is shown, at one scale.
+    """The window of a plot: the part of a plane that is shown, at one scale.
 
     Attributes:
         axes: The world's axes to the right and up.
@@ -57,7 +57,7 @@ class Window:
 
 
 def _remembered(kept: dict[K, V], key: K, find: Callable[[], V]) -> V:
-    """What was found for a key, as long as it is among the latest few."""
+    """Return the value of a key from a small cache, or compute it."""
     if key not in kept:
         while len(kept) >= _KEPT:
             kept.pop(next(iter(kept)))
@@ -215,7 +215,7 @@ def draw_plane(outside: Outside | None, window: Window, nearest: float, marks: s
 
 
 def behind(outside: Outside | None, nearest: float, alone: str) -> str:
-    """What a plot shows of the scene, in words; ``alone``: what it shows where there is none."""
+    """Return a caption of what a plot shows of the scene; ``alone``: the caption without a scene."""
     if outside is None:
         return f"The scene has no elements with a place of their own (a NeRF's field has none): {alone}."
     text = "Behind them the opaque Gaussians of the scene, as ellipses of one standard deviation"

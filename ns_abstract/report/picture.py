@@ -69,7 +69,7 @@ def frame_figure(result: FrameResult, *, guarantee: str = "", about: str = "") -
 
     Args:
         result: The frame.
-        guarantee: "float32-sound", "real-sound" or "sampled"; shown in the title.
+        guarantee: Shown in the title; see `ns_abstract.report.figures.short_guarantee`.
         about: More for the title, such as the scene's name.
     """
     from matplotlib.figure import Figure

@@ -1,4 +1,4 @@
-"""What a page needs to show a frame's bounds at any pose of its set: numbers, rounded outward, in few bytes.
+"""Compressed data with which a page shows a frame's bounds at any pose of its set, rounded outward.
 
 On a leaf's box every pixel lies between two functions that are linear in the parameters
 (`ns_abstract.refine.result.Leaves`). Their coefficients become whole multiples of one step; what that rounding may move

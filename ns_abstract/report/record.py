@@ -24,7 +24,7 @@ from ns_abstract.io.jsonio import file_size, is_number, load_json
 from ns_abstract.io.version import ADVISORY, stale
 from ns_abstract.io.version import VERSION as PACKAGE
 from ns_abstract.refine.result import FrameResult, Layer, TracePoint
-from ns_abstract.report.figures import layer_metrics, metrics, seconds_to
+from ns_abstract.report.figures import layer_metrics, metrics, seconds_to, short_guarantee
 from ns_abstract.report.files import (
     StoredFrame,
     check_frame,
@@ -75,7 +75,7 @@ _LIMITS = {
 
 
 def guarantee_text(guarantee: str, renderer: str = "gsplat", bounded: str | None = None) -> str:
-    """What a guarantee says, as the end of a sentence about an abstract image.
+    """Return the text of a guarantee, as the end of a sentence about an abstract image.
 
     Args:
         guarantee: "float32-sound", "real-sound" or "sampled".
@@ -147,7 +147,7 @@ def frame_digests(document: Any) -> dict[str, str]:
 
 
 def explanations(document: Any) -> dict[int, tuple[str, ...]]:
-    """What a report.json, which others may have written, tells of why frames are loose."""
+    """Return the explanations of frames in a report.json, which others may have written."""
     frames = document.get("frames") if isinstance(document, dict) else None
     found = {}
     for entry in frames if isinstance(frames, list) else ():
@@ -177,7 +177,7 @@ def failed_self_check(problem: str) -> str:
 
 @dataclass(frozen=True)
 class Run:
-    """What a command is about to compute; all mappings must have a JSON form (see `plain`).
+    """The record of a command's run; all mappings must have a JSON form (see `plain`).
 
     Attributes:
         guarantee: "float32-sound", "real-sound" or "sampled".
@@ -227,7 +227,7 @@ def differences(old: Mapping[str, Any], new: Mapping[str, Any]) -> list[str]:
 
 
 def merged(older: FrameResult, newer: FrameResult) -> FrameResult:
-    """One frame from two computations of the same set: both enclose it, so their intersection does.
+    """Return the intersection of two results for one frame; both enclose the set, so it does.
 
     Times and cells add up; the trace of ``newer`` follows that of ``older`` and never gets worse.
 
@@ -526,7 +526,8 @@ class Report:
 
         name = str(self.run.scene.get("name", ""))
         path = self.folder / frame_name(result.index, "png")
-        save_picture(path, result, guarantee=self.run.guarantee, about=name)
+        guarantee = short_guarantee(self.run.guarantee, self.run.scene.get("bounded"))
+        save_picture(path, result, guarantee=guarantee, about=name)
         for layer in result.layers:
             save_layer_picture(self.folder / layer_name(result.index, layer), result, layer)
         self._previews[result.index] = previews(result, _PREVIEW_PIXELS)

@@ -21,7 +21,7 @@ MOST, _TOGETHER, _OUTPUTS = 6, 64, 10
 
 @dataclass(frozen=True)
 class Region:
-    """Falsified cells of a frame that hang together.
+    """A connected region of falsified cells of a frame.
 
     Attributes:
         frame: Number of the set.
@@ -43,7 +43,7 @@ class Region:
 
 @dataclass(frozen=True)
 class Shown:
-    """A picture and what the network says of it.
+    """A picture with the network's outputs for it.
 
     Attributes:
         title: What it is.
@@ -201,7 +201,7 @@ def _pose(one: Shown, other: Shown, sides: Sequence[Mapping[str, Any]]) -> str:
 
 
 def told_outputs(broken: Sequence[float], right: Sequence[float] | None, most: int = _OUTPUTS) -> list[int]:
-    """Numbers of the outputs to tell, in order: all, or those that differ most (without ``right``: the largest)."""
+    """Return the numbers of the outputs to report: all, or those that differ most (without ``right``: the largest)."""
     values = np.asarray(broken, np.float64)
     change = np.abs(values if right is None else values - np.asarray(right, np.float64))
     order = np.argsort(-np.where(np.isfinite(change), change, np.inf), kind="stable")[:most]

@@ -1,4 +1,4 @@
-"""Verdicts over pairs of parameters: parts of every place's volume over the others, exactly from the cells' boxes."""
+"""Maps of verdicts over pairs of parameters: certified and falsified shares, exactly from the cells' boxes."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ _WIDTH, _GAP, _LEFT, _BELOW, _TOP, _PANEL = 760, 10, 62, 34, 8, 190
 
 @dataclass(frozen=True)
 class PairMaps:
-    """Parts of a set's volume by place; none is larger than the truth.
+    """Certified and falsified shares of a set's volume by bin; no share exceeds the true one.
 
     Attributes:
         certified, falsified: By pair (i, j), i < j, of positions of parameters: [bins, bins] parts of the volume over

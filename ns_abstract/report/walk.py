@@ -20,7 +20,7 @@ _FULL_TURN = 2.0 * np.pi
 
 @dataclass(frozen=True)
 class Stop:
-    """A pose to be shown.
+    """A pose that the slider shows, with its verdict.
 
     Attributes:
         frame: Number of its set.

@@ -1,4 +1,4 @@
-"""Whether a network has an unsafe output for some input of a box: bounds, attacks, boxes cut in two, or branches.
+"""Decide whether a network has an unsafe output in a box of inputs: bounds, attacks, bisection, branch and bound.
 
 See docs/design.md, V11.
 """
@@ -46,7 +46,7 @@ _TUNING = BoxTuning()
 
 @dataclass(frozen=True)
 class Answer:
-    """What is known of an instance.
+    """The answer to an instance.
 
     Attributes:
         word: The verdict.
@@ -69,7 +69,7 @@ def decide(
     memory: int = 1 << 30,
     arithmetic: NetworkArithmetic = "float32",
 ) -> Answer:
-    """Look for an input of some region with an unsafe output, and for a proof that there is none (V11).
+    """Search the regions for an input with an unsafe output and for a proof that there is none (V11).
 
     Args:
         network: The network.
@@ -228,7 +228,7 @@ class _Search:
 
 
 def _cut(lower: np.ndarray, upper: np.ndarray, slopes: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]] | None:
-    """The box in two halves across the input that matters most by ``slopes`` [k, n]; None if it is too small."""
+    """Return two halves of the box, cut across the most influential input by ``slopes`` [k, n]; None if too small."""
     width = upper - lower
     # slopes are by half widths
     score = np.abs(slopes).max(0) + _TUNING.width * width
@@ -242,13 +242,13 @@ def _cut(lower: np.ndarray, upper: np.ndarray, slopes: np.ndarray) -> list[tuple
 
 
 def run_once(network: Network, run: Callable[[np.ndarray], np.ndarray], x: np.ndarray) -> np.ndarray:
-    """Outputs [k] float64 that the program computes for the float32 numbers next to ``x`` [n]."""
+    """Return the runtime's outputs [k] float64 for the float32 numbers nearest to ``x`` [n]."""
     image = np.asarray(x, np.float32).reshape(1, *network.input_shape)
     return np.asarray(run(image), np.float64).reshape(-1)
 
 
 def proves(bounds: Any, groups: Sequence[Sequence[int]]) -> np.ndarray:
-    """[m] whether in every group some row is certainly positive; NaN proves nothing."""
+    """Return [m] whether in every group some row is certainly positive; NaN proves nothing."""
     positive = np.asarray(bounds.lower) > 0.0
     proved = np.ones(len(positive), bool)
     for group in groups:

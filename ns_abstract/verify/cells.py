@@ -1,4 +1,4 @@
-"""Cells of a set of poses on an integer grid, so that they tile it exactly (docs/design.md, V6, V7)."""
+"""Cells of a set of poses on an integer grid, which tile the set exactly (docs/design.md, V6, V7)."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ class Cell:
 
 @dataclass(frozen=True)
 class Grid:
-    """A frame's parameters cut into ``units[k]`` equal parts each; the cells consist of whole units.
+    """The grid of a frame: each parameter cut into ``units[k]`` equal units, of which cells consist.
 
     Attributes:
         box: The set.
@@ -139,7 +139,7 @@ class Grid:
 
 
 def coarse_parts(motion: np.ndarray, pixels: float) -> tuple[int, ...]:
-    """Parts along each parameter such that the picture moves by at most ``pixels`` over a part.
+    """Return the number of initial cells along each parameter such that the picture moves by ``pixels`` in one.
 
     Fewer where there would be too many; in several parameters the search finds by itself where fine cells
     are needed, so it begins with large ones.

@@ -1,4 +1,4 @@
-"""Cells that are proved part by part (docs/design.md, V15).
+"""Prove a cell by proving sub-boxes that cover it (docs/design.md, V15).
 
 A cell of several parameters is mostly too wide for its own linear sets, which lose by what they leave out and not by
 what the pictures do. So parts of it are bounded, slanted ones where that helps (P2); a few neighbours are joined to one
@@ -62,7 +62,7 @@ _NEAR = 0.5
 
 @dataclass(frozen=True)
 class PictureSets:
-    """Linear sets of a box: what `ns_abstract.verify.protocol.Scene.sets` gives."""
+    """Linear sets of pictures over a box, from `ns_abstract.verify.protocol.Scene.sets`."""
 
     box: ParameterBox
     linear: tuple[np.ndarray, ...]
@@ -85,7 +85,7 @@ class PictureSets:
 
 @dataclass(frozen=True)
 class Weights:
-    """What pixels are worth: the margin's gradient [H, W, 3] somewhere in a cell, in parts of the ``margin`` there."""
+    """Pixel weights: the margin's gradient [H, W, 3] at a pose of the cell, relative to the ``margin`` there."""
 
     slopes: np.ndarray
     margin: float
@@ -110,7 +110,7 @@ class Weights:
 
 @dataclass(frozen=True)
 class Covered:
-    """What came of a cell.
+    """The result of a cell.
 
     Attributes:
         margin: Proven lower bound of the margin on all of it; None: there is none.
@@ -128,17 +128,17 @@ Frame = Callable[[ParameterBox], tuple[ParameterBox, Callable[[ParameterBox], Pa
 
 
 def straight(box: ParameterBox) -> tuple[ParameterBox, Callable[[ParameterBox], ParameterBox | None]]:
-    """A cell in its own parameters."""
+    """Return a cell in its own parameters (no change of parameters)."""
     return box, lambda part: part
 
 
 class _StoppedError(Exception):
-    """A cell is given up."""
+    """Raised when the proof of a cell is given up."""
 
 
 @dataclass
 class _Work:
-    """One cell under way.
+    """The state of the proof of one cell.
 
     Attributes:
         feasible: See `Frame`.
@@ -170,7 +170,7 @@ class _Work:
 
 @dataclass(frozen=True)
 class _Node:
-    """A box under way, what it is expected to cost, and what part of the cell's box it is."""
+    """A sub-box to prove, its expected cost, and its share of the cell's box."""
 
     box: ParameterBox
     effects: np.ndarray
@@ -190,7 +190,7 @@ class _Node:
 
 @dataclass(frozen=True)
 class Cover:
-    """Proves cells of several parameters part by part.
+    """Proves cells of several parameters sub-box by sub-box.
 
     Args:
         scene: Pictures, in the parameters of ``frame``.
@@ -461,7 +461,7 @@ class Cover:
 
 
 def _about_middle(box: ParameterBox, share: float | np.ndarray) -> ParameterBox:
-    """The box about the middle of ``box`` whose widths are a ``share`` (or [d] shares) of its own."""
+    """Return the concentric box whose widths are a ``share`` (or [d] shares) of those of ``box``."""
     inner, shares = box, np.broadcast_to(share, (box.dimensions,)).tolist()
     for axis, (middle, part) in enumerate(zip(box.middle.tolist(), shares, strict=True)):
         half = 0.5 * part * (box.upper[axis] - box.lower[axis])
@@ -470,7 +470,7 @@ def _about_middle(box: ParameterBox, share: float | np.ndarray) -> ParameterBox:
 
 
 def divisions(effects: np.ndarray, cost: float, aim: float, most: int) -> list[int]:
-    """Into how many equal parts to divide each parameter, for their sets to cost ``aim`` of the margin.
+    """Return into how many equal parts to divide each parameter so that their sets cost ``aim`` of the margin.
 
     There is no use in many more parts than ``most``.
     """
@@ -484,7 +484,7 @@ def divisions(effects: np.ndarray, cost: float, aim: float, most: int) -> list[i
 
 
 def joined(parts: Sequence[PictureSets]) -> PictureSets:
-    """Sets, over a box around those of ``parts``, that hold every picture of each (V15)."""
+    """Return linear sets over the hull of the boxes of ``parts`` that contain every picture of each (V15)."""
     boxes = [sets.box for sets in parts]
     lower, upper = (np.array([getattr(box, name) for box in boxes]) for name in ("lower", "upper"))
     first = boxes[0]

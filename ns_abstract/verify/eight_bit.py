@@ -1,4 +1,4 @@
-"""Pictures of 8 bits, as files and cameras have them: rounded, and enclosed after rounding (docs/design.md, V10)."""
+"""8-bit pictures, as files and cameras store them: rounding, and enclosures after rounding (docs/design.md, V10)."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def rounded(image: np.ndarray) -> np.ndarray:
 def rounded_sets(
     linear: tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray], lower: np.ndarray, upper: np.ndarray
 ) -> tuple[tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray], np.ndarray, np.ndarray]:
-    """Sets that hold the rounded pictures of those that ``linear``, ``lower`` and ``upper`` hold (design.md, V10).
+    """Return sets that contain the rounded pictures of those in ``linear``, ``lower`` and ``upper`` (V10).
 
     Rounding may be to either neighbour at a tie, and in float32: any program that computes 255 x + 1/2 with two
     roundings and cuts the fraction off, or takes the nearest whole number, is enclosed. Linear sets keep their slopes

@@ -1,4 +1,4 @@
-"""Abstract images for other verifiers: ONNX with the linear renderer in front of the network, and VNN-LIB.
+"""Export abstract images to other verifiers: ONNX with a linear renderer before the network, and VNN-LIB.
 
 See design.md, N8.
 
@@ -85,7 +85,7 @@ def write_vnnlib(
 
 
 def _parallel(images: ImageSets) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """A [n, d], c [n] and r [n] in float32 with every image of the cell in ``A p + c + r [-1, 1]``."""
+    """Return A [n, d], c [n], r [n] in float32 such that ``A p + c + r [-1, 1]`` contains every image of the cell."""
     slopes = 0.5 * (images.a_lower[0] + images.a_upper[0])
     apart = 0.5 * np.abs(images.a_upper[0] - images.a_lower[0]).sum(axis=1)
     center = 0.5 * (images.b_lower[0] + images.b_upper[0])

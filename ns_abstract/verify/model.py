@@ -1,4 +1,4 @@
-"""A network behind the picture, as the search for certificates asks it."""
+"""A network with its preprocessing, as the search for certificates uses it."""
 
 from __future__ import annotations
 
@@ -99,7 +99,7 @@ class NetworkModel:
 
 @dataclasses.dataclass(frozen=True)
 class ModelFamily:
-    """A cell and others; see `ns_abstract.verify.protocol.SharedBounds`."""
+    """Bounds of a cell, and of others with its coefficients; see `ns_abstract.verify.protocol.SharedBounds`."""
 
     family: Family
 
@@ -111,7 +111,7 @@ class ModelFamily:
 
 
 def parametric(images: ImageSets) -> ImageSets:
-    """The same sets with at least one parameter: that of a single pose moves nothing."""
+    """Return the sets with at least one parameter; for a single pose one is added that moves nothing."""
     if images.dimensions:
         return images
     still = np.zeros((*images.b_lower.shape, 1))

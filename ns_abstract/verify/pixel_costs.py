@@ -1,4 +1,4 @@
-"""How much of a property's margin the width of each pixel's bounds may cost, about: where bounds are worth refining."""
+"""Estimate how much of a property's margin each pixel's bounds cost: where refining pays."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""From rendered pictures to a network's input: concretely, and for linear sets of pictures.
+"""Preprocessing from rendered pictures to a network's input, for pictures and for linear sets of pictures.
 
 Resizing is done by the renderer, which draws at the network's resolution (docs/design.md, V1).
 """
@@ -147,7 +147,7 @@ class Preprocess:
 
 
 def parse_preprocess(value: Any) -> Preprocess:
-    """Check the object under the key ``preprocess`` of a property file.
+    """Parse and check the object under the key ``preprocess`` of a property file.
 
     Raises:
         InputError: A key is unknown, or a value cannot be used.

@@ -1,4 +1,4 @@
-"""What a network is to do on every image of a set: the property file, its concrete check, and its proof.
+"""Properties of a network on every image of a set: their file, their concrete check, and their proof.
 
 A property is a margin, a function of the network's outputs and the pose: it holds where the margin is
 above 0 (docs/design.md, V2-V5). ``Property`` is what the file says; ``bind`` makes it a ``Claim`` about
@@ -13,7 +13,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import torch
@@ -43,7 +43,7 @@ _COMPONENTS = ("camera.x", "camera.y", "camera.z", "object.x", "object.y", "obje
 
 @dataclass(frozen=True)
 class Query:
-    """Linear functions ``rows @ y + offset`` of the outputs whose lower bounds a proof needs.
+    """The linear functions ``rows @ y + offset`` of the outputs whose lower bounds a proof needs.
 
     Attributes:
         rows: [k, output_size].
@@ -57,7 +57,7 @@ class Query:
 
 
 class Claim(ABC):
-    """A property of one frame's set of poses."""
+    """A property that is bound to one frame's set of poses."""
 
     @abstractmethod
     def margin(self, outputs: torch.Tensor, values: torch.Tensor) -> torch.Tensor:
@@ -73,7 +73,7 @@ class Claim(ABC):
 
 
 class Property(ABC):
-    """What a property file says."""
+    """A property as its file states it."""
 
     preprocess: Preprocess
     partitions: tuple[int, ...] | None
@@ -218,7 +218,7 @@ class Truth:
 
 @dataclass(frozen=True, eq=False)
 class RegressionClaim(Claim):
-    """Outputs are close to the truth (V3)."""
+    """The claim that outputs are close to the true values (V3)."""
 
     truth: Truth
     absolute: tuple[float, ...] | None
@@ -326,7 +326,7 @@ def decode(outputs: torch.Tensor, stride: float) -> tuple[torch.Tensor, torch.Te
 
 @dataclass(frozen=True)
 class DetectionClaim(Claim):
-    """Some box has score and overlap above their thresholds (V4).
+    """The claim that some detected box has score and overlap above their thresholds (V4).
 
     Attributes:
         label: Class, or None: objectness alone.
@@ -488,12 +488,23 @@ class Detection(Property):
 # ---------------------------------------------------------------- the file
 
 _COMMON = ("type", "preprocess", "partitions", "output")
-_KEYS = {
-    "classification": ("label",),
-    "regression": ("target", "tolerance", "origin", "scale"),
-    "detection": ("class", "iou", "confidence", "box"),
-    "vnnlib": ("file",),
-}
+
+
+class _Setting(NamedTuple):
+    """What a parser knows beside the file: where it lies, numbers of the network's inputs and outputs, the picture."""
+
+    folder: Path
+    inputs: int
+    outputs: int
+    height: int
+    width: int
+
+
+class _Type(NamedTuple):
+    """The keys of a type of property, and what makes the property of the file's object and the common attributes."""
+
+    keys: tuple[str, ...]
+    parse: Callable[[dict[str, Any], _Setting, dict[str, Any]], Property]
 
 
 def _fail(name: str, found: Any, fix: str) -> InputError:
@@ -501,7 +512,7 @@ def _fail(name: str, found: Any, fix: str) -> InputError:
 
 
 def loading(root: Any) -> dict[str, Any]:
-    """Keywords of `load_network` that a parsed PROP.json says: the output, and the size of the pictures.
+    """Return the keywords of `load_network` in a parsed PROP.json: the output, and the size of the pictures.
 
     Raises:
         InputError: A field cannot be used.
@@ -515,37 +526,24 @@ def loading(root: Any) -> dict[str, Any]:
 
 
 def parse_property(root: Any, folder: Path, input_shape: tuple[int, ...], output_shape: tuple[int, ...]) -> Property:
-    """The property that a parsed PROP.json describes; files that it names lie in ``folder``.
+    """Return the property that a parsed PROP.json describes; files that it names lie in ``folder``.
 
     Raises:
         InputError: A field cannot be used.
     """
-    outputs = math.prod(output_shape)
     if not isinstance(root, dict):
         raise InputError(f"the top level is {show(root)}, not an object", fix='write {"type": ...}')
     kind = root.get("type")
-    if not isinstance(kind, str) or kind not in _KEYS:
+    if not isinstance(kind, str) or kind not in _TYPES:
         raise InputError(
-            "missing" if kind is None else f"found {show(kind)}", field="type", fix=f"write one of {', '.join(_KEYS)}"
+            "missing" if kind is None else f"found {show(kind)}", field="type", fix=f"write one of {', '.join(_TYPES)}"
         )
-    known(root, (*_COMMON, *_KEYS[kind]), "", lambda name, problem, fix: InputError(problem, field=name, fix=fix))
+    known(root, (*_COMMON, *_TYPES[kind].keys), "", lambda name, problem, fix: InputError(problem, field=name, fix=fix))
     preprocess = parse_preprocess(root.get("preprocess", {}))
     height, width = preprocess.size(input_shape)
     common: dict[str, Any] = {"preprocess": preprocess, "partitions": _partitions(root)}
-    if kind == "classification":
-        return _classification(root, outputs, common)
-    if kind == "regression":
-        return _regression(root, outputs, common)
-    if kind == "detection":
-        return _detection(root, outputs, height, width, common)
-    name = root.get("file")
-    if not isinstance(name, str) or not name:
-        raise _fail("file", name, "write the name of a VNN-LIB file, relative to this one")
-    try:
-        file = file_beside(folder, name)
-    except InputError as error:
-        raise InputError(error.problem, field="file", fix=error.fix) from None
-    return VnnLib(file=file, unsafe=load_vnnlib(file, outputs, math.prod(input_shape)), **common)
+    setting = _Setting(folder, math.prod(input_shape), math.prod(output_shape), height, width)
+    return _TYPES[kind].parse(root, setting, common)
 
 
 def _partitions(root: dict[str, Any]) -> tuple[int, ...] | None:
@@ -558,8 +556,8 @@ def _partitions(root: dict[str, Any]) -> tuple[int, ...] | None:
     return tuple(counts)
 
 
-def _classification(root: dict[str, Any], outputs: int, common: dict[str, Any]) -> Property:
-    label = root.get("label")
+def _classification(root: dict[str, Any], setting: _Setting, common: dict[str, Any]) -> Property:
+    label, outputs = root.get("label"), setting.outputs
     if outputs < 2:
         raise InputError(f"the network has {outputs} output", field="type", fix="use a classifier")
     if type(label) is not int or not 0 <= label < outputs:
@@ -567,8 +565,8 @@ def _classification(root: dict[str, Any], outputs: int, common: dict[str, Any]) 
     return Classification(label=label, classes=outputs, **common)
 
 
-def _regression(root: dict[str, Any], outputs: int, common: dict[str, Any]) -> Property:
-    target = root.get("target")
+def _regression(root: dict[str, Any], setting: _Setting, common: dict[str, Any]) -> Property:
+    target, outputs = root.get("target"), setting.outputs
     if target in ("camera", "object"):
         target = [f"{target}.{axis}" for axis in "xyz"]
     elif target == "distance":
@@ -606,7 +604,8 @@ def _regression(root: dict[str, Any], outputs: int, common: dict[str, Any]) -> P
     return Regression(truth=truth, absolute=absolute, relative=relative, **common)
 
 
-def _detection(root: dict[str, Any], outputs: int, height: int, width: int, common: dict[str, Any]) -> Property:
+def _detection(root: dict[str, Any], setting: _Setting, common: dict[str, Any]) -> Property:
+    outputs, height, width = setting.outputs, setting.height, setting.width
     grid = math.isqrt(outputs // _HEAD)
     if outputs != _HEAD * grid * grid or grid == 0 or height != width or height % grid:
         raise InputError(
@@ -639,3 +638,22 @@ def _detection(root: dict[str, Any], outputs: int, height: int, width: int, comm
         stride=height / grid,
         **common,
     )
+
+
+def _vnnlib(root: dict[str, Any], setting: _Setting, common: dict[str, Any]) -> Property:
+    name = root.get("file")
+    if not isinstance(name, str) or not name:
+        raise _fail("file", name, "write the name of a VNN-LIB file, relative to this one")
+    try:
+        file = file_beside(setting.folder, name)
+    except InputError as error:
+        raise InputError(error.problem, field="file", fix=error.fix) from None
+    return VnnLib(file=file, unsafe=load_vnnlib(file, setting.outputs, setting.inputs), **common)
+
+
+_TYPES = {
+    "classification": _Type(("label",), _classification),
+    "regression": _Type(("target", "tolerance", "origin", "scale"), _regression),
+    "detection": _Type(("class", "iou", "confidence", "box"), _detection),
+    "vnnlib": _Type(("file",), _vnnlib),
+}

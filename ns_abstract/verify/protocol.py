@@ -1,4 +1,4 @@
-"""What a search asks of its pictures and its network (docs/design.md, V6, V15)."""
+"""The interfaces of pictures and networks that a search uses (docs/design.md, V6, V15)."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from ns_abstract.verify.properties import Query
 
 
 class Scene(Protocol):
-    """One frame's pictures, at the network's resolution."""
+    """The pictures of one frame at the network's resolution."""
 
     box: ParameterBox
 
@@ -61,7 +61,7 @@ class Model(Protocol):
 
 
 class SharedBounds(Protocol):
-    """Bounds of a cell, and of others by its rows; see `ns_abstract.verify.network.family.Family`."""
+    """Bounds of a cell, and of others with its coefficients (`verify.network.family.Family`)."""
 
     def first(self, query: Query) -> OutputBounds:
         """Bounds of the query's rows over the cell."""
@@ -73,7 +73,7 @@ class SharedBounds(Protocol):
 
 
 class SharingModel(Protocol):
-    """A network whose rows can be shared."""
+    """A network whose backward coefficients can be reused across cells."""
 
     @property
     def lends_anywhere(self) -> bool:

@@ -1,4 +1,4 @@
-"""Pictures of a scene that may stand elsewhere as a whole, and a network behind them (docs/design.md, V13, P3).
+"""Pictures of a scene whose registration is uncertain: the whole scene may be shifted (docs/design.md, V13, P3).
 
 Where the scene stands is three parameters more, which the sets of pictures and the network's bounds keep; only what is
 left of them at the end is taken at its worst.
@@ -25,7 +25,7 @@ PLACE = 3
 
 
 class RegisteredScene:
-    """Pictures of poses, each for all places of the scene; see `ns_abstract.verify.protocol.Scene`.
+    """Pictures of poses for every position of the scene; see `ns_abstract.verify.protocol.Scene`.
 
     Args:
         scene: Pictures of a set of `PoseSet.registered`: its last parameters tell where the scene stands.
@@ -68,7 +68,7 @@ class RegisteredScene:
 
 @dataclass(frozen=True)
 class RegisteredMember:
-    """One place of a scene; see `ns_abstract.refine.protocol.Member`.
+    """One position of the scene; see `ns_abstract.refine.protocol.Member`.
 
     Attributes:
         scene: The pictures.
@@ -103,7 +103,7 @@ class RegisteredMember:
 
 
 def _sign(leaf: torch.Tensor) -> np.ndarray:
-    """The gradient's signs; 0 where there is none."""
+    """Return the signs of the gradient; 0 where there is no gradient."""
     return np.zeros(len(leaf)) if leaf.grad is None else np.sign(np.nan_to_num(leaf.grad.numpy()))
 
 

@@ -1,4 +1,4 @@
-"""Cameras whose response is off: brightness, white balance and gamma of the whole picture (docs/design.md, V14)."""
+"""Cameras with uncertain response: brightness, white balance and gamma of the whole picture (docs/design.md, V14)."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ ResponseName = Literal["brightness", "white balance", "gamma"]
 
 @dataclass(frozen=True)
 class Response:
-    """All cameras near the one that shows what is rendered.
+    """A set of camera responses around the nominal one.
 
     Attributes:
         name: "brightness": all values times one factor; "white balance": each channel times one of its own; "gamma":
@@ -88,7 +88,7 @@ class Response:
 
 
 def shown_sets(bounds: Bounds, camera: Camera, response: Response | None) -> tuple[LinearSets, np.ndarray, np.ndarray]:
-    """Linear sets, lower and upper bounds [H, W, 3] of whole pictures from those of all tiles, seen by cameras."""
+    """Return linear sets, lower and upper bounds [H, W, 3] of whole pictures under every camera response."""
     assert bounds.linear is not None
     whole = [assemble(part, camera) for part in (*bounds.linear, bounds.lower, bounds.upper)]
     found = (whole[0], whole[1], whole[2], whole[3]), whole[4], whole[5]
@@ -97,7 +97,7 @@ def shown_sets(bounds: Bounds, camera: Camera, response: Response | None) -> tup
 
 @dataclass(frozen=True)
 class ResponseMember:
-    """One camera of a set; see `ns_abstract.refine.protocol.Member`.
+    """One camera response of a set; see `ns_abstract.refine.protocol.Member`.
 
     Attributes:
         frame: What is rendered.

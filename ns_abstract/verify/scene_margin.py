@@ -1,4 +1,4 @@
-"""How far a scene may vary before what is certified is lost: bisection over sound runs (docs/design.md, V13).
+"""The scene margin: the largest variation of the scene that keeps a certificate, by bisection (docs/design.md, V13).
 
 Cells that were certified for the stored scene are bounded again for all scenes around it. Sets of scenes are nested, so
 what is proved of a radius holds of every smaller one, and one pass over the cells with the smallest radius so far does.
@@ -49,7 +49,7 @@ _TUNING = MarginTuning()
 
 @dataclass(frozen=True)
 class Kind:
-    """What varies; of `KINDS`, of every Gaussian independently; of `CAMERA_KINDS`, of the camera; of `PLACES`, all.
+    """A kind of variation: of each Gaussian (`KINDS`), of the camera (`CAMERA_KINDS`), of the whole scene (`PLACES`).
 
     Attributes:
         name: Key of a scene variation, of `KINDS`.
@@ -109,7 +109,7 @@ PLACES = (REGISTRATION, TURN)
 
 @dataclass(frozen=True)
 class Settled:
-    """What is known of a cell for all scenes of a set.
+    """The outcome of a cell for all scenes of a set.
 
     Attributes:
         outcome: "holds": proved; "falsified": a scene was found, and rendered again, that breaks it; "unknown".
@@ -159,7 +159,7 @@ class Trial:
 
 @dataclass
 class SceneMargin:
-    """What a bisection found.
+    """The result of a bisection.
 
     Attributes:
         kind: What varies.
@@ -244,7 +244,7 @@ class SceneMargin:
 
 
 def widest(kind: Kind, cells: Sequence[Certified], settle: Settle, over: Callable[[], bool]) -> SceneMargin:
-    """The largest radius, within a tenth, for which every cell is proved again (V13).
+    """Return the largest radius, within a tenth, for which every cell is proved again (V13).
 
     Args:
         kind: What varies.
@@ -276,12 +276,12 @@ def widest(kind: Kind, cells: Sequence[Certified], settle: Settle, over: Callabl
 
 
 def _told(radius: float) -> float:
-    """Of three digits, so that a report tells exactly what was proved."""
+    """Return the radius rounded down to three digits, so that a report states exactly what was proved."""
     return float(f"{radius:.3g}")
 
 
 class _Bisection:
-    """Runs of one kind."""
+    """The bisection of one kind of variation."""
 
     def __init__(self, found: SceneMargin, settle: Settle) -> None:
         self.found, self.kind, self.settle = found, found.kind, settle
@@ -355,7 +355,7 @@ class _Bisection:
 
 
 def check_scenes(varied: bool, rays: bool) -> None:
-    """Refuse what has no margin.
+    """Raise InputError where a scene margin is not defined.
 
     Args:
         varied: Whether the sets hold several scenes already.

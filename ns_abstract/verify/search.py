@@ -60,7 +60,7 @@ _ATTACKERS = 24
 
 @dataclass(frozen=True)
 class Leaf:
-    """A cell that is done with.
+    """A finished cell with its verdict.
 
     Attributes:
         cell: The cell.
@@ -89,7 +89,7 @@ class Leaf:
 
 @dataclass(frozen=True)
 class Findings:
-    """What became of a block.
+    """The result of a block of cells.
 
     Attributes:
         leaves: Cells that are done with.
@@ -114,7 +114,7 @@ Sample = tuple[np.ndarray, "Member | None"]
 
 @dataclass
 class _Seen:
-    """Concrete pictures of one cell."""
+    """Concrete pictures of one cell, with their margins."""
 
     cell: Cell
     box: ParameterBox
@@ -600,7 +600,7 @@ class Search:
 
 
 class ContradictionError(RuntimeError):
-    """A cell was proved although a pose in it breaks the property: the program has a fault."""
+    """Raised where a cell was proved although a pose in it breaks the property: a fault of the program."""
 
 
 #: What may go wrong in one cell without ending the run; lack of memory and a user's mistake do end it.
@@ -608,7 +608,7 @@ FAILURES = (ArithmeticError, ValueError, IndexError, KeyError, TypeError, Runtim
 
 
 def failure_text(error: Exception) -> str:
-    """One of `FAILURES` in a line."""
+    """Return one of `FAILURES` as a line of text."""
     return " ".join(f"{type(error).__name__}: {error}".split())[:200]
 
 
@@ -617,7 +617,7 @@ def _timed(leaf: Leaf, seconds: float) -> Leaf:
 
 
 def _key(sample: Sample) -> tuple[bytes, int]:
-    """Equal for one picture; members are told apart by their identity."""
+    """Return a key that is equal for equal pictures; scene samples are distinguished by identity."""
     pose, member = sample
     return pose.tobytes(), id(member)
 

@@ -1,4 +1,4 @@
-"""What the correlation of a picture's pixels is worth to a certificate (docs/design.md, V9).
+"""Measure what the correlation between a picture's pixels gains for a certificate (docs/design.md, V9).
 
 Verdicts come from bounds into which the parameters are substituted everywhere; here certified cells are bounded
 again in the weaker ways as well.
@@ -47,7 +47,7 @@ class Comparison:
 
 
 class _LateError(Exception):
-    """The time is over."""
+    """Raised when the deadline has passed."""
 
 
 class _Ladder:
@@ -142,7 +142,7 @@ def compare(search: Search, cell: ParameterBox, deadline: float) -> Comparison |
 
 
 def gains(comparisons: Sequence[Comparison]) -> dict[Substitution, float | None]:
-    """Geometric mean, by weaker mode, of how many times wider cells the strongest one certifies.
+    """Return, by weaker mode, the geometric mean of how much wider the cells are that the strongest mode certifies.
 
     Cells where a width is unknown or ended by the ladder or the set are left out.
     """

@@ -1,4 +1,4 @@
-"""VNN-LIB files (version 1): which outputs of a network are unsafe, and for which inputs.
+"""Read VNN-LIB files (version 1): sets of unsafe outputs, and boxes of inputs.
 
 Only what the format's users write is read: ``declare-const``, and ``assert`` of ``<=``, ``>=``, ``and``,
 ``or`` over bounds of single inputs and linear expressions of the outputs. In certificates of scenes bounds of the
@@ -63,7 +63,7 @@ class UnsafeSet:
 
 @dataclass(frozen=True)
 class Region:
-    """A box of inputs with what is unsafe there.
+    """A box of inputs with the outputs that are unsafe there.
 
     Attributes:
         lower, upper: [n] float64.

@@ -1,4 +1,4 @@
-"""Abstract images for a viewer: asked for at any time, answered at once with what is known so far (design.md, W2).
+"""Abstract images for a viewer: requests are answered at once with the best bounds so far (design.md, W2).
 
 The bounding itself runs in worker processes (`ns_abstract.viewer.worker`). One works, one is kept
 ready in reserve: a worker that is still busy with what nobody wants any more is ended and the other
@@ -34,7 +34,7 @@ _Key = tuple[Any, ...]
 
 @dataclass(frozen=True)
 class Status:
-    """What the background does.
+    """The state of the background process.
 
     Attributes:
         state: "off" (nothing to bound), "starting", "working", "idle" or "failed".

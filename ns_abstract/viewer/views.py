@@ -1,4 +1,4 @@
-"""What is looked at, what is known about it, and where bounds come from (design.md, W1, W3, W6)."""
+"""View requests, snapshots of their bounds, and the sources of bounds (design.md, W1, W3, W6)."""
 
 from __future__ import annotations
 
@@ -97,7 +97,7 @@ class View:
 
 @dataclass(frozen=True, eq=False)
 class Snapshot:
-    """What is known about a view at one size.
+    """The bounds of a view at one size.
 
     Attributes:
         lower, upper: [h, w, 3] float32 bounds.

@@ -118,7 +118,7 @@ def device_bytes(field: FieldWeights, basis: ChebyshevBasis) -> int:
 
 @dataclass
 class RayBounds:
-    """What is known of n rays over a box.
+    """Bounds of n rays over a box.
 
     Attributes:
         lower, upper: [n, 3] float64 bounds of the colours.
@@ -139,7 +139,7 @@ class RayBounds:
 
 @dataclass(frozen=True)
 class _Asked:
-    """What `NerfBounds.rays` is asked for."""
+    """The arguments of `NerfBounds.rays`."""
 
     pose_set: PoseSet
     box: ParameterBox
@@ -338,7 +338,7 @@ class NerfBounds:
 
 
 def typical_displacement(parts: Sequence[RayBounds]) -> float:
-    """The geometric mean of what ``parts`` tell; the order in which they were worked on plays no part."""
+    """Return the geometric mean of the displacements of ``parts``, whatever their order."""
     return math.exp(sum(math.log(part.displacement) for part in parts) / len(parts))
 
 

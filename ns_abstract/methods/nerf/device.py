@@ -1,4 +1,4 @@
-"""Where fields are bounded: on the processor, or on a GPU in float64 (design.md, F15)."""
+"""The device on which fields are bounded: the CPU, or a GPU in float64 (design.md, F15)."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ EMULATION = "CUBLAS_EMULATE_DOUBLE_PRECISION"
 
 
 def check_device(device: str | None) -> str:
-    """The device to bound fields on, "cpu" where nothing is said.
+    """Return the device on which fields are bounded; "cpu" by default.
 
     Raises:
         InputError: It is not there, or does not calculate in float64.

@@ -1,4 +1,4 @@
-"""Nested equal cells of a box of poses, and the parts that results are kept for."""
+"""Nested uniform subdivisions of a box of poses, and the parts for which bounds are stored."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import numpy as np
 
 @dataclass(frozen=True)
 class Division:
-    """Nested equal cells of a box, and the parts that results are kept for.
+    """Nested uniform subdivisions of a box, and the parts for which bounds are stored.
 
     A line has levels of 3, 6, 12, ... cells between those of 2, 4, 8, ...: cells are then nearer to the width that
     the network's bounds bear.
@@ -99,7 +99,7 @@ class Division:
 def divided(
     moves: np.ndarray, displacement: float, most: int, deeper: int, finer: int, swept: bool = False
 ) -> Division | None:
-    """Levels of cells that bear ``displacement``, for samples that move by half of ``moves`` [n, samples, d].
+    """Return the subdivision whose cells keep samples within ``displacement``; ``moves`` [n, samples, d] over the box.
 
     Args:
         deeper: Levels that are for refinement.

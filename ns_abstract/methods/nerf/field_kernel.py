@@ -1,4 +1,4 @@
-"""Layer after layer on a few pieces at a time, which stay in a core's cache meanwhile (design.md, F4, F5)."""
+"""Kernels that propagate batches small enough for a core's cache through all layers (design.md, F4, F5)."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ CHUNK = 16
 
 
 class Layers(NamedTuple):
-    """Layers one behind the other, so that kernels are compiled once for any number of them; made by `stacked`.
+    """All layers of a network in flat arrays, so that one compiled kernel serves any depth; made by `stacked`.
 
     Attributes:
         shapes: [L, 3] rows that belong to an encoded vector, to neurons, and outputs.
@@ -75,7 +75,7 @@ class Outputs(NamedTuple):
 
 
 class Room(NamedTuple):
-    """Where CHUNK pieces are kept behind a ``layer`` and its ``activation``, each array flat, for the widest layer."""
+    """Scratch for CHUNK pieces behind a ``layer`` and its ``activation``, sized for the widest layer."""
 
     layer: Behind
     activation: relu_kernel.Behind
@@ -202,7 +202,7 @@ def through_layers(z, encoded, remainder, layers, last, grid, limit, out, output
         encoded, remainder: [B, m, k] and [B, k] of the vector that layers see (`layer_kernel.linear`).
         layers, last: `Layers`; at most one is last, which sees no encoded vector.
         grid, limit: See `relu_kernel.relu`.
-        out: `layer_kernel.Before` behind ``layers``, filled; [B limit, n] columns and [B n] new error terms have room.
+        out: `layer_kernel.Before` behind ``layers``; room for [B limit, n] columns and [B n] new error terms.
         outputs: `Outputs` of the last layer, filled.
 
     Returns:

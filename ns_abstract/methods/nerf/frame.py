@@ -66,7 +66,7 @@ _PATIENCE, _GRACE = 0.2, 3.0
 
 @dataclass(frozen=True)
 class RayContext:
-    """What a cell has shown of some rays, for the same rays of the cells inside it.
+    """Opacities of rays over a cell, reused for the same rays in the cells inside it.
 
     Attributes:
         tiles: [t] numbers of the rays, ascending.
@@ -157,7 +157,7 @@ class NerfFrame:
         compiled = self.bounds.field.compiled
         self._share = int(np.clip(_WORK // weights, 1, 32)) if compiled else _RAYS_ON_DEVICE
         self.tiles_at_once = workers * self._share * (_SHARES if compiled and workers > 1 else 1)
-        self._witness: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None
+        self._inner: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None
         #: whether boxes need not wait for what others tell of the width of cells
         self._steady = False
 
@@ -394,13 +394,13 @@ class NerfFrame:
             strips.layout()
         return strips.effort, strips.count
 
-    def watch(self, tiles: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> None:
-        """Take notice of the inner bounds [t, 1, 1, 3] of ``tiles`` [t] in a refinement, which change meanwhile."""
+    def observe(self, tiles: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> None:
+        """Take the inner bounds [t, 1, 1, 3] of ``tiles`` [t] so far."""
         places = np.full(self.tile_count, -1)
         places[tiles] = np.arange(tiles.size)
-        self._witness = places, lower, upper
+        self._inner = places, lower, upper
 
-    def allow(self, excess: float) -> float:
+    def set_tolerance(self, excess: float) -> float:
         """Nothing is left out of first cells, which cost nothing."""
         return 0.0
 
@@ -415,12 +415,12 @@ class NerfFrame:
         )
 
     def _reached(self, box: ParameterBox, tiles: np.ndarray, shifted: bool) -> tuple[np.ndarray, np.ndarray]:
-        """Ends [n, 3] of the colours reached over the box or, where a refinement is watched, the set.
+        """Ends [n, 3] of the colours reached over the box or, where a refinement reports them, the set.
 
         Before any shift of colours: where they are ``shifted``, what a refinement sees is of no use.
         """
-        if self._witness is not None and not shifted:
-            places, *sides = self._witness
+        if self._inner is not None and not shifted:
+            places, *sides = self._inner
             low, high = (side[places[tiles], 0, 0].astype(np.float64) for side in sides)
         else:
             rng, pixels, box = np.random.default_rng(0), self._pixels(tiles), box.without(COLOR_SHIFTS)

@@ -1,4 +1,4 @@
-"""How a NeRF's run is opened; torch and the bounds are loaded once there is one."""
+"""The representation of vanilla-NeRF runs; torch and the bounds are imported when one is opened."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a field's outputs are on parts of a cell, from polynomials and error terms (design.md, F2, F7)."""
+"""Bounds of a field's outputs on parts of a cell, from polynomials and error terms (design.md, F2, F7)."""
 
 from __future__ import annotations
 

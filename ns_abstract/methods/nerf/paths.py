@@ -1,4 +1,4 @@
-"""Bounds of rays that Nerfstudio samples by itself, where every sample is followed (design.md, F16).
+"""Bounds of hierarchically sampled rays that follow every sample along its path (design.md, F16).
 
 On a cell of poses the coarse pass tells where each sample may be: on a line in the pose, but for a short rest. The fine
 field is bounded there and nowhere else, with the place in the rest as one more parameter of its polynomials.
@@ -78,7 +78,7 @@ class Cells:
 
 @dataclass(frozen=True)
 class Lines:
-    """Where the middles of samples are on cells: ``|m - (middle + slope p)| <= rest`` for p in [-1, 1]^d.
+    """Linear bounds of sample midpoints on cells: ``|m - (middle + slope p)| <= rest`` for p in [-1, 1]^d.
 
     Attributes:
         middle, rest: [k, S].
@@ -111,7 +111,7 @@ class Lines:
 
 
 class Paths:
-    """Bounds of a scene's rays from samples that are followed.
+    """Bounds of a scene's rays by following their samples.
 
     Args:
         coarse: The coarse pass' field, by pose.
@@ -316,7 +316,7 @@ class Following:
 
 
 class Samples:
-    """What the samples of some cells are: densities and colours by part.
+    """Bounds of the samples of several cells: densities and colours by part.
 
     Args:
         owner: Bounds of the scene.

@@ -1,4 +1,4 @@
-"""Linear bounds in the parameters from bounds by part of a cell (design.md, F12)."""
+"""Fit linear bounds in the parameters to bounds by part of a cell (design.md, F12)."""
 
 from __future__ import annotations
 

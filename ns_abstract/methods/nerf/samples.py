@@ -1,4 +1,4 @@
-"""Where Nerfstudio's own samples lie, and what a ray shows that is sampled there (design.md, F14)."""
+"""Bounds of hierarchical sample positions, and of the colours of rays sampled there (design.md, F14)."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def edge_bounds(alpha_low: np.ndarray, alpha_high: np.ndarray, sampling: Samplin
 
 @njit(cache=True, error_model="numpy")
 def hulls(edges_low, edges_high, start, step, densities, colors, density, color):
-    """What the field is in the samples' middles, from what it is on parts of the rays (design.md, F14).
+    """Return bounds of the field at sample midpoints from its bounds on parts of the rays (design.md, F14).
 
     Args:
         edges_low, edges_high: [r, S + 1] of `edge_bounds`.
@@ -79,7 +79,7 @@ def hulls(edges_low, edges_high, start, step, densities, colors, density, color)
 
 @njit(cache=True, error_model="numpy")
 def composite(edges_low, edges_high, density, color, lower, upper):
-    """Bounds of rays' colours from where they are sampled and what the field is there (design.md, F14).
+    """Return bounds of rays' colours from bounds of their sample positions and of the field there (design.md, F14).
 
     Args:
         edges_low, edges_high: [r, S + 1] of `edge_bounds`.

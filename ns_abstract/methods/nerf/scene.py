@@ -54,7 +54,7 @@ class Layer:
 
 
 class Waves(NamedTuple):
-    """What of an encoded vector some weight looks at.
+    """The components of an encoded vector that have a nonzero weight.
 
     Attributes:
         frequencies: [k] those of `Encoding.frequencies`.

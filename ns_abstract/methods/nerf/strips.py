@@ -1,4 +1,4 @@
-"""Linear bounds of all rays of a frame, cell after cell, from bounds by part that are made once (design.md, F12, F13).
+"""Linear bounds of all rays of a frame over cells, from bounds by strip that are computed once (design.md, F12, F13).
 
 The set of poses is cut into strips, ever narrower from level to level. Rays are bounded over whole strips, a group of
 neighbours at a time, and kept by part of the strip; a cell of a certificate takes what lies in it from there. What a

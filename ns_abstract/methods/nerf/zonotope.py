@@ -1,4 +1,4 @@
-"""Bounds of a field over curves of points: Chebyshev zonotopes through its layers (design.md, F3-F6).
+"""Bounds of a field over curves of points, by propagating Chebyshev zonotopes through its layers (F3-F6).
 
 A batch of B pieces, each a curve (or patch) of points over its own cell of poses ``p in [-1, 1]^d``, is kept as
 
@@ -73,7 +73,7 @@ def column_sums(columns: Tensor, owner: Tensor, pieces: int) -> Tensor:
 
 @dataclass
 class Pieces:
-    """A batch after some layer.
+    """A batch of Chebyshev zonotopes behind an activation.
 
     Attributes:
         poly: [B, m, n] Chebyshev coefficients.
@@ -124,7 +124,7 @@ class Pieces:
 
 @dataclass
 class Affine:
-    """A batch before an activation: as in `Pieces`, with all error terms in ``columns``, whose sums are ``spread``."""
+    """A batch before an activation: `Pieces` with all error terms in ``columns``, whose sums are ``spread``."""
 
     poly: Tensor
     columns: Tensor

@@ -1,4 +1,4 @@
-"""Pose-independent quantities of a scene, in float64: what every render and bound starts from."""
+"""Activated Gaussians of a scene in float64, independent of the pose."""
 
 from __future__ import annotations
 

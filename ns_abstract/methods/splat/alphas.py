@@ -597,7 +597,7 @@ def _fitted_exponential(exponent, limits, charges):
 
 @njit(cache=True, error_model="numpy", forceinline=True)
 def _drawn(middle, error, sigma, limits, charges):
-    """The `_Drawn` of the `_Range` ``sigma``; the form is about ``middle``, off by ``error``, of its scale (B4)."""
+    """The `_Drawn` of the `_Range` ``sigma``; the form is about ``middle``, off by ``error`` (B4)."""
     opacity_low, opacity_high, alpha_max = limits.opacity_low, limits.opacity_high, limits.alpha_max
     slack, at_low = sigma.slack, sigma.at_low
     opacity = 0.5 * (opacity_low + opacity_high)

@@ -52,7 +52,7 @@ _JUMPS_MATTER = BlendTuning.jumps_matter
 
 
 class _Shown(NamedTuple):
-    """What is known of a pixel; lanes are channels.
+    """Bounds and form of a pixel; lanes are channels.
 
     Attributes:
         low, high: Bounds by forms.
@@ -334,7 +334,7 @@ def _slack(q, ends, block, inputs, u):
 
 @njit(cache=True, error_model="numpy", forceinline=True)
 def _form_bounds(begin, end, block, inputs, linear):
-    """What forms and intervals say of the list entries [begin, end) of a pixel: a `_Shown` (design.md, B7-B11).
+    """Return the `_Shown` of a pixel's list entries [begin, end), by forms and intervals (design.md, B7-B11).
 
     The block's sums receive the polynomials, scratch behind them; ``linear`` tells whether their sets are asked for.
     """

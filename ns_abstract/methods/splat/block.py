@@ -1,4 +1,4 @@
-"""What the pixel stage keeps of a block of pixels, and where (design.md, B1-B12).
+"""The memory layout of a block of pixels in the pixel stage (design.md, B1-B12).
 
 A fragment is one Gaussian on one pixel: what is known of its alpha, and of the light before and behind it. Fragments
 lie one after the other; each pixel lists those that may contribute to it, nearest first, with the places of their
@@ -113,7 +113,7 @@ class Palette(NamedTuple):
 
 
 class Entries(NamedTuple):
-    """What is known of each position of a block's list; [entries] all.
+    """Properties of each position of a block's list; [entries] all.
 
     Attributes:
         pixels: The set of the block's pixels that may be reached; valid where ``asked`` is 1.
@@ -156,7 +156,7 @@ class Reordering(NamedTuple):
 
 
 class Jumps(NamedTuple):
-    """Fragments of one pixel that some poses skip (design.md, B11), farthest first.
+    """Fragments of one pixel whose alpha crosses the threshold within the cell (B11), farthest first.
 
     Attributes:
         entries: [capacity] where they stand in the pixel's list.
@@ -278,7 +278,7 @@ def jump_rows(shape):
 
 @njit(cache=True, error_model="numpy")
 def _jump_room(shape, capacity):
-    """Columns of `Jumps`: the channels, then ``capacity``; the last row holds what a part needs beside them."""
+    """Columns of `Jumps`: channels, then ``capacity``; the last row holds what a part needs."""
     return max(JUMP_LANES + -(-capacity // JUMP_LANES) * JUMP_LANES, 20 * shape.dimensions + 80)
 
 

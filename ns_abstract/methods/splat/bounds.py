@@ -56,7 +56,7 @@ PAIR_LIMIT = 30_000
 
 @contextmanager
 def alone(stage: str) -> Iterator[None]:
-    """Inside, of `STAGES` only one does anything, so that it alone is compiled.
+    """Replace all `STAGES` but one by no-ops inside the block, so that only that one is compiled.
 
     What `SplatBounds.cell` then returns is no bound of anything.
     """

@@ -1,4 +1,4 @@
-"""Frames of a splat scene with one difficulty taken away: what it costs is what their bounds are tighter by.
+"""Ablations of a splat scene: frames without one cause of looseness, whose gain is what the cause costs.
 
 Their bounds hold of another program or scene than the one asked for. They explain bounds and are never results.
 """
@@ -38,7 +38,7 @@ _WITH_TILES = "the alpha threshold and tiles"
 
 
 class _OrderedBounds(SplatBounds):
-    """Bounds as if every Gaussian kept its place in the order of the cell's middle."""
+    """Bounds that assume the depth order of the cell's middle."""
 
     def _viewing_axes(
         self, forms: PoseForms, rotation_magnitude: np.ndarray, gaussians: ProjectedGaussians
@@ -52,7 +52,7 @@ class _OrderedBounds(SplatBounds):
 def easier(
     scene: SplatScene, rasteriser: Rasteriser, arithmetic: Arithmetic, poses: PoseSet, varied: VariedSplats
 ) -> Iterator[tuple[str, SplatFrame]]:
-    """What makes bounds loose, and the frame without it; nothing for what the scene does not have.
+    """Return the causes of looseness that the scene has, each with the frame without it.
 
     Args:
         scene: The stored scene.
@@ -89,7 +89,7 @@ def easier(
 
 
 def holders(frame: SplatFrame, box: ParameterBox, tile: int, count: int) -> list[tuple[int, float]]:
-    """The Gaussians without which the mean gap of a tile over a cell is least, and by how much it is then less.
+    """Return the Gaussians that cost a tile the most mean gap over a cell, and how much each costs.
 
     Groups are left out in turn, and those that matter are looked at closer, so Gaussians that matter only together
     may be missed.

@@ -1,4 +1,4 @@
-"""Signed steps of a pose and of all Gaussians at once, by the reference renderer (design.md, V12)."""
+"""Signed-gradient steps (FGSM) of a pose and of all Gaussians at once (design.md, V12)."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def pushed(
     score: Callable[[Show, torch.Tensor], torch.Tensor],
     size: float,
 ) -> tuple[Float64Array, Splats]:
-    """A pose of ``box`` and a scene of the set a signed step uphill (design.md, V12); what has no slope stays.
+    """Return a pose of ``box`` and a scene of the set one signed-gradient step uphill (design.md, V12).
 
     Args:
         reference: Renders with gradients.

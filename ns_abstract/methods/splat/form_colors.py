@@ -1,4 +1,4 @@
-"""Spherical harmonics over cells of any number of parameters (design.md, C2): forms of eight Gaussians at a time."""
+"""Spherical harmonics as forms over cells of any number of parameters, eight Gaussians at a time (design.md, C2)."""
 
 from __future__ import annotations
 

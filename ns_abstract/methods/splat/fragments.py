@@ -1,4 +1,4 @@
-"""Fragments of a block of pixels, nearest first: what may be drawn, in which orders, and where the stop hides it.
+"""Collect the fragments of a block of pixels, nearest first, with uncertain depth orders and early termination.
 
 Gaussian by Gaussian, `collect_fragments` finds the pixels that it may reach and its alpha there, keeps what may
 contribute, and notes which Gaussians that share a pixel may change places (design.md, B5-B6, O1).
@@ -48,7 +48,7 @@ GROW = -2
 
 
 class _Listed(NamedTuple):
-    """A block's list, nearest first, and what is known of its Gaussians: pointers, see `ProjectedGaussians`.
+    """A block's list of Gaussians, nearest first, with pointers to their `ProjectedGaussians`.
 
     Attributes:
         numbers: [length] the Gaussians' rows.
@@ -92,7 +92,7 @@ class _Window(NamedTuple):
 
 
 class _Stop(NamedTuple):
-    """Light at which the rasteriser may stop, and surely does; what no light beyond is followed of; step's rounding."""
+    """Bounds on the transmittance of early termination, the transmittance below which tracking ends, and rounding."""
 
     low: float
     high: float
@@ -181,7 +181,7 @@ def _depth_radii(numbers, gaussians, slope, ray, m, entries):
 
 @njit(cache=True, error_model="numpy", forceinline=True)
 def _start(numbers, inputs, block):
-    """Set what is known of pixels and list positions to what it is before the first; the `_Window`."""
+    """Reset a block's pixels and list positions; returns the `_Window`."""
     entries, per_pixel, lengths = block.entries, block.fragments.per_pixel, block.fragments.lengths
     for q in range(PIXELS):
         per_pixel[TLO + q] = 1.0
@@ -500,7 +500,7 @@ def _colors_behind(first, listed, colors, channels, palette, marks):
 
 @njit(cache=True, error_model="numpy", forceinline=True)
 def _place_batch(start, some, live, listed, inputs, block):
-    """Find the pixels of `Batch` for ``some`` positions from ``start`` on: those that may be reached and take light.
+    """Find the pixels of `Batch` for ``some`` positions from ``start`` on that they may be drawn on.
 
     Returns how many there are.
     """
@@ -534,7 +534,7 @@ def _place_batch(start, some, live, listed, inputs, block):
 
 @njit(cache=True, error_model="numpy", forceinline=True)
 def _find_alphas(start, some, used, place, listed, inputs, block):
-    """Alphas of `_place_batch`'s positions on their pixels: fragments from number ``used`` on, and `Batch.found`."""
+    """Write the alphas of `_place_batch`'s positions: fragments from number ``used`` on, and `Batch.found`."""
     batch = block.batch
     for b in range(some):
         i = listed.numbers[start + b]

@@ -60,7 +60,7 @@ _TUNING = FrameTuning()
 
 @dataclass(frozen=True)
 class Context:
-    """What a cell may show on the pixels that were wanted, for these pixels of the cells inside it.
+    """The Gaussians that a cell may show on the requested pixels, reused for the cells inside it.
 
     Attributes:
         visible: [n] scene indices.
@@ -234,8 +234,8 @@ class SplatFrame:
             for splats in self.varied.members(np.random.default_rng(seed)):
                 yield SplatMember(self, splats, self._reference)
 
-    def allow(self, excess: float) -> float:
-        """Save time from now on where that loosens gaps by no more than a small part of ``excess`` on average (B6).
+    def set_tolerance(self, excess: float) -> float:
+        """Let later bounds be looser by a small part of ``excess`` on average, where that saves time (B6).
 
         Returns:
             What no more light comes to is left out; 0: nothing is.
@@ -244,7 +244,7 @@ class SplatFrame:
         self._floor = floor if floor > _TUNING.worth_it * self._stop > 0.0 else -1.0
         return max(self._floor, 0.0)
 
-    def watch(self, tiles: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> None:
+    def observe(self, tiles: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> None:
         """Bounds do not depend on what was rendered."""
 
     def plan(self, shown: int | None, lower: np.ndarray, upper: np.ndarray) -> list[str]:

@@ -1,4 +1,4 @@
-"""Fragments that some poses of a cell skip, bounded together over parts of the cell (design.md, B11).
+"""Alpha-threshold crossings of a pixel's fragments, bounded jointly over parts of the cell (design.md, B11).
 
 Where alpha passes the threshold, a fragment is drawn on one side and skipped on the other. A pixel is blended as if
 none of them were skipped; what skipping takes away is a sum of one term for each, which is bounded here: from above and

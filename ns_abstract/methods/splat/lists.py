@@ -93,7 +93,7 @@ def touching(indices, rectangles, table):
 
 @njit(cache=True, error_model="numpy")
 def marked(marks, numbers, box, tiles, side):
-    """Those of ``numbers`` whose mark is not 0, and the rectangles of pixels that they may be drawn on (design.md, R2).
+    """Return the ``numbers`` whose mark is not 0, and the pixel rectangles on which they may be drawn (design.md, R2).
 
     Args:
         marks, numbers: [n].

@@ -1,4 +1,4 @@
-"""What the per-Gaussian stage leaves for the pixels: float errors, pixel regions and tile ranges (design.md, G5-G12).
+"""Float errors, pixel regions and tile ranges of projected Gaussians (design.md, G5-G12).
 
 For every Gaussian that some pose of the cell may show, one record is written:
 
@@ -503,7 +503,7 @@ def projected_stretch(rules, camera):
 
 @njit(cache=True, error_model="numpy")
 def regions(s, n, rules, camera, charges):
-    """What is known of each Gaussian, from the rows of `float_errors` (design.md, G5-G12): rows GONE .. T7.
+    """Compute regions and tile ranges from the rows of `float_errors` (design.md, G5-G12): rows GONE .. T7.
 
     GONE is 1 where no pose shows it, KNOWN where its forms may be relied on. The others may cover every pixel. Of a
     record: the opacities, kappa and the exponent from which on alpha is below the threshold.

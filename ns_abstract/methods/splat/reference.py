@@ -1,4 +1,4 @@
-"""A slow second renderer, written from gsplat's formulas alone, to check the fast one and the bounds.
+"""A slow reference renderer, written from gsplat's formulas alone, to check the fast one and the bounds.
 
 It shares nothing with the compiled kernels but the constants: own activations, spherical harmonics,
 projection (``J W Sigma W^T J^T``), tiles and compositing, in torch. Pictures are differentiable with

@@ -1,4 +1,4 @@
-"""What a pixel may show where the depth order of its fragments is uncertain (design.md, O2-O4).
+"""Bounds of a pixel whose fragments have an uncertain depth order (design.md, O2-O4).
 
 SIMD lanes are the three channels, and a fourth one of nothing.
 """

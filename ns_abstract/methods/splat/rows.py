@@ -1,4 +1,4 @@
-"""Which stored Gaussians can be drawn, and which of them gsplat provably never draws."""
+"""Select the stored Gaussians that can be drawn; gsplat provably never draws the others."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How the threads of a process share a kernel's work: each takes the next piece that none has taken yet."""
+"""Share a kernel's work among threads: each takes the next piece that none has taken yet."""
 
 from __future__ import annotations
 

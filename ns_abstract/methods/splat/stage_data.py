@@ -1,4 +1,4 @@
-"""What the compiled stages of the bounds are given and what they leave, as typed records (design.md, G and B).
+"""Typed inputs and outputs of the compiled stages of the bounds (design.md, G and B).
 
 Kernels take named tuples of arrays and numbers. Inside them the arrays of a record may be pointers to the elements
 (`ns_abstract.arithmetic.simd.intrinsics.pointer`), which are not counted; the fields keep their names and meaning.
@@ -118,7 +118,7 @@ class SceneColors(NamedTuple):
 
 
 class ProjectedGaussians(NamedTuple):
-    """What the per-Gaussian stage leaves of every candidate (design.md, G4-G10).
+    """The projected Gaussians that the per-Gaussian stage writes (design.md, G4-G10).
 
     Attributes:
         record: [n, columns] see `records`: mean in pixels, opacity, whitening forms.
@@ -152,7 +152,7 @@ class ViewingAxes(NamedTuple):
 
 
 class Colors(NamedTuple):
-    """What the Gaussians and the background look like.
+    """Colours of the Gaussians and of the background.
 
     Attributes:
         values: [n, channels] colours, or [n, channels (k + 1)] forms by channel: k coefficients and a radius; k is 1 or
@@ -171,7 +171,7 @@ class Colors(NamedTuple):
 
 
 class Cutoffs(NamedTuple):
-    """What bounds need not follow.
+    """Cut-offs below which effects are bounded but not tracked.
 
     Attributes:
         floor: Fragments are left out where no pose lets more light come to them (B6); none if negative.
@@ -230,7 +230,7 @@ def cell_parts(counts: np.ndarray) -> Parts:
 
 
 class PixelBounds(NamedTuple):
-    """What the pixel stage leaves.
+    """The bounds that the pixel stage writes.
 
     Attributes:
         lower, upper: [t, side, side, 3].

@@ -1,4 +1,4 @@
-"""An attack on an abstract image: search its set of poses for an image that leaves it.
+"""Attack an abstract image: search its set of poses for a rendered image outside its bounds.
 
 Tolerance is zero. What the attack returns is a lower bound of what is wrong: no violation found is no
 proof. The poses tried are, in this order, given ones, the middle and corners of the box, random ones,
@@ -73,7 +73,7 @@ class Violation:
 
 @dataclass(frozen=True)
 class Attack:
-    """What an attack did and found.
+    """The result of an attack: violations, the closest approach, and the work that was done.
 
     Attributes:
         poses: Images rendered in full.
@@ -116,7 +116,7 @@ class _Enough(Exception):
 
 
 class _Record:
-    """Compares images with the bounds and remembers the extremes and where they were seen."""
+    """Compares images with the bounds and keeps the extreme values with their poses."""
 
     def __init__(
         self, lower: ArrayLike, upper: ArrayLike, box: ParameterBox, render: Render, limit: int, deadline: float
@@ -496,7 +496,7 @@ def _search(
 
 
 def merge(attacks: Sequence[Attack]) -> Attack:
-    """The sum of attacks on images of one size; at least one."""
+    """Return one result for several attacks on images of one size."""
     worst = sorted((v for a in attacks for v in a.worst), key=_severity, reverse=True)[:_KEPT]
     return Attack(
         poses=sum(a.poses for a in attacks),

@@ -1,4 +1,4 @@
-"""The renderers of a set of poses, as `ns_abstract.verify.attack.falsify` takes them."""
+"""Renderers of a set of poses for `ns_abstract.verify.attack.falsify`."""
 
 from __future__ import annotations
 

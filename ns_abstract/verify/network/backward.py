@@ -1,4 +1,4 @@
-"""Rows passed back through a network, to the image or to nodes on the way (docs/design.md, N5, N17, N18)."""
+"""The backward pass of CROWN: coefficients propagated from a node to the input (docs/design.md, N5, N17, N18)."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ ROWS_AT_ONCE = 24 << 20
 
 @dataclass
 class Batch:
-    """Rows under way.
+    """Coefficients that are being propagated backwards.
 
     Attributes:
         waiting: By node.
@@ -67,7 +67,7 @@ class Batch:
 
 
 class Backward:
-    """Passes rows back over what is known of the nodes; changes nothing of it.
+    """Propagates coefficients backwards over the relaxations of the nodes, which it does not change.
 
     Args:
         known: What is known so far.

@@ -74,7 +74,7 @@ def bound_outputs(
 
 
 class _Cells:
-    """Bounds of one network over some cells: the parts put together, and the nodes gone through.
+    """Bounds of one network over several cells: builds the passes and runs them over all nodes.
 
     Attributes:
         known: What is known of the nodes.

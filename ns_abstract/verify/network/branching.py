@@ -1,4 +1,4 @@
-"""Proofs by branching on the signs of units (docs/design.md, N16)."""
+"""Branch and bound on the activation phases of unstable neurons (docs/design.md, N16)."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _STEPS = 12
 
 @dataclass(frozen=True)
 class Branching:
-    """What became of a proof.
+    """The result of branch and bound.
 
     Attributes:
         proved: Whether every branch was.
@@ -37,7 +37,7 @@ class Branching:
 
 @dataclass(frozen=True)
 class _Branch:
-    """Signs that are assumed, by how much the claim holds or fails, and the unit to branch on (-1: none is left)."""
+    """One branch: its assumed phases, its bound, and the neuron to split next (-1: none is left)."""
 
     signs: Mapping[int, Signs]
     value: float
@@ -105,7 +105,7 @@ def branch(
 
 
 def _repeated(images: ImageSets, count: int) -> ImageSets:
-    """The one cell of ``images``, ``count`` times."""
+    """Return ``count`` copies of the single cell of ``images``."""
     return ImageSets(*(np.repeat(getattr(images, name), count, axis=0) for name in ImageSets.__dataclass_fields__))
 
 

@@ -1,4 +1,4 @@
-"""Layers from checked weights and attributes, whatever the file they come from (design.md, N7)."""
+"""Build layers from checked weights and attributes, for every file format (design.md, N7)."""
 
 from __future__ import annotations
 

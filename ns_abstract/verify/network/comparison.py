@@ -1,4 +1,4 @@
-"""Whether a network's reading computes what the program that runs its file computes."""
+"""Compare a network as it was read with the runtime that executes its file."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ _BOUNDED, _UNITS = 32, 1 << 16
 
 
 def compare(network: Network, run: Run, images: Iterable[np.ndarray], *, usual: bool = True) -> None:
-    """Refuse a network whose reading gives other numbers than the program that runs the file.
+    """Raise InputError if the network as read and the runtime of its file give different outputs.
 
     Args:
         network: As it is read.
@@ -85,7 +85,7 @@ def compare(network: Network, run: Run, images: Iterable[np.ndarray], *, usual: 
 
 
 def _within(network: Network, image: np.ndarray, expected: np.ndarray) -> bool:
-    """Whether outputs of a small network lie within the bounds of float32 evaluations.
+    """Return whether the runtime's outputs lie within the network's bounds, which charge float32 rounding.
 
     Sums of computed constants may cancel, and then two programs differ by much.
     """
@@ -101,7 +101,7 @@ def _within(network: Network, image: np.ndarray, expected: np.ndarray) -> bool:
 
 
 def probes(network: Network) -> tuple[Iterator[np.ndarray], Iterator[np.ndarray]]:
-    """Usual inputs, and others: corners, large and tiny numbers, and inputs that bring units to their other sides."""
+    """Yield test inputs: usual ones, corners, large and tiny ones, and ones that switch activation phases."""
     return _usual(network), _strange(network)
 
 
@@ -136,7 +136,7 @@ def _strange(network: Network) -> Iterator[np.ndarray]:
 
 
 class _Sides:
-    """Which sides of their kinks the units of a network have been on."""
+    """Records which activation phases the test inputs have visited."""
 
     def __init__(self, network: Network) -> None:
         self.network = network

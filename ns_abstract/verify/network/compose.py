@@ -1,4 +1,4 @@
-"""Layers of networks that are made of several rules of the table (docs/design.md, N11, N19)."""
+"""Build operators that consist of several basic layers (docs/design.md, N11, N19)."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ _CENTRED_AT_ONCE = 1 << 16
 
 
 class Composer(Builder):
-    """A builder of what networks have besides the plain layers."""
+    """Builds operators such as softmax, normalisation and resizing from basic layers."""
 
     # ------------------------------------------------------------ what is known of nodes
 
@@ -621,7 +621,7 @@ class Composer(Builder):
 
 
 class Axis(NamedTuple):
-    """How rows or columns of a map are resized.
+    """The interpolation matrix along one axis, and its error.
 
     Attributes:
         weight: [out, size].
@@ -633,7 +633,7 @@ class Axis(NamedTuple):
 
 
 def nearest_pixels(size: int, out: int, coordinates: str, nearest: str, ratio: float) -> np.ndarray:
-    """[out] the pixel that onnxruntime takes along one axis: places are computed in float32, one operation a time.
+    """Return [out] the input pixels that onnxruntime picks along one axis; it computes positions in float32.
 
     Exact places differ from these by up to a pixel where they lie half way or on a number.
     """

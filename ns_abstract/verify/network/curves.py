@@ -1,4 +1,4 @@
-"""Functions of one number that are convex, concave or straight between known points (docs/design.md, N10, N21).
+"""Activations that are convex, concave or linear between known points (docs/design.md, N10, N21).
 
 One relaxation serves them all. The interval is cut at evenly spaced points and at the known ones, so that every
 part has one curvature. A line with any slope becomes a sound one by the greatest or least distance of the function
@@ -50,7 +50,7 @@ _POINT = 2.0**-36
 
 
 class _Cuts(NamedTuple):
-    """A function at points [K, ...] that grow along the first axis.
+    """Samples of a function at ascending points [K, ...].
 
     Attributes:
         z, value, slope: [K, ...].
@@ -67,7 +67,7 @@ class _Cuts(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Curve(Activation):
-    """A function with parts of one curvature each."""
+    """An activation that is piecewise convex, concave or linear."""
 
     @property
     def breaks(self) -> tuple[float, ...]:
@@ -218,7 +218,7 @@ class Curve(Activation):
 
 
 class Assumed(Curve):
-    """A curve whose float32 evaluation uses a library's exponential, logarithm or error function."""
+    """An activation whose float32 evaluation calls a library's exponential, logarithm or error function."""
 
 
 def _fields(lines: Lines) -> tuple[Tensor, Tensor, Tensor, Tensor]:
@@ -374,7 +374,7 @@ class Reciprocal(Curve):
 
 
 class Share(Reciprocal):
-    """The reciprocal of a sum of capped exponentials: a softmax (N11)."""
+    """The reciprocal in a softmax: of a sum of capped exponentials (N11)."""
 
     def missing(self, lower: Tensor, upper: Tensor) -> Tensor | float:
         # the share and this are both less than exp(-CAP) and its roundings there; sums keep half their size
@@ -382,7 +382,7 @@ class Share(Reciprocal):
 
 
 def _unknown(lower: Tensor, upper: Tensor, where: Tensor) -> tuple[Tensor, Tensor]:
-    """Intervals where nothing is known are not numbers: such a cell is given up."""
+    """Return NaN where the function has no bound; the cell is then given up."""
     nan = torch.full_like(lower, math.nan)
     return torch.where(where, nan, lower), torch.where(where, nan, upper)
 

@@ -1,4 +1,4 @@
-"""Layers whose constants are known within bounds only: what programs compute of stored constants (N23)."""
+"""Layers whose constants are intervals, because programs compute them from stored ones (N23)."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ Doubts = tuple[np.ndarray, np.ndarray]
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Doubtful(Linear):
-    """Adds what constants that are off change, for inputs of at most some sizes.
+    """A linear layer with interval constants: charges their width times the input's magnitude.
 
     Attributes:
         real, single: The layer with the doubts as weights and offset: of the exact value, and of float32 evaluations.
@@ -63,7 +63,7 @@ _KINDS = {
 
 
 def doubtful(layer: Linear, weight: Doubts | None, offset: Doubts | None) -> Linear:
-    """The layer with doubts of its weights (a scale's factor) and of its offset, in their shapes; None: exact."""
+    """Return the layer with interval weights (a scale's factor) and offset, in their shapes; None: exact."""
     name = "factor" if isinstance(layer, Scale) else "weight"
     sides = []
     for side in range(2):

@@ -1,4 +1,4 @@
-"""Constants that a program computes from stored ones: what exact arithmetic gives, and what any float32 order may.
+"""Enclosures of constants that programs compute from stored ones: exact values, and every float32 order.
 
 A folded constant is not the one number that one library returns (docs/design.md, N23). Every result is enclosed
 twice: ``real`` holds the exact value, ``single`` what any evaluation in the constant's own type may give, with sums
@@ -117,13 +117,13 @@ def scaled_integers(number: np.ndarray, scale: Enclosed) -> np.ndarray | Enclose
 
 
 def enclosed(value: np.ndarray) -> Enclosed:
-    """A stored constant, which is exact."""
+    """Return the enclosure of a stored constant: its exact value."""
     number = value.astype(np.float64)
     return Enclosed(value.dtype, (number, number), (number, number))
 
 
 def arithmetic(node: onnx.NodeProto, values: Sequence[np.ndarray | None], doubtful: bool) -> bool:
-    """Whether a node of constants computes with floats, so that its results are to be enclosed."""
+    """Return whether a constant node computes with floats, so that its results need an enclosure."""
     if doubtful:
         return True
     kind = node.op_type
@@ -143,7 +143,7 @@ _COMPARES = frozenset(("And", "Equal", "Greater", "GreaterOrEqual", "Less", "Les
 def fold_enclosed(
     node: onnx.NodeProto, values: Sequence[np.ndarray | Enclosed | None], opset: int
 ) -> list[np.ndarray | Enclosed]:
-    """The results of a node of constants; those that every evaluation gives alike as arrays.
+    """Return the results of a constant node: arrays where every evaluation agrees, else enclosures.
 
     Raises:
         InputError: They would be too large, cannot be enclosed, or may be decided either way.

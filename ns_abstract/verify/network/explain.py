@@ -1,4 +1,4 @@
-"""What a network consists of, and what a cell of it will take, before any of it is bounded."""
+"""Describe a network's layers and estimate the cost of a cell before anything is bounded."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ _OPEN, _DEEP_OPEN = 0.1, 0.4
 
 
 def products(network: Network, index: int) -> float:
-    """Products that one evaluation of node ``index`` takes."""
+    """Return the number of multiplications in one evaluation of node ``index``."""
     layer = network.nodes[index - 1].layer
     size = float(np.prod(layer.shape))
     if isinstance(layer, Convolution):
@@ -41,7 +41,7 @@ def products(network: Network, index: int) -> float:
 
 
 def estimate(network: Network, dimensions: int) -> tuple[float, float, bool]:
-    """(bytes, seconds of one core, whether rows are given up) of one cell; the seconds are rough."""
+    """Return a cell's bytes, seconds on one core (roughly), and whether backward passes are skipped."""
     count = len(network.nodes)
     sizes = [float(np.prod(network.shape(k))) for k in range(count + 1)]
     forwards = 2.0 * sum(products(network, k) for k in range(1, count + 1)) * (1 + dimensions)
@@ -57,7 +57,7 @@ def estimate(network: Network, dimensions: int) -> tuple[float, float, bool]:
 def check_cell(
     network: Network, dimensions: int, allowed: float, remedy: str = "a larger --memory-limit, fewer --workers"
 ) -> None:
-    """Refuse a network one cell of which takes more than ``allowed`` bytes, before any is bounded.
+    """Raise InputError if one cell of the network takes more than ``allowed`` bytes.
 
     ``remedy`` is what may be given instead of a smaller network.
 
@@ -76,7 +76,7 @@ def check_cell(
 
 
 def explain(network: Network, dimensions: int = 2) -> Sequence[str]:
-    """Lines: every layer with its size, and an estimate of memory and time of one cell."""
+    """Return lines of text: every layer with its size, and the estimated memory and time of one cell."""
     lines = [f"{network.source}: {item(network.input_shape)} -> {item(network.output_shape)}"]
     for k, node in enumerate(network.nodes, 1):
         kind = type(node.layer).__name__

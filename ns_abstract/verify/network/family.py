@@ -1,4 +1,4 @@
-"""Bounds of cells by the rows of one of them (docs/design.md, N15)."""
+"""Backward coefficients of one cell, reused to bound others (docs/design.md, N15)."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ _NEARLY = 0.25
 
 
 def lends_anywhere(network: Network) -> bool:
-    """Whether rows of a cell serve for others that are no parts of it.
+    """Return whether one cell's coefficients are valid for cells outside it.
 
     At maxima and products they gather what holds for the cell alone, and where what they are on the way is too much to
     be kept.
@@ -46,12 +46,12 @@ def lends_anywhere(network: Network) -> bool:
 
 
 def _numbers(network: Network) -> int:
-    """Numbers of all nodes."""
+    """Return the number of neurons of all nodes."""
     return sum(int(np.prod(network.shape(k))) for k in range(len(network.nodes) + 1))
 
 
 class Family:
-    """Bounds of one cell, and of others by the rows that were passed back for it.
+    """Bounds one cell, and other cells with the backward coefficients of that one.
 
     Args:
         network: The network.
@@ -99,7 +99,7 @@ class Family:
 
 @dataclass
 class _Lent:
-    """Rows of one cell on numbers of one node.
+    """Stored backward coefficients of one cell for neurons of one node.
 
     Attributes:
         flat: [R] which numbers; a number may have two rows.
@@ -131,7 +131,7 @@ class _Lent:
 
 
 class _First(Sharing):
-    """One cell that remembers rows of numbers before activations and products."""
+    """The cell whose coefficients are stored, for neurons that feed activations and products."""
 
     def __init__(self, network: Network, images: ImageSets, memory: int, arithmetic: NetworkArithmetic) -> None:
         self.network = network
@@ -191,7 +191,7 @@ class _First(Sharing):
 
 
 class _Said(NamedTuple):
-    """What rows say of numbers of a node, relative to the reference: they are within ``half`` of ``slopes p + middle``.
+    """Bounds of neurons from stored coefficients: within ``half`` of ``slopes p + middle`` about the reference.
 
     Attributes:
         slopes: [m, R, d].
@@ -207,7 +207,7 @@ class _Said(NamedTuple):
 
 
 class _Other(Sharing):
-    """Cells that are bounded by rows of another one (N15)."""
+    """Cells that are bounded with the stored coefficients of another cell (N15)."""
 
     def __init__(
         self, first: _First, images: ImageSets, memory: int, arithmetic: NetworkArithmetic, fresh: bool

@@ -1,4 +1,4 @@
-"""What is known of a node's numbers: affine forms in the parameters, and intervals (docs/design.md, N0, N1)."""
+"""Affine forms in the parameters, and intervals, that enclose a node's values (docs/design.md, N0, N1)."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from ns_abstract.arithmetic.network_charges import OWN_FEW, UP
 
 
 class Interval(NamedTuple):
-    """What a node's numbers are at least and at most, [m, *shape]."""
+    """Lower and upper bounds of a node's values, [m, *shape]."""
 
     lower: Tensor
     upper: Tensor
@@ -29,7 +29,7 @@ class Interval(NamedTuple):
 
 @dataclass
 class Form:
-    """``z = reference + c + a p + e`` with |e| <= r: what is known of a node in every cell (N1).
+    """The affine form ``z = reference + c + a p + e``, |e| <= r, of a node's values in every cell (N1).
 
     Attributes:
         reference: [m, *shape]: the node's exact values are near it; all that follows is relative to it.

@@ -1,4 +1,4 @@
-"""The pass forwards over all nodes: forms, better bounds of what is open, and signs (docs/design.md, N1, N16, N18)."""
+"""The forward pass: affine forms of all nodes, tighter bounds of unstable neurons (docs/design.md, N1, N16, N18)."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from ns_abstract.verify.network.slopes import Held
 
 
 class Forward:
-    """Takes the nodes in order.
+    """Propagates forms through the nodes in order and refines intermediate bounds.
 
     Args:
         known: What is known, to begin with of the image alone.

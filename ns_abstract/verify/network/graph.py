@@ -1,4 +1,4 @@
-"""A network as a list of nodes, checked and ready to be evaluated or bounded."""
+"""A network as a checked list of nodes that can be evaluated and bounded."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ _SIGMOIDAL = "sigmoid and tanh are taken to be evaluated within 2^-20 of the exa
 
 @dataclass(frozen=True, eq=False)
 class Node:
-    """One layer at its place.
+    """One layer of a network with the nodes that it reads.
 
     Attributes:
         name: As in the file.

@@ -1,4 +1,4 @@
-"""Sets of images as rows and forms want them, relative to a reference (docs/design.md, N, N0, N22)."""
+"""Planes and forms of the network's input, relative to a reference image (docs/design.md, N, N0, N22)."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from ns_abstract.verify.network.sets import ImageSets, Substitution
 
 
 class ImagePlanes(NamedTuple):
-    """What is known of the image, as rows want it.
+    """Linear bounds of the input image as the backward pass reads them.
 
     Attributes:
         slopes: [m, 2, C, H, W, d] of the lower and the upper plane.
@@ -29,7 +29,7 @@ class ImagePlanes(NamedTuple):
 
 
 def finite(images: ImageSets) -> tuple[list[Float64], np.ndarray]:
-    """The fields of image sets without numbers that are not finite, and [m] which cells have no others to begin with.
+    """Return the image sets with non-finite numbers replaced, and [m] which cells had none.
 
     Cells with numbers past the limit of N22 are not among these.
     """
@@ -42,14 +42,14 @@ def finite(images: ImageSets) -> tuple[list[Float64], np.ndarray]:
 
 
 def middle_of(fields: list[Float64]) -> Float64:
-    """[m, n] pictures in the middle of the sets."""
+    """Return [m, n] the middle picture of every set."""
     return 0.5 * (np.maximum(fields[1], fields[4]) + np.minimum(fields[3], fields[5]))
 
 
 def planes_of(
     fields: list[Float64], middle: Float64, input_shape: tuple[int, ...], substitution: Substitution
 ) -> ImagePlanes:
-    """Image sets as rows want them, relative to the reference ``middle``."""
+    """Return the image sets as planes relative to the reference ``middle``."""
     m, _, d = fields[0].shape
     shape = grid(input_shape)
     a_lower, b_lower, a_upper, b_upper, lower, upper = fields
@@ -67,7 +67,7 @@ def planes_of(
 
 
 def form_of(planes: ImagePlanes, middle: Float64, input_shape: tuple[int, ...]) -> Form:
-    """The image as a form: the middle of its planes."""
+    """Return the input as a form: the mean of its lower and upper plane."""
     m, d = len(middle), planes.slopes.shape[-1]
     slopes, offsets = torch.from_numpy(planes.slopes), torch.from_numpy(planes.offsets)
     a = slopes.mean(1).movedim(-1, 1).reshape(m, d, *input_shape)

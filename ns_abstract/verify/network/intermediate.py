@@ -1,4 +1,4 @@
-"""Intermediate bounds: numbers of a node bounded by rows of their own (docs/design.md, N5, N6, N18)."""
+"""Intermediate bounds by backward passes that start at single neurons (docs/design.md, N5, N6, N18)."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from ns_abstract.verify.network.sharing import Sharing
 
 
 class Intermediate:
-    """Bounds numbers of nodes by rows.
+    """Bounds chosen neurons of a node by backward passes of their own.
 
     Args:
         known: What is known so far.

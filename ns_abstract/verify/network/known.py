@@ -1,4 +1,4 @@
-"""What is known of a network's nodes over some cells: forms, and what rows take (docs/design.md, N1, N16, N18)."""
+"""Intermediate bounds and relaxations of all nodes over several cells (docs/design.md, N1, N16, N18)."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from ns_abstract.verify.network.slopes import Held, OpenUnits
 
 
 class Known:
-    """What is known so far; passing forms forwards adds to it, and rows that are passed back read it.
+    """Forms and relaxations of the nodes: the forward pass adds to them, the backward pass reads them.
 
     Args:
         network: The network.

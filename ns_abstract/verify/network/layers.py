@@ -1,4 +1,4 @@
-"""One table of layer rules: what a layer computes, what it does to forms, and how rows pass it backwards.
+"""Layers: what each computes, and how forms pass it forwards and coefficients backwards.
 
 See design.md, N3, N4.
 
@@ -339,7 +339,7 @@ class Pad(Linear):
 
 @dataclass(frozen=True, eq=False)
 class Channels(Linear):
-    """A map among channels of zeros: its first channel becomes number ``first``."""
+    """Places the input's channels among channels of zeros, from number ``first`` on."""
 
     first: int = 0
 
@@ -354,7 +354,7 @@ class Channels(Linear):
 
 @dataclass(frozen=True, eq=False)
 class Gather(Linear):
-    """Numbers of the input in another order.
+    """Gathers numbers of the input by index.
 
     Attributes:
         index: [prod(shape)] flat positions in the input; -1 stands for ``fill``.
@@ -386,7 +386,7 @@ class Gather(Linear):
 
 @dataclass(frozen=True)
 class Lines:
-    """Lines that enclose an activation over an interval: ``slope * z + offset``, float64, broadcast like z."""
+    """The linear relaxation of an activation over an interval: lines ``slope * z + offset``, float64, shaped as z."""
 
     lower_slope: Tensor
     lower_offset: Tensor
@@ -396,7 +396,7 @@ class Lines:
 
 @dataclass(frozen=True, eq=False)
 class Activation:
-    """A function of every number by itself; ``shape`` is one item."""
+    """An elementwise activation; ``shape`` is that of one item."""
 
     shape: Shape
     #: `function` in float64 is within this of the true one, beside roundings relative to its value.

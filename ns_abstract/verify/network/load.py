@@ -1,4 +1,4 @@
-"""Loading a network from a file, and comparing it with another program that reads the same file."""
+"""Load a network from a file and compare it with the runtime of that file format."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Linear layers of few numbers: sparse matrices, differences, transposed convolutions.
+"""Sparse linear layers: sparse matrices, pairwise differences, transposed convolutions.
 
 See docs/design.md, N11, N19; the plain ones are in `ns_abstract.verify.network.layers`.
 """
@@ -37,7 +37,7 @@ def _none() -> Tensor:
 
 @dataclass(frozen=True, eq=False)
 class Sparse(Linear):
-    """A matrix of few numbers on the flattened item: means over axes, resizing, differences.
+    """A sparse matrix applied to the flattened item: means over axes, resizing, differences.
 
     Attributes:
         to, source: [E] int64 positions in the output and in the input.
@@ -103,7 +103,7 @@ class Sparse(Linear):
 
 @dataclass(frozen=True, eq=False)
 class Variance(Sparse):
-    """Means of squares of centred numbers, the first input; the second holds the numbers themselves.
+    """The variance: means of squares of centred numbers (first input) of the numbers in the second input.
 
     A program may work the variance out as mean of squares minus square of the mean: what that loses is
     relative to the numbers and not to their spread (N11).
@@ -138,7 +138,7 @@ class Variance(Sparse):
 
 @dataclass(frozen=True, eq=False)
 class Resized(Sparse):
-    """A map whose rows and columns lie between those of another; positions are computed in float32, too.
+    """A resized map: rows and columns are interpolated; programs compute their positions in float32.
 
     Attributes:
         rows, columns: [2, out, in] sizes of the weights along an axis, and what they may be off.

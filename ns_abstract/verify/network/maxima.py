@@ -1,4 +1,4 @@
-"""Maxima over windows of a map, bounded without a chain of differences (docs/design.md, N12)."""
+"""Max pooling, relaxed by one plane per window (docs/design.md, N12)."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _LARGE = 1e300
 
 @dataclass(frozen=True, eq=False)
 class MaxPool:
-    """Maxima of windows of every channel; places in the padding do not count.
+    """Max pooling over windows of every channel; padding never wins.
 
     Attributes:
         input_shapes: One item of the only input, [C, H, W].
@@ -72,7 +72,7 @@ class MaxPool:
 
 
 class Candidates(NamedTuple):
-    """What is known of the numbers of B windows: ``z = reference + u``.
+    """Bounds of the inputs of B pooling windows, ``z = reference + u``.
 
     Attributes:
         inside: [B, K] False in the padding; nothing is said of those.
@@ -119,7 +119,7 @@ class Candidates(NamedTuple):
 
 
 class Planes(NamedTuple):
-    """``low <= max z - slopes z <= high`` for every window.
+    """Planes of pooling windows: ``low <= max z - slopes z <= high``.
 
     Attributes:
         slopes: [B, K] float64, not negative, zero in the padding.
@@ -132,7 +132,7 @@ class Planes(NamedTuple):
 
 
 def upper_planes(window: Candidates, apart: Tensor) -> Planes:
-    """For every window the upper plane that is lowest in the middle, of those tried (N12)."""
+    """Return for every window the tried upper plane that is lowest in the middle (N12)."""
     at = torch.arange(len(apart))
     winner = window.winner
     middle = torch.where(window.inside, window.reference + window.middle, torch.zeros_like(window.middle))

@@ -1,4 +1,4 @@
-"""Reading an ONNX file into a network. Nothing in the file is executed; what is not understood is refused."""
+"""Read an ONNX file into a network; nothing in it is executed, and unsupported operators are refused."""
 
 from __future__ import annotations
 

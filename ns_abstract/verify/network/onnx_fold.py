@@ -1,4 +1,4 @@
-"""Arithmetic on constants in an ONNX graph: shapes, masks, indices; by the reference operators of `onnx`."""
+"""Fold constants of an ONNX graph (shapes, masks, indices) with the reference operators of `onnx`."""
 
 from __future__ import annotations
 

@@ -101,7 +101,7 @@ _BY_ITEM = frozenset(
 
 
 class Asked(NamedTuple):
-    """What of a file is read.
+    """Which output of a file is read, and how its input is shaped.
 
     Attributes:
         output: Name of the output; None: the only one.
@@ -121,7 +121,7 @@ _PICKS = frozenset(("ArgMax", "ArgMin", "TopK"))
 
 
 class Value(NamedTuple):
-    """What a name stands for: a node of the network, and its shape in the file for a batch of 1."""
+    """A tensor of the graph: a node of the network, and the tensor's shape in the file for a batch of 1."""
 
     index: int
     whole: Shape
@@ -138,7 +138,7 @@ class Value(NamedTuple):
 
 
 class Reader:
-    """Turns one graph's nodes into layers."""
+    """Turns the nodes of one ONNX graph into layers."""
 
     def __init__(self, path: Path, graph: onnx.GraphProto, opset: int, rules: dict[str, Rule], asked: Asked) -> None:
         self.path, self.graph, self.opset, self.rules = path, graph, opset, rules
@@ -363,7 +363,7 @@ class Reader:
 
 
 class Attributes:
-    """A node's attributes, each of which a rule must ask for."""
+    """A node's attributes; every one must be read or the node is refused."""
 
     def __init__(self, reader: Reader, node: onnx.NodeProto) -> None:
         self.reader, self.node = reader, node

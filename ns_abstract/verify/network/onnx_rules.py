@@ -1,4 +1,4 @@
-"""What each ONNX operator becomes; what is not understood is refused, with what to do about it."""
+"""Rules that turn ONNX operators into layers; other operators are refused with a fix."""
 
 from __future__ import annotations
 

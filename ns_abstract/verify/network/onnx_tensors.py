@@ -1,4 +1,4 @@
-"""What an ONNX file stores, checked before it is read: its messages and its tensors."""
+"""Read an ONNX file's messages and tensors after checking their sizes."""
 
 from __future__ import annotations
 

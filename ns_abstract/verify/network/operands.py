@@ -1,4 +1,4 @@
-"""What nodes and constants make together, in shapes as a file sees them: products of matrices, and joins."""
+"""Contractions of nodes and constants (einsum, matrix products) and concatenation, in the file's shapes."""
 
 from __future__ import annotations
 
@@ -122,7 +122,7 @@ def _matrix(constant: Any) -> Any:
 
 
 def joined(b: Composer, parts: Sequence[Operand], axis: int) -> tuple[int, Shape]:
-    """Nodes and constants one after another along an axis, and their shape.
+    """Return the concatenation of nodes and constants along an axis, and its shape.
 
     Raises:
         InputError: They do not fit, or a constant is not finite.

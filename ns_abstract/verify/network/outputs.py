@@ -1,4 +1,4 @@
-"""Bounds of rows of a network's outputs, with slopes and multipliers of their own (docs/design.md, N14, N16)."""
+"""Bounds of linear functions of the outputs, with optimised slopes and multipliers (docs/design.md, N14, N16)."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _SURE = 1e-9
 
 
 class Outputs:
-    """Bounds rows of outputs, when all that they pass is known.
+    """Bounds linear functions of the outputs once all intermediate bounds are there.
 
     Args:
         known: What is known of the nodes.

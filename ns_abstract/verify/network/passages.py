@@ -1,4 +1,4 @@
-"""What rows take on their way back through the nodes: lines, planes and rounding (docs/design.md, N2, N4, N9, N12)."""
+"""Linear relaxations and rounding errors that the backward pass applies (docs/design.md, N2, N4, N9, N12)."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from ns_abstract.verify.network.rows import Float64, Int64, Rows, pass_maximum
 
 
 class Maxima(NamedTuple):
-    """Planes of a maximum's windows, as rows want them (N12).
+    """Planes of pooling windows as the backward pass applies them (N12).
 
     Attributes:
         winner: [m, C, H, W] int16, the number that the lower plane follows.
@@ -54,7 +54,7 @@ class Maxima(NamedTuple):
 
 
 class Offered(NamedTuple):
-    """An activation beside slopes of another cell's rows (N15).
+    """The relaxation of an activation around slopes that another cell's coefficients use (N15).
 
     Attributes:
         lines: [6, m, C, H, W] float32 as `pass_activation` takes them.
@@ -67,7 +67,7 @@ class Offered(NamedTuple):
 
 @dataclass
 class Passage:
-    """What rows of one type take on their way through the nodes, with what they lose themselves (N2).
+    """The relaxations of all nodes for coefficients of one float type, and that type's own rounding (N2).
 
     Attributes:
         dtype: Of rows, slopes and offsets.

@@ -1,4 +1,4 @@
-"""How forms and rows pass maxima over windows, and which differences in them rows bound (docs/design.md, N12)."""
+"""Forward and backward propagation through max pooling (docs/design.md, N12)."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _TRIED, _CLOSES = 64, 0.1
 
 
 class _Exceeded(NamedTuple):
-    """Windows whose winner may be exceeded, and planes above them.
+    """Pooling windows whose largest input is not certain, and planes above them.
 
     Attributes:
         at: Their cells, channels and numbers, [n] each.
@@ -42,7 +42,7 @@ class _Exceeded(NamedTuple):
 
 
 class Pooling:
-    """Passes maxima over windows.
+    """Propagates forms through max pooling and bounds differences of its inputs.
 
     Args:
         known: What is known so far; rows that pass the maxima find their planes there.

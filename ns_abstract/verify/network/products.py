@@ -1,4 +1,4 @@
-"""Products of two values that both depend on the image (docs/design.md, N9)."""
+"""Products of two values that both depend on the image: McCormick's planes (docs/design.md, N9)."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _MOVES = 2.0**-7
 
 
 class Interval(Protocol):
-    """What is known of a node: [m, *shape] each."""
+    """Bounds of a node's values, [m, *shape] each."""
 
     @property
     def lower(self) -> Tensor:

@@ -1,4 +1,4 @@
-"""How forms pass linear layers, activations and products (docs/design.md, N1-N4, N9, N21, N22)."""
+"""Forward propagation of forms through layers, activations and products (docs/design.md, N1-N4, N9, N21, N22)."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ from ns_abstract.verify.network.slopes import OpenUnits
 
 
 class Propagation:
-    """Passes forms through single nodes.
+    """Propagates forms through single nodes.
 
     Args:
         known: What is known so far; rows that pass the nodes find lines and rounding there.
@@ -249,7 +249,7 @@ def _tilted(slope: Tensor, z: Form, line: tuple[Tensor, Tensor, Tensor]) -> tupl
 
 
 def _open_units(layer: LeakyRelu, given: tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]) -> OpenUnits:
-    """The units [m, *shape] of a ReLU that are open, with what `OpenUnits` holds of them."""
+    """Return the unstable neurons [m, *shape] of a ReLU as `OpenUnits`."""
     where = layer.open(given[0], given[1]).flatten(1).nonzero()
     at = where[:, 0], where[:, 1]
     lower, upper, reference, image, loose, room = (v.flatten(1)[at].numpy() for v in given)

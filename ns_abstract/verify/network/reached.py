@@ -1,4 +1,4 @@
-"""What rows are found to be, when that is enough, and what they are on the way (docs/design.md, N5, N6, N15, N17)."""
+"""Concretised bounds of the backward pass, and the criterion that stops it early (docs/design.md, N5, N6, N15, N17)."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from ns_abstract.verify.network.rows import Float64, Int64, Rows, full
 
 @dataclass
 class Reached:
-    """What rows are at least and at most.
+    """Concretised bounds of backward coefficients, and the planes they come from.
 
     Attributes:
         plane: [R, 2, d + 1] slopes and offset of a plane below and one above; NaN if unknown.
@@ -70,7 +70,7 @@ class Reached:
 
 
 class Goal(NamedTuple):
-    """What rows of a node's numbers are to find out; a matter of tightness alone (N6, N17).
+    """How tight the bounds of a neuron have to be; plays no part in soundness (N6, N17).
 
     Attributes:
         width: How far apart a number's bounds may be; None: its sign is all that is asked.
@@ -85,7 +85,7 @@ class Goal(NamedTuple):
 
 @dataclass(frozen=True)
 class Enough:
-    """When rows of single numbers need not go on to the image.
+    """The criterion that stops the backward pass of a neuron before it is at the image.
 
     Attributes:
         goal: What is asked for.
@@ -114,7 +114,7 @@ class Enough:
 
 
 class Trace:
-    """What rows of one call of `Backward.bound` are on their way to the image.
+    """Coefficients that one call of `Backward.bound` has at the nodes on its way to the image.
 
     Args:
         count: Rows R.

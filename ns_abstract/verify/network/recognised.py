@@ -1,4 +1,4 @@
-"""Functions that a graph spells out with constants of its own: bounded as they stand, not as what they resemble.
+"""Activations that a graph writes out with constants of its own, bounded with these constants.
 
 A file's 0.70710677 is not ``1 / sqrt(2)``. In exact arithmetic the difference may decide a verdict, so that the
 curves here take the file's numbers (docs/design.md, N24).

@@ -1,4 +1,4 @@
-"""What float32 evaluations of a network and rows may be off (docs/design.md, N2, N20-N22)."""
+"""Rounding errors of float32 evaluations and of the backward pass (docs/design.md, N2, N20-N22)."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ _LONG = 256
 
 
 def outward(value: Tensor, side: float) -> Tensor:
-    """The float32 neighbour on one side, half a unit away at least; zero stays."""
+    """Return the float32 neighbour on one side, at least half a unit away; zero stays."""
     near = value.float()
     return torch.where(value == 0.0, near, torch.nextafter(near, torch.full_like(near, side * torch.inf)))
 
@@ -50,7 +50,7 @@ class Extremes(NamedTuple):
 
 
 class Rounding:
-    """What float32 evaluations of a network's linear layers may be off."""
+    """Bounds the float32 rounding errors of a network's linear layers."""
 
     def __init__(self, network: Network) -> None:
         self.network = network

@@ -1,4 +1,4 @@
-"""Rows of coefficients on windows of a map: what passes backwards through a network (design.md, N5).
+"""Backward coefficients on windows of a map, and their kernels (design.md, N5).
 
 A row is one linear function of the numbers at a node. In a convolutional network it depends on a window of
 the map only, its receptive field, so that is what is stored: ``value`` [R, C, h, w], float32 or float64, and the
@@ -28,7 +28,7 @@ Floats = NDArray[np.floating[Any]]
 
 
 def grid(shape: tuple[int, ...]) -> tuple[int, int, int]:
-    """(channels, rows, columns) of an item: a vector is one row of one channel."""
+    """Return (channels, rows, columns) of an item: a vector is one row of one channel."""
     if len(shape) == 3:
         return shape[0], shape[1], shape[2]
     return 1, 1, int(np.prod(shape, dtype=np.int64))
@@ -36,7 +36,7 @@ def grid(shape: tuple[int, ...]) -> tuple[int, int, int]:
 
 @dataclass
 class Rows:
-    """Windows of rows; see the module."""
+    """Backward coefficients that vanish outside a window of a node's map."""
 
     value: Floats
     y: Int64
@@ -65,7 +65,7 @@ class Rows:
 
 
 def join(one: Rows, two: Rows, shape: tuple[int, ...]) -> Rows:
-    """Sum of two sets of rows on a node of ``shape``."""
+    """Return the sum of two sets of coefficients on a node of ``shape``."""
     one, two = full(one, shape), full(two, shape)
     if one.covers(shape) or two.covers(shape):
         one, two = full(one, shape, force=True), full(two, shape, force=True)
@@ -86,14 +86,14 @@ def join(one: Rows, two: Rows, shape: tuple[int, ...]) -> Rows:
 
 
 def shifted(rows: Rows, height: int, width: int) -> Rows:
-    """The same rows on the whole map."""
+    """Return the same coefficients on the whole map."""
     value = np.zeros((*rows.value.shape[:2], height, width), rows.value.dtype)
     _place(rows.value, rows.y, rows.x, value)
     return Rows.whole(value)
 
 
 def full(rows: Rows, shape: tuple[int, ...], force: bool = False) -> Rows:
-    """Rows on the whole map of ``shape``, if their windows are no smaller than it (or always)."""
+    """Return the coefficients on the whole map of ``shape`` if their windows are no smaller (or always)."""
     _, height, width = grid(shape)
     if rows.covers(shape):
         return rows
@@ -161,7 +161,7 @@ def _scale(value, y, x, factor):
 
 @njit(cache=True, error_model="numpy", nogil=True, inline="always")
 def _passed(rows, at, line, here, plane):
-    """What a number becomes, and what it adds below and above."""
+    """Return a coefficient on the activation's input, and what it adds to the lower and upper bound."""
     a = rows[at]
     # all lines are read and one kept: signs are as good as random, and so several numbers go side by side
     s0, l0, m0 = line[here], line[here + plane], line[here + 2 * plane]
@@ -312,7 +312,7 @@ def charge(value, y, x, cell, noise, total):
 
 
 class Columns(NamedTuple):
-    """What is known of the numbers of a node, as `concretize` takes it (design.md, N5).
+    """Planes and intervals of a node's values, laid out for `concretize` (design.md, N5).
 
     Attributes:
         values: [m K C H W + 8]: for each cell the middles of the planes' slopes and offsets [d + 1] and of the

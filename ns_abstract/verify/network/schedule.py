@@ -1,4 +1,4 @@
-"""What rows cost, and how many of them a deep network is worth (docs/design.md, N13, N17, N18)."""
+"""The cost model of backward passes and of refined neurons (docs/design.md, N13, N17, N18)."""
 
 from __future__ import annotations
 
@@ -77,7 +77,7 @@ Found = TypeVar("Found")
 
 
 class Way(NamedTuple):
-    """How a row of one number of a node goes back.
+    """The route of a neuron's backward pass: where it stops and what it costs.
 
     Attributes:
         cut: It passes through the nodes behind this one and ends on those up to it; 0: it ends on the image.
@@ -107,7 +107,7 @@ class Way(NamedTuple):
 
 
 class Plan(NamedTuple):
-    """Which rows a cell of a network is worth (N18).
+    """Which neurons of a network are refined in a cell (N18).
 
     Attributes:
         ways: By node: how rows for all of its numbers go back.
@@ -125,7 +125,7 @@ class Plan(NamedTuple):
 
 
 class Foreseen(NamedTuple):
-    """What rows of one cell take.
+    """The estimated cost of a cell's backward passes.
 
     Attributes:
         products: Of all rows.
@@ -139,7 +139,7 @@ class Foreseen(NamedTuple):
 
 
 class Costs:
-    """Products that rows of one network take."""
+    """Estimates the multiplications of backward passes through one network."""
 
     def __init__(self, network: Network) -> None:
         self.network = network
@@ -394,7 +394,7 @@ class Costs:
 
 
 class Schedule:
-    """How far the work of one cell has gone."""
+    """Decides from the work spent on a cell whether further backward passes pay."""
 
     def __init__(self, network: Network) -> None:
         self.network = network
@@ -501,7 +501,7 @@ def costs_of(network: Network) -> Costs:
 
 
 def on_threads(work: Callable[[int], Found], parts: Iterable[int], threads: int) -> Iterator[Found]:
-    """``work`` of every part, in order; kernels and torch let other threads run meanwhile, each torch on one."""
+    """Return ``work`` of every part, in order, computed by several threads."""
     if threads < 2:
         yield from map(work, parts)
         return

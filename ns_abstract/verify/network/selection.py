@@ -1,4 +1,4 @@
-"""Which numbers of a node rows bound before an activation or a product (docs/design.md, N6, N13, N17, N18)."""
+"""Choose which neurons before an activation or product are refined (docs/design.md, N6, N13, N17, N18)."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ _STRAIGHT, _BENT = 2.0**-20, 2.0**-5
 
 
 class Selection:
-    """Decides which numbers are bounded better; a matter of tightness alone.
+    """Chooses the neurons whose bounds are refined; plays no part in soundness.
 
     Args:
         known: What is known so far.

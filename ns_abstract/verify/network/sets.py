@@ -1,4 +1,4 @@
-"""Sets of images, signs that are assumed, and bounds of outputs over them (docs/design.md, N)."""
+"""Linear sets of images, assumed activation phases, and output bounds over them (docs/design.md, N)."""
 
 from __future__ import annotations
 

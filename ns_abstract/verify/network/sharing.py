@@ -1,4 +1,4 @@
-"""What cells have in common with other cells: by themselves nothing (docs/design.md, N15)."""
+"""Where a cell takes references, slopes and coefficients from: by default from itself (docs/design.md, N15)."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from ns_abstract.verify.network.rows import Float64, Int64
 
 
 class Sharing:
-    """Cells that are bounded by themselves; others take and give references, slopes and rows here.
+    """Bounds every cell by itself; subclasses store coefficients for other cells or reuse stored ones.
 
     Attributes:
         known: What is known of the cells, before anything but `about` is asked.
@@ -53,7 +53,7 @@ class Sharing:
         apart: Tensor | None,
         layer: Activation | None,
     ) -> tuple[Form, Tensor, Tensor | None]:
-        """What is known of node ``index``, what of it is open, and how far its lines are apart (see `Selection`)."""
+        """Return bounds of node ``index``, its unstable neurons, and their relaxation gaps (see `Selection`)."""
         return form, open_, apart
 
     def trace(self, count: int) -> Trace | None:

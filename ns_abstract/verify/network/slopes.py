@@ -1,4 +1,4 @@
-"""Slopes of lower lines and multipliers of assumed signs, chosen for a row (docs/design.md, N14, N16)."""
+"""Optimised slopes (alpha) and multipliers (beta) of alpha-beta-CROWN (docs/design.md, N14, N16)."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ _NEXT_TO_NOTHING = 1e-30
 
 @dataclass(frozen=True)
 class OpenUnits:
-    """Units of one node that may be on either side of their kink, in all cells.
+    """The unstable neurons of one node, in all cells.
 
     Attributes:
         cell, flat: [U] where they are.
@@ -76,7 +76,7 @@ class OpenUnits:
 
 @dataclass(frozen=True)
 class Held:
-    """Numbers of one node of one cell whose signs are assumed (N16).
+    """Neurons of one node of one cell whose activation phases are assumed (N16).
 
     Attributes:
         flat: [B] where they are.
@@ -103,7 +103,7 @@ class Held:
 
 @dataclass
 class Chosen:
-    """Slopes and multipliers of a cell's rows, and what rows are on the way.
+    """The slopes and multipliers of a cell's coefficients, and the coefficients themselves.
 
     Attributes:
         lines: By node: as `pass_activation` wants them, with rows in place of cells.
@@ -198,7 +198,7 @@ def derivatives(
     others: Mapping[int, Any],
     held: Mapping[int, Held],
 ) -> tuple[dict[int, Float64], dict[int, Float64]]:
-    """By node: how bounds of rows change with the slopes of lower lines [R, U] and with multipliers [R, B].
+    """Return, by node, the derivatives of bounds by lower slopes [R, U] and by multipliers [R, B].
 
     A row's bound is a sum of products along the lines that it took; read forwards from the image where it is least,
     these lines give a value to every node. A slope counts its row's coefficient times that value, a multiplier the

@@ -1,4 +1,4 @@
-"""How large the partial sums of a sum in any order may be, together (docs/design.md, N20)."""
+"""Bounds of the partial sums of a sum in any order (docs/design.md, N20)."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from ns_abstract.arithmetic.network_charges import UP
 
 
 def partial_sums(count: Tensor | int, peak: Tensor, squares: Tensor, end: Tensor) -> Tensor:
-    """The sizes of all partial sums together, at most, in any order and tree of ``count`` additions.
+    """Return an upper bound of the total size of all partial sums, in any order of ``count`` additions.
 
     Args:
         count: Additions, broadcast like the others.

@@ -1,0 +1,345 @@
+"""One search for verdicts on cells, whatever is claimed of them: open, examine, split, store, report.
+
+A `CellQuestion` says what is claimed, with a margin that is positive where it holds; `CellSearch` does the rest.
+"""
+
+from __future__ import annotations
+
+import io
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Generic, Protocol, TypeVar
+
+import numpy as np
+
+from ns_abstract.api.margins import NOT_ASKED, SHARE, Margins, certified_cells
+from ns_abstract.api.searching import paced, search_blocks
+from ns_abstract.execution.ending import Deadline
+from ns_abstract.execution.engines import Engine
+from ns_abstract.execution.opening import Recipe, opened
+from ns_abstract.execution.stopping import StopRequest
+from ns_abstract.execution.threads import use_threads
+from ns_abstract.geometry.box import ParameterBox
+from ns_abstract.report.certificate import LastReport
+from ns_abstract.verify.cells import Cell, Grid
+from ns_abstract.verify.scene_margin import Kind, SceneMargin, Settle
+from ns_abstract.verify.search import Findings
+from ns_abstract.verify.store import Block, Store
+
+P = TypeVar("P")
+#: A row of ``cells``, JSON read: see `Store.leaves`.
+Row = dict[str, Any]
+
+
+class Examiner(Protocol):
+    """What finds verdicts; opened once by every process that examines cells."""
+
+    @property
+    def fingerprint(self) -> Mapping[str, Any]:
+        """What a stored search must agree with to be continued."""
+        ...
+
+    @property
+    def recipe(self) -> Recipe[Any]:
+        """How another process opens it."""
+        ...
+
+    def examine(self, number: int, grid: Grid, cells: tuple[Cell, ...]) -> Findings:
+        """What becomes of cells of the set with this number: verdicts, and smaller cells where there is none.
+
+        Depends on the cells alone. "certified" means a proved lower bound above 0 of the margin of every picture.
+
+        Raises:
+            AbandonedError: There is no time for it.
+        """
+        ...
+
+
+def examine_here(examiner: Examiner, number: int, grid: Grid, cells: tuple[Cell, ...]) -> Findings:
+    """Examine cells in this process."""
+    import torch
+
+    # as many workers as cores; more threads would only wait for each other
+    use_threads(1)
+    torch.set_num_threads(1)
+    return examiner.examine(number, grid, cells)
+
+
+def examine_block(recipe: Recipe[Any], number: int, grid: Grid, cells: tuple[Cell, ...]) -> Findings:
+    """Examine cells on a worker, which opens the files once and keeps them.
+
+    Raises:
+        InputError: The worker reads other files under the same names than the command did.
+    """
+    return examine_here(opened(recipe), number, grid, cells)
+
+
+class CellQuestion(ABC, Generic[P]):
+    """A claim with a margin about sets of poses, each under a number, and the report on it.
+
+    Args:
+        examiner: Finds verdicts.
+        parameters: Names and units of the parameters of all sets together.
+        sets: The set of every number that is asked about.
+        fixed: By number, the values of parameters that do not vary in it.
+    """
+
+    #: Whether one block is waited for however late it is, so that resuming with any budget gets on.
+    waits = True
+
+    def __init__(
+        self,
+        examiner: Examiner,
+        parameters: Sequence[tuple[str, str]],
+        sets: Mapping[int, ParameterBox],
+        fixed: Mapping[int, Mapping[str, float]],
+    ) -> None:
+        self.examiner, self.parameters = examiner, list(parameters)
+        self.sets, self.fixed = dict(sets), fixed
+
+    def grid(self, number: int) -> Grid:
+        """The cells of a set whose search begins: the set as one cell, if nothing else is known."""
+        return Grid.adaptive(self.sets[number], [1] * self.sets[number].dimensions)
+
+    def first_blocks(self, grid: Grid) -> list[list[Cell]]:
+        """What the search of a set begins with."""
+        return [grid.roots()]
+
+    def stored_set(self, number: int) -> ParameterBox | None:
+        """The set of a number that an earlier command asked about, or None."""
+        return None
+
+    def counterexamples(self, number: int, grid: Grid, findings: Any) -> Iterator[tuple[str, dict[str, Any]]]:
+        """Names and arrays of the files that show why cells are falsified."""
+        return iter(())
+
+    def check(self, request: Request) -> None:
+        """Refuse what cannot be done, before anything is written.
+
+        Raises:
+            InputError: What and why.
+        """
+
+    def reserved(self, seconds: float) -> float:
+        """Seconds of so many for search and report together that are kept for `after`."""
+        return 0.0
+
+    def prepare(self, search: CellSearch[P], request: Request) -> None:
+        """What comes before the first cell is examined; a signal ends it at once."""
+        search.report("running")
+        request.on_open(search.store)
+
+    def before(self, search: CellSearch[P], deadline: Deadline) -> None:
+        """What comes first of the time that is given."""
+
+    def after(self, search: CellSearch[P], deadline: Deadline) -> None:
+        """What is made of the verdicts for the last report."""
+
+    def finish(self, search: CellSearch[P]) -> None:
+        """Prepare for the last report, also after a failure."""
+
+    def varied_scenes(self) -> tuple[Sequence[Kind], Callable[[Kind], Settle]] | None:
+        """What may vary of the scene, and what bounds and attacks cells for all such scenes (V13); None: nothing."""
+        return None
+
+    def margin_rows(self, rows: dict[int, list[Row]]) -> tuple[dict[int, list[Row]], dict[str, Any]]:
+        """Those of the certified rows whose scene margin is looked for, and what report.json says besides."""
+        return rows, {}
+
+    @abstractmethod
+    def progress(self, store: Store) -> P:
+        """Where the search stands."""
+
+    @abstractmethod
+    def report(self, search: CellSearch[P], state: str) -> dict[str, Any]:
+        """Write report.json and report.html with `CellSearch.last`; returns the former's content."""
+
+
+@dataclass(frozen=True)
+class Request:
+    """How much is to be done.
+
+    Attributes:
+        budget: Seconds.
+        resume: Whether to go on with what the folder holds.
+        report: Whether to write a report.
+        scene_margin: Whether to look for the largest variation of the scene for which what is certified holds, in half
+            of the time.
+        on_open: Called with the store before the search, when there is a report.
+        on_progress: Told about once a second where the search stands.
+        on_margin: Told the margins, kind by kind.
+    """
+
+    budget: float
+    resume: bool = False
+    report: bool = True
+    scene_margin: bool = False
+    on_open: Callable[[Store], object] = lambda store: None
+    on_progress: Callable[[Any], object] = lambda progress: None
+    on_margin: Callable[[SceneMargin], object] = lambda margin: None
+
+
+@dataclass
+class CellSearch(Generic[P]):
+    """The search for verdicts on a question's cells.
+
+    Args:
+        question: What is claimed.
+        folder: Output folder.
+
+    Attributes:
+        grids: By number, the cells of its set.
+        store: ``cells.sqlite``, from `open` on.
+        stop: Asks the search to end.
+        rows: By number, the cells at the end.
+        last: Writes the report, also when the process is ended.
+        scene_margin: What report.json says of margins of the scene.
+        deadline: When no more pictures are made for the report.
+    """
+
+    question: CellQuestion[P]
+    folder: Path
+    grids: dict[int, Grid] = field(default_factory=dict)
+    rows: dict[int, list[Row]] = field(default_factory=dict)
+    scene_margin: dict[str, Any] = field(default_factory=lambda: {"skipped": NOT_ASKED, "kinds": []})
+    deadline: Deadline = field(default_factory=Deadline)
+    request: Request = field(default_factory=lambda: Request(0.0))
+    stop: StopRequest = field(default_factory=StopRequest)
+
+    def __post_init__(self) -> None:
+        self.last = LastReport(self.folder)
+        self.store: Store
+
+    def open(self, *, resume: bool) -> Store:
+        """The store, with the sets begun.
+
+        Raises:
+            InputError: The folder cannot be used.
+        """
+        question = self.question
+        fingerprint = question.examiner.fingerprint
+        self.store = store = Store(self.folder, fingerprint, question.parameters, question.fixed, resume=resume)
+        with store.told():
+            for number, box in question.sets.items():
+                grid = store.grid(number, box)
+                if grid is None:
+                    grid = question.grid(number)
+                    store.begin(number, grid, question.first_blocks(grid))
+                self.grids[number] = grid
+            # sets of an earlier command that were not asked for now
+            for tally in store.tallies():
+                box = None if tally.frame in self.grids else question.stored_set(tally.frame)
+                stored = None if box is None else store.grid(tally.frame, box)
+                if stored is not None:
+                    self.grids[tally.frame] = stored
+        return store
+
+    def box(self, number: int, row: Mapping[str, Any]) -> ParameterBox:
+        """A cell that was read back."""
+        names, box = [name for name, _ in self.question.parameters], self.grids[number].box
+        for axis, name in enumerate(box.names):
+            column = names.index(name)
+            box = box.replace(axis, row["lower"][column], row["upper"][column])
+        return box
+
+    def report(self, state: str) -> dict[str, Any]:
+        """Bring the report up to date; returns the content of report.json."""
+        return self.question.report(self, state)
+
+    def run(self, engine: Callable[[ExitStack], Engine], stop: StopRequest, request: Request) -> dict[str, Any]:
+        """Search, and write the results as they come; returns the content of report.json.
+
+        Args:
+            engine: Starts the engine, which ends with the stack.
+            stop: Asked at least twice a second.
+            request: How much is to be done.
+
+        Raises:
+            InputError: The folder cannot be used, or the question cannot be asked.
+        """
+        question, self.request, self.stop = self.question, request, stop
+        question.check(request)
+        budget = request.budget
+        searching = (1.0 - SHARE) * budget if request.scene_margin else budget
+        whole = Deadline(budget, stop)
+        # where one block may take longer than there is time, all that is done counts
+        self.deadline = Deadline(request=stop) if question.waits else whole
+        with ExitStack() as stack:
+            # a signal waits until there is a store to report on
+            store = self.open(resume=request.resume)
+            stack.callback(store.close)
+            stack.enter_context(store.told())
+            stack.enter_context(stop.last_words(self.last.interrupted))
+            try:
+                with stop.at_once():
+                    question.prepare(self, request)
+                if question.waits:
+                    whole = Deadline(budget, stop)
+                searched = whole.before(budget - searching)
+                end = searched.before(question.reserved(searching))
+                question.before(self, end)
+                with ExitStack() as engines:
+                    self.search(engine(engines), end, stop)
+                question.after(self, searched)
+                if request.scene_margin and not stop():
+                    self._margins(whole)
+            finally:
+                # also after a failure: what is finished is written
+                question.finish(self)
+                store.finish(self.grids)
+                document = self.report("interrupted" if stop() else "budget" if store.open_blocks else "done")
+            self.rows = {tally.frame: store.leaves(tally.frame) for tally in store.tallies()}
+        return document
+
+    def search(self, engine: Engine, deadline: Deadline, stop: StopRequest) -> None:
+        """Examine open blocks until none is left, the time is over or ``stop`` says so; closes the engine."""
+        question, store, request = self.question, self.store, self.request
+        search_blocks(
+            store,
+            engine,
+            self.grids,
+            lambda *found: examine_here(question.examiner, *found),
+            (examine_block, question.examiner.recipe),
+            deadline=deadline,
+            stop=stop,
+            keep=self._keep_counterexamples,
+            between=paced(
+                store,
+                lambda: request.on_progress(question.progress(store)),
+                (lambda: self.report("running")) if request.report else lambda: None,
+            ),
+            waits=question.waits,
+        )
+        store.trace()
+        request.on_progress(question.progress(store))
+
+    def _keep_counterexamples(self, block: Block, findings: Findings) -> None:
+        """Store what breaks the claim before the cells are said to be falsified."""
+        for name, arrays in self.question.counterexamples(block.frame, self.grids[block.frame], findings):
+            buffer = io.BytesIO()
+            np.savez(buffer, **arrays)
+            self.store.keep_image(name, buffer.getvalue())
+
+    def _margins(self, deadline: Deadline) -> None:
+        """How far the scene may vary before what is certified is lost."""
+        question, store = self.question, self.store
+        varied = question.varied_scenes()
+        if varied is None:
+            return
+        kinds, settle = varied
+        certified = {tally.frame: store.leaves(tally.frame, "certified") for tally in store.tallies()}
+        rows, about = question.margin_rows(certified)
+        margins = Margins(certified_cells(rows, self.box), settle, store, self.request.on_margin)
+        try:
+            margins.find(deadline, kinds)
+        finally:
+            margins.keep()
+            self.scene_margin = {**about, **margins.entry}
+
+
+def cell_place(cell: Cell, otherwise: str) -> str:
+    """A part of a file's name that tells a cell from all others of its set."""
+    return "_".join(f"{a}-{b}" for a, b in zip(cell.first, cell.past, strict=True)) or otherwise

@@ -1,0 +1,241 @@
+"""The report on a certificate: figures, and pictures of samples, of counterexamples and of cells."""
+
+from __future__ import annotations
+
+import zipfile
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ns_abstract.api.cell_search import CellSearch
+from ns_abstract.api.certification import Certification
+from ns_abstract.api.showing import look_closer
+from ns_abstract.api.substitution import substitution_entry
+from ns_abstract.execution.ending import AbandonedError
+from ns_abstract.report.cameras import Cameras, cameras_entry, cell_cameras, standing
+from ns_abstract.report.certificate import CertifiedRun, certificate_document
+from ns_abstract.report.certificate_page import certificate_page
+from ns_abstract.report.outside import Outside
+from ns_abstract.report.picture import preview, to_bytes
+from ns_abstract.report.verdict_picture import write_pictures
+from ns_abstract.verify.store import Store, Tally, fractions
+from ns_abstract.verify.store_file import IMAGES
+
+#: Counterexamples in report.json by frame, and images of each kind on the page.
+_EXAMPLES, _IMAGES = 5, 6
+_PIXELS = 256
+#: Cells whose picture the page shows when they are chosen, and its longest side.
+_SEEN, _SEEN_PIXELS = 64, 96
+
+
+class CertificateReport:
+    """Writes report.json and report.html of a search.
+
+    Args:
+        job: What is certified.
+        about: What the report says of the command.
+        search: The search.
+    """
+
+    def __init__(self, job: Certification, about: CertifiedRun, search: CellSearch[Any]) -> None:
+        self.job, self.about, self.search = job, about, search
+        self.shown: list[dict[str, Any]] = []
+        self.seen: dict[tuple[int, int], dict[str, Any]] = {}
+        self.cameras: Cameras | None = None
+        #: certified cells bounded in weaker ways, too
+        self.substitution = substitution_entry([], "made when the search ends without being interrupted")
+
+    def document(self, store: Store, state: str) -> tuple[dict[str, Any], dict[int, list[dict[str, Any]]]]:
+        """Content of report.json, and the cells by frame."""
+        rows = {tally.frame: store.leaves(tally.frame) for tally in store.tallies()}
+        entries = [self._entry(tally, rows[tally.frame]) for tally in store.tallies()]
+        sets = {frame: self.job.job.pose_sets[frame] for frame in rows}
+        cells, left_out = cell_cameras(sets, rows, [name for name, _ in self.job.parameters])
+        self.cameras = Cameras(cells, left_out, self._standing, self._outside)
+        document = certificate_document(
+            self.about,
+            entries,
+            state=state,
+            trace=store.points,
+            seconds=store.seconds,
+            effort=store.effort,
+            reasons=store.reasons,
+            cells_seal={"rows": store.seal.rows, "sum": store.seal.text},
+            substitution=self.substitution,
+            scene_margin=self.search.scene_margin,
+            cameras=cameras_entry(cells, left_out),
+        )
+        return document, rows
+
+    def write(self, state: str, *, pictures: bool = True) -> dict[str, Any]:
+        """Write both files, with new pictures or those there are; returns the content of report.json."""
+        search = self.search
+        document, rows = self.document(search.store, state)
+        # kernels may have to be compiled for others
+        if pictures and state != "interrupted":
+            self.shown = self._pictures(rows)
+            # positions of cells change while they are split
+            self.seen = {} if state == "running" else self._cell_pictures(rows)
+        elif self.seen:
+            self.seen = {}
+        ended = state in ("done", "budget")
+        frames = document["frames"]
+        closer = look_closer(self.job, frames, rows, self._kept_image, search.deadline) if ended else None
+        search.last.write(
+            document,
+            lambda: certificate_page(document, rows, self.shown, self.seen, self.cameras, closer),
+        )
+        if ended:
+            write_pictures(search.folder, document, rows, self.cameras)
+        return document
+
+    @cached_property
+    def _standing(self) -> tuple[np.ndarray, np.ndarray]:
+        """Where cameras may stand; the same for every report, so that the scene is drawn once."""
+        return standing({frame: self.job.job.pose_sets[frame] for frame in self.search.grids})
+
+    @cached_property
+    def _outside(self) -> Outside | None:
+        elements = self.job.job.method.elements()
+        return None if elements is None else Outside(elements)
+
+    def _kept_image(self, frame: int, pose: np.ndarray) -> np.ndarray | None:
+        """The stored image of a counterexample."""
+        files = sorted((self.search.folder / IMAGES).glob(f"frame_{frame:05d}_*.npz"))
+        return next((image for file in files if (image := _image_at(file, pose)) is not None), None)
+
+    def _entry(self, tally: Tally, rows: list[dict[str, Any]]) -> dict[str, Any]:
+        shares = fractions(tally)
+        names = [name for name, _ in self.job.parameters]
+        box = self.job.job.pose_sets[tally.frame].box
+        fixed = self.job.fixed[tally.frame]
+        sides = {n: (low, high) for n, low, high in zip(box.names, box.lower, box.upper, strict=True)}
+        counts = {kind: sum(row["verdict"] == kind for row in rows) for kind in ("certified", "falsified", "unknown")}
+        # cells that an ended command has left open stand as unknown without a margin or a time
+        left = sum(row["verdict"] == "unknown" and row["seconds"] == 0.0 for row in rows)
+        broken = _worst(rows)
+        proven = [row["margin"] for row in rows if row["verdict"] == "certified"]
+        total = self.job.partitions(self.search.grids[tally.frame])
+        return {
+            "index": tally.frame,
+            "parameters": [
+                {
+                    "name": name,
+                    "unit": unit,
+                    "lower": sides.get(name, (fixed.get(name, 0.0),) * 2)[0],
+                    "upper": sides.get(name, (fixed.get(name, 0.0),) * 2)[1],
+                }
+                for name, unit in self.job.parameters
+            ],
+            "coverage": {
+                "certified": shares["certified"],
+                "falsified": shares["falsified"],
+                "unknown": shares["unknown"] + shares["open"],
+                "not_examined": shares["open"],
+            },
+            "cells": {**counts, "unknown": counts["unknown"] - left, "open": left if tally.open else 0},
+            "sampled": {
+                "poses": tally.poses,
+                "right": tally.holding,
+                "sampled_right": tally.holding / tally.poses if tally.poses else None,
+            },
+            # unknown units were sampled; those count where the property was seen to hold at every sample
+            "partition": None
+            if total is None
+            else {
+                "partitions": total,
+                "certified": tally.certified,
+                "right": tally.certified + tally.unknown - tally.undecided,
+                "undecided": tally.undecided,
+                "not_examined": tally.open,
+            },
+            "least_margin": min(proven, default=None),
+            "counterexamples": [
+                {"values": dict(zip(names, row["counterexample"], strict=True)), "margin": row["margin"]}
+                for row in broken[:_EXAMPLES]
+            ],
+        }
+
+    def _pictures(self, rows: Mapping[int, list[dict[str, Any]]]) -> list[dict[str, Any]]:
+        """A sample, the certified image with the smallest margin, and counterexamples."""
+        names = [name for name, _ in self.job.parameters]
+        wanted: list[tuple[str, str, int, list[float]]] = []
+        first = min(rows)
+        box = self.job.job.pose_sets[first].box
+        middle = dict(zip(box.names, box.middle.tolist(), strict=True))
+        wanted.append(("sample", f"frame {first}, middle of its set", first, [middle.get(n, 0.0) for n in names]))
+        proven = [(r["margin"], k, r) for k, found in rows.items() for r in found if r["verdict"] == "certified"]
+        if proven:
+            margin, frame, row = min(proven, key=lambda item: item[:2])
+            pose = [0.5 * (a + b) for a, b in zip(row["lower"], row["upper"], strict=True)]
+            wanted.append(("worst certified", f"frame {frame}, margin at least {margin:.4g}", frame, pose))
+        broken = [(_depth(row), frame, row) for frame, found in rows.items() for row in _worst(found)]
+        for _, frame, row in sorted(broken, key=lambda item: item[:2])[:_IMAGES]:
+            margin = row["margin"]
+            text = f"frame {frame}, margin {'not a number' if margin is None else f'{margin:.4g}'}"
+            wanted.append(("counterexample", text, frame, row["counterexample"]))
+        found = []
+        with suppress(AbandonedError):
+            for title, text, frame, values in wanted:
+                found.append({"title": title, "text": text, "png": self._drawn(frame, values, _PIXELS)})
+        return found
+
+    def _drawn(self, frame: int, values: Sequence[float], side: int) -> bytes:
+        """PNG of the picture at parameter values in the order of all parameters.
+
+        Raises:
+            AbandonedError: There is no time for more pictures.
+        """
+        known = dict(zip((name for name, _ in self.job.parameters), values, strict=True))
+        pictures = self.job.pictures(frame)
+        pose = np.array([known[name] for name in pictures.box.names])
+        # of another scene of the set, maybe
+        image = self._kept_image(frame, pose) if pictures.pose_set.perturbation.scene else None
+        if image is None:
+            with self.search.deadline.enforced():
+                image = pictures.image(pose)
+        return preview(to_bytes(image), side)
+
+    def _cell_pictures(self, rows: Mapping[int, list[dict[str, Any]]]) -> dict[tuple[int, int], dict[str, Any]]:
+        """By frame and position, a picture of some cells: the same number of each verdict, evenly spread."""
+        kinds = {
+            kind: [(frame, k) for frame, found in rows.items() for k, row in enumerate(found) if row["verdict"] == kind]
+            for kind in ("certified", "falsified", "unknown")
+        }
+        share = _SEEN // max(1, sum(map(bool, kinds.values())))
+        wanted = [key for keys in kinds.values() for key in keys[:: max(1, -(-len(keys) // share))]]
+        found = {}
+        with suppress(AbandonedError):
+            for frame, k in wanted:
+                row = rows[frame][k]
+                values, text = row["counterexample"], "the counterexample's picture"
+                if values is None:
+                    values = [0.5 * (a + b) for a, b in zip(row["lower"], row["upper"], strict=True)]
+                    text = "one picture, at the cell's middle"
+                found[frame, k] = {"png": self._drawn(frame, values, _SEEN_PIXELS), "text": text}
+        return found
+
+
+def _image_at(file: Path, pose: np.ndarray) -> np.ndarray | None:
+    """The image of a stored counterexample, if it is that of ``pose``; None also where others have changed the file."""
+    try:
+        with np.load(file, allow_pickle=False) as stored:
+            image = stored["image"] if np.array_equal(stored["values"], pose) else None
+            return None if image is None or image.ndim != 3 or image.dtype != np.float32 else image
+    except (OSError, ValueError, LookupError, zipfile.BadZipFile):
+        return None
+
+
+def _depth(row: Mapping[str, Any]) -> float:
+    """The margin of a counterexample; what is no number is worse than all."""
+    return -np.inf if row["margin"] is None else row["margin"]
+
+
+def _worst(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Falsified cells, worst first; neighbours may share their counterexample, which counts once."""
+    found = sorted((row for row in rows if row["verdict"] == "falsified"), key=_depth)
+    return list({tuple(row["counterexample"]): row for row in reversed(found)}.values())[::-1]

@@ -1,0 +1,208 @@
+"""A network in the loop, opened: scene, camera, law of motion and network (docs/design.md, L1 to L5)."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Callable
+from dataclasses import replace
+from functools import cached_property, partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ns_abstract.api.assumptions import choice, set_choices
+from ns_abstract.api.certification import MEMORY
+from ns_abstract.api.job import Job, require_sound_platform
+from ns_abstract.api.scenes import Scene
+from ns_abstract.arithmetic.forms import MAX_DIMENSIONS
+from ns_abstract.execution.opening import Recipe
+from ns_abstract.geometry.box import ParameterBox
+from ns_abstract.io.assumptions import Assumption
+from ns_abstract.io.errors import InputError
+from ns_abstract.perturbation.specification import TRANSLATIONS
+from ns_abstract.reach.learned import LearnedDynamics
+from ns_abstract.reach.loop import Loop, load_loop, parse_loop
+from ns_abstract.reach.search import QUESTIONS, LoopFindings, LoopSearch
+from ns_abstract.reach.tubes import Dependence, Pictures, Pilot, Reacher
+from ns_abstract.report.record import file_stamp
+from ns_abstract.verify.cells import Cell, Grid
+from ns_abstract.verify.model import NetworkModel
+from ns_abstract.verify.network import NetworkArithmetic, load_network
+from ns_abstract.verify.network.explain import check_cell
+from ns_abstract.verify.response import Response
+from ns_abstract.verify.scene_margin import REGISTRATION, Kind, Settle, Settled
+
+#: Of the search's rules: results of different ones are not mixed.
+_RULES = 2
+
+
+class LoopJob:
+    """An opened scene and a loop.
+
+    Args:
+        job: The scene, with the poses of the loop's camera as its only set.
+        loop: The loop.
+        network_arithmetic: Whether every float32 evaluation of the network is meant, or the exact one alone.
+
+    Raises:
+        InputError: The loop does not go with the network, or the platform's arithmetic is not sound.
+    """
+
+    def __init__(self, job: Job, loop: Loop, network_arithmetic: NetworkArithmetic = "float32") -> None:
+        require_sound_platform()
+        self.job, self.loop = job, loop
+        self.network = load_network(loop.network, **loop.loading)
+        self.model = NetworkModel(self.network, loop.preprocess, MEMORY, network_arithmetic)
+        outputs = loop.control.gain.shape[1]
+        if self.network.output_size != outputs:
+            raise InputError(
+                f"the network has {self.network.output_size} outputs, the gain {outputs} columns",
+                field="control.gain",
+                fix=f"write one column by output, {self.network.output_size}",
+            )
+
+    def reacher(self, dependence: Dependence = "kept") -> Reacher:
+        """Computes tubes of the loop."""
+        view = Pictures(self.job.method, self.job.pose_sets[0])
+        return Reacher(self.loop, view, Pilot(self.model, self.loop.control), dependence)
+
+    @cached_property
+    def search(self) -> LoopSearch:
+        """The search."""
+        return LoopSearch(self.reacher())
+
+    def examine(self, number: int, grid: Grid, cells: tuple[Cell, ...]) -> LoopFindings:
+        """What becomes of cells of a question; see `ns_abstract.api.cell_search.Examiner`."""
+        return self.search.examine(number, grid, cells)
+
+    @property
+    def _moves(self) -> bool:
+        # a place that does not depend on the state is no parameter that could be off
+        return set(TRANSLATIONS) <= set(self.loop.camera.names)
+
+    def places(self, kind: Kind) -> bool:
+        """Whether the scene's place can be bounded beside the pose: within it, or as more parameters."""
+        fits = len(self.loop.camera.names) + len(kind.place) <= MAX_DIMENSIONS
+        return fits or (kind is REGISTRATION and self._moves)
+
+    def _varied(self, kind: Kind, radius: float) -> Reacher:
+        """Computes tubes for all scenes around the stored one (V13)."""
+        method, poses = self.job.method, self.job.pose_sets[0]
+        if kind is REGISTRATION and self._moves:
+            return replace(self.reacher(), registration=radius)
+        if kind.place:
+            view = Pictures(method, poses.registered(kind.place, radius))
+        elif kind.response is not None:
+            view = Pictures(method, poses, Response(kind.response, radius))
+        else:
+            view = Pictures(method, self.job.varied(0, kind.variation(radius)))
+        return replace(self.reacher(), view=view)
+
+    def settle(self, kind: Kind) -> Settle:
+        """Bounds and attacks cells for all scenes around the stored one (V13)."""
+        kept: dict[float, LoopSearch] = {}
+
+        def settle(radius: float, number: int, box: ParameterBox) -> Settled:
+            if radius not in kept:
+                # radii come one after the other
+                kept.clear()
+                kept[radius] = LoopSearch(self._varied(kind, radius))
+            found = kept[radius].settle(QUESTIONS[number], box)
+            if found.example is None:
+                return found
+            return replace(found, example={**found.example, "radius": np.array(radius)})
+
+        return settle
+
+    @property
+    def questions(self) -> list[int]:
+        """Numbers of the questions that are asked."""
+        return [k for k, name in enumerate(QUESTIONS) if (self.loop.goal if name == "reaches" else self.loop.unsafe)]
+
+    @property
+    def recipe(self) -> Recipe[LoopJob]:
+        """How another process opens it; files are looked for under the same paths."""
+        loop = self.loop
+        # laws of motion do not travel
+        again = partial(
+            _open, self.job.recipe.open, dict(loop.value), loop.network.absolute().parent, self.model.arithmetic
+        )
+        return Recipe(again, self.fingerprint, self.job.source.file)
+
+    @property
+    def assumptions(self) -> tuple[Assumption, ...]:
+        """What the verdicts rest on, and where each choice came from."""
+        output = self.loop.value.get("output")
+        arithmetic = None if self.model.arithmetic == "float32" else self.model.arithmetic
+        return (
+            *self.job.assumptions,
+            choice("network output", self.network.output or "the only one", output, "loop file: output"),
+            choice("network_arithmetic", self.model.arithmetic, arithmetic, "--network-arithmetic"),
+        )
+
+    @property
+    def fingerprint(self) -> dict[str, Any]:
+        """What a stored search must agree with to be continued."""
+        return self._fingerprint
+
+    @cached_property
+    def _fingerprint(self) -> dict[str, Any]:
+        text = json.dumps(self.loop.value, sort_keys=True)
+        law = self.loop.dynamics
+        learned = {"dynamics": file_stamp(law.file)["sha256"]} if isinstance(law, LearnedDynamics) else {}
+        return {
+            **self.job.fingerprint,
+            **learned,
+            "network": file_stamp(self.loop.network)["sha256"],
+            "loop": hashlib.sha256(text.encode()).hexdigest(),
+            "network_arithmetic": self.model.arithmetic,
+            "rules": _RULES,
+        }
+
+
+def _open(open_job: Callable[[], Job], value: dict[str, Any], folder: Path, arithmetic: NetworkArithmetic) -> LoopJob:
+    return LoopJob(open_job(), parse_loop(value, folder), arithmetic)
+
+
+def open_loop(
+    scene: Scene,
+    file: Path,
+    arithmetic: str | None = None,
+    network_arithmetic: NetworkArithmetic = "float32",
+    workers: int = 1,
+) -> LoopJob:
+    """Open LOOP.json with its network.
+
+    Raises:
+        InputError: A file or a field cannot be used, or there is not the memory for ``workers`` processes.
+    """
+    loop = load_loop(file)
+    try:
+        require_sound_platform()
+        size = loop.preprocess.size(load_network(loop.network, **loop.loading).input_shape)
+        job = LoopJob(_seen(scene, loop, size, arithmetic), loop, network_arithmetic)
+        dimensions = job.job.pose_sets[0].box.dimensions
+        check_cell(job.network, dimensions, job.job.memory / workers, "fewer --workers")
+        return job
+    except InputError as error:
+        raise error.within(file) if error.field and not error.field.startswith("--") else error from None
+
+
+def _seen(scene: Scene, loop: Loop, size: tuple[int, int], arithmetic: str | None) -> Job:
+    """The scene with the poses of the loop's camera.
+
+    Raises:
+        InputError: Loops are not for this scene.
+    """
+    poses = loop.camera.poses(size)
+    origin = "the network's input" if loop.preprocess.resize is None else "loop file: preprocess.resize"
+    job = Job(scene, [poses], arithmetic=arithmetic, set_choices=set_choices([poses], origin, "loop file: camera"))
+    if job.rays:
+        raise InputError(
+            f"loops are for splats, this run is a {job.method.content}",
+            file=scene.source.file,
+            fix="give a run of splatfacto or a .ply",
+        )
+    return job

@@ -1,0 +1,254 @@
+"""The report on a network in the loop: figures, tubes beside simulated runs, and a film."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from ns_abstract.api.cell_search import CellSearch, Row
+from ns_abstract.api.loop_job import LoopJob
+from ns_abstract.execution.ending import AbandonedError, Deadline, abandoning
+from ns_abstract.geometry.box import ParameterBox
+from ns_abstract.reach.film import along, film_size, made
+from ns_abstract.reach.learned import LearnedDynamics
+from ns_abstract.reach.page import loop_page
+from ns_abstract.reach.search import QUESTIONS, Question, Run, pushes, simulate
+from ns_abstract.reach.tubes import Dependence, Tube
+from ns_abstract.report.certificate import SCENE_MARGIN, now
+from ns_abstract.report.outside import Outside
+from ns_abstract.report.record import file_stamp, guarantee_text, plain, versions
+from ns_abstract.verify.search import Verdict
+from ns_abstract.verify.store import Store, Tally, fractions
+
+#: Random runs; runs from a cell whose tube is shown; cells whose tube is shown.
+_RUNS, _CELL_RUNS, _SHOWN = 200, 20, 2
+#: Falsifying runs in report.json.
+_EXAMPLES = 5
+#: What is said in the report of every question.
+SENTENCES: dict[Question, str] = {
+    "safe": "no state of any run from the cell is in an unsafe set, at the sampling times 0 to the last",
+    "reaches": "that, and every run from the cell is inside the goal, at the end or (when: any) at some one step",
+}
+#: What the words of the report mean.
+METRICS = {
+    "certified": "part of the initial box's volume where the question is answered yes for every run",
+    "falsified": "part in cells with a run, stored and simulated again, that goes wrong",
+    "unknown": "the rest",
+    "simulated": "runs from random initial states with random disturbances, and the part that went well; says nothing "
+    "about others",
+    "width": "mean over the states of the width of the tube by step, and of the hull of simulated runs from the same "
+    "cell",
+    "camera": "of a tube, by step: least and largest x, y, z of the camera's position, normalised units",
+    "film": "of the widest certified cell (or the first one), by step: mean and largest gap of the abstract image of "
+    "all poses of the tube, in a picture of the given height and width; null: not asked for",
+    "scene_margin": SCENE_MARGIN,
+}
+
+
+class LoopReport:
+    """Writes report.json and report.html of a search.
+
+    Args:
+        job: The loop.
+        settings: What the report says that was asked for.
+        command: The command line, or the call.
+    """
+
+    def __init__(self, job: LoopJob, settings: Mapping[str, Any], command: tuple[str, ...]) -> None:
+        self.job, self.settings, self.command = job, settings, command
+        self.started = now()
+        self.simulated: list[Run] = []
+        self.tubes: list[dict[str, Any]] = []
+        self.examples: list[dict[str, Any]] = []
+        self.film: dict[str, Any] | None = None
+        self._strips: list[tuple[int, bytes]] = []
+        elements = job.job.method.elements()
+        self._outside = None if elements is None else Outside(elements)
+
+    def add_example(self, question: Question, run: Run) -> None:
+        """Take a run that goes wrong, if there are not enough of them."""
+        if len(self.examples) < _EXAMPLES:
+            margin = run.margin(self.job.loop, question)
+            self.examples.append({"question": question, "margin": margin, "states": run.states})
+
+    def simulate_runs(self, deadline: Deadline) -> None:
+        """Random runs, the same ones every time."""
+        loop, reacher = self.job.loop, self.job.search.reacher
+        for number in range(_RUNS):
+            generator = np.random.default_rng([17, number])
+            start = loop.box.sample(1, generator)[0]
+            if deadline.request() or (self.simulated and deadline.late):
+                return
+            try:
+                with abandoning(deadline.request):
+                    push = pushes(loop, generator, "random")
+                    self.simulated.append(simulate(reacher, loop.state(loop.box, start), push))
+            except AbandonedError:
+                return
+
+    def show_tubes(self, store: Store, deadline: Deadline) -> None:
+        """Tubes of a few certified cells beside simulated runs and what less dependence would give."""
+        found = [row for number in self.job.questions for row in store.leaves(number, "certified")]
+        if not found:
+            return
+        chosen = [found[len(found) * (2 * k + 1) // (2 * _SHOWN)] for k in range(_SHOWN)]
+        for row in {json.dumps([row["lower"], row["upper"]]): row for row in chosen}.values():
+            try:
+                with deadline.enforced():
+                    self.tubes.append(shown_tube(self.job, row["lower"], row["upper"], _CELL_RUNS))
+            except AbandonedError:
+                return
+
+    def make_film(self, store: Store, deadline: Deadline) -> None:
+        """Abstract images along the tube of the widest certified cell of the strongest question, or of the first."""
+        job, steps, box = self.job, [], self.job.loop.box
+
+        def strongest(kind: Verdict | None) -> list[dict[str, Any]]:
+            return next((found for n in reversed(job.questions) if (found := store.leaves(n, kind))), [])
+
+        def volume(row: dict[str, Any]) -> float:
+            return float(np.prod(np.subtract(row["upper"], row["lower"])))
+
+        row = max(strongest("certified"), key=volume, default=None) or next(iter(strongest(None)), None)
+        if row is None:
+            self.film = {"skipped": "no cell has a verdict"}
+            return
+        cell = ParameterBox(box.names, box.units, tuple(row["lower"]), tuple(row["upper"]))
+        try:
+            with deadline.enforced():
+                tube = job.search.reacher.tube(cell, whole=True)
+                size = film_size(job.loop.preprocess.size(job.network.input_shape))
+                for step in along(job.search.reacher, job.job.method, size, tube):
+                    steps.append(step)
+        except AbandonedError:
+            pass
+        if not steps:
+            self.film = {"skipped": "the work was interrupted" if deadline.request() else "the time ended first"}
+            return
+        found = made(steps, cell.lower, cell.upper, row["verdict"])
+        ending, content = found.encoded()
+        self.film = {"file": store.keep(f"film.{ending}", content).name, **found.about}
+        self._strips = found.strips()
+
+    def write(self, search: CellSearch[Any], state: str) -> dict[str, Any]:
+        """Write report.json and report.html; returns the former's content."""
+        rows = {tally.frame: search.store.leaves(tally.frame) for tally in search.store.tallies()}
+        document = self._document(search, rows, state)
+        search.last.write(document, lambda: loop_page(document, rows, self.job.loop, self._outside, self._strips))
+        return document
+
+    def _document(self, search: CellSearch[Any], rows: Mapping[int, list[Row]], state: str) -> dict[str, Any]:
+        job, loop, store = self.job, self.job.loop, search.store
+        entries = {QUESTIONS[tally.frame]: self._entry(tally, rows[tally.frame]) for tally in store.tallies()}
+        program, scene = job.job.method.program, job.job.describe()
+        learned: dict[str, Any] = {}
+        if isinstance(loop.dynamics, LearnedDynamics):
+            law = loop.dynamics
+            learned = {"dynamics_model": file_stamp(law.file), "dynamics_guarantee": law.network.guarantee()}
+        return plain(
+            {
+                "version": 1,
+                "kind": "loop",
+                "verdict": verdict(entries),
+                "questions": entries,
+                "guarantee": job.job.method.guarantee,
+                "guarantee_text": guarantee_text(job.job.method.guarantee, program["name"], scene.get("bounded")),
+                "network_guarantee": job.network.guarantee(job.model.arithmetic),
+                "renderer": {name: program[name] for name in ("name", "version")},
+                "scene": scene,
+                "assumptions": [vars(entry) for entry in job.assumptions],
+                "model": file_stamp(loop.network),
+                "loop": loop.value,
+                "dynamics": loop.dynamics.about,
+                **learned,
+                "parameters": [
+                    {"name": n, "unit": u, "lower": a, "upper": b}
+                    for n, u, a, b in zip(loop.box.names, loop.box.units, loop.box.lower, loop.box.upper, strict=True)
+                ],
+                "simulated_states": [run.states for run in self.simulated[:40]],
+                "tubes": self.tubes,
+                "film": self.film,
+                "scene_margin": search.scene_margin,
+                "falsifying": self.examples,
+                "trace": store.points,
+                "seconds": store.seconds,
+                "effort": store.effort,
+                "unknown_because": store.reasons,
+                "cells_seal": {"rows": store.seal.rows, "sum": store.seal.text},
+                "plan": job.job.plan,
+                "state": state,
+                "metrics": METRICS,
+                "settings": self.settings,
+                "fingerprint": job.fingerprint,
+                "command": self.command,
+                "packages": versions(),
+                "started": self.started,
+                "updated": now(),
+            }
+        )
+
+    def _entry(self, tally: Tally, rows: Sequence[Row]) -> dict[str, Any]:
+        question, shares = QUESTIONS[tally.frame], fractions(tally)
+        kinds = ("certified", "falsified", "unknown")
+        went_well = sum(run.margin(self.job.loop, question) > 0.0 for run in self.simulated)
+        count = len(self.simulated)
+        return {
+            "text": SENTENCES[question],
+            "certified": shares["certified"],
+            "falsified": shares["falsified"],
+            "unknown": shares["unknown"] + shares["open"],
+            "not_examined": shares["open"],
+            "cells": {kind: sum(row["verdict"] == kind for row in rows) for kind in kinds},
+            "simulated": {"runs": count, "went_well": went_well / count if count else None},
+            "certified_of_went_well": shares["certified"] * count / went_well if went_well else None,
+            "least_margin": min((row["margin"] for row in rows if row["verdict"] == "certified"), default=None),
+        }
+
+
+def verdict(entries: Mapping[str, Mapping[str, Any]]) -> str:
+    """Of the whole initial box: falsified, reaches, safe or unknown."""
+    if any(entry["cells"]["falsified"] for entry in entries.values()):
+        return "falsified"
+    done = [name for name, entry in entries.items() if entry["unknown"] == 0.0 and entry["cells"]["certified"]]
+    return done[-1] if done else "unknown"
+
+
+def shown_tube(job: LoopJob, lower: list[float], upper: list[float], runs: int) -> dict[str, Any]:
+    """A tube beside the hull of simulated runs, and its widths with less dependence.
+
+    Args:
+        job: The loop.
+        lower, upper: [m] the cell.
+        runs: How many.
+    """
+    box = ParameterBox(job.loop.box.names, job.loop.box.units, tuple(lower), tuple(upper))
+    kept = job.search.reacher
+    tube = kept.tube(box, whole=True)
+    generator = np.random.default_rng(5)
+    starts = [*box.corners(), *box.sample(max(0, runs - 2**box.dimensions), generator)]
+    found = [simulate(kept, job.loop.state(box, start), pushes(job.loop, generator, "ends")) for start in starts]
+    states = np.stack([run.states for run in found])
+    modes: tuple[Dependence, ...] = ("step", "none")
+    hulls = [entry.hull() for entry in tube.sets]
+    return {
+        "lower": list(box.lower),
+        "upper": list(box.upper),
+        "tube": [[low.tolist(), high.tolist()] for low, high in hulls],
+        "camera": [[end.tolist() for end in kept.places(entry)] for entry in tube.sets],
+        "runs": len(found),
+        "hull": [
+            [low.tolist(), high.tolist()] for low, high in zip(states.min(axis=0), states.max(axis=0), strict=True)
+        ],
+        "width": widths(tube),
+        "width_simulated": (states.max(axis=0) - states.min(axis=0)).mean(axis=1).tolist(),
+        "width_by_dependence": {mode: widths(job.reacher(mode).tube(box, whole=True)) for mode in modes},
+        "reason": tube.reason,
+    }
+
+
+def widths(tube: Tube) -> list[float]:
+    """By step, the mean over the states of a tube's width; as far as the tube goes."""
+    return [float(np.mean(np.subtract(*entry.hull()[::-1]))) for entry in tube.sets]

@@ -1,0 +1,134 @@
+"""What compiling costs at first use, by kernel."""
+
+from __future__ import annotations
+
+import os
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from concurrent.futures import ProcessPoolExecutor
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any
+
+from ns_abstract.api.files import PathJob
+from ns_abstract.bench.sets import pose_set
+from ns_abstract.execution.opening import Recipe, opened
+from ns_abstract.geometry.poses import PoseSet
+
+#: Functions that a row names: those that took most by themselves.
+_NAMED = 3
+
+
+@dataclass
+class _Running:
+    """A function that is being compiled.
+
+    Attributes:
+        name: Module and name.
+        wall, processor: Clocks when it began, seconds.
+        inner: Processor seconds of the functions that were compiled for it.
+    """
+
+    name: str
+    wall: float
+    processor: float
+    inner: float = 0.0
+
+
+@dataclass
+class _Recorder:
+    """Rows of the kernels that numba compiles while it is registered (numba's events "compile" and "llvm_lock")."""
+
+    stage: str = ""
+    rows: list[dict[str, Any]] = field(default_factory=list)
+    _running: list[_Running] = field(default_factory=list)
+    _own: dict[str, float] = field(default_factory=dict)
+    _llvm: float = 0.0
+
+    def start(self, event: Any) -> None:
+        """A function's turn begins."""
+        function = event.data["dispatcher"].py_func
+        name = f"{function.__module__.removeprefix('ns_abstract.')}.{function.__name__}"
+        self._running.append(_Running(name, time.perf_counter(), time.process_time()))
+
+    def end(self, event: Any) -> None:
+        """It is compiled; a kernel's row is done with it."""
+        last = self._running.pop()
+        seconds = time.process_time() - last.processor
+        self._own[last.name] = self._own.get(last.name, 0.0) + seconds - last.inner
+        if self._running:
+            self._running[-1].inner += seconds
+            return
+        most = sorted(self._own.items(), key=lambda item: -item[1])[:_NAMED]
+        self.rows.append({
+            "stage": self.stage,
+            "kernel": last.name,
+            "functions": len(self._own),
+            "wall s": time.perf_counter() - last.wall,
+            "processor s": seconds,
+            "LLVM s": self._llvm,
+            "of it": ", ".join(f"{name.rpartition('.')[2]} {own:.1f}" for name, own in most),
+        })  # fmt: skip
+        self._own, self._llvm = {}, 0.0
+
+    def llvm(self, seconds: float) -> None:
+        """So long LLVM held its lock."""
+        self._llvm += seconds
+
+
+def _measured(recipe: Recipe[Any], poses: PoseSet) -> list[dict[str, Any]]:
+    """The rows of one process, which has no kernel."""
+    from numba.core import event
+
+    found = _Recorder()
+
+    class Listener(event.Listener):
+        on_start: Callable[[Any], None] = staticmethod(found.start)
+        on_end: Callable[[Any], None] = staticmethod(found.end)
+
+    job = opened(recipe)
+    view = job.method.frame(poses)
+    listener = Listener()
+    with event.install_listener("numba:compile", listener), event.install_timer("numba:llvm_lock", found.llvm):
+        for stage in (*view.stages, None):
+            found.stage = stage or "the rest"
+            view.warm_up(stage)
+    return found.rows
+
+
+@contextmanager
+def _without_kernels() -> Iterator[None]:
+    """Processes that start inside find no kernel, and keep none."""
+    from ns_abstract.arithmetic.kernel_cache import SESSION, VARIABLE
+
+    before = dict(os.environ)
+    with tempfile.TemporaryDirectory(prefix="ns-abstract-compiling-") as folder:
+        os.environ.pop(SESSION, None)
+        os.environ[VARIABLE] = str(Path(folder) / "kernels")
+        try:
+            yield
+        finally:
+            os.environ.clear()
+            os.environ.update(before)
+
+
+def compile_times(job: PathJob, name: str, frame: int) -> list[dict[str, Any]]:
+    """Seconds that each kernel of a frame takes to compile in one new process, stage by stage, and all together.
+
+    Args:
+        job: The scene.
+        name: Of the set of poses; see `sets.SETS`.
+        frame: Entry of the camera path.
+
+    Returns:
+        By kernel: its stage, how many functions it is linked from, seconds by the clock, of the processor, and inside
+        LLVM, and what took most of it.
+    """
+    with _without_kernels(), ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool:
+        rows = pool.submit(_measured, job.recipe, pose_set(job, name, frame)).result()
+    counted = ("functions", "wall s", "processor s", "LLVM s")
+    total = {key: sum(row[key] for row in rows) for key in counted}
+    return [{"set": name, **row} for row in [*rows, {"stage": "all", "kernel": "", **total, "of it": ""}]]

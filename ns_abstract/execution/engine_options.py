@@ -1,0 +1,65 @@
+"""Where work is done, as users say it; importing this is quick, as ``--help`` must be."""
+
+from __future__ import annotations
+
+import os
+from contextlib import AbstractContextManager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
+
+from ns_abstract.io.errors import InputError
+
+if TYPE_CHECKING:
+    from ns_abstract.execution.engines import Engine
+
+
+@dataclass(frozen=True)
+class EngineOptions:
+    """Where the work is done."""
+
+    engine: Literal["local", "dask"] = "local"
+    """dask: spread the work over a Dask cluster (needs the extra "cluster")."""
+    scheduler_address: str | None = None
+    """HOST:PORT of a running Dask scheduler. Default: a cluster on this machine."""
+    tls_ca_file: Path | None = None
+    """Certificate of who signs the scheduler's (PEM), as for `dask scheduler`; with --tls-cert and --tls-key."""
+    tls_cert: Path | None = None
+    """This command's certificate (PEM)."""
+    tls_key: Path | None = None
+    """The certificate's key (PEM)."""
+    workers: int | None = None
+    """Processes on this machine; 1 works in this process. They bound cells of splats, rays of a NeRF. None: one by
+    core."""
+
+    @property
+    def processes(self) -> int:
+        """Processes on this machine."""
+        return len(os.sched_getaffinity(0)) if self.workers is None else self.workers
+
+    @property
+    def ray_processes(self) -> int:
+        """Processes that bound the rays of a NeRF; the workers of a cluster have one each."""
+        return 1 if self.engine == "dask" and self.workers is None else self.processes
+
+    def check(self) -> None:
+        """Refuse what makes no sense together.
+
+        Raises:
+            InputError: The option and its value.
+        """
+        if self.processes < 1:
+            raise InputError(f"found {self.workers}", field="--workers", fix="give a number of at least 1")
+        if self.engine == "local" and self.scheduler_address is not None:
+            raise InputError("given without --engine dask", field="--scheduler-address", fix="add --engine dask")
+
+    def started(self, processes: int) -> AbstractContextManager[Engine]:
+        """The engine, closed at the end of the block; ``processes`` work on this machine.
+
+        Raises:
+            InputError: A file of the connection is missing, or no scheduler answers.
+        """
+        from ns_abstract.execution.engines import Tls, started
+
+        tls = Tls.of(self.tls_ca_file, self.tls_cert, self.tls_key, self.scheduler_address)
+        return started(self.engine, self.scheduler_address, processes, tls)

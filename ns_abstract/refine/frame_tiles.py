@@ -1,0 +1,122 @@
+"""The tiles of a frame that one refinement bounds, and the cells that they are bounded over."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+
+from ns_abstract.geometry.box import ParameterBox
+from ns_abstract.refine.protocol import COLORS, DEPTH, Bounds, Context, Frame, PartsFrame
+from ns_abstract.refine.result import gap
+from ns_abstract.refine.sub_boxes import SubBox
+
+
+class Cell:
+    """A sub-box of the set, the context for cells inside it, and how much the picture varies along each axis [d]."""
+
+    __slots__ = ("context", "narrow", "number", "part", "slopes")
+
+    def __init__(self, number: int, part: SubBox, narrow: bool) -> None:
+        self.number, self.part, self.narrow = number, part, narrow
+        self.context: Context | None = None
+        self.slopes = np.zeros(part.box.dimensions)
+
+    @property
+    def box(self) -> ParameterBox:
+        """Its range of parameters."""
+        return self.part.box
+
+
+class FrameTiles:
+    """Some tiles of a frame, numbered by their place in the list; measures are those of their pixels (R6).
+
+    Args:
+        frame: Bounds and renders.
+        tiles: The frame's numbers of the tiles, ascending; None: all.
+        keep_linear: Whether bounds carry linear sets.
+    """
+
+    def __init__(self, frame: Frame, tiles: np.ndarray | None = None, keep_linear: bool = False) -> None:
+        self.frame, self.keep_linear = frame, keep_linear
+        self.selected = None if tiles is None else np.asarray(tiles, np.int64)
+        self.count = frame.tile_count if self.selected is None else self.selected.size
+        self.all = np.arange(self.count)
+        self.inside = pixels_inside(frame)[self.numbers(None)]
+
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        """Of one tile's values."""
+        return self.frame.side, self.frame.side, self.frame.channels
+
+    @property
+    def by_pixel(self) -> bool:
+        """Whether cells may be split for some of their pixels only.
+
+        Linear sets are kept of all pixels, and nobody looks where layers are open.
+        """
+        return isinstance(self.frame, PartsFrame) and not self.keep_linear and self.frame.channels == COLORS
+
+    def numbers(self, places: np.ndarray | None) -> np.ndarray:
+        """The frame's numbers of tiles; of all of these if None."""
+        if self.selected is None:
+            return self.all if places is None else places
+        return self.selected if places is None else self.selected[places]
+
+    def filled(self, value: float) -> np.ndarray:
+        """[t, side, side, channels] float32 of one value."""
+        return np.full((self.count, *self.shape), value, np.float32)
+
+    def render(self, render: Callable[..., np.ndarray], values: np.ndarray, places: np.ndarray | None) -> np.ndarray:
+        """Tiles at ``places`` (None: all) as ``render`` shows them at parameter values [d]."""
+        whole = self.selected is None and places is None
+        return render(values, None if whole else self.numbers(places))
+
+    def bound(
+        self, cells: Sequence[Cell], parent: Cell | None, places: np.ndarray, pixels: np.ndarray | None = None
+    ) -> Sequence[Bounds]:
+        """Bounds of each cell in the tiles at ``places``.
+
+        Args:
+            cells: Parts of ``parent``.
+            parent: A cell that was bounded in these tiles before, or None.
+            places: [t] which tiles.
+            pixels: [t, side, side] which pixels are wanted, of those that were wanted of ``parent``; None: all.
+        """
+        within = None if parent is None else parent.context
+        boxes, numbers = [cell.box for cell in cells], self.numbers(places)
+        if isinstance(self.frame, PartsFrame):
+            return self.frame.bound_parts(boxes, numbers, within, self.keep_linear, pixels)
+        return [self.frame.bound(box, numbers, within, self.keep_linear) for box in boxes]
+
+    def mean_gap(self, lower: np.ndarray, upper: np.ndarray) -> float:
+        """MPG between [t, side, side, channels] values of all tiles."""
+        return float(gap(lower[..., :COLORS], upper[..., :COLORS])[self.inside].mean())
+
+
+def pixels_inside(frame: Frame) -> np.ndarray:
+    """[T, side, side] whether a tile's pixel belongs to the image."""
+    rows = np.arange(frame.down * frame.side) < frame.camera.height
+    columns = np.arange(frame.across * frame.side) < frame.camera.width
+    grid = (rows[:, None] & columns[None, :]).reshape(frame.down, frame.side, frame.across, frame.side)
+    return grid.swapaxes(1, 2).reshape(-1, frame.side, frame.side)
+
+
+def usable(lower: np.ndarray, upper: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Bounds within [0, 1]; where they are not finite, cross or miss [0, 1], nothing is known.
+
+    Depths are at least 0, and may be unknown above or nowhere (see `Frame`).
+    """
+    good = np.isfinite(lower) & np.isfinite(upper) & (lower <= upper) & (lower <= 1.0) & (upper >= 0.0)
+    low, high = np.clip(lower, 0.0, 1.0), np.clip(upper, 0.0, 1.0)
+    low, high = np.where(good, low, np.zeros_like(low)), np.where(good, high, np.ones_like(high))
+    if lower.shape[-1] > DEPTH:
+        near, far = lower[..., DEPTH], upper[..., DEPTH]
+        known = ((near <= far) & np.isfinite(near) & (near >= 0.0)) | ((near == np.inf) & (far == -np.inf))
+        low[..., DEPTH], high[..., DEPTH] = np.where(known, near, 0.0), np.where(known, far, np.inf)
+    return low, high
+
+
+def context_bytes(context: Context | None) -> int:
+    """Memory that a context holds."""
+    return 0 if context is None else context.nbytes

@@ -1,0 +1,232 @@
+"""The leaves of a refinement: bounds of every (cell, tile) pair, and the outer bound that they make up."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from ns_abstract.refine.frame_tiles import Cell, FrameTiles, context_bytes, usable
+from ns_abstract.refine.goal import Goal
+from ns_abstract.refine.inner import InnerBound
+from ns_abstract.refine.protocol import COLORS, MOST_PARTS, Context
+from ns_abstract.refine.tuning import TUNING, Tuning
+
+
+@dataclass
+class Change:
+    """What a round does to the leaves of one tile: rows that go, and what comes in their place."""
+
+    gone: list[int] = field(default_factory=list)
+    cells: list[Cell] = field(default_factory=list)
+    lower: list[np.ndarray] = field(default_factory=list)
+    upper: list[np.ndarray] = field(default_factory=list)
+
+
+@dataclass
+class TileLeaves:
+    """The leaves of one tile: [n, side, side, channels] bounds, and everything that is no longer split."""
+
+    closed_lower: np.ndarray
+    closed_upper: np.ndarray
+    cells: list[Cell] = field(default_factory=list)
+    lower: np.ndarray | None = None
+    upper: np.ndarray | None = None
+
+    def replace(self, change: Change) -> None:
+        """Take out the leaves in the rows ``change.gone`` and append the new ones."""
+        keep = np.ones(len(self.cells), bool)
+        keep[change.gone] = False
+        old_lower = [] if self.lower is None else [self.lower[keep]]
+        old_upper = [] if self.upper is None else [self.upper[keep]]
+        self.cells = [cell for cell, stays in zip(self.cells, keep, strict=True) if stays] + change.cells
+        if not self.cells:
+            self.lower = self.upper = None
+            return
+        self.lower = np.concatenate([*old_lower, *(a[None] for a in change.lower)])
+        self.upper = np.concatenate([*old_upper, *(a[None] for a in change.upper)])
+
+    def close(self, which: np.ndarray) -> None:
+        """Leaves ``which`` [n] (bool) keep their bounds and are not split any more."""
+        if self.lower is None or self.upper is None or not which.any():
+            return
+        self.closed_lower = np.minimum(self.closed_lower, self.lower[which].min(axis=0))
+        self.closed_upper = np.maximum(self.closed_upper, self.upper[which].max(axis=0))
+        stay = ~which
+        self.cells = [cell for cell, s in zip(self.cells, stay, strict=True) if s]
+        self.lower, self.upper = (self.lower[stay], self.upper[stay]) if self.cells else (None, None)
+
+    def outer(self, change: Change | None = None) -> tuple[np.ndarray, np.ndarray]:
+        """[side, side, channels] bounds over all leaves, as they will be after ``change``."""
+        lower, upper = [self.closed_lower[None]], [self.closed_upper[None]]
+        if self.lower is not None and self.upper is not None:
+            keep = np.ones(len(self.cells), bool)
+            if change is not None:
+                keep[change.gone] = False
+            lower.append(self.lower[keep])
+            upper.append(self.upper[keep])
+        if change is not None:
+            lower += [a[None] for a in change.lower]
+            upper += [a[None] for a in change.upper]
+        return np.concatenate(lower).min(axis=0), np.concatenate(upper).max(axis=0)
+
+
+class LeafBounds:
+    """The leaves of all tiles, and which of them are split next.
+
+    Args:
+        tiles: The tiles.
+        inner: What leaves are measured against.
+        known: [t, side, side, 3] bounds of the same set that hold anyway; None: there are none.
+        tuning: How much a round of splitting takes on.
+
+    Attributes:
+        lower, upper: [t, side, side, channels] float32, the outer bound of the set.
+        bytes: Memory that open leaves hold, as `next_round` has counted it.
+    """
+
+    def __init__(
+        self,
+        tiles: FrameTiles,
+        inner: InnerBound,
+        known: tuple[np.ndarray, np.ndarray] | None = None,
+        tuning: Tuning = TUNING,
+    ) -> None:
+        self.tiles, self.inner, self.known, self.tuning = tiles, inner, known, tuning
+        self.by_tile = [
+            TileLeaves(np.full(tiles.shape, np.inf, np.float32), np.full(tiles.shape, -np.inf, np.float32))
+            for _ in range(tiles.count)
+        ]
+        self.lower, self.upper = usable(tiles.filled(np.nan), tiles.filled(0.0))
+        self._intersect(tiles.all)
+        self.lower[~tiles.inside] = 0.0
+        self.upper[~tiles.inside] = 0.0
+        self.bytes = 0
+        #: what a leaf may leave open at a pixel that it is not bounded at any more; never falls
+        self._closed_excess = 0.0
+
+    @property
+    def mean_gap(self) -> float:
+        """MPG of the outer bound."""
+        return self.tiles.mean_gap(self.lower, self.upper)
+
+    def begin(self, leaves: list[tuple[Cell, np.ndarray, np.ndarray]]) -> None:
+        """Take cells that cover the set, with lower and upper bounds [t, side, side, channels] of all tiles."""
+        for t in self.tiles.all:
+            cells, lowers, uppers = zip(*((cell, lower[t], upper[t]) for cell, lower, upper in leaves), strict=True)
+            self.by_tile[t].replace(Change([], list(cells), list(lowers), list(uppers)))
+        self.update(self.tiles.all)
+
+    def update(self, places: np.ndarray, changes: dict[int, Change] | None = None) -> None:
+        """Update the outer bound of the tiles at ``places``, given what has changed since the round began."""
+        for t in places:
+            self.lower[t], self.upper[t] = self.by_tile[t].outer(None if changes is None else changes[t])
+        self._intersect(places)
+        self.lower[places], self.upper[places] = usable(self.lower[places], self.upper[places])
+
+    def apply(self, changes: dict[int, Change]) -> None:
+        """End a round with what has changed in it."""
+        for t, change in changes.items():
+            self.by_tile[t].replace(change)
+        self.update(np.array(sorted(changes), np.int64))
+
+    def _intersect(self, places: np.ndarray) -> None:
+        """Take what was known before into the outer bound of tiles: both hold (design.md, R5)."""
+        if self.known is not None:
+            lower, upper = self.known
+            low, high = self.lower[..., :COLORS], self.upper[..., :COLORS]
+            low[places], high[places] = np.maximum(low[places], lower[places]), np.minimum(high[places], upper[places])
+
+    def row(self, t: int, row: int) -> tuple[np.ndarray, np.ndarray]:
+        """[side, side, channels] bounds of one leaf of tile t."""
+        tile = self.by_tile[t]
+        assert tile.lower is not None and tile.upper is not None
+        return tile.lower[row], tile.upper[row]
+
+    def wanted(self, rows: dict[int, int]) -> np.ndarray | None:
+        """[t, side, side] the pixels that leaves in the tiles and rows ``rows`` are split for; None: all."""
+        if not self.tiles.by_pixel:
+            return None
+        return np.stack([self._open(t, *(side[None] for side in self.row(t, row)))[0] > 0.0 for t, row in rows.items()])
+
+    def close_excess(self, allowed: float) -> None:
+        """Leave pixels of leaves for good that could take little more away from the excess that is ``allowed``."""
+        if self.tiles.by_pixel:
+            self._closed_excess = max(self._closed_excess, self.tuning.closed_share * allowed)
+
+    def next_round(self, goal: Goal) -> tuple[list[tuple[Cell, dict[int, int]]], int]:
+        """The cells to split in the next round, each with its row by tile, and into how many parts."""
+        while True:
+            amounts, owner = self._excess()
+            if not owner:
+                return [], 2
+            order = np.argsort(-amounts, kind="stable")
+            if self.bytes <= goal.leaf_bytes:
+                break
+            self._close_least(order, owner)
+        running = np.cumsum(amounts[order])
+        count = int(np.searchsorted(running, self.tuning.round_share * running[-1])) + 1
+        by_cell: dict[int, tuple[Cell, dict[int, int]]] = {}
+        for position in order[:count]:
+            t, k = owner[position]
+            cell = self.by_tile[t].cells[k]
+            by_cell.setdefault(cell.number, (cell, {}))[1][t] = k
+        jobs = []
+        for cell, rows in by_cell.values():
+            ordered = sorted(rows.items())
+            step = self.tiles.frame.tiles_at_once or len(ordered)
+            jobs += [(cell, dict(ordered[i : i + step])) for i in range(0, len(ordered), step)]
+        # excess falls at least in proportion to the width: far from the goal, levels are skipped
+        moved = (self.inner.upper - self.inner.lower)[..., :COLORS]
+        allowed = (goal.ratio - 1.0) * float(moved[self.tiles.inside].sum())
+        return jobs, MOST_PARTS if running[-1] > self.tuning.wide_split_excess * allowed else 2
+
+    def _excess(self) -> tuple[np.ndarray, list[tuple[int, int]]]:
+        """What every open leaf leaves open beyond the inner bound, and its tile and row.
+
+        Leaves that cannot be improved are closed; the memory of the others is counted.
+        """
+        excess: list[np.ndarray] = [np.empty(0)]
+        owner: list[tuple[int, int]] = []
+        contexts: dict[int, Context | None] = {}
+        self.bytes = 0
+        for t, tile in enumerate(self.by_tile):
+            if tile.lower is None or tile.upper is None:
+                continue
+            amount = self._open(t, tile.lower, tile.upper).sum(axis=(1, 2), dtype=np.float64)
+            done = (amount <= 0.0) | np.array([cell.narrow for cell in tile.cells])
+            tile.close(done)
+            amount = amount[~done]
+            if tile.lower is not None and tile.upper is not None:
+                self.bytes += tile.lower.nbytes + tile.upper.nbytes
+            for cell in tile.cells:
+                contexts[id(cell.context)] = cell.context
+            excess.append(amount)
+            owner.extend((t, k) for k in range(amount.size))
+        self.bytes += sum(context_bytes(context) for context in contexts.values())
+        return np.concatenate(excess), owner
+
+    def _open(self, t: int, lower: np.ndarray, upper: np.ndarray) -> np.ndarray:
+        """[n, side, side] what leaves of tile t leave open beyond the inner bound, where that is not too little.
+
+        A pixel where a leaf has nothing open has nothing open in any part of it, then or later.
+        """
+        colors = np.s_[..., :COLORS]
+        lower, upper = lower[colors], upper[colors]
+        if self.known is not None:
+            lower, upper = np.maximum(lower, self.known[0][t]), np.minimum(upper, self.known[1][t])
+        beyond = np.maximum(0.0, self.inner.lower[t][colors] - lower)
+        beyond += np.maximum(0.0, upper - self.inner.upper[t][colors])
+        beyond = beyond.sum(axis=-1)
+        return np.where(self.tiles.inside[t] & (beyond > self._closed_excess), beyond, 0.0)
+
+    def _close_least(self, order: np.ndarray, owner: list[tuple[int, int]]) -> None:
+        """Free memory: the half of the leaves that have least excess are not split any more."""
+        closing: dict[int, list[int]] = {}
+        for position in order[order.size // 2 :]:
+            t, k = owner[position]
+            closing.setdefault(t, []).append(k)
+        for t, which in closing.items():
+            mask = np.zeros(len(self.by_tile[t].cells), bool)
+            mask[which] = True
+            self.by_tile[t].close(mask)

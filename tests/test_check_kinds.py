@@ -1,0 +1,373 @@
+"""What the program that checks results knows beside splats in real numbers: float32, networks, loops, NeRFs, files."""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import json
+import shutil
+import sqlite3
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import onnxruntime
+import pytest
+import torch
+from certifying import classifier, write_onnx
+from conftest import InProcess, Inputs, blob_scene, ring
+from nerfs import UNIFORM, tiny_weights, view
+from onnx import helper
+from scene_files import ply
+
+import ns_abstract as nsa
+from ns_abstract.api.checking import check
+from ns_abstract.check.fields import Field
+from ns_abstract.check.forms import Form
+from ns_abstract.check.inputs import BadInput, read_poses, read_scene
+from ns_abstract.check.networks import Network
+from ns_abstract.check.poses import Camera, Poses
+from ns_abstract.check.splats import FLOAT, activated, meeting, picture, pixels, reaches
+from ns_abstract.cli import check as check_command
+from ns_abstract.demo.writing import write_loop_demo
+from ns_abstract.geometry.camera_path import Camera as PathCamera
+from ns_abstract.io.atomic import write_json
+from ns_abstract.methods.nerf.render import NerfRenderer
+from ns_abstract.methods.nerf.scene import NerfScene
+from ns_abstract.methods.splat.constants import VERSIONS
+from ns_abstract.methods.splat.reference import Reference
+
+# ---------------------------------------------------------------- float32
+
+
+@pytest.mark.parametrize("mode", ["classic", "antialiased"])
+def test_float32_pictures_are_enclosed_and_need_their_charges(mode: str) -> None:
+    scene = dataclasses.replace(blob_scene(60, degree=2), rasterize_mode=mode)
+    pose = np.asarray(ring()[1].camera_to_world, np.float64)[:3]
+    focal = 8.0 / np.tan(np.radians(45.0) / 2.0)
+    values = (pose, focal, focal, 8.0, 8.0, 16, 16)
+    reference = Reference(scene, VERSIONS["1.4.0"], torch.float32)
+    image = reference.image(PathCamera(*values), torch.from_numpy(pose)).double().numpy()
+    splats = activated(
+        scene.means, scene.log_scales, scene.quats, scene.opacity_logits, scene.sh, sigmoid=False, degree=2,
+        antialiased=mode == "antialiased", background=scene.background, version="1.4.0",
+    )  # fmt: skip
+    cam, none = Camera(*values), np.zeros((1, 0))
+    seen = Poses(cam, ()).view(none, none)
+    for unit, holds in ((FLOAT, True), (0.0, False)):
+        form = picture(splats, cam, seen, unit)
+        low, high = form.range()
+        outside = (np.clip(low, 0.0, 1.0) > image) | (np.clip(high, 0.0, 1.0) < image)
+        assert outside.any() != holds
+        if unit:
+            assert form.r.max() < 5e-3
+    # pictures are those of their pixels
+    ends = reaches(splats, cam, seen, 0.0)
+    one, _, _ = pixels(splats, cam, seen, meeting(ends, 7, 9)[None], (np.array([7]), np.array([9])))
+    assert np.abs(one.clamped(0.0, 1.0).c[0] - form.c[7, 9]).max() < 1e-12
+
+
+# ---------------------------------------------------------------- networks
+
+
+def pooled(file: Path) -> Path:
+    """Convolutions with a sum of branches, padding, average pooling and two products."""
+    rng = np.random.default_rng(4)
+    weights = {
+        "k": 0.4 * rng.normal(size=(4, 3, 3, 3)), "c": 0.1 * rng.normal(size=4),
+        "l": 0.3 * rng.normal(size=(4, 4, 3, 3)), "w": rng.normal(size=(6, 4 * 16)), "b": rng.normal(size=6),
+        "v": rng.normal(size=(6, 3)),
+    }  # fmt: skip
+    nodes = [
+        helper.make_node("Conv", ["image", "k", "c"], ["a"], pads=[1, 1, 1, 1]),
+        helper.make_node("Relu", ["a"], ["p"]),
+        helper.make_node("Conv", ["p", "l"], ["q"], pads=[1, 1, 1, 1]),
+        helper.make_node("Add", ["p", "q"], ["s"]),
+        helper.make_node("Relu", ["s"], ["t"]),
+        helper.make_node("AveragePool", ["t"], ["m"], kernel_shape=[2, 2], strides=[2, 2]),
+        helper.make_node("Flatten", ["m"], ["f"]),
+        helper.make_node("Gemm", ["f", "w", "b"], ["g"], transB=1),
+        helper.make_node("Relu", ["g"], ["h"]),
+        helper.make_node("MatMul", ["h", "v"], ["y"]),
+    ]
+    return write_onnx(file, (3, 8, 8), nodes, weights, 3)
+
+
+@pytest.mark.parametrize("radius", [0.0, 1e-3, 0.1])
+def test_networks_are_enclosed(radius: float, tmp_path: Path) -> None:
+    file, rng = pooled(tmp_path / "net.onnx"), np.random.default_rng(2)
+    session = onnxruntime.InferenceSession(file, providers=["CPUExecutionProvider"])
+    c, g = rng.random((1, 3, 8, 8), np.float32).astype(np.float64), radius * rng.normal(size=(2, 1, 3, 8, 8))
+    # what rounding the input to float32 moves it by is part of the set
+    form = Form(c, g, np.full(c.shape, 0.1 * radius + 4e-7))
+    network, exact = Network(file, None, FLOAT), Network(file, None, 0.0)
+    rows = torch.tensor([[1.0, -1.0, 0.0], [0.0, 0.5, 2.0]], dtype=torch.float64)
+    outputs, least, most = network.outputs(form), network.least(form, rows), -network.least(form, -rows)
+    found = []
+    for _ in range(50):
+        s, e = rng.uniform(-1.0, 1.0, 2), 0.1 * radius * rng.uniform(-1.0, 1.0, c.shape)
+        x = (c + s[0] * g[0] + s[1] * g[1] + e).astype(np.float32)
+        y = session.run(None, {"image": x})[0][0].astype(np.float64)
+        assert (np.abs(y - outputs.c[0] - s @ outputs.g[:, 0]) <= outputs.r[0]).all()
+        value = rows.numpy() @ y
+        assert (least[0].numpy() <= value).all() and (value <= most[0].numpy()).all()
+        found.append(value)
+    # rows that go back keep what the picture's slopes cancel
+    assert (most - least).max() < 8.0 * max(np.ptp(found, axis=0).max(), 1e-3)
+    assert (exact.least(form, rows) >= least).all() and (exact.least(form, rows) > least).any()
+
+
+def test_a_float32_network_leaves_the_exact_one(tmp_path: Path) -> None:
+    """At one picture the exact network's bounds are narrower than float32's error, and float32's hold it."""
+    file, c = pooled(tmp_path / "net.onnx"), np.random.default_rng(3).random((64, 3, 8, 8)).astype(np.float32)
+    session = onnxruntime.InferenceSession(file, providers=["CPUExecutionProvider"])
+    y = session.run(None, {"image": c})[0].astype(np.float64)
+    form = Form(c.astype(np.float64), np.zeros((0, *c.shape)), np.zeros(c.shape))
+    for unit, holds in ((FLOAT, True), (0.0, False)):
+        low, high = Network(file, None, unit).outputs(form).range()
+        assert bool(((low <= y) & (y <= high)).all()) == holds
+
+
+# ---------------------------------------------------------------- certificates
+
+
+@pytest.fixture(scope="module")
+def certificate(blobs: Inputs, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("certified")
+    net = classifier(folder / "net.onnx", size=8)
+    path = json.loads(blobs.path.read_text())
+    write_json(
+        folder / "path.json", path | {"render_width": 8, "render_height": 8, "camera_path": path["camera_path"][:1]}
+    )
+    scene = nsa.load_scene(blobs.config)
+    camera = nsa.load_camera_path(folder / "path.json").cameras[0]
+    image = nsa.render(scene, nsa.Camera(camera.camera_to_world, fov=45.0, width=8, height=8))
+    session = onnxruntime.InferenceSession(net, providers=["CPUExecutionProvider"])
+    (y,) = session.run(None, {"image": np.moveaxis(image, -1, 0)[None].astype(np.float32)})
+    write_json(folder / "prop.json", {"type": "classification", "label": int(y[0].argmax())})
+    import sys
+
+    from ns_abstract.cli.certify import main
+
+    options = {
+        "load-config": blobs.config, "camera-path-filename": folder / "path.json", "model": net,
+        "property": folder / "prop.json", "output-dir": folder / "out", "time-budget": 60,
+    }  # fmt: skip
+    before = sys.argv
+    sys.argv = [
+        "certify",
+        *(str(v) for k, o in options.items() for v in (f"--{k}", o)),
+        "--translation",
+        "0.002",
+        "0",
+        "0",
+    ]
+    try:
+        with pytest.raises(SystemExit) as ended:
+            main()
+    finally:
+        sys.argv = before
+    assert ended.value.code in (0, None)
+    return folder / "out"
+
+
+@pytest.fixture
+def copy(certificate: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(certificate, tmp_path / "copy"))
+
+
+def rewrite(folder: Path, change: str) -> None:
+    """Change the table of cells and seal it anew, as who forges a certificate would."""
+    with sqlite3.connect(folder / "cells.sqlite") as base:
+        base.execute(change)
+        rows = list(base.execute("SELECT frame, lower, upper, verdict, margin, seconds, counterexample FROM cells"))
+    digests = (hashlib.sha256(json.dumps(list(row)).encode()).digest() for row in rows)
+    seal = {"rows": len(rows), "sum": f"{sum(int.from_bytes(d, 'big') for d in digests) % (1 << 256):064x}"}
+    file = folder / "report.json"
+    file.write_text(json.dumps(json.loads(file.read_text()) | {"cells_seal": seal}))
+
+
+def test_a_certificate_is_proved_again(copy: Path) -> None:
+    found = check(copy, claims=3, seconds=120)
+    assert (found.claims, found.proved, found.float32, found.exit_code) == (3, 3, 3, 0)
+    assert found.uniform["claims"] == 2 and found.uniform["float32_at_least"] > 0.2
+
+
+def test_a_margin_that_is_too_large_is_refuted(copy: Path, in_process: InProcess) -> None:
+    rewrite(copy, "UPDATE cells SET margin = margin + 10")
+    code, out, _ = in_process(check_command.main, [str(copy), "--claims", "1", "--seconds", "60"])
+    assert code == 1 and "the margin is" in out
+
+
+def test_another_class_is_refuted(copy: Path) -> None:
+    file = copy / "report.json"
+    document = json.loads(file.read_text())
+    document["property"]["label"] = (document["property"]["label"] + 1) % 3
+    file.write_text(json.dumps(document))
+    found = check(copy, claims=1, seconds=60)
+    assert found.refuted == 1 and found.refutations[0]["margin"] < 0.0
+
+
+BAD: dict[str, tuple[str, int, str]] = {
+    "another cell": (
+        "UPDATE cells SET upper = '[0.0015]' WHERE rowid = (SELECT max(rowid) FROM cells)",
+        1,
+        "partition",
+    ),
+    "a verdict": (
+        "UPDATE cells SET verdict = 'unknown' WHERE rowid = (SELECT min(rowid) FROM cells)",
+        1,
+        "report counts",
+    ),
+    "no list": ("UPDATE cells SET lower = '7'", 2, "cannot be read as the cells"),
+    "no number": ("UPDATE cells SET lower = '[NaN]'", 2, "cannot be read as the cells"),
+}
+
+
+@pytest.mark.parametrize("name", BAD)
+def test_a_forged_table_is_found(name: str, copy: Path, in_process: InProcess) -> None:
+    change, expected, words = BAD[name]
+    rewrite(copy, change)
+    code, out, err = in_process(check_command.main, [str(copy), "--claims", "1"])
+    assert code == expected and words in out + err and len(err.splitlines()) == (expected == 2)
+
+
+def test_an_edited_table_is_refused(copy: Path, in_process: InProcess) -> None:
+    with sqlite3.connect(copy / "cells.sqlite") as base:
+        base.execute("UPDATE cells SET margin = 100")
+    code, _, err = in_process(check_command.main, [str(copy)])
+    assert code == 2 and "cells_seal" in err and len(err.splitlines()) == 1
+
+
+def test_a_network_that_was_moved_is_asked_for(copy: Path, certificate: Path, in_process: InProcess) -> None:
+    net, file = certificate.parent / "net.onnx", copy / "report.json"
+    document = json.loads(file.read_text())
+    document["settings"]["model"] = "/nowhere.onnx"
+    file.write_text(json.dumps(document))
+    code, _, err = in_process(check_command.main, [str(copy)])
+    assert code == 2 and "--model" in err
+    assert check(copy, claims=1, seconds=60, model=net).proved == 1
+    other = copy / "other.onnx"
+    other.write_bytes(net.read_bytes() + b"\0")
+    code, _, err = in_process(check_command.main, [str(copy), "--model", str(other)])
+    assert code == 2 and "sha256" in err
+
+
+# ---------------------------------------------------------------- loops
+
+
+def test_a_loop_is_proved_again_and_other_sets_are_not(tmp_path: Path) -> None:
+    config, loop = write_loop_demo(tmp_path / "course")
+    about = json.loads(loop.read_text()) | {"steps": 3}
+    about["initial"] |= {"along": 0.0, "across": [0.1, 0.104], "up": 0.0}
+    del about["goal"]
+    loop.write_text(json.dumps(about))
+    out = tmp_path / "out"
+    nsa.reach(nsa.load_scene(config), loop, time_budget=60.0, output_dir=out)
+    file = out / "report.json"
+    document = json.loads(file.read_text())
+    document["settings"] |= {"load_config": str(config), "loop": str(loop)}
+    file.write_text(json.dumps(document))
+    found = check(out, claims=1, seconds=120)
+    assert (found.proved, found.refuted, found.structure) == (1, 0, [])
+    # a half-space that runs do enter
+    document["loop"]["unsafe"] = [{"half_space": {"normal": [0.0, 1.0, 0.0, 0.0, 0.0], "at_least": 0.05}}]
+    file.write_text(json.dumps(document))
+    assert check(out, claims=1, seconds=5).proved == 0
+
+
+# ---------------------------------------------------------------- NeRFs
+
+
+def nerf(seed: int = 0) -> tuple[NerfScene, Field]:
+    scene = NerfScene(tiny_weights(seed), tiny_weights(seed + 1), 0.0, 4.0)
+    fine, found = scene.fine, {}
+    parts = {f"mlp_base.layers.{k}": layer for k, layer in enumerate(fine.base)}
+    parts |= {f"mlp_head.layers.{k}": layer for k, layer in enumerate(fine.head)}
+    parts |= {"field_output_density.net": fine.density, "field_heads.0.net": fine.color}
+    for name, layer in parts.items():
+        found |= {f"field_fine.{name}.weight": layer.weight, f"field_fine.{name}.bias": layer.bias}
+    field = Field(found)
+    field.near, field.far, field.samples, field.background = 0.0, UNIFORM.far, UNIFORM.samples, UNIFORM.background
+    return scene, field
+
+
+@pytest.mark.parametrize("half", [0.0, 1e-5, 1e-3])
+def test_rays_contain_pictures_of_another_renderer(half: float) -> None:
+    scene, field = nerf()
+    theirs = view()
+    ours = Camera(*(getattr(theirs, n) for n in ("camera_to_world", "fx", "fy", "cx", "cy", "width", "height")))
+    renderer, poses = NerfRenderer(scene, UNIFORM), Poses(ours, ("x", "yaw"))
+    low, high = np.full((1, 2), -half), np.full((1, 2), half)
+    rng, widths = np.random.default_rng(0), []
+    for pixel in ((0, 1), (1, 2), (2, 3), (1, 0)):
+        form = field.pixels(ours, poses.view(low, high), (np.array(pixel[:1]), np.array(pixel[1:])))
+        widths.append(form.r.max())
+        for s in rng.uniform(-1.0, 1.0, (6, 2)):
+            turn, place = poses.posed(poses.given(half * s[None], half * s[None]))
+            pose = np.array([[e.c[0] for e in (*row, o)] for row, o in zip(turn, place, strict=True)])
+            color = renderer.pixels(theirs, pose, np.array([pixel]))[0]
+            value = form.c[0] + (s @ form.g[:, 0] if half else 0.0)
+            room = form.r[0] + 1e-10
+            assert (np.clip(value - room, 0, 1) <= color + 1e-12).all()
+            assert (np.clip(value + room, 0, 1) >= color - 1e-12).all()
+    assert max(widths) < {0.0: 1e-9, 1e-5: 1e-4, 1e-3: np.inf}[half]
+
+
+def test_neurons_that_bend_are_enclosed() -> None:
+    from ns_abstract.check.fields import _Zonotope
+
+    rng = np.random.default_rng(0)
+    form = Form(rng.normal(size=(1, 2, 5)), 0.3 * rng.normal(size=(2, 1, 2, 5)), 0.1 * rng.random((1, 2, 5)))
+    weight, bias = rng.normal(size=(6, 5)), rng.normal(size=6)
+    found = _Zonotope.of(form).layer(weight, bias).bent().layer(weight[:, :5].T @ np.eye(6)[:6, :6], bias[:5]).form(2)
+    for _ in range(200):
+        s, e = rng.uniform(-1.0, 1.0, 2), rng.choice([-1.0, 1.0], form.c.shape)
+        x = form.c + s[0] * form.g[0] + s[1] * form.g[1] + e * form.r
+        y = np.maximum(x @ weight.T + bias, 0.0) @ weight + bias[:5]
+        assert (np.abs(y - found.c - s[0] * found.g[0] - s[1] * found.g[1]) <= found.r + 1e-12).all()
+
+
+# ---------------------------------------------------------------- files
+
+
+@pytest.mark.parametrize(
+    ("comments", "mode"),
+    [
+        (("Antialiased: 1",), "antialiased"),
+        (("Antialiased 0", "SplatRenderMode: mip"), "antialiased"),
+        (("SplatRenderMode: mip", "antialiased = false"), "classic"),
+        ((), "classic"),
+    ],
+)
+def test_comments_of_ply_files_choose_the_mode(comments: tuple[str, ...], mode: str, tmp_path: Path) -> None:
+    file = ply(tmp_path / "scene.ply", blob_scene(5, degree=0), comments)
+    report: dict[str, Any] = {
+        "settings": {}, "scene": {"rasterize_mode": mode, "background": [0.0, 0.0, 0.0]},
+        "renderer": {"name": "gsplat", "version": "1.4.0"}, "fingerprint": {},
+    }  # fmt: skip
+    with pytest.raises(BadInput, match="digest differs"):
+        read_scene(file, report)
+    report["scene"]["rasterize_mode"] = "classic" if mode == "antialiased" else "antialiased"
+    with pytest.raises(BadInput, match="another mode"):
+        read_scene(file, report)
+
+
+def test_a_filter_is_refused(tmp_path: Path) -> None:
+    scene = blob_scene(5, degree=0)
+    file = ply(tmp_path / "scene.ply", scene, filter_3D=np.full(5, 0.1, np.float32))
+    report = {"settings": {}, "scene": {}, "renderer": {"name": "gsplat"}, "fingerprint": {}}
+    with pytest.raises(BadInput, match="filter"):
+        read_scene(file, report)
+
+
+@pytest.mark.parametrize("cycle", [True, False])
+def test_the_last_leg_of_a_cycle_is_swept(cycle: bool, blobs: Inputs, tmp_path: Path) -> None:
+    path = json.loads(blobs.path.read_text()) | {"is_cycle": cycle}
+    file = write_json(tmp_path / "path.json", path)
+    poses, free = read_poses(file, {"version": 1, "sweep": "segments", "translation": {"x": 0.01}}, 2, {}, 1.0)
+    assert [name for name, _, _ in free] == (["x", "segment"] if cycle else ["x"])
+    if cycle:
+        end = np.array([[0.0, 1.0]])
+        first = np.array(path["camera_path"][0]["camera_to_world"]).reshape(4, 4)[:3, 3]
+        assert np.abs(poses.view(end, end).origin[0] - first).max() < 1e-12
