@@ -86,7 +86,7 @@ class ChebyshevBasis:
 
     @cached_property
     def interpolation_rounding(self) -> float:
-        """Sum of the errors of an interpolant's coefficients, in parts of the largest value at a node (F3)."""
+        """What an interpolant's coefficients are off by together, in parts of the largest value at a node (F3)."""
         size = sum(float(np.abs(matrix).sum()) for matrix in self.interpolation)
         return gamma(len(self.nodes) + INTERPOLATION_ROUNDINGS) * size * GRID_UP
 
