@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from ns_abstract.arithmetic.network_charges import LEAST_DIVISOR
 from ns_abstract.io.errors import InputError
 from ns_abstract.verify.network import curves
 from ns_abstract.verify.network.compose import Axis, Composer, interpolation
@@ -73,8 +74,8 @@ def _number(a: Arguments, name: str, default: float) -> float:
 
 def _positive(a: Arguments, name: str, default: float) -> float:
     value = _number(a, name, default)
-    if not 0.0 < value < 2.0**20:
-        raise InputError(f"argument {name} = {value} is not supported", fix="it must be positive")
+    if not LEAST_DIVISOR < value < 2.0**20:
+        raise InputError(f"argument {name} = {value} is not supported", fix="between 1e-30 and 1e6 expected")
     return value
 
 
