@@ -38,7 +38,8 @@ CONSTANTS = {name: value for name, value in vars(network_charges).items() if nam
 BASES = {"Activation", "Assumed", "Curve", "Weighted", "Lines", "Axis"}
 #: Numbers that no proof rests on: defaults of torch's operators, limits of what is read, sizes of memory.
 PREFERENCES = re.compile(
-    r"a\.get\(\"eps|LEAST_DIVISOR < value <|GiB|2\*\*31|_LARGE|normal\(size=shape\)|np\.log\(max|clamp\(min=2\.0\*\*-1000\)"
+    r"a\.get\(\"eps|LEAST_DIVISOR < value <|GiB|2\*\*31|_LARGE|normal\(size=shape\)|"
+    r"np\.log\(max|clamp\(min=2\.0\*\*-1000\)"
 )
 
 
