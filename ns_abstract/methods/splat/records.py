@@ -478,9 +478,7 @@ def ellipse_is_met(sharpness, widest, thinnest, eta, span, charges):
     tips = (sharpness * sharpness > ELLIPSE_SHARPNESS * unit) & (
         sharpness * np.sqrt(thinnest) > ELLIPSE_TIPS * unit * span
     )
-    met = steep & tips & (eta < ELLIPSE_ERROR) & (span < ELLIPSE_SPAN)
-    # in exact arithmetic no tile is missed
-    return met | (unit == 0.0)
+    return steep & tips & (eta < ELLIPSE_ERROR) & (span < ELLIPSE_SPAN)
 
 
 @njit(cache=True, error_model="numpy", forceinline=True)
