@@ -318,7 +318,6 @@ class CellSearch(Generic[P]):
             waits=question.waits,
         )
         store.trace()
-        request.on_progress(question.progress(store))
 
     def _keep_counterexamples(self, block: Block, findings: Findings) -> None:
         """Store what breaks the claim before the cells are said to be falsified."""

@@ -90,6 +90,7 @@ class LoopQuestion(CellQuestion[ReachProgress]):
         self.reports.simulate_runs(deadline.within(_RUNS_SHARE * deadline.left))
 
     def after(self, search: CellSearch[ReachProgress], deadline: Deadline) -> None:
+        search.request.on_progress(self.progress(search.store))
         filming = _FILM_SHARE / self.reserved(1.0) * deadline.left if self.film else 0.0
         self.reports.show_tubes(search.store, deadline.before(filming))
         if self.film:
