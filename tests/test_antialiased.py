@@ -165,6 +165,7 @@ def records(scene: SplatScene, poses: PoseSet, order: int) -> tuple[np.ndarray, 
     return low, high, found[:, UNBOUNDED] != 0.0, shown
 
 
+@pytest.mark.slow_cases
 @pytest.mark.parametrize("name", SETS)
 @pytest.mark.parametrize("shape", SHAPES)
 def test_computed_factor(shape: str, name: str) -> None:

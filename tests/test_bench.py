@@ -50,6 +50,7 @@ def test_ours_are_tighter_than_the_papers(job: PathJob) -> None:
     assert others[0] < others[-1]
 
 
+@pytest.mark.slow
 def test_wrong_rules_are_noticed(job: PathJob, monkeypatch: pytest.MonkeyPatch) -> None:
     own = rules._own
 
@@ -97,6 +98,7 @@ def test_a_plan_that_loses_something_is_noticed(job: PathJob, monkeypatch: pytes
     assert rows[0]["looser by"] == 0.0 and rows[1]["looser by"] > 0.005
 
 
+@pytest.mark.slow
 def test_commands(blobs, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     files = {"load_config": (blobs.config,), "camera_path_filename": blobs.path}
     assert bench(Plan(**files, output_dir=tmp_path, sets=("x",), cells=4)) == DONE

@@ -301,6 +301,7 @@ def test_rounded_pictures(planted: Case, tmp_path: Path) -> None:
     assert "rounded to 8 bits" in (tmp_path / "out" / "report.html").read_text()
 
 
+@pytest.mark.slow
 def test_random_network(blobs: Inputs, net: Path, tmp_path: Path) -> None:
     """Two parameters, a network with two layers of ReLU; the label is the one of the middle."""
     spec = {"version": 1, "translation": {"x": 0.004}, "rotation": {"yaw": 0.004}}
@@ -1058,6 +1059,7 @@ def test_a_variation_that_picks_nothing(
     assert code == 2 and said.count("\n") == 1 and "spec.json: scene[0].select" in said and "picks none" in said
 
 
+@pytest.mark.slow
 def test_help_is_quick_and_light() -> None:
     shown = subprocess.run(
         [sys.executable, "-X", "importtime", "-m", MODULE, "--help"],

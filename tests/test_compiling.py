@@ -139,6 +139,7 @@ while not Path(sys.argv[2]).exists():
 """
 
 
+@pytest.mark.slow
 def test_what_is_compiled_is_told_where_there_is_no_terminal(
     blobs: Inputs, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -179,6 +180,7 @@ def test_what_is_compiled_is_told_where_there_is_no_terminal(
     assert any(line.startswith(wanted) for line in said)
 
 
+@pytest.mark.slow
 def test_worker_compiles_what_it_is_told(blobs: Inputs, tmp_path: Path) -> None:
     """A process of its own opens the job anew and runs one stage; kernels are there, so nothing is compiled."""
     job = open_job(Settings(blobs.config, blobs.path, blobs.spec))

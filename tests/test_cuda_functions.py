@@ -69,6 +69,7 @@ def test_the_least_quaternion_is_the_loaders(program: ModuleType, factor: float)
             load()
 
 
+@pytest.mark.slow
 @compiled
 def test_exact_functions_are_within_their_charges(program: ModuleType, binary: Path, tmp_path: Path) -> None:
     status, rows = run(program, binary, tmp_path)

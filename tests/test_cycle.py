@@ -134,6 +134,7 @@ def test_the_closing_leg_has_one_field_of_view(tmp_path: Path, inputs: Inputs) -
 # ---------------------------------------------------------------- poses and bounds
 
 
+@pytest.mark.slow_cases
 @pytest.mark.parametrize("count", [2, 3])
 def test_poses_of_the_closing_leg(tmp_path: Path, count: int) -> None:
     """Against a slerp of quaternions, and enclosed exactly."""

@@ -148,7 +148,7 @@ print(store().compiled > 0)
     assert run(program, NS_ABSTRACT_CACHE_DIR=str(folder))[0] == "False"
 
 
-@pytest.mark.slow_cases
+@pytest.mark.slow
 @pytest.mark.parametrize("content", [b"", b"garbage", None], ids=["empty", "garbage", "truncated"])
 @pytest.mark.parametrize("what", ["blobs", "manifest"])
 def test_damaged_files(folder: Path, what: str, content: bytes | None) -> None:
@@ -177,6 +177,7 @@ def test_manifest_leads_nowhere_else(tmp_path: Path, folder: Path) -> None:
     assert set(tmp_path.rglob("*.nb?")) == before
 
 
+@pytest.mark.slow
 def test_no_place_to_write(tmp_path: Path) -> None:
     """Without a folder that can be written, one line says so and a temporary folder serves, which is removed."""
     temporary = tmp_path / "tmp"
@@ -189,6 +190,7 @@ def test_no_place_to_write(tmp_path: Path) -> None:
     assert not list(temporary.iterdir())
 
 
+@pytest.mark.slow
 def test_no_home(tmp_path: Path) -> None:
     """A home that does not exist and cannot be made is no error."""
     file = tmp_path / "file"
@@ -235,6 +237,7 @@ def test_killed(folder: Path) -> None:
     assert not list(version(folder).glob("session-*"))
 
 
+@pytest.mark.slow
 def test_old_versions_are_cleared(folder: Path) -> None:
     """Of the versions that are no longer used the last few stay; what is not ours stays."""
     changes = {"NS_ABSTRACT_CACHE_DIR": str(folder)}

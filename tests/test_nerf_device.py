@@ -55,6 +55,7 @@ def test_as_tight_as_compiled_kernels(name: str, device: str) -> None:
     assert np.abs(mine.upper - theirs.upper).max() < 1e-3 * gap
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("device", DEVICES)
 def test_bins_of_the_coarse_pass(device: str) -> None:
     scene, pose_set = tiny_scene(0), poses(SETS["yaw"])

@@ -45,12 +45,14 @@ def test_every_choice_of_samples_is_enclosed(name: str) -> None:
         assert compared > 0 and violations == 0
 
 
+@pytest.mark.slow
 def test_a_smooth_field_is_tight() -> None:
     scene, pose_set = tiny_scene(3, density=1.0, color=0.5), poses(SETS["yaw"])
     found = by_bins(scene, pose_set)
     assert (found.upper - found.lower).mean() < 0.25
 
 
+@pytest.mark.slow
 def test_where_samples_lie_makes_opaque_fields_tight(monkeypatch: pytest.MonkeyPatch) -> None:
     scene, pose_set = tiny_scene(1, density=1e3), poses({"rotation": {"yaw": 1e-4}})
     found = by_bins(scene, pose_set)

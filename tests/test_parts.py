@@ -184,6 +184,7 @@ def test_scenes_that_vary(make_blobs: Callable[..., Inputs]) -> None:
     assert mean_pixel_gap(result.lower, result.upper) < 0.5
 
 
+@pytest.mark.slow
 def test_rays_of_a_nerf() -> None:
     scene, pose_set = tiny_scene(2, density=30.0), poses({"rotation": {"yaw": 0.01}})
     frame = NerfFrame(scene, UNIFORM, pose_set)
@@ -198,6 +199,7 @@ def test_rays_of_a_nerf() -> None:
 # ---------------------------------------------------------------- a cluster
 
 
+@pytest.mark.slow
 @needs_dask
 def test_two_workers_one_of_them_killed_equal_this_process(blobs: Inputs) -> None:
     job = job_of(blobs)

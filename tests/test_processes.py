@@ -89,6 +89,7 @@ def test_a_report_with_a_faulty_worker_is_sampled(
     assert report["guarantee"] == "float32-sound" and "self-check" not in str(report["limits"])
 
 
+@pytest.mark.slow
 def test_a_faulty_worker_certifies_nothing(blobs: Inputs, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     net = classifier(tmp_path / "net.onnx")
     job = Case(tmp_path / "case", blobs, net, {"type": "classification", "label": 0, "preprocess": PRE}).job
@@ -100,6 +101,7 @@ def test_a_faulty_worker_certifies_nothing(blobs: Inputs, tmp_path: Path, monkey
         examine_block(job.recipe, *block)
 
 
+@pytest.mark.slow
 def test_a_faulty_worker_reaches_nothing(course: Any, monkeypatch: pytest.MonkeyPatch) -> None:  # noqa: F811
     job = course.job
     faulty(monkeypatch)
