@@ -114,10 +114,11 @@ def render(package: Path, files: dict[str, Path], out: Path, cache: str, tiny: b
         command = [
             sys.executable, "-W", "ignore", "-m", "ns_abstract.cli.render", "--load-config", str(files[name]),
             "--camera-path-filename", str(files["path"]), "--perturbation-filename", str(files[f"{name} set"]),
-            "--output-dir", str((out / name).absolute()), "--save-cells", "--time-budget", "60", "--target-ratio", "1.2",
+            "--output-dir", str((out / name).absolute()), "--save-cells",
+            "--time-budget", "60", "--target-ratio", "1.2",
         ]  # fmt: skip
         with (out / f"{name}.log").open("w") as log:
-            # Python looks into the folder it is started in first
+            # Python looks first where it is started
             done = subprocess.run(
                 command, env=environment, cwd=package, stdout=log, stderr=log, timeout=1500, check=False
             )
