@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ns_abstract.check.forms import Form
-from ns_abstract.check.poses import Poses, View
+from ns_abstract.check.poses import Poses
 from ns_abstract.check.results import Cells
 from ns_abstract.check.splats import FLOAT, Splats, meeting, pixels, reaches
 
@@ -211,6 +211,3 @@ def divided(low: Array, high: Array, motion: Array, full: Array) -> list[tuple[A
         parts.append((rest[0], top))
         rest = (bottom, rest[1])
     return [*parts, rest]
-
-
-__all__ = ["Picture", "View", "divided", "units"]
