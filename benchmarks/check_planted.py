@@ -68,6 +68,15 @@ def inputs(folder: Path, tiny: bool) -> dict[str, Path]:
     return found
 
 
+def blind(package: Path) -> None:
+    """Lets the copy write bounds that its own renders leave, which it refuses otherwise: the checker is alone."""
+    file, test = package / "ns_abstract" / "report" / "files.py", "if not excess <= 0.0:"
+    text = file.read_text()
+    if text.count(test) != 1:
+        raise ValueError(f"{test} stands {text.count(test)} times in {file}")
+    file.write_text(text.replace(test, "if np.isnan(excess):"))
+
+
 def dependents(package: Path, file: str) -> set[str]:
     """The modules of the copy that import ``file``, directly or not, and itself; without ".py", relative to it."""
     imports: dict[str, set[str]] = {}
@@ -180,6 +189,7 @@ def main() -> None:
             with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as temporary:
                 package = Path(temporary) / "package"
                 copy_package(package)
+                blind(package)
                 if fault is not None:
                     mutate(package, fault)
                 cache, kept = Path(temporary) / "cache", options.work / "kernels"
