@@ -70,11 +70,17 @@ def inputs(folder: Path, tiny: bool) -> dict[str, Path]:
 
 def blind(package: Path) -> None:
     """Lets the copy write bounds that its own renders leave, which it refuses otherwise: the checker is alone."""
-    file, test = package / "ns_abstract" / "report" / "files.py", "if not excess <= 0.0:"
+    file = package / "ns_abstract" / "report" / "files.py"
     text = file.read_text()
-    if text.count(test) != 1:
-        raise ValueError(f"{test} stands {text.count(test)} times in {file}")
-    file.write_text(text.replace(test, "if np.isnan(excess):"))
+    changes = {"if not excess <= 0.0:": "if np.isnan(excess):"}
+    changes["if not ((images >= result.lower).all() and (images <= result.upper).all()):"] = (
+        "if np.isnan(images).any():"
+    )
+    for old, new in changes.items():
+        if text.count(old) != 1:
+            raise ValueError(f"{old} stands {text.count(old)} times in {file}")
+        text = text.replace(old, new)
+    file.write_text(text)
 
 
 def dependents(package: Path, file: str) -> set[str]:
