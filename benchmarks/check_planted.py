@@ -68,6 +68,21 @@ def inputs(folder: Path, tiny: bool) -> dict[str, Path]:
     return found
 
 
+def blind(package: Path) -> None:
+    """Lets the copy write bounds that its own renders leave, which it refuses otherwise: the checker is alone."""
+    file = package / "ns_abstract" / "report" / "files.py"
+    text = file.read_text()
+    changes = {"if not excess <= 0.0:": "if np.isnan(excess):"}
+    changes["if not ((images >= result.lower).all() and (images <= result.upper).all()):"] = (
+        "if np.isnan(images).any():"
+    )
+    for old, new in changes.items():
+        if text.count(old) != 1:
+            raise ValueError(f"{old} stands {text.count(old)} times in {file}")
+        text = text.replace(old, new)
+    file.write_text(text)
+
+
 def dependents(package: Path, file: str) -> set[str]:
     """The modules of the copy that import ``file``, directly or not, and itself; without ".py", relative to it."""
     imports: dict[str, set[str]] = {}
@@ -114,10 +129,11 @@ def render(package: Path, files: dict[str, Path], out: Path, cache: str, tiny: b
         command = [
             sys.executable, "-W", "ignore", "-m", "ns_abstract.cli.render", "--load-config", str(files[name]),
             "--camera-path-filename", str(files["path"]), "--perturbation-filename", str(files[f"{name} set"]),
-            "--output-dir", str((out / name).absolute()), "--save-cells", "--time-budget", "60", "--target-ratio", "1.2",
+            "--output-dir", str((out / name).absolute()), "--save-cells",
+            "--time-budget", "60", "--target-ratio", "1.2",
         ]  # fmt: skip
         with (out / f"{name}.log").open("w") as log:
-            # Python looks into the folder it is started in first
+            # Python looks first where it is started
             done = subprocess.run(
                 command, env=environment, cwd=package, stdout=log, stderr=log, timeout=1500, check=False
             )
@@ -179,6 +195,7 @@ def main() -> None:
             with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as temporary:
                 package = Path(temporary) / "package"
                 copy_package(package)
+                blind(package)
                 if fault is not None:
                     mutate(package, fault)
                 cache, kept = Path(temporary) / "cache", options.work / "kernels"
