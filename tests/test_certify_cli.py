@@ -29,7 +29,7 @@ from interrupting import check_ended_in_a_library_call, check_interrupted, held_
 from PIL import Image
 from waiting import LONG, until
 
-from ns_abstract.api import showing, substitution
+from ns_abstract.api import showing
 from ns_abstract.api.cell_search import examine_block
 from ns_abstract.api.certification import (
     Certification,
@@ -690,51 +690,6 @@ def test_report(planted: Case, finished: Path) -> None:
     found = sorted(cell["position"] for cell in places["cells"])
     assert places["left_out"] == 0 and {cell["frame"] for cell in places["cells"]} == {0}
     np.testing.assert_allclose(found, sorted(poses.pose(np.array([x]))[:, 3].tolist() for x in middles), atol=1e-5)
-
-
-@pytest.mark.slow
-def test_substitutions_are_compared(blobs: Inputs, net: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Half-widths that any way certifies hold under attack, and the way of the verdicts gives no smaller ones."""
-    monkeypatch.setattr(substitution, "_LEAST", 120.0)
-    spec = {"version": 1, "translation": {"x": 0.02}}
-    case = Case(tmp_path / "case", blobs, net, {"type": "classification", "label": 0, "preprocess": PRE}, spec)
-    pictures = case.job.pictures(0)
-    label = int(case.job.model.outputs(pictures.image(pictures.box.middle)[None])[0].argmax())
-    case = Case(tmp_path / "case", blobs, net, {"type": "classification", "label": label, "preprocess": PRE}, spec)
-    document = case.run(tmp_path / "out", frames=None)
-    found = document["substitution"]
-    assert found["skipped"] is None and 1 <= len(found["cells"]) <= 5 and found["seconds"] > 0.0
-    assert set(found["modes"]) == {"everywhere", "end", "box"}
-    rng = np.random.default_rng(3)
-    for cell in found["cells"]:
-        pictures = case.job.pictures(cell["frame"])
-        claim, margin, half = case.job.claim(pictures), cell["margin"], cell["half_width"]
-        assert margin["everywhere"] > 0.0 and margin["everywhere"] >= margin["box"] - 1e-6
-        middle = 0.5 * (cell["lower"][0] + cell["upper"][0])
-        assert half["everywhere"][0] >= 0.5 * (cell["upper"][0] - cell["lower"][0]) * (1 - 1e-9)
-        for width in half.values():
-            if width is None:
-                continue
-            assert width[0] <= half["everywhere"][0]
-            poses = np.clip(middle + width[0] * np.append(rng.uniform(-1, 1, 5), [-1, 1]), -0.02, 0.02)[:, None]
-            outputs = case.job.model.outputs(np.stack([pictures.image(v) for v in poses]))
-            assert (claim.margin(torch.from_numpy(outputs).double(), torch.from_numpy(poses)) > 0.0).all()
-    page = (tmp_path / "out" / "report.html").read_text()
-    assert "What the shared parameters are worth" in page and "margin, everywhere" in page
-
-
-@pytest.mark.slow
-def test_substitutions_are_not_compared(
-    blobs: Inputs, bright: tuple[Path, float, float], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    prop = {"type": "classification", "label": 0, "preprocess": PRE}
-    document = Case(tmp_path / "pose", blobs, bright[0], prop, None).run(tmp_path / "one")
-    assert "more than one pose" in document["substitution"]["skipped"] and not document["substitution"]["cells"]
-    assert "Not compared: no cell of more" in (tmp_path / "one" / "report.html").read_text()
-    monkeypatch.setattr(substitution, "_LEAST", 1e-9)
-    monkeypatch.setattr(substitution, "SUBSTITUTION_SHARE", 1e-9)
-    document = Case(tmp_path / "set", blobs, bright[0], prop).run(tmp_path / "two")
-    assert "bounding one cell in 3 ways takes about" in document["substitution"]["skipped"]
 
 
 def test_page(finished: Path) -> None:

@@ -22,7 +22,6 @@ from ns_abstract.verify.network import ImageSets, OutputBounds
 from ns_abstract.verify.properties import LinearClaim, Query
 from ns_abstract.verify.search import BLOCK, ContradictionError, Findings, Leaf, Search
 from ns_abstract.verify.store import Block, Store, fractions
-from ns_abstract.verify.substitution import STEP, compare, gains, spread_by_volume
 
 CLAIM = LinearClaim(np.array([[1.0, -1.0]]), np.zeros(1), ((0,),))
 FINGERPRINT = {"scene": "a", "rules": 1}
@@ -80,7 +79,7 @@ class Threshold:
             lower.reshape(m, -1), upper.reshape(m, -1),
         )  # fmt: skip
 
-    def bound(self, images: ImageSets, query: Query, substitution: Any = "everywhere") -> OutputBounds:
+    def bound(self, images: ImageSets, query: Query) -> OutputBounds:
         a, b = images.a_lower.mean(1)[:, None], images.b_lower.mean(1)[:, None] - self.threshold
         return OutputBounds(b - np.abs(a).sum(-1), a, b)
 
@@ -251,7 +250,7 @@ SPOILT_BOUNDS: dict[str, Callable[[OutputBounds], OutputBounds]] = {
 @pytest.mark.parametrize("name", SPOILT_BOUNDS)
 def test_bad_network_bounds_certify_nothing(name: str) -> None:
     class Spoilt(Threshold):
-        def bound(self, images: ImageSets, query: Query, substitution: Any = "everywhere") -> OutputBounds:
+        def bound(self, images: ImageSets, query: Query) -> OutputBounds:
             return SPOILT_BOUNDS[name](super().bound(images, query))
 
     search = Search(Ramp(), Spoilt(0.1), CLAIM, Grid(interval(), (8,), (2,)))
@@ -296,7 +295,7 @@ def test_false_proof_is_noticed() -> None:
             return np.full((2, 2, 3), 0.9 if float(values[0]) in hidden else 0.1, np.float32)
 
     class Liar(Threshold):
-        def bound(self, images: ImageSets, query: Query, substitution: Any = "everywhere") -> OutputBounds:
+        def bound(self, images: ImageSets, query: Query) -> OutputBounds:
             found = super().bound(images, query)
             return OutputBounds(np.ones_like(found.lower), found.a, found.b)
 
@@ -677,63 +676,3 @@ def test_blocks_survive_as_they_are(tmp_path: Path) -> None:
         dataclasses.astuple(Block(k + 1, 0, 0, tuple(search.grid.roots()[i : i + BLOCK])))
         for k, i in enumerate(range(0, 9, BLOCK))
     ]
-
-
-# ---------------------------------------------------------------- weaker bounds
-
-
-class Weaker(Threshold):
-    """Bounds that lose known amounts where parameters are substituted late."""
-
-    def bound(self, images: ImageSets, query: Query, substitution: Any = "everywhere") -> OutputBounds:
-        found = super().bound(images, query)
-        loss = {"everywhere": 0.0, "end": 1.0, "box": 3.0}[substitution]
-        return dataclasses.replace(found, lower=found.lower - loss * np.abs(found.a).sum(-1))
-
-
-def test_comparison_of_substitutions() -> None:
-    """Margins and half-widths against those that follow from the stand-in's formula."""
-    search = search_of(Ramp(slack=1e-4), Weaker(0.43))
-    cell = search.grid.box.replace(0, 0.0, 0.1)
-    found = compare(search, cell, np.inf)
-    assert found is not None and found.box == cell and found.open_ended == ()
-    room = 0.5 + 0.2 * 0.05 - 0.43 - 1e-4
-    for mode, loss in (("everywhere", 1.0), ("end", 2.0), ("box", 4.0)):
-        assert found.margins[mode] == pytest.approx(room - 0.2 * 0.05 * loss)
-        # the largest power of the step that fits
-        most = room / (0.2 * 0.05 * loss)
-        assert found.factors[mode] == pytest.approx(STEP ** np.floor(np.log(most) / np.log(STEP)))
-    assert gains([found])["end"] == pytest.approx(found.factors["everywhere"] / found.factors["end"])
-
-
-def test_comparison_where_widths_end() -> None:
-    # everywhere certified: the whole set ends the ladder
-    search = search_of(Ramp(), Weaker(-2.0))
-    found = compare(search, search.grid.box.replace(0, -0.25, 0.25), np.inf)
-    assert found is not None and set(found.open_ended) == {"everywhere", "end", "box"}
-    assert found.factors["everywhere"] == pytest.approx(4.0) and gains([found])["end"] is None
-    # nothing certified, nothing known
-    search = search_of(Ramp(), Weaker(2.0))
-    found = compare(search, search.grid.box.replace(0, -0.25, 0.25), np.inf)
-    assert found is not None and set(found.factors.values()) == {None} and found.open_ended == ()
-    assert gains([found])["box"] is None
-    # no time
-    assert compare(search, search.grid.box, 0.0) is None
-
-
-@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
-def test_comparison_of_bounds_that_are_no_numbers(value: float) -> None:
-    class Broken(Threshold):
-        def bound(self, images: ImageSets, query: Query, substitution: Any = "everywhere") -> OutputBounds:
-            found = super().bound(images, query)
-            return OutputBounds(found.lower + value, found.a, found.b)
-
-    search = search_of(Ramp(), Broken(0.0))
-    found = compare(search, search.grid.box, np.inf)
-    assert found is not None and set(found.margins.values()) == {-np.inf} and set(found.factors.values()) == {None}
-
-
-def test_cells_spread_by_volume() -> None:
-    assert spread_by_volume([1.0] * 10, 5) == [5, 3, 7, 1, 9]
-    assert spread_by_volume([97.0, 1.0, 1.0, 1.0], 3) == [0]
-    assert spread_by_volume([], 5) == [] and spread_by_volume([0.0], 5) == []

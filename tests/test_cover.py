@@ -395,7 +395,7 @@ class Rounded(Threshold):
         self.lends_anywhere = lends_anywhere
         self.asked: list[tuple[str, int]] = []
 
-    def bound(self, images: ImageSets, query: Query, substitution: Any = "everywhere") -> Any:
+    def bound(self, images: ImageSets, query: Query) -> Any:
         self.asked.append(("alone", images.count))
         return self._lost(images, query)
 

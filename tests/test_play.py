@@ -389,7 +389,6 @@ def certificate(folder: Path) -> Path:
     document = certificate_document(
         about, [entry(0, ("azimuth",)), entry(1, ("azimuth", "<b>"))], state="done", trace=[], seconds=1.0,
         effort={"worker_seconds": 1.0, "cells_bounded": 8}, reasons={}, cells_seal={},
-        substitution={"skipped": "none", "modes": {}, "cells": [], "wider_than": {}, "step": 1.1, "seconds": 0.0},
         scene_margin={"skipped": "not asked for", "kinds": []},
     )  # fmt: skip
     red = preview(np.full((4, 4, 3), (200, 10, 10), np.uint8), 64)

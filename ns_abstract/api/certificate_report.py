@@ -14,7 +14,6 @@ import numpy as np
 from ns_abstract.api.cell_search import CellSearch
 from ns_abstract.api.certification import Certification
 from ns_abstract.api.showing import look_closer
-from ns_abstract.api.substitution import substitution_entry
 from ns_abstract.execution.ending import AbandonedError
 from ns_abstract.report.cameras import Cameras, cameras_entry, cell_cameras, standing
 from ns_abstract.report.certificate import CertifiedRun, certificate_document
@@ -47,7 +46,6 @@ class CertificateReport:
         self.seen: dict[tuple[int, int], dict[str, Any]] = {}
         self.cameras: Cameras | None = None
         #: certified cells bounded in weaker ways, too
-        self.substitution = substitution_entry([], "made when the search ends without being interrupted")
 
     def document(self, store: Store, state: str) -> tuple[dict[str, Any], dict[int, list[dict[str, Any]]]]:
         """Content of report.json, and the cells by frame."""
@@ -65,7 +63,6 @@ class CertificateReport:
             effort=store.effort,
             reasons=store.reasons,
             cells_seal={"rows": store.seal.rows, "sum": store.seal.text},
-            substitution=self.substitution,
             scene_margin=self.search.scene_margin,
             cameras=cameras_entry(cells, left_out),
         )

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -26,7 +25,6 @@ from ns_abstract.api.certification import MEMORY, Certification, PropertySource,
 from ns_abstract.api.job import Job
 from ns_abstract.api.poses import PoseSet
 from ns_abstract.api.scenes import Scene
-from ns_abstract.api.substitution import SUBSTITUTION_SHARE, weaker_bounds
 from ns_abstract.execution.ending import Deadline
 from ns_abstract.execution.engines import EngineName, started
 from ns_abstract.geometry.box import ParameterBox
@@ -153,9 +151,6 @@ class CertificateQuestion(CellQuestion[CertifyProgress]):
         if request.scene_margin:
             check_scenes(any(p.perturbation.scene for p in self.job.job.pose_sets), self.job.job.rays)
 
-    def reserved(self, seconds: float) -> float:
-        return SUBSTITUTION_SHARE * seconds
-
     def prepare(self, search: CellSearch[CertifyProgress], request: Request) -> None:
         if request.report:
             clear_pictures(search.folder)
@@ -170,11 +165,6 @@ class CertificateQuestion(CellQuestion[CertifyProgress]):
         if request.report:
             # renders pictures, for which kernels may have to be compiled
             search.report("running")
-
-    def after(self, search: CellSearch[CertifyProgress], deadline: Deadline) -> None:
-        if search.request.report and not search.stop():
-            with suppress(KeyboardInterrupt), search.stop.at_once():
-                self.reports(search).substitution = weaker_bounds(self.job, search)
 
     def finish(self, search: CellSearch[CertifyProgress]) -> None:
         search.deadline = search.deadline.extended(_LAST)

@@ -33,9 +33,6 @@ METRICS = {
     "not_examined": "part of unknown whose cells were still to be examined",
     "sampled_right": "part of evenly spread poses at whose images the property holds; says nothing about others",
     "margin": "how far the property is from failing; proved from below in certified cells",
-    "substitution": "certified cells bounded in weaker ways, too: margin on the cell, and the largest half-widths "
-    "about its middle that each way certifies, on a ladder of steps by the given factor; says how much the shared "
-    "parameters are worth, and is no part of the certificate",
     "scene_margin": SCENE_MARGIN,
     "cameras": "where the camera of a cell's middle pose stands and where it looks, a unit vector, in the normalised "
     "frame, for the cells that are the largest parts of their sets; left_out: number of the others",
@@ -115,7 +112,6 @@ def certificate_document(
     effort: Mapping[str, float],
     reasons: Mapping[str, int],
     cells_seal: Mapping[str, Any],
-    substitution: Mapping[str, Any],
     scene_margin: Mapping[str, Any],
     cameras: Mapping[str, Any] | None = None,
 ) -> dict[str, Any]:
@@ -131,7 +127,6 @@ def certificate_document(
         effort: Figures of the work done.
         reasons: Why cells are unknown, and how many.
         cells_seal: Number of rows of ``cells`` with a verdict, and the sum of their hashes.
-        substitution: A few certified cells bounded in weaker ways, too.
         scene_margin: Largest variations of the scene for which what is certified holds.
         cameras: Where cameras of cells stand; None: of none.
     """
@@ -171,7 +166,6 @@ def certificate_document(
             "effort": effort,
             "unknown_because": reasons,
             "cells_seal": cells_seal,
-            "substitution": substitution,
             "scene_margin": scene_margin,
             "cameras": cameras or {"cells": [], "left_out": 0},
             "plan": run.plan,

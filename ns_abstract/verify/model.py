@@ -15,7 +15,6 @@ from ns_abstract.verify.network import (
     Network,
     NetworkArithmetic,
     OutputBounds,
-    Substitution,
     bound_outputs,
     lends_anywhere,
 )
@@ -73,14 +72,13 @@ class NetworkModel:
         shared = Family(self.network, parametric(images), memory=self.memory, arithmetic=self.arithmetic)
         return ModelFamily(shared)
 
-    def bound(self, images: ImageSets, query: Query, substitution: Substitution = "everywhere") -> OutputBounds:
+    def bound(self, images: ImageSets, query: Query) -> OutputBounds:
         d = images.dimensions
         found = bound_outputs(
             self.network,
             parametric(images),
             query.rows,
             query.offset,
-            substitution=substitution,
             memory=self.memory,
             arithmetic=self.arithmetic,
         )

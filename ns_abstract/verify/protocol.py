@@ -10,7 +10,7 @@ import torch
 
 from ns_abstract.geometry.box import ParameterBox
 from ns_abstract.refine.protocol import Member
-from ns_abstract.verify.network import ImageSets, OutputBounds, Substitution
+from ns_abstract.verify.network import ImageSets, OutputBounds
 from ns_abstract.verify.properties import Query
 
 
@@ -51,7 +51,7 @@ class Model(Protocol):
         """Sets of the network's input; see `ns_abstract.verify.preprocess.Preprocess.sets`."""
         ...
 
-    def bound(self, images: ImageSets, query: Query, substitution: Substitution = "everywhere") -> OutputBounds:
+    def bound(self, images: ImageSets, query: Query) -> OutputBounds:
         """Bounds of the query's rows over the sets."""
         ...
 

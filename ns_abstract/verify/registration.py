@@ -16,7 +16,7 @@ import torch
 from ns_abstract.arithmetic.network_charges import OWN_LINE
 from ns_abstract.geometry.box import ParameterBox
 from ns_abstract.refine.protocol import Frame, Member, Score
-from ns_abstract.verify.network import ImageSets, OutputBounds, Substitution
+from ns_abstract.verify.network import ImageSets, OutputBounds
 from ns_abstract.verify.properties import Query
 from ns_abstract.verify.protocol import Model, Scene
 
@@ -120,9 +120,9 @@ class RegisteredModel:
         # what holds for all parameters holds for all places
         self.branch = model.branch
 
-    def bound(self, images: ImageSets, query: Query, substitution: Substitution = "everywhere") -> OutputBounds:
+    def bound(self, images: ImageSets, query: Query) -> OutputBounds:
         """Bounds in the poses' parameters, for all places of the scene."""
-        found = self.model.bound(images, query, substitution)
+        found = self.model.bound(images, query)
         kept = images.dimensions - PLACE
         lost = np.abs(found.a[..., kept:]).sum(axis=-1)
         with np.errstate(invalid="ignore"):
