@@ -32,15 +32,14 @@ sys.path[:0] = [str(ROOT), str(ROOT / "tests"), str(ROOT / "benchmarks")]
 
 import extreme_networks as extreme  # noqa: E402  # pyright: ignore[reportMissingImports]
 import network_attack as attack  # noqa: E402  # pyright: ignore[reportMissingImports]
+from network_charges_page import CHARGES, page  # noqa: E402  # pyright: ignore[reportMissingImports]
 
-from ns_abstract.arithmetic import network_charges  # noqa: E402
-from ns_abstract.arithmetic.network_table import FUNCTIONS, ROWS, SUMS, SYMBOLS, Row  # noqa: E402
+from ns_abstract.arithmetic.network_table import ROWS  # noqa: E402
 from ns_abstract.io.errors import InputError  # noqa: E402
 from ns_abstract.verify.network import ImageSets, bound_outputs  # noqa: E402
 from ns_abstract.verify.network.onnx_file import read_onnx  # noqa: E402
 
 PAGE = ROOT / "docs" / "measurements.md"
-CHARGES = ROOT / "docs" / "network-charges.md"
 MARKS = "<!-- ledger of networks -->", "<!-- end of the ledger of networks -->"
 BITS = 200
 Array = np.ndarray
@@ -453,57 +452,6 @@ def table(found: dict[str, Entry]) -> str:
                 f"| {row.kind} | {entry.compared:,} | {entry.unbounded:,} | {entry.ratio:.2f} | {entry.program} |"
             )
     return "\n".join(lines)
-
-
-# ---------------------------------------------------------------- the page of charges
-
-
-def page() -> str:
-    """docs/network-charges.md."""
-
-    def rows(part: tuple[Row, ...]) -> str:
-        lines = ["| layer | charge | programs | proof |", "|---|---|---|---|"]
-        for row in part:
-            charge = f"`{row.charge}`".replace("|", "\\|")
-            also = "; with real arithmetic, too" if row.real else ""
-            lines.append(f"| {row.kind} | {charge}{also} | {row.programs} | {row.labels} |")
-        return "\n".join(lines)
-
-    symbols = "\n".join(f"| `{name}` | {meaning} |" for name, meaning in SYMBOLS.items())
-    constants = "\n".join(
-        f"| `{name}` | {value / network_charges.UNIT:.6g} | {value:.4g} |"
-        for name, value in vars(network_charges).items()
-        if name.isupper() and isinstance(value, float) and value < 2.0**-8
-    )
-    return f"""# What networks are charged with
-
-For every kind of layer: how far a float32 program may be from the layer's exact value, which programs that covers, and
-where it is proved. The table is `ns_abstract/arithmetic/network_table.py`, its constants with their counts are in
-`ns_abstract/arithmetic/network_charges.py`; `python benchmarks/network_ledger.py --write` writes this page and measures
-every row ([measurements](measurements.md#ledger-of-networks-charges)).
-
-Not covered: TF32 and half precision, Winograd and FFT convolutions.
-
-## Sums, scales, maps
-
-{rows(SUMS)}
-
-## Functions of one number
-
-{rows(FUNCTIONS)}
-
-## Symbols
-
-| symbol | meaning |
-|---|---|
-{symbols}
-
-## Constants
-
-| constant | units of float32 | value |
-|---|---|---|
-{constants}
-"""
 
 
 def main() -> int:
