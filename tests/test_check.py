@@ -360,7 +360,7 @@ def test_bounds_moved_inward_are_refuted(copy: Path) -> None:
     found = check(copy, claims=30, seconds=60)
     assert found.refuted > 0 and found.exit_code == 1
     worst = found.refutations[0]
-    assert worst["bound"] == "upper" and worst["error"] < 1e-6 and worst["excess"] > worst["error"]
+    assert worst["bound"] == "upper" and worst["error"] < 1e-3 and worst["excess"] > worst["error"]
 
 
 @pytest.mark.slow

@@ -114,7 +114,7 @@ def read_verdicts(folder: Path, report: dict[str, Any]) -> list[Cells]:
     try:
         sets: dict[int, Any] = dict.fromkeys((0, 1), report["parameters"]) if loop else {}
         sets |= {} if loop else {int(f["index"]): f["parameters"] for f in report["frames"]}
-        base = sqlite3.connect(f"{file.resolve().as_uri()}?mode=ro&immutable=1", uri=True)
+        base = sqlite3.connect(f"{file.resolve().as_uri()}?mode=ro", uri=True)
         # rows that stand for what is still to be examined
         query = "SELECT value FROM search_state WHERE key = 'open_rows'"
         left = set(json.loads((base.execute(query).fetchone() or ["[]"])[0]))

@@ -123,12 +123,7 @@ class _Verdicts:
 
 
 class Certificate(_Verdicts):
-    """The claims of a frame's cells: a class is the largest output on every picture of a cell, or not on one.
-
-    Args:
-        cells, scene, poses, report: As for `Picture`.
-        model: The network's file.
-    """
+    """The claims of a frame's cells: a class is the largest output on every picture of a cell, or not on one."""
 
     kinds = "certified", "falsified"
 
