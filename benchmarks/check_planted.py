@@ -4,6 +4,7 @@ Every fault is applied to a copy of the package, which compiles its kernels into
 scenes. Where a bound differs from the healthy one by more than 1e-3 the healthy package's checker audits the result.
 
     python benchmarks/check_planted.py WORK [--faults 40] [--seed 0] [--claims 200] [--seconds 120] [--audit-only]
+        [--interpreted] [--part 0 1]
 
 keeps results in WORK, goes on from what lies there, and prints one line a fault.
 """
@@ -42,8 +43,8 @@ def candidates() -> list[Fault]:
     return [f for f in FAULTS if f.file.startswith(folder) and not f.file[len(folder) :].startswith(_OTHER)]
 
 
-def inputs(folder: Path) -> dict[str, Path]:
-    """Writes the runs, the camera path and the sets; the path of each by its name."""
+def inputs(folder: Path, tiny: bool) -> dict[str, Path]:
+    """Writes the runs, the path and the sets; the path of each by its name. ``tiny``: for interpreted kernels."""
     sys.path.insert(0, str(ROOT / "tests"))
     from dataclasses import replace
 
@@ -53,8 +54,9 @@ def inputs(folder: Path) -> dict[str, Path]:
     for name, mode in (("shift", "classic"), ("turn", "antialiased")):
         where = folder / name
         where.mkdir(parents=True, exist_ok=True)
-        scene = blob_scene(40, degree=2)
+        scene = blob_scene(14 if tiny else 40, degree=1 if tiny else 2)
         scene = replace(scene, rasterize_mode=mode, opacity_logits=2.0 * scene.opacity_logits)
+        scene = replace(scene, log_scales=scene.log_scales + np.float32(0.8 * tiny))
         config = where / "blobs"
         found[name] = (
             next(config.rglob("config.yml"))
@@ -62,8 +64,23 @@ def inputs(folder: Path) -> dict[str, Path]:
             else write_splatfacto_run(scene, where, timestamp="2026-01-01_120000", experiment_name="blobs")
         )
         found[f"{name} set"] = write_json(where / "spec.json", _SPECS[name])
-    found["path"] = write_json(folder / "path.json", path_json(ring(1, 24)))
+    found["path"] = write_json(folder / "path.json", path_json(ring(1, 6 if tiny else 24)))
     return found
+
+
+def blind(package: Path) -> None:
+    """Lets the copy write bounds that its own renders leave, which it refuses otherwise: the checker is alone."""
+    file = package / "ns_abstract" / "report" / "files.py"
+    text = file.read_text()
+    changes = {"if not excess <= 0.0:": "if np.isnan(excess):"}
+    changes["if not ((images >= result.lower).all() and (images <= result.upper).all()):"] = (
+        "if np.isnan(images).any():"
+    )
+    for old, new in changes.items():
+        if text.count(old) != 1:
+            raise ValueError(f"{old} stands {text.count(old)} times in {file}")
+        text = text.replace(old, new)
+    file.write_text(text)
 
 
 def dependents(package: Path, file: str) -> set[str]:
@@ -90,7 +107,8 @@ def warm(package: Path, file: str, kept: Path, cache: Path) -> None:
         return
     environment = {k: v for k, v in os.environ.items() if k != "NS_ABSTRACT_DEV_KEY"} | {"PYTHONPATH": str(package)}
     program = "from ns_abstract.arithmetic.kernel_cache import source_key; print(source_key())"
-    done = subprocess.run([sys.executable, "-c", program], env=environment, capture_output=True, text=True, check=True)
+    command = [sys.executable, "-c", program]
+    done = subprocess.run(command, env=environment, cwd=package, capture_output=True, text=True, check=True)
     (old,) = (path.parent for path in kept.glob("*/manifest.json"))
     new = cache / done.stdout.split()[-1]
     shutil.copytree(old, new, ignore=shutil.ignore_patterns("session-*"))
@@ -100,20 +118,25 @@ def warm(package: Path, file: str, kept: Path, cache: Path) -> None:
     (new / "manifest.json").write_text(json.dumps(left))
 
 
-def render(package: Path, files: dict[str, Path], out: Path, cache: str) -> bool:
+def render(package: Path, files: dict[str, Path], out: Path, cache: str, tiny: bool) -> bool:
     """Bounds both scenes with the package in ``package``; whether that ended well."""
     environment = {k: v for k, v in os.environ.items() if k != "NS_ABSTRACT_DEV_KEY"}
     environment |= {"PYTHONPATH": str(package), "PYTHONDONTWRITEBYTECODE": "1", "NS_ABSTRACT_CACHE_DIR": cache}
+    environment |= {"NUMBA_DISABLE_JIT": "1"} if tiny else {}
     for name in _SPECS:
         if (out / name / "report.json").exists():
             continue
         command = [
             sys.executable, "-W", "ignore", "-m", "ns_abstract.cli.render", "--load-config", str(files[name]),
             "--camera-path-filename", str(files["path"]), "--perturbation-filename", str(files[f"{name} set"]),
-            "--output-dir", str(out / name), "--save-cells", "--time-budget", "60", "--target-ratio", "1.2",
+            "--output-dir", str((out / name).absolute()), "--save-cells",
+            "--time-budget", "60", "--target-ratio", "1.2",
         ]  # fmt: skip
         with (out / f"{name}.log").open("w") as log:
-            done = subprocess.run(command, env=environment, stdout=log, stderr=log, timeout=1500, check=False)
+            # Python looks first where it is started
+            done = subprocess.run(
+                command, env=environment, cwd=package, stdout=log, stderr=log, timeout=1500, check=False
+            )
         if done.returncode != 0:
             return False
     return True
@@ -153,12 +176,16 @@ def main() -> None:
     parser.add_argument("--claims", type=int, default=200)
     parser.add_argument("--seconds", type=float, default=120.0)
     parser.add_argument("--audit-only", action="store_true", help="audit what has been rendered, and render nothing")
+    parser.add_argument("--interpreted", action="store_true", help="interpret the kernels, on tiny scenes")
+    parser.add_argument("--part", type=int, nargs=2, default=(0, 1), help="every n-th fault from the k-th on: k n")
     options = parser.parse_args()
     options.work.mkdir(parents=True, exist_ok=True)
-    files = inputs(options.work / "inputs")
+    files = inputs(options.work / "inputs", options.interpreted)
     drawn: list[Fault | None] = [None, *random.Random(options.seed).sample(candidates(), options.faults)]
     changed = refuted = 0
     for number, fault in enumerate(drawn):
+        if fault is not None and number % options.part[1] != options.part[0]:
+            continue
         out = options.work / ("healthy" if fault is None else f"{number:02d}")
         out.mkdir(exist_ok=True)
         name = "no fault" if fault is None else fault.name
@@ -168,13 +195,14 @@ def main() -> None:
             with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as temporary:
                 package = Path(temporary) / "package"
                 copy_package(package)
+                blind(package)
                 if fault is not None:
                     mutate(package, fault)
                 cache, kept = Path(temporary) / "cache", options.work / "kernels"
                 if fault is not None:
                     warm(package, fault.file, kept, cache)
-                ended = render(package, files, out, str(cache))
-                if fault is None:
+                ended = render(package, files, out, str(cache), options.interpreted)
+                if fault is None and not options.interpreted:
                     shutil.copytree(cache, kept)
                 if not ended:
                     (out / "failed").touch()

@@ -165,18 +165,20 @@ def main() -> int:
         if options.list:
             print(f"{len(chosen)} mutants apply")
             return 0
-        healthy: dict[str, bool] = {}
+        healthy: dict[str, int] = {}
         for mutant in chosen:
             if time.perf_counter() - begun > options.seconds:
                 break
             compiled = options.compiled or mutant.compiled
             if mutant.test not in healthy:
                 code, output, _ = run_test(folder, mutant.test, compiled)
-                healthy[mutant.test] = code == _PASSED
+                healthy[mutant.test] = code
                 if code != _PASSED:
                     print(output[-2000:])
             verdict, seconds = "its test fails without it", 0.0
-            if healthy[mutant.test]:
+            if healthy[mutant.test] == _LATE:
+                verdict = "timed out"
+            elif healthy[mutant.test] == _PASSED:
                 original = mutate(folder, mutant)
                 code, output, seconds = run_test(folder, mutant.test, compiled)
                 (folder / "ns_abstract" / mutant.file).write_text(original)
@@ -185,7 +187,9 @@ def main() -> int:
                 verdicts = {_PASSED: "survived", _FAILED: "killed" if asserted else "crashed", _LATE: "timed out"}
                 verdict = verdicts.get(code, f"pytest {code}")
             ran, killed = ran + 1, killed + (verdict == "killed")
-            outcomes[digest(mutant)] = Outcome(verdict, seconds, date.today().isoformat())
+            # a machine that is busy says nothing of a fault
+            if verdict != "timed out":
+                outcomes[digest(mutant)] = Outcome(verdict, seconds, date.today().isoformat())
             REPORT.write_text(table(outcomes))
             print(f"{verdict:10s} {seconds:6.1f} s  {mutant.name}", flush=True)
     print(f"{killed} of {len(chosen)} mutants killed, {len(chosen) - ran} were not run.")

@@ -59,7 +59,7 @@ MEASURED: dict[str, tuple[tuple[str, ...], ...]] = {
     "layer of sums: fully connected, (transposed) convolution, mean, average pooling": (("gemm",), ("sum",), ("mean",)),
     "shift folded into the sums behind it": (("scale", "gemm"), ("shift", "gemm"), ("batch norm", "gemm")),
     "scale, shift, batch normalisation": (("scale",), ("shift",), ("batch norm",), ("gemm", "scale")),
-    "sum of nodes": (("residual",), ("gemm", "residual")),
+    "sum of nodes": (("mean",), ("gemm", "residual")),
     "flushed numbers of every linear layer": (("scale", "scale"), ("gemm", "scale", "scale")),
     "variance of a norm": (("norm",), ("spelled norm",)),
     "maximum, minimum": (("maximum",),),

@@ -7,17 +7,20 @@ import os
 import signal
 import sys
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numba
 import numpy as np
 import pytest
 
 from ns_abstract.arithmetic.kernel_cache import store
+from ns_abstract.execution.engine_options import EngineOptions
 from ns_abstract.geometry.views import View, look_at, path_json
 from ns_abstract.io.atomic import write_json
+from ns_abstract.methods.overrides import Overrides
+from ns_abstract.methods.program_options import ProgramOptions
 from ns_abstract.methods.splat.scene import SplatScene
 from ns_abstract.methods.splat.write import write_splatfacto_run
 
@@ -62,6 +65,20 @@ def environment() -> dict[str, str]:
     """For processes of their own: they find this package wherever they run, and the kernels that were compiled here."""
     store().publish()
     return os.environ | {"PYTHONPATH": str(ROOT)}
+
+
+#: Records of options that several commands have.
+_RECORDS = {"program": ProgramOptions, "where": EngineOptions, "overrides": Overrides}
+T = TypeVar("T")
+
+
+def command_options(command: Callable[..., T], *given: Any, **values: Any) -> T:
+    """Options of a command by name, whichever record declares them."""
+    for record, kind in _RECORDS.items():
+        names = {entry.name for entry in fields(kind)} & set(values)
+        if names:
+            values[record] = kind(**{name: values.pop(name) for name in names})
+    return command(*given, **values)
 
 
 #: A command's ``main`` and its options to exit code, stdout and stderr.

@@ -165,6 +165,7 @@ def records(scene: SplatScene, poses: PoseSet, order: int) -> tuple[np.ndarray, 
     return low, high, found[:, UNBOUNDED] != 0.0, shown
 
 
+@pytest.mark.slow_cases
 @pytest.mark.parametrize("name", SETS)
 @pytest.mark.parametrize("shape", SHAPES)
 def test_computed_factor(shape: str, name: str) -> None:
@@ -230,6 +231,7 @@ def run(request: pytest.FixtureRequest, tmp_path: Path) -> tuple[Path, Path]:
     return config, RUNS / request.param / "camera_path.json"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("run", ["playbot_lod3", "plant"], indirect=True)
 def test_runs(run: tuple[Path, Path]) -> None:
     """A trained scene: one pose, and a set that moves the camera by 0.02."""
@@ -253,6 +255,7 @@ def test_runs(run: tuple[Path, Path]) -> None:
     assert gaps["float32", "x"] < 1.02 * gaps["real", "x"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("run", ["playbot_lod3"], indirect=True)
 def test_attack(run: tuple[Path, Path]) -> None:
     """Refined float32 bounds against both renderers."""

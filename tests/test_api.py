@@ -189,6 +189,7 @@ def test_on_progress_ends_the_work(wall: nsa.Scene) -> None:
     assert all(p.frame == 0 and p.budget <= 600.0 and p.mpg >= p.mpg_witness for p in seen)
 
 
+@pytest.mark.slow_cases
 @pytest.mark.parametrize("how", ["signal", "raised"])
 def test_interrupt_keeps_what_is_known(how: str, wall: nsa.Scene, request: pytest.FixtureRequest) -> None:
     if how == "signal":
@@ -216,6 +217,7 @@ def test_interrupt_keeps_what_is_known(how: str, wall: nsa.Scene, request: pytes
     assert not nsa.bound(wall, poses, target_ratio=100.0).interrupted
 
 
+@pytest.mark.slow
 def test_certificate_ends_early_and_goes_on(wall: nsa.Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     from ns_abstract.api import searching
 
@@ -267,6 +269,7 @@ def test_splats(blobs: Inputs, tmp_path: Path) -> None:
     assert wider.mpg > 0.0 and any("opacity" in sentence for sentence in wider.plan)
 
 
+@pytest.mark.slow
 def test_nerf(tmp_path: Path) -> None:
     config = write_nerf_run(tiny_scene(0), tmp_path, timestamp="2026-01-01_000000", experiment_name="tiny")
     scene = nsa.load_scene(config, num_samples=8)
@@ -355,6 +358,7 @@ def test_results_show_themselves(wall: nsa.Scene, tmp_path: Path) -> None:
     assert "certified" in text and "every image" in text
 
 
+@pytest.mark.slow
 def test_import_is_light() -> None:
     code = (
         "import sys, ns_abstract as nsa; assert not {'numpy', 'torch', 'numba', 'onnx'} & set(sys.modules); "
@@ -366,6 +370,7 @@ def test_import_is_light() -> None:
         nsa.nothing  # noqa: B018
 
 
+@pytest.mark.slow
 def test_a_function_is_not_hidden_by_the_folder_of_its_name() -> None:
     code = "from ns_abstract import ReachResult; from ns_abstract import reach; reach.__call__"
     subprocess.run([sys.executable, "-c", code], check=True, timeout=120)

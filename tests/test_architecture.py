@@ -9,6 +9,7 @@ import shutil
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -59,6 +60,12 @@ def imported(tree: ast.AST) -> Iterator[tuple[int, str]]:
             yield from ((node.lineno, f"{node.module}.{alias.name}") for alias in node.names)
 
 
+@cache
+def imports(text: str) -> list[tuple[int, str]]:
+    """`imported` of a source, looked for once."""
+    return list(imported(ast.parse(text)))
+
+
 def dotted(node: ast.AST) -> str:
     """``a.b.c`` of a name or attribute, else what can be told of it."""
     if isinstance(node, ast.Attribute):
@@ -92,7 +99,7 @@ def circle(texts: dict[str, str]) -> list[str]:
     """Modules that import one another in a circle, given their texts; what is imported for types alone counts, too."""
     used = {}
     for name, text in texts.items():
-        found = {which for _, which in imported(ast.parse(text))}
+        found = {which for _, which in imports(text)}
         used[name] = {w if w in texts else w.rpartition(".")[0] for w in found} & texts.keys()
     try:
         graphlib.TopologicalSorter(used).prepare()
@@ -149,7 +156,7 @@ def drawing() -> str:
     for file in sources():
         folder = file.relative_to(PACKAGE).parts[0]
         if folder in used:
-            names = [name.split(".") for _, name in imported(ast.parse(file.read_text(encoding="utf-8")))]
+            names = [name.split(".") for _, name in imports(file.read_text(encoding="utf-8"))]
             used[folder] |= {parts[1] for parts in names if parts[0] == "ns_abstract" and len(parts) > 1}
     width = max(map(len, LEVELS))
     rows = []
@@ -189,7 +196,7 @@ def test_only_the_plug_in_imports_nerfstudio() -> None:
     plug_in = {"nerfstudio", "viser", "torchmetrics", "gsplat"}
     for file in sources():
         if file.relative_to(PACKAGE).parts[0] != "nerfstudio":
-            found = {name.split(".")[0] for _, name in imported(ast.parse(file.read_text(encoding="utf-8")))}
+            found = {name.split(".")[0] for _, name in imports(file.read_text(encoding="utf-8"))}
             assert not found & plug_in, file
 
 
@@ -281,7 +288,7 @@ def test_every_import_is_a_dependency() -> None:
     optional = required(extras["nerfstudio"] + extras["cluster"] + extras["video"])
     used: set[str] = set()
     for file in sources():
-        for _, name in imported(ast.parse(file.read_text(encoding="utf-8"))):
+        for _, name in imports(file.read_text(encoding="utf-8")):
             top = name.split(".")[0]
             if top not in sys.stdlib_module_names and top != "ns_abstract":
                 used.add(DISTRIBUTIONS.get(top, top).lower())

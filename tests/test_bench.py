@@ -39,6 +39,7 @@ def job(blobs) -> PathJob:
     return open_jobs((blobs.config,), blobs.path, 1.0)[0]
 
 
+@pytest.mark.slow
 def test_ours_are_tighter_than_the_papers(job: PathJob) -> None:
     rows = rules.compare(job, "yaw", 0, 8, pixels=3, most=12)
     assert [row["rules"] for row in rows] == ["ours", *rules.PAPER_RULES]
@@ -49,6 +50,7 @@ def test_ours_are_tighter_than_the_papers(job: PathJob) -> None:
     assert others[0] < others[-1]
 
 
+@pytest.mark.slow
 def test_wrong_rules_are_noticed(job: PathJob, monkeypatch: pytest.MonkeyPatch) -> None:
     own = rules._own
 
@@ -96,6 +98,7 @@ def test_a_plan_that_loses_something_is_noticed(job: PathJob, monkeypatch: pytes
     assert rows[0]["looser by"] == 0.0 and rows[1]["looser by"] > 0.005
 
 
+@pytest.mark.slow
 def test_commands(blobs, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     files = {"load_config": (blobs.config,), "camera_path_filename": blobs.path}
     assert bench(Plan(**files, output_dir=tmp_path, sets=("x",), cells=4)) == DONE
@@ -141,6 +144,7 @@ def test_resampled_scenes_cover_as_much(job: PathJob, count: int) -> None:
         assert {tuple(m) for m in found.means} <= {tuple(m) for m in scene.means}
 
 
+@pytest.mark.slow
 def test_cost_by_scale(blobs, tmp_path: Path) -> None:
     options = Scale((blobs.config,), blobs.path, tmp_path, gaussians=(10, 60), widths=(24,), repeats=1, seconds=1.0)
     assert bench(options) == DONE

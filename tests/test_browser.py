@@ -97,6 +97,7 @@ def slider(label: str) -> str:
     )
 
 
+@pytest.mark.slow
 def test_slider_to_picture(server: Server, tmp_path: Path) -> None:
     with Browser(server.url, tmp_path / "profile") as browser:
         until(lambda: "send to certify" in browser.text(), "the panel")

@@ -24,7 +24,7 @@ import onnxruntime
 import pytest
 import torch
 from certifying import classifier, linear
-from conftest import InProcess, Inputs, environment
+from conftest import InProcess, Inputs, command_options, environment
 from interrupting import check_ended_in_a_library_call, check_interrupted, held_at, interrupted_at
 from PIL import Image
 from waiting import LONG, until
@@ -92,7 +92,7 @@ class Case:
         return found
 
     def run(self, output: Path, **more: Any) -> dict[str, Any]:
-        assert certify(Certify(**self.values(output, **more))) == 0
+        assert certify(command_options(Certify, **self.values(output, **more))) == 0
         return report(output)
 
     @property
@@ -301,6 +301,7 @@ def test_rounded_pictures(planted: Case, tmp_path: Path) -> None:
     assert "rounded to 8 bits" in (tmp_path / "out" / "report.html").read_text()
 
 
+@pytest.mark.slow
 def test_random_network(blobs: Inputs, net: Path, tmp_path: Path) -> None:
     """Two parameters, a network with two layers of ReLU; the label is the one of the middle."""
     spec = {"version": 1, "translation": {"x": 0.004}, "rotation": {"yaw": 0.004}}
@@ -328,7 +329,7 @@ def test_unsound_network_bounds_are_caught_by_the_attack(
     monkeypatch.setattr(model, "bound_outputs", raised)
     forget()
     try:
-        assert certify(Certify(**planted.values(tmp_path / "out"))) == 0
+        assert certify(command_options(Certify, **planted.values(tmp_path / "out"))) == 0
     except RuntimeError as error:
         # its own attack noticed it first
         assert "internal error" in str(error)
@@ -355,7 +356,7 @@ def test_broken_bounds_never_certify(kind: str, planted: Case, tmp_path: Path, m
 
     monkeypatch.setattr(model, "bound_outputs", broken)
     forget()
-    assert certify(Certify(**planted.values(tmp_path / "out", time_budget=5.0))) == 0
+    assert certify(command_options(Certify, **planted.values(tmp_path / "out", time_budget=5.0))) == 0
     forget()
     document = report(tmp_path / "out")
     assert document["coverage"]["certified"] == 0.0
@@ -478,7 +479,7 @@ def test_killed_run_resumed_equals_an_uninterrupted_one(planted: Case, finished:
         process = held_at(1, MODULE, planted.options(folder, resume=resume))
         process.kill()
         process.wait()
-    planted.run(folder, resume=True)
+    assert certify(command_options(Certify, **planted.values(folder, resume=True))) == 0
     assert cells(folder) == cells(finished)
     one, other = report(folder), report(finished)
     for key in ("verdict", "coverage", "sampled"):
@@ -532,23 +533,23 @@ def test_ended_while_kernels_are_compiled(planted: Case, tmp_path: Path) -> None
 @pytest.mark.slow
 def test_budget_ends_with_a_result_and_is_continued(planted: Case, finished: Path, tmp_path: Path) -> None:
     folder = tmp_path / "out"
-    assert certify(Certify(**planted.values(folder, time_budget=1e-6))) == 0
+    assert certify(command_options(Certify, **planted.values(folder, time_budget=1e-6))) == 0
     first = report(folder)
     assert first["state"] == "budget" and first["verdict"] != "certified"
     assert first["coverage"]["not_examined"] > 0.0 and first["frames"][0]["cells"]["open"] > 0
     # a second frame without any result is not done
-    assert certify(Certify(**planted.values(tmp_path / "two", time_budget=1e-6, frames=(0, 1)))) == 3
+    assert certify(command_options(Certify, **planted.values(tmp_path / "two", time_budget=1e-6, frames=(0, 1)))) == 3
     planted.run(folder, resume=True)
     assert cells(folder) == cells(finished)
 
 
 def test_resume_refuses_other_inputs(planted: Case, net: Path, finished: Path, tmp_path: Path) -> None:
     folder = tmp_path / "out"
-    certify(Certify(**planted.values(folder, time_budget=1e-6)))
+    certify(command_options(Certify, **planted.values(folder, time_budget=1e-6)))
     before = cells(folder)
     for change in ({"model": net}, {"arithmetic": "real"}, {"perturbation_filename": None}):
         with pytest.raises(InputError) as caught:
-            certify(Certify(**planted.values(folder, resume=True, **change)))
+            certify(command_options(Certify, **planted.values(folder, resume=True, **change)))
         assert caught.value.field == "--resume"
     assert [row[:3] for row in cells(folder)] == [row[:3] for row in before]
 
@@ -1013,6 +1014,7 @@ def test_a_variation_that_picks_nothing(
     assert code == 2 and said.count("\n") == 1 and "spec.json: scene[0].select" in said and "picks none" in said
 
 
+@pytest.mark.slow
 def test_help_is_quick_and_light() -> None:
     shown = subprocess.run(
         [sys.executable, "-X", "importtime", "-m", MODULE, "--help"],

@@ -591,6 +591,7 @@ def test_cells_far_from_a_proof_come_last() -> None:
     assert nothing.examine([cell]).ranks[0] > 1e6
 
 
+@pytest.mark.slow
 def test_deep_first_proves_early() -> None:
     """Where every cell needs several cuts, half of the work proves nearly half of the set."""
 

@@ -113,7 +113,7 @@ def test_networks_are_enclosed(radius: float, tmp_path: Path) -> None:
         assert (least[0].numpy() <= value).all() and (value <= most[0].numpy()).all()
         found.append(value)
     # rows that go back keep what the picture's slopes cancel
-    assert (most - least).max() < 8.0 * max(np.ptp(found, axis=0).max(), 1e-3)
+    assert (most - least).max() < 16.0 * max(np.ptp(found, axis=0).max(), 2e-3)
     assert (exact.least(form, rows) >= least).all() and (exact.least(form, rows) > least).any()
 
 
@@ -151,7 +151,7 @@ def certificate(blobs: Inputs, tmp_path_factory: pytest.TempPathFactory) -> Path
 
     options = {
         "load-config": blobs.config, "camera-path-filename": folder / "path.json", "model": net,
-        "property": folder / "prop.json", "output-dir": folder / "out", "time-budget": 60,
+        "property": folder / "prop.json", "output-dir": folder / "out", "time-budget": 300,
     }  # fmt: skip
     before = sys.argv
     sys.argv = [

@@ -95,6 +95,7 @@ def check_samples(inputs: Inputs, folder: Path, index: int, **settings: Any) -> 
 # ---------------------------------------------------------------- help
 
 
+@pytest.mark.slow_cases
 @pytest.mark.parametrize(
     ("module", "option"),
     [
@@ -599,6 +600,7 @@ def test_damaged_frames_are_computed_again(
     same_pictures(frame(tmp_path, 1), frame(finished, 1))
 
 
+@pytest.mark.slow_cases
 @pytest.mark.parametrize("change", ["spec", "downscale_factor", "renderer", "arithmetic", "scene"])
 def test_resuming_with_other_settings_is_refused(
     change: str, make_blobs: Callable[..., Inputs], tmp_path: Path, call: Callable[..., tuple[int, str]]
@@ -672,6 +674,7 @@ def test_interrupted_before_the_first_frame(
         same_pictures(frame(folder, 0), frame(finished, 0))
 
 
+@pytest.mark.slow
 def test_ended_while_kernels_are_compiled(blobs: Inputs, tmp_path: Path) -> None:
     folder = tmp_path / "out"
     options = blobs.options(folder, frames=[0])

@@ -93,6 +93,7 @@ def busy(client: Any, folder: Path) -> Cluster:
     return engine
 
 
+@pytest.mark.slow
 def test_a_killed_worker_loses_nothing(parts: Parts, tmp_path: Path) -> None:
     with connected(parts.address) as client:
         until(lambda: len(client.nthreads()) == 2)
@@ -107,6 +108,7 @@ def test_a_killed_worker_loses_nothing(parts: Parts, tmp_path: Path) -> None:
         assert engine.collect(0.1) == []
 
 
+@pytest.mark.slow
 def test_a_killed_scheduler_is_noticed(parts: Parts, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(engines, "_GONE", 1.0)
     with connected(parts.address) as client:
@@ -118,6 +120,7 @@ def test_a_killed_scheduler_is_noticed(parts: Parts, tmp_path: Path, monkeypatch
         engine.close()
 
 
+@pytest.mark.slow
 def test_workers_that_do_not_come_back_are_noticed(
     parts: Parts, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -149,6 +152,7 @@ if __name__ == "__main__":
 """
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("local", [True, False])
 def test_a_killed_client_leaves_nothing_behind(local: bool, tmp_path: Path) -> None:
     """A cluster of its own ends with it; another one forgets its tasks and serves the next client."""
@@ -313,6 +317,7 @@ def pem(tmp_path: Path) -> dict[str, Path]:
     return {"ca_file": cert, "cert": cert, "key": key}
 
 
+@pytest.mark.slow
 def test_tls_from_end_to_end(pem: dict[str, Path], tmp_path: Path) -> None:
     security = [word for name, file in pem.items() for word in (f"--tls-{name.replace('_', '-')}", str(file))]
     parts = Parts(tmp_path, "--protocol", "tls", *security)

@@ -139,13 +139,14 @@ while not Path(sys.argv[2]).exists():
 """
 
 
+@pytest.mark.slow
 def test_what_is_compiled_is_told_where_there_is_no_terminal(
     blobs: Inputs, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """A line with two counts and the seconds left, at once and every few seconds."""
     job = open_job(Settings(blobs.config, blobs.path, blobs.spec))
     popen, told = subprocess.Popen, logging.getLogger("ns_abstract.kernels")
-    wanted = "compiling kernels (first use only): 14 of 273, about "
+    wanted = "compiling kernels (first use only): 14 of 386 functions, about "
 
     def seen(record: logging.LogRecord) -> bool:
         # both processes work until it was said
@@ -171,13 +172,15 @@ def test_what_is_compiled_is_told_where_there_is_no_terminal(
         told.setLevel(level)
     said = capsys.readouterr().err.splitlines()
     assert all(
-        re.fullmatch(r"compiling kernels \(first use only\): \d+ of 273, about \d+ s left", line) for line in said
+        re.fullmatch(r"compiling kernels \(first use only\): \d+ of 386 functions, about \d+ s left", line)
+        for line in said
     )
     # before anything is done, too
-    assert said[0].startswith("compiling kernels (first use only): 0 of 273, about ")
+    assert said[0].startswith("compiling kernels (first use only): 0 of 386 functions, about ")
     assert any(line.startswith(wanted) for line in said)
 
 
+@pytest.mark.slow
 def test_worker_compiles_what_it_is_told(blobs: Inputs, tmp_path: Path) -> None:
     """A process of its own opens the job anew and runs one stage; kernels are there, so nothing is compiled."""
     job = open_job(Settings(blobs.config, blobs.path, blobs.spec))

@@ -17,7 +17,7 @@ if not all(page.exists() for page in PAGES):
 #: What paths in the pages begin at.
 HOMES = (ROOT, PACKAGE, *(PACKAGE / name for name in ("methods", "arithmetic", "verify")))
 #: Files that users write or commands leave, and words of other programs.
-FOREIGN = {"format", "LOOP.json", "report.json", "onnxruntime", "gsplat", "nerfstudio", "main", "patch", "-n"}
+FOREIGN = {"LOOP.json", "report.json", "Unreleased", "release", "site"}
 
 
 @cache
@@ -39,7 +39,8 @@ def problems(text: str) -> list[str]:
     """What ``text`` cites, in backticks, links or commands, that there is not."""
     fenced = re.findall(r"^```\w*\n(.*?)^```", text, re.M | re.S)
     plain = re.sub(r"^```\w*\n.*?^```", "", text, flags=re.M | re.S)
-    words = {word for span in re.findall(r"`([^`]+)`", plain) for word in span.split()}
+    spans = set(re.findall(r"`([^`]+)`", plain))
+    words = {word for span in spans for word in span.split()}
     words |= {
         word for block in fenced for word in block.split() if "/" in word and not word.startswith((".venv", "dist"))
     }
@@ -48,7 +49,8 @@ def problems(text: str) -> list[str]:
     found = [word for word in paths if not any((home / word).exists() for home in HOMES)]
     links = set(re.findall(r"\]\(([\w./-]+)(?:#[\w-]+)?\)", plain))
     found += [link for link in links if not (ROOT / link).exists()]
-    found += [word for word in cited - paths if re.fullmatch(r"[A-Za-z_][\w]*", word) and word not in names()]
+    # of commands, only the paths
+    found += [word for word in spans - paths - FOREIGN if re.fullmatch(r"[A-Za-z_]\w*", word) and word not in names()]
     return sorted(found)
 
 

@@ -879,7 +879,7 @@ ROWS = dict(
 )
 
 
-@pytest.mark.slow_cases(every=20)
+@pytest.mark.slow_cases(every=50)
 @pytest.mark.parametrize("name", ROWS)
 def test_case(name: str, bench: Bench) -> None:
     case: Row = ROWS[name]

@@ -96,7 +96,7 @@ def others(images: ImageSets, local: str) -> ImageSets:
     return ImageSets(*(np.concatenate([getattr(cell, name) for cell in cells]) for name in fields))
 
 
-@pytest.mark.slow_cases(every=12)
+@pytest.mark.slow
 @pytest.mark.parametrize("local", ["", "product", "maximum", "short"])
 @pytest.mark.parametrize("fresh", [False, True])
 @pytest.mark.parametrize(("radius", "slack"), [(0.02, 0.02), (0.1, 0.05), (1e-6, 1e-6)])
@@ -254,7 +254,7 @@ def test_rows_of_a_cell_say_as_much_of_it_as_its_bounds(tmp_path: Path) -> None:
     assert np.mean(near, axis=0)[0] < 1.5 and np.mean(near, axis=0)[1] < 1.4
 
 
-@pytest.mark.slow_cases
+@pytest.mark.slow
 @pytest.mark.parametrize("local", ["product", "maximum"])
 def test_rows_of_a_whole_serve_its_parts_behind_products_and_maxima(local: str, tmp_path: Path) -> None:
     gains = []
@@ -441,6 +441,7 @@ def covered(threshold: float, lends_anywhere: bool = True, **settings: Any) -> t
     return Search(pictures, model, CLAIM, Grid.adaptive(scene.box, (2, 2)), cover=cover), model
 
 
+@pytest.mark.slow_cases
 @pytest.mark.parametrize("lends_anywhere", [False, True])
 @pytest.mark.parametrize("threshold", [0.1, 0.31, 0.43])
 def test_verdicts_of_covered_cells_are_the_truth(threshold: float, lends_anywhere: bool) -> None:

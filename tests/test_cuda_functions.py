@@ -69,6 +69,7 @@ def test_the_least_quaternion_is_the_loaders(program: ModuleType, factor: float)
             load()
 
 
+@pytest.mark.slow
 @compiled
 def test_exact_functions_are_within_their_charges(program: ModuleType, binary: Path, tmp_path: Path) -> None:
     status, rows = run(program, binary, tmp_path)
@@ -92,6 +93,7 @@ def test_planted_charges_are_exceeded(program: ModuleType, binary: Path, tmp_pat
     assert sum(row["verdict"] == "EXCEEDED" for row in rows) > 25
 
 
+@pytest.mark.slow
 @compiled
 def test_one_wrong_result_is_found(program: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """One input in some hundred thousand: no number in one build, off by eight ulps in the other."""

@@ -134,6 +134,7 @@ def test_the_closing_leg_has_one_field_of_view(tmp_path: Path, inputs: Inputs) -
 # ---------------------------------------------------------------- poses and bounds
 
 
+@pytest.mark.slow_cases
 @pytest.mark.parametrize("count", [2, 3])
 def test_poses_of_the_closing_leg(tmp_path: Path, count: int) -> None:
     """Against a slerp of quaternions, and enclosed exactly."""
@@ -217,6 +218,7 @@ def question(tmp_path: Path) -> list[str]:
     return ["--model", str(net), "--property", str(tmp_path / "prop.json")]
 
 
+@pytest.mark.slow
 def test_certify_covers_the_closing_leg(
     inputs: Inputs, question: list[str], tmp_path: Path, in_process: InProcess
 ) -> None:
@@ -242,6 +244,7 @@ def test_exported_boxes_cover_the_closing_leg(
     assert sides == [("segment", 0.0, 0.5), ("segment", 0.5, 1.0)]
 
 
+@pytest.mark.slow_cases
 @pytest.mark.parametrize("how", ["render", "certify", "export"])
 def test_one_keyframe_serves_every_command(
     inputs: Inputs, question: list[str], tmp_path: Path, in_process: InProcess, how: str

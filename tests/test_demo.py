@@ -388,6 +388,7 @@ NERFSTUDIO = textwrap.dedent(
 )
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(importlib.util.find_spec("nerfstudio") is None, reason="nerfstudio is not installed")
 @pytest.mark.parametrize("moved", [False, True])
 def test_nerfstudio_itself_loads_the_run(run: Path, scene: SplatScene, tmp_path: Path, moved: bool) -> None:

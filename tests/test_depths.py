@@ -250,6 +250,7 @@ def test_nothing_is_drawn_at_all() -> None:
         assert (layer.lower == 0.0).all() and (layer.upper == 0.0).all()
 
 
+@pytest.mark.slow
 def test_command(blobs: Inputs, tmp_path: Path) -> None:
     options = {
         "load_config": blobs.config, "camera_path_filename": blobs.path, "perturbation_filename": blobs.spec,

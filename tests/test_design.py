@@ -87,6 +87,7 @@ def test_code_says_the_label(label: str) -> None:
         assert label in cited(docstring or ""), f"{name} does not cite {label}"
 
 
+@pytest.mark.slow_cases
 @pytest.mark.parametrize("label", LABELS)
 def test_tests_exist(label: str) -> None:
     names = named(BODIES[label], "Tests")

@@ -45,6 +45,7 @@ def pose_set(name: str, seed: int) -> PoseSet:
     return PoseSet.around(keyframe(seed), parse_perturbation(SPECS[name]), keyframe(seed + 1000))
 
 
+@pytest.mark.slow_cases
 @pytest.mark.parametrize("name", SPECS)
 @settings(max_examples=15, deadline=None)
 @given(seed=st.integers(0, 999))

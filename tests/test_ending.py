@@ -79,7 +79,7 @@ def test_checkpoints_end_what_is_over() -> None:
     checkpoint()
 
 
-@pytest.mark.slow_cases
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["uniform", "hierarchical"])
 @pytest.mark.parametrize("asked", [0, 3, 12])
 def test_rays_without_time_are_left_open(kind: Any, asked: int, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -148,6 +148,7 @@ def nerf(tmp_path: Path) -> Settings:
     return Settings(config, path, spec)
 
 
+@pytest.mark.slow
 def test_a_picture_that_takes_too_long_is_told_at_once(nerf: Settings, monkeypatch: pytest.MonkeyPatch) -> None:
     """Rays are costly: a few show that the time does not do for one picture."""
     render = NerfFrame.render
@@ -472,6 +473,7 @@ with stop.installed(), stop.last_words(lambda: None), stop.last_words(fail):
     assert process.returncode == 3 and said == "interrupted\n" and shown == "saved\n"
 
 
+@pytest.mark.slow_cases
 @pytest.mark.parametrize(
     ("code", "said"),
     [

@@ -85,6 +85,7 @@ def box_of(*limits: tuple[float, float]) -> ParameterBox:
     return ParameterBox(tuple(f"p{k}" for k in range(d)), ("1",) * d, low, high)
 
 
+@pytest.mark.slow_cases
 @pytest.mark.parametrize(
     ("spec", "cells"),
     [
@@ -122,6 +123,7 @@ def grid_bounds(scene: SplatScene, pose_set: PoseSet, count: int) -> tuple[np.nd
     return images, images.min(axis=0) - 4.0 * step, images.max(axis=0) + 4.0 * step
 
 
+@pytest.mark.slow
 def test_narrow_range() -> None:
     scene, pose_set = crowd(1), poses({"translation": {"x": 0.3}})
     images, lower, upper = grid_bounds(scene, pose_set, 301)
@@ -192,6 +194,7 @@ def test_jump(with_probe: bool) -> None:
     assert falsify(lower, upper, box, jumping, poses=150, strategies=("corners", "random")).violations == 0
 
 
+@pytest.mark.slow
 def test_threshold_of_scene() -> None:
     # moving right, a white ball leaves the pixel (alpha falls to 1/255 and then to 0) while a bright haze
     # comes in: the pixel is brightest just before the jump

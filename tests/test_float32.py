@@ -71,6 +71,7 @@ SHAPES = {
 }
 
 
+@pytest.mark.slow_cases
 @pytest.mark.parametrize("compensated", [False, True])
 @pytest.mark.parametrize("shape", SHAPES)
 def test_single_gaussian(compensated, shape):

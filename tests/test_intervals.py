@@ -109,6 +109,7 @@ class _Pixel:
         return shown
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("counts", [(8,), (4, 2), (2, 2, 2), (4, 4, 2), (8, 1, 1), (2, 1, 4, 1, 1, 2)])
 @pytest.mark.parametrize("size", [0.3, 2.0])
 def test_blends_over_parts_hold_every_exact_blend(counts, size):

@@ -57,6 +57,7 @@ def version(folder: Path) -> Path:
     return found
 
 
+@pytest.mark.slow
 def test_other_module_changed(tmp_path: Path, folder: Path) -> None:
     """Kernels of one module are compiled again where another one, whose constants they hold, has changed."""
     package = tmp_path / "ns_abstract"
@@ -127,6 +128,7 @@ def test_session_of_another_version_is_not_shared(tmp_path: Path) -> None:
     assert not other.session.exists()
 
 
+@pytest.mark.slow
 def test_nothing_is_compiled_where_all_must_be_kept(folder: Path) -> None:
     program = """
 import numpy as np
@@ -146,6 +148,7 @@ print(store().compiled > 0)
     assert run(program, NS_ABSTRACT_CACHE_DIR=str(folder))[0] == "False"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("content", [b"", b"garbage", None], ids=["empty", "garbage", "truncated"])
 @pytest.mark.parametrize("what", ["blobs", "manifest"])
 def test_damaged_files(folder: Path, what: str, content: bytes | None) -> None:
@@ -159,6 +162,7 @@ def test_damaged_files(folder: Path, what: str, content: bytes | None) -> None:
     assert run(**changes)[0] == HIT
 
 
+@pytest.mark.slow
 def test_manifest_leads_nowhere_else(tmp_path: Path, folder: Path) -> None:
     """A manifest that names files elsewhere is not followed."""
     changes = {"NS_ABSTRACT_CACHE_DIR": str(folder)}
@@ -173,6 +177,7 @@ def test_manifest_leads_nowhere_else(tmp_path: Path, folder: Path) -> None:
     assert set(tmp_path.rglob("*.nb?")) == before
 
 
+@pytest.mark.slow
 def test_no_place_to_write(tmp_path: Path) -> None:
     """Without a folder that can be written, one line says so and a temporary folder serves, which is removed."""
     temporary = tmp_path / "tmp"
@@ -185,6 +190,7 @@ def test_no_place_to_write(tmp_path: Path) -> None:
     assert not list(temporary.iterdir())
 
 
+@pytest.mark.slow
 def test_no_home(tmp_path: Path) -> None:
     """A home that does not exist and cannot be made is no error."""
     file = tmp_path / "file"
@@ -208,6 +214,7 @@ def test_read_only_folder(folder: Path) -> None:
         version(folder).chmod(0o700)
 
 
+@pytest.mark.slow
 def test_two_first_starts(folder: Path) -> None:
     """Processes that compile at once both work, and leave one whole set."""
     changes = {"NS_ABSTRACT_CACHE_DIR": str(folder)}
@@ -218,6 +225,7 @@ def test_two_first_starts(folder: Path) -> None:
     assert not list(version(folder).glob("session-*"))
 
 
+@pytest.mark.slow
 def test_killed(folder: Path) -> None:
     """What a killed process leaves behind is cleared by the next one."""
     changes = {"NS_ABSTRACT_CACHE_DIR": str(folder)}
@@ -229,6 +237,7 @@ def test_killed(folder: Path) -> None:
     assert not list(version(folder).glob("session-*"))
 
 
+@pytest.mark.slow
 def test_old_versions_are_cleared(folder: Path) -> None:
     """Of the versions that are no longer used the last few stay; what is not ours stays."""
     changes = {"NS_ABSTRACT_CACHE_DIR": str(folder)}

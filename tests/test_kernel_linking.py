@@ -13,6 +13,7 @@ from numba.core.errors import TypingError
 from ns_abstract.arithmetic import kernel_linking
 from ns_abstract.arithmetic.kernel_cache import store
 from ns_abstract.arithmetic.kernel_linking import LinkedOnly
+from ns_abstract.bench.compiling import recording
 
 
 def kernel(function: Any, module: str = "ns_abstract.of_a_test") -> Any:
@@ -64,6 +65,21 @@ def test_functions_within_a_kernel_have_no_machine_code() -> None:
         return outer(values) + inner(values[0], 0.5)
 
     assert kernel(twice)(np.array(values)) == by_hand(values) + 0.1 / 3.0
+
+
+def test_seconds_of_a_kernel_are_those_of_what_it_is_linked_from() -> None:
+    _, middle, outer = chain("ns_abstract.of_a_test")
+    with recording() as found:
+        found.stage = "a stage"
+        outer(np.array([0.1]))
+        middle(0.1, 0.5)
+    assert [(row["stage"], row["kernel"].rpartition(".")[2]) for row in found.rows] == [
+        ("a stage", "total"), ("a stage", "shifted"),
+    ]  # fmt: skip
+    first, second = found.rows
+    # and what numba compiles for them; the second kernel has the innermost function from the first
+    assert first["functions"] >= 3 > second["functions"] >= 1
+    assert all(row["processor s"] > 0.0 and 0.0 < row["LLVM s"] <= row["wall s"] for row in found.rows)
 
 
 def test_kernels_of_others_are_compiled_as_numba_does() -> None:

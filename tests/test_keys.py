@@ -89,7 +89,7 @@ def missing(table: KeyTable, names: Iterator[str], prefix: str) -> list[str]:
     return [name for name in found if name not in sections and table.find(name) is None]
 
 
-@pytest.mark.slow_cases
+@pytest.mark.slow
 @needs_nerfstudio
 @pytest.mark.parametrize("method", MODELS)
 def test_every_field_of_the_models_is_in_a_table(nerfstudio: SimpleNamespace, method: str) -> None:

@@ -70,6 +70,7 @@ def cells(box: ParameterBox) -> list[ParameterBox]:
     return found if box.dimensions else found[:1]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", SETS)
 def test_renders_lie_between_the_planes(name: str) -> None:
     frame = NerfFrame(tiny_scene(3), UNIFORM, poses(SETS[name]))
@@ -80,6 +81,7 @@ def test_renders_lie_between_the_planes(name: str) -> None:
             assert outside(frame, box, found) == 0
 
 
+@pytest.mark.slow_cases
 @pytest.mark.parametrize("seed", [0, 1])
 def test_stiff_fields_lie_between_the_planes(seed: int) -> None:
     for changes in ({"density": 1e4}, {"color": 1e4}, {"rough": 20.0}):
@@ -88,6 +90,7 @@ def test_stiff_fields_lie_between_the_planes(seed: int) -> None:
             assert outside(frame, box, frame.sets(box, lambda: COSTLY)) == 0
 
 
+@pytest.mark.slow
 def test_any_choice_of_samples_lies_between_the_planes() -> None:
     sampling = Sampling("hierarchical", 0.0, 4.0, 24, 8, (0.2, 0.6, 1.0))
     camera = Camera(view().camera_to_world, 5.0, 5.0, 1.0, 0.5, 2, 1)
@@ -132,6 +135,7 @@ def test_planes_lie_beyond_every_part_exactly(counts: tuple[int, ...]) -> None:
                     assert top >= Fraction(float(high[(ray, *part, channel)]))
 
 
+@pytest.mark.slow
 def test_what_a_cell_gets_does_not_depend_on_what_was_asked_before() -> None:
     scene, pose_set = tiny_scene(2), poses(SETS["orbit"])
     parts = pose_set.box.split(0, 16)
@@ -186,6 +190,7 @@ def a_quarter_strip_on(self: Any, axis: int, count: int, first: int, past: int, 
 original_ends = strips_module.Strips._part_ends
 
 
+@pytest.mark.slow_cases
 @pytest.mark.parametrize(
     ("target", "name", "fault"),
     [
@@ -254,6 +259,7 @@ def claim_above(level: float, folder: Path) -> Path:
     return file
 
 
+@pytest.mark.slow
 def test_an_orbit_is_certified_and_attacked(run: Path, net: Path, tmp_path: Path) -> None:
     scene, poses = opened(run), small_set()
     truth = differences(scene, poses, np.linspace(0.3, 0.33, 200))
@@ -265,6 +271,7 @@ def test_an_orbit_is_certified_and_attacked(run: Path, net: Path, tmp_path: Path
         assert cell.margin is not None and (differences(scene, poses, angles) - level > cell.margin - 1e-4).all()
 
 
+@pytest.mark.slow
 def test_where_it_fails_is_falsified(run: Path, net: Path, tmp_path: Path) -> None:
     scene, poses = opened(run), small_set()
     angles = np.linspace(0.3, 0.33, 400)
@@ -283,6 +290,7 @@ def test_where_it_fails_is_falsified(run: Path, net: Path, tmp_path: Path) -> No
     assert list((tmp_path / "out").glob("*/frame_00000_*.npz")), "no counterexample was kept"
 
 
+@pytest.mark.slow
 def test_colours_and_several_parameters_are_certified(run: Path, net: Path, tmp_path: Path) -> None:
     scene = opened(run)
     camera = nsa.Camera(EYE, width=SIDE, height=SIDE)
@@ -292,6 +300,7 @@ def test_colours_and_several_parameters_are_certified(run: Path, net: Path, tmp_
     assert found.certified == 1.0 and len(found.parameters) == 3
 
 
+@pytest.mark.slow
 def test_the_picture_is_differentiable() -> None:
     pose_set = poses({"rotation": {"yaw": 0.1}, "hue": 0.1})
     method = NerfMethod(tiny_scene(3), num_samples=24)

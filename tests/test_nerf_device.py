@@ -32,6 +32,7 @@ def bounded(
     return bounds.rays(pose_set, pose_set.box, pixels_of(pose_set.camera), 0.02)
 
 
+@pytest.mark.slow_cases(every=5)
 @pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize("name", ["point", "yaw", "orbit", "yaw and shift", "three"])
 @pytest.mark.parametrize("field", FIELDS)
@@ -54,6 +55,7 @@ def test_as_tight_as_compiled_kernels(name: str, device: str) -> None:
     assert np.abs(mine.upper - theirs.upper).max() < 1e-3 * gap
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("device", DEVICES)
 def test_bins_of_the_coarse_pass(device: str) -> None:
     scene, pose_set = tiny_scene(0), poses(SETS["yaw"])
@@ -78,6 +80,7 @@ def test_cells_of_certificates(device: str) -> None:
         assert outside(frame, box, found) == 0
 
 
+@pytest.mark.slow
 def test_a_planted_fault_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
     sums = zonotope.column_sums
     monkeypatch.setattr(zonotope, "column_sums", lambda *arguments: 0.2 * sums(*arguments))

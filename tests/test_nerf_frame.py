@@ -97,6 +97,7 @@ def test_far_too_wide_boxes_say_nothing() -> None:
     assert (found.lower == 0.0).all() and (found.upper == 1.0).all() and found.cells == 0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("spec", [SETS["yaw"], SETS["yaw and shift"]], ids=["one", "two"])
 def test_refinement_approaches_the_truth(spec: dict) -> None:
     scene, pose_set = tiny_scene(2, density=30.0), poses(spec)
@@ -270,6 +271,7 @@ def narrow_pencil(self, *arguments) -> None:
 original_pencil = bounds_module.Pencil.__init__
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("target", "name", "fault"),
     [
@@ -334,6 +336,7 @@ def test_rays_of_wide_sets_lie_in_their_polynomials() -> None:
     assert worst.max() > 0.1 * radius.max(), "far too wide"
 
 
+@pytest.mark.slow
 def test_processes_find_what_this_process_finds_and_survive_a_kill() -> None:
     scene, pose_set = tiny_scene(2, density=30.0), poses(SETS["yaw"])
     box = pose_set.box.split(0, 2)[0]

@@ -34,6 +34,7 @@ def by_bins(scene: NerfScene, pose_set: PoseSet) -> RayBounds:
     return bounds._apart(asked, None, False, bounds_module._DISPLACEMENT)
 
 
+@pytest.mark.slow_cases
 @pytest.mark.parametrize("name", SETS)
 def test_every_choice_of_samples_is_enclosed(name: str) -> None:
     for seed, changes in ((3, {}), (1, {"density": 1e3})):
@@ -44,12 +45,14 @@ def test_every_choice_of_samples_is_enclosed(name: str) -> None:
         assert compared > 0 and violations == 0
 
 
+@pytest.mark.slow
 def test_a_smooth_field_is_tight() -> None:
     scene, pose_set = tiny_scene(3, density=1.0, color=0.5), poses(SETS["yaw"])
     found = by_bins(scene, pose_set)
     assert (found.upper - found.lower).mean() < 0.25
 
 
+@pytest.mark.slow
 def test_where_samples_lie_makes_opaque_fields_tight(monkeypatch: pytest.MonkeyPatch) -> None:
     scene, pose_set = tiny_scene(1, density=1e3), poses({"rotation": {"yaw": 1e-4}})
     found = by_bins(scene, pose_set)
@@ -131,6 +134,7 @@ def only_middles(self, values, end, axis=-1):
     return np.repeat(values.reshape(shape).take(inner // 2, axis=axis + 1), inner, axis=axis)
 
 
+@pytest.mark.slow
 def test_planted_faults_are_found(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(bounds_module._Work, "_anywhere", only_middles)
     scene, pose_set = tiny_scene(3, density=30.0), poses(SETS["yaw"])

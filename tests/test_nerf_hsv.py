@@ -58,6 +58,7 @@ def excess(width: float, span: float, seed: int, special: int = 100, samples: in
     return float(max((down - lowest).max(), (highest - up).max())), float(wider)
 
 
+@pytest.mark.slow_cases
 @pytest.mark.parametrize("width", [0.0, 1e-3, 0.05, 0.4, 1.0])
 @pytest.mark.parametrize("span", [0.0, 0.02, 0.3, 2.0])
 def test_bounds_contain_every_shifted_colour(width: float, span: float) -> None:
@@ -110,6 +111,7 @@ def attacked(spec: dict, cells: int) -> tuple[int, int, float]:
     return found.comparisons, found.violations, last.mpg / last.mpg_witness
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", SETS)
 def test_sets_of_colours_are_enclosed(name: str) -> None:
     compared, violations, ratio = attacked(SETS[name], 40)
@@ -117,6 +119,7 @@ def test_sets_of_colours_are_enclosed(name: str) -> None:
     assert ratio < 2.5
 
 
+@pytest.mark.slow
 def test_forgotten_shifts_are_found(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(frame_module.NerfFrame, "_shifts", lambda self, box: [])
     assert attacked(SETS["hue"], 8)[1] > 0

@@ -61,7 +61,7 @@ def reached(scene: NerfScene, pose_set: PoseSet) -> float:
     return float((shown.max(axis=0) - shown.min(axis=0)).mean())
 
 
-@pytest.mark.slow_cases
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", FIELDS)
 @pytest.mark.parametrize("name", SETS)
 def test_rays_are_enclosed_and_tight(name: str, kind: str) -> None:
@@ -103,6 +103,7 @@ def test_shifted_colours_are_enclosed() -> None:
         assert (found.lower <= picture).all() and (picture <= found.upper).all()
 
 
+@pytest.mark.slow
 def test_refinement_reaches_the_renders() -> None:
     """On a set of which bounds by bins leave 0.2 of the whole range open, and renders reach 0.005."""
     frame = NerfFrame(tiny_scene(3), BINS, poses({"rotation": {"yaw": 5e-4}}))

@@ -365,6 +365,7 @@ class Machine:
         self.actions.append(action)
 
 
+@pytest.mark.slow
 def test_viewer_finds_the_panel_and_works_in_the_background(
     viewer: Any, model: Any, nerfstudio: SimpleNamespace, tmp_path: Path
 ) -> None:
@@ -449,6 +450,7 @@ def test_viewer_finds_the_panel_and_works_in_the_background(
     del viewer.render_statemachines[77]
 
 
+@pytest.mark.slow
 def test_render_thread_survives_interrupts(
     model: Any, nerfstudio: SimpleNamespace, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -519,6 +521,7 @@ def test_options_are_ns_viewers(nerfstudio: SimpleNamespace) -> None:
 # ---------------------------------------------------------------- registered methods
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("ours", "theirs"), [("abstract_splatfacto", "splatfacto"), ("abstract_nerf", "vanilla-nerf")])
 def test_methods_train_like_their_parents(nerfstudio: SimpleNamespace, ours: str, theirs: str) -> None:
     mine = getattr(nerfstudio.methods, ours).config
@@ -564,6 +567,7 @@ def test_nerf_has_the_chosen_size(nerfstudio: SimpleNamespace) -> None:
 # ---------------------------------------------------------------- nerfstudio's own commands
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("first", ["splat", "nerf"])
 def test_registration_does_not_depend_on_what_is_imported_first(folder: Path, first: str) -> None:
     code = (
@@ -588,6 +592,7 @@ _TRAIN = [
 ]  # fmt: skip
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", ["abstract-nerf", "vanilla-nerf"])
 def test_train_and_open(nerfstudio: SimpleNamespace, folder: Path, method: str) -> None:
     options = ["--pipeline.model.width", "16"] if method == "abstract-nerf" else []
@@ -601,6 +606,7 @@ def test_train_and_open(nerfstudio: SimpleNamespace, folder: Path, method: str) 
     assert found["rgb_fine"].shape == (6, 6, 3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("option", ["num_frequencies", "max_frequency_exponent", "num_direction_frequencies", None])
 def test_the_loader_reads_what_was_trained(nerfstudio: SimpleNamespace, folder: Path, option: str | None) -> None:
     """Every option of abstract-nerf changes the picture, and both renderers change alike; vanilla-nerf has none."""
@@ -647,6 +653,7 @@ def test_the_loader_reads_what_was_trained(nerfstudio: SimpleNamespace, folder: 
     assert np.abs(other - expected).max() > 1e-3
 
 
+@pytest.mark.slow
 def test_a_nerf_in_the_viewer(nerfstudio: SimpleNamespace, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Concrete pictures grow while the view stays, bounds come ray by ray, and the panel says of what they are."""
     file = folder / "outputs" / "options-None" / "abstract-nerf" / "t0" / "config.yml"
@@ -713,6 +720,7 @@ def test_a_nerf_in_the_viewer(nerfstudio: SimpleNamespace, folder: Path, monkeyp
         model._background.close()
 
 
+@pytest.mark.slow
 def test_stock_viewer_starts(nerfstudio: SimpleNamespace, folder: Path, config_file: Path) -> None:
     config = abstract_run(nerfstudio, folder, config_file)
     arguments = [*wrapped("ns-viewer"), "--load-config", config.relative_to(folder)]
@@ -722,6 +730,7 @@ def test_stock_viewer_starts(nerfstudio: SimpleNamespace, folder: Path, config_f
         assert server.process.poll() is None and "Traceback" not in server.said(), server.said()
 
 
+@pytest.mark.slow
 def test_eval_reports_abstract_figures(nerfstudio: SimpleNamespace, folder: Path, config_file: Path) -> None:
     config = abstract_run(nerfstudio, folder, config_file)
     command(
@@ -735,6 +744,7 @@ def test_eval_reports_abstract_figures(nerfstudio: SimpleNamespace, folder: Path
     assert Image.open(folder / "eval" / "eval_abstract_0000.png").size == (80, 40)
 
 
+@pytest.mark.slow
 def test_render_writes_abstract_images(nerfstudio: SimpleNamespace, folder: Path, config_file: Path) -> None:
     config = abstract_run(nerfstudio, folder, config_file)
     tools = folder / "tools"

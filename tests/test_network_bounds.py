@@ -129,6 +129,7 @@ def test_the_oracle_finds_kinks() -> None:
     assert exact_least([one, two], np.array([0.25]), np.array([1.0]), np.array([1.0])) == 0
 
 
+@pytest.mark.slow
 def test_modes_are_ordered_on_average(tmp_path: Path) -> None:
     """Correlation helps; single bounds may be worse, as lines with less area are not always the better ones."""
     gains = []
@@ -388,6 +389,7 @@ def chain(folder: Path) -> Network:
     return load_network(f.write(folder / "net.onnx"))
 
 
+@pytest.mark.slow
 def test_short_rows_keep_deep_networks_bounded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A tenth of what all rows to the image take leaves bounds that say something, and none leaves none."""
     network, rows = chain(tmp_path), np.eye(3)
@@ -637,6 +639,7 @@ def test_curves_are_bounded_by_what_rows_leave(deep: bool, tmp_path: Path, monke
         assert (found[cell] <= least).all()
 
 
+@pytest.mark.slow
 def test_deep_networks_are_given_up_early(tmp_path: Path) -> None:
     network = load_network(residual(tmp_path))
     run = schedule.Schedule(network)
@@ -645,6 +648,7 @@ def test_deep_networks_are_given_up_early(tmp_path: Path) -> None:
     assert run.vain(0.5, 0.95, 0.9) and run.left == 0.0
 
 
+@pytest.mark.slow
 def test_rows_cost_what_their_windows_hold(tmp_path: Path) -> None:
     network = load_network(residual(tmp_path))
     costs = schedule.Costs(network)

@@ -357,7 +357,7 @@ def test_extreme_networks(first: int, tmp_path: Path) -> None:
     assert compared > 30_000 and finite > 30
 
 
-@pytest.mark.slow_cases
+@pytest.mark.slow
 @pytest.mark.parametrize("first", range(0, 16, 8))
 def test_extreme_maps(first: int, tmp_path: Path) -> None:
     compared = 0

@@ -261,6 +261,7 @@ def rows_for(size: int, k: int = 4, seed: int = 5) -> np.ndarray:
     return rows
 
 
+@pytest.mark.slow_cases
 @pytest.mark.parametrize("name", CASES)
 def test_read_like_onnxruntime(name: str, tmp_path: Path) -> None:
     for seed in range(3):
@@ -343,6 +344,7 @@ def test_narrow_sets_have_tight_bounds(name: str, tmp_path: Path) -> None:
     assert 0.0 < worst <= LEDGER.get(name, 1.4), worst
 
 
+@pytest.mark.slow_cases
 @pytest.mark.parametrize("name", CASES)
 def test_a_single_image_has_bounds_of_rounding_size(name: str, tmp_path: Path) -> None:
     file = written(name, tmp_path)

@@ -387,6 +387,7 @@ def test_softplus_switches_where_the_file_says(beta: float, limit: float, tmp_pa
 # ---------------------------------------------------------------- resizing
 
 
+@pytest.mark.slow_cases
 @pytest.mark.parametrize("coordinates", ["half_pixel", "pytorch_half_pixel", "asymmetric", "align_corners"])
 @pytest.mark.parametrize("mode", ["floor", "ceil", "round_prefer_floor", "round_prefer_ceil"])
 def test_nearest_pixels_are_onnxruntimes(coordinates: str, mode: str, tmp_path: Path) -> None:

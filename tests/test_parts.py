@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from conftest import Inputs
+from conftest import Inputs, command_options
 from nerfs import UNIFORM, images, poses, tiny_scene
 
 from ns_abstract.api import bounding
@@ -184,6 +184,7 @@ def test_scenes_that_vary(make_blobs: Callable[..., Inputs]) -> None:
     assert mean_pixel_gap(result.lower, result.upper) < 0.5
 
 
+@pytest.mark.slow
 def test_rays_of_a_nerf() -> None:
     scene, pose_set = tiny_scene(2, density=30.0), poses({"rotation": {"yaw": 0.01}})
     frame = NerfFrame(scene, UNIFORM, pose_set)
@@ -198,6 +199,7 @@ def test_rays_of_a_nerf() -> None:
 # ---------------------------------------------------------------- a cluster
 
 
+@pytest.mark.slow
 @needs_dask
 def test_two_workers_one_of_them_killed_equal_this_process(blobs: Inputs) -> None:
     job = job_of(blobs)
@@ -263,7 +265,7 @@ class Machines:
 
 
 def options(blobs: Inputs, folder: Path, **more: Any) -> Render:
-    return Render(blobs.config, blobs.path, folder, perturbation_filename=blobs.spec, **more)
+    return command_options(Render, blobs.config, blobs.path, folder, perturbation_filename=blobs.spec, **more)
 
 
 def test_frames_are_divided_where_threads_are_many(blobs: Inputs, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -330,6 +330,7 @@ values = st.recursive(
 )
 
 
+@pytest.mark.slow
 @settings(max_examples=150, deadline=None, database=None, derandomize=True)
 @given(value=values, indent=st.sampled_from([None, 1]), plain=st.booleans())
 def test_strict_json_round_trip(value: Any, indent: int | None, plain: bool) -> None:

@@ -63,7 +63,7 @@ def _fitted(exponent_, limits, charged, out_):
     store(out, 24, alpha.curve)
 
 
-@pytest.mark.slow_cases
+@pytest.mark.slow
 @pytest.mark.parametrize("middle", [1.0, 2.0, 4.0])
 def test_a_straight_exponent_is_fitted(middle):
     """exp of an exponent that is linear in one parameter: only the fit's remainder and rounding are left (B3)."""
@@ -186,7 +186,7 @@ def _moved(record_, offsets_, rows_, limits, charged, m, out_):
     store(out, 24, alpha.curve)
 
 
-@pytest.mark.slow_cases
+@pytest.mark.slow
 @pytest.mark.parametrize("across", [0.0, 0.3, 1.0])
 def test_what_moves_along_or_across_its_offset(across):
     """Of offsets that two parameters move, the curvature stands for no more of itself than it may (B3)."""
@@ -215,7 +215,7 @@ def _curved(exponent_, limits, charged, rows_, scratch, m):
     _set_curvature(_alpha(exponent_, limits, charged), pointer(rows_), scratch, m)
 
 
-@pytest.mark.slow_cases
+@pytest.mark.slow
 @pytest.mark.parametrize("d", [1, 2, 3, 6])
 def test_the_range_of_alpha_s_curvature(d):
     """What products of parameters add to alpha stays within its range, which is that of squares alone exactly (B10)."""
@@ -260,7 +260,7 @@ def _blended(values, lists, colors, background, shape, forms, count, t_, out_):
     store(nothing, 8, ends.high)
 
 
-@pytest.mark.slow_cases
+@pytest.mark.slow
 @pytest.mark.parametrize("moving", [False, True], ids=["still", "moving"])
 @pytest.mark.parametrize("size, count, most", [(0.02, 4, 2.0), (0.3, 2, 1.6), (0.3, 24, 4.0)])
 def test_blends_of_exact_quadratic_alphas(size, count, most, moving):

@@ -9,12 +9,14 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
 from benchmark_scripts import script
 
 ROOT = Path(__file__).resolve().parents[1]
 mutants = script("mutants")
 
 
+@pytest.mark.slow
 def test_every_change_applies() -> None:
     """In the file that is named, each on its own, and to something else than what stands there."""
     for fault in mutants.FAULTS:
@@ -42,6 +44,7 @@ def test_table_has_every_fault() -> None:
     assert mutants.digest(fault) in outcomes and mutants.digest(changed) not in outcomes
 
 
+@pytest.mark.slow
 def test_kernels_run_interpreted() -> None:
     tests = [f"{ROOT / 'tests' / 'test_bounds.py'}::{name}" for name in ("test_near_plane_alone", "test_ties")]
     done = subprocess.run(

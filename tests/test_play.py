@@ -282,6 +282,7 @@ def point_at(tab: Browser, row: int, column: int, height: int, width: int) -> No
     tab.call("Input.dispatchMouseEvent", type="mouseMoved", x=at[0], y=at[1])
 
 
+@pytest.mark.slow
 @needs_browser
 def test_slider_moves_pixels_and_pixels_are_those_of_the_file(tab: Browser, tmp_path: Path) -> None:
     result = sloped()
@@ -340,6 +341,7 @@ def test_slider_moves_pixels_and_pixels_are_those_of_the_file(tab: Browser, tmp_
     assert (tmp_path / "report.png").stat().st_size > 10_000
 
 
+@pytest.mark.slow
 @needs_browser
 def test_policy_refuses_other_scripts(tab: Browser, tmp_path: Path) -> None:
     written(tmp_path, sloped())
@@ -398,6 +400,7 @@ def certificate(folder: Path) -> Path:
     return folder / "certificate.html"
 
 
+@pytest.mark.slow
 @needs_browser
 def test_cell_of_a_certificate_is_told_about(tab: Browser, tmp_path: Path) -> None:
     opened(tab, certificate(tmp_path), "document.getElementById('cell-hint')?.hidden === false")
@@ -422,6 +425,7 @@ def test_cell_of_a_certificate_is_told_about(tab: Browser, tmp_path: Path) -> No
     tab.screenshot(tmp_path / "certificate.png")
 
 
+@pytest.mark.slow
 @needs_browser
 def test_slider_of_a_certificate_shows_one_picture_at_a_time(tab: Browser, tmp_path: Path) -> None:
     opened(tab, certificate(tmp_path), "!!document.getElementById('walk-slider')")

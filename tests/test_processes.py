@@ -22,7 +22,6 @@ from ns_abstract.api.bounding import bound_frames
 from ns_abstract.api.cell_search import examine_block
 from ns_abstract.api.files import Settings, open_job
 from ns_abstract.arithmetic import selfcheck
-from ns_abstract.cli import rendering
 from ns_abstract.cli.render import Render, render
 from ns_abstract.execution.engines import Here
 from ns_abstract.execution.opening import forget
@@ -80,7 +79,7 @@ def test_a_report_with_a_faulty_worker_is_sampled(
         return json.loads((tmp_path / "report.json").read_text())
 
     with monkeypatch.context() as patch:
-        patch.setattr(rendering, "started", lambda *_: nullcontext(FaultyWorker()))
+        patch.setattr("ns_abstract.execution.engines.started", lambda *_: nullcontext(FaultyWorker()))
         report = command()
     assert report["guarantee"] == "sampled"
     assert any("self-check" in limit and "exp(" in limit for limit in report["limits"])
@@ -90,6 +89,7 @@ def test_a_report_with_a_faulty_worker_is_sampled(
     assert report["guarantee"] == "float32-sound" and "self-check" not in str(report["limits"])
 
 
+@pytest.mark.slow
 def test_a_faulty_worker_certifies_nothing(blobs: Inputs, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     net = classifier(tmp_path / "net.onnx")
     job = Case(tmp_path / "case", blobs, net, {"type": "classification", "label": 0, "preprocess": PRE}).job
@@ -101,6 +101,7 @@ def test_a_faulty_worker_certifies_nothing(blobs: Inputs, tmp_path: Path, monkey
         examine_block(job.recipe, *block)
 
 
+@pytest.mark.slow
 def test_a_faulty_worker_reaches_nothing(course: Any, monkeypatch: pytest.MonkeyPatch) -> None:  # noqa: F811
     job = course.job
     faulty(monkeypatch)

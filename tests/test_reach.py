@@ -247,7 +247,7 @@ def reacher(folder: Path, value: dict[str, Any], dependence: Dependence = "kept"
     return Reacher(loop, wall, Pilot(model, loop.control), dependence)
 
 
-@pytest.mark.slow_cases
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["affine", "unicycle", "double integrator", "fixed wing", "quadrotor", "onnx"])
 def test_tubes_hold_every_run(tmp_path: Path, kind: str) -> None:
     """More than 1000 simulated states by law of motion, in tubes of every kind, without a tolerance."""
@@ -377,6 +377,7 @@ def test_a_good_controller_is_certified_and_a_bad_one_falsified(tmp_path: Path) 
     assert all(leaf.margin <= 0.0 and leaf.counterexample is not None for leaf in bad)
 
 
+@pytest.mark.slow
 def test_cells_are_cut_where_runs_differ(tmp_path: Path) -> None:
     """Some initial states are unsafe at once: their part is falsified, the rest certified down to small cells."""
     value = specification("affine") | {"initial": {"p": [-0.02, 0.02], "q": 0.0, "r": 0.0}}

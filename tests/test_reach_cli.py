@@ -116,6 +116,7 @@ def test_no_two_gaussians_are_equally_deep() -> None:
     assert np.diff(np.sort(splat_scene("gate").means[:, 0])).min() > 5e-4
 
 
+@pytest.mark.slow
 def test_a_part_of_the_box_is_certified(course: Course, tmp_path: Path) -> None:
     """Three dimensions, 24 steps, all of it; then hundreds of runs stay inside the tubes of its cells."""
     part = course.changed("part.json", initial=PART)
@@ -163,6 +164,7 @@ def check_film(folder: Path, document: dict[str, Any], last: int) -> None:
             assert (np.array(low) <= box[0][:3]).all() and (np.array(high) >= box[1][:3]).all()
 
 
+@pytest.mark.slow
 def test_a_film_encloses_what_runs_see(course: Course) -> None:
     part = course.changed("film.json", initial=SMALL, steps=10).job
     loop, box, reacher, rng = part.loop, part.loop.box, part.reacher(), np.random.default_rng(4)
@@ -176,6 +178,7 @@ def test_a_film_encloses_what_runs_see(course: Course) -> None:
             assert (step.lower <= seen).all() and (seen <= step.upper).all()
 
 
+@pytest.mark.slow
 def test_interrupted_in_a_film(
     course: Course, tmp_path: Path, in_process: InProcess, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -192,12 +195,14 @@ def test_interrupted_in_a_film(
     assert (tmp_path / "out" / again["film"]["file"]).exists()
 
 
+@pytest.mark.slow
 def test_without_video_a_film_is_a_gif(course: Course, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("ns_abstract.report.export.has_video", lambda: False)
     document = course.changed("gif.json", "goal", initial=SMALL, steps=10).run(tmp_path / "out", film=True)
     assert document["film"]["file"] == "film.gif" and (tmp_path / "out" / "film.gif").read_bytes()[:3] == b"GIF"
 
 
+@pytest.mark.slow
 def test_without_elements_tubes_are_alone(course: Course, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("ns_abstract.methods.splat.method.SplatMethod.elements", lambda self: None)
     course.changed("bare.json", "goal", initial=SMALL, steps=10).run(tmp_path / "out")
@@ -205,6 +210,7 @@ def test_without_elements_tubes_are_alone(course: Course, tmp_path: Path, monkey
     assert "tubes alone" in page and "<image" not in page and 'class="tube"' in page and "Along a tube" not in page
 
 
+@pytest.mark.slow
 def test_where_runs_go_wrong(edge: Course, finished: Path) -> None:
     """The edge of the funnel's reach lies in the box: both verdicts, and stored runs that leave the funnel again."""
     document = json.loads((finished / "report.json").read_text())
@@ -223,6 +229,7 @@ def test_where_runs_go_wrong(edge: Course, finished: Path) -> None:
         assert (again.states == stored["states"]).all() and again.margin(job.loop, "safe") <= 0.0
 
 
+@pytest.mark.slow
 def test_a_planted_bad_controller_is_falsified(course: Course, tmp_path: Path) -> None:
     """It steers away from the axis."""
     control = json.loads(course.loop.read_text())["control"] | {"gain": [[1.2, 0.0], [0.0, -1.2]]}
@@ -232,6 +239,7 @@ def test_a_planted_bad_controller_is_falsified(course: Course, tmp_path: Path) -
     assert document["questions"]["reaches"]["falsified"] == 1.0 == document["questions"]["safe"]["falsified"]
 
 
+@pytest.mark.slow
 def test_scene_margin(course: Course, tmp_path: Path) -> None:
     """Runs in scenes at the ends of the certified radius stay in the tubes and go well; stored ones fail."""
     part = course.changed("margin.json", "goal", initial=SMALL, steps=10)
@@ -299,6 +307,7 @@ def start(options: list[str]) -> subprocess.Popen[str]:
     )
 
 
+@pytest.mark.slow
 def test_interrupted_and_resumed(edge: Course, finished: Path, tmp_path: Path) -> None:
     folder = tmp_path / "out"
     process = held_at(3, MODULE, edge.options(folder))
@@ -315,6 +324,7 @@ def test_interrupted_and_resumed(edge: Course, finished: Path, tmp_path: Path) -
         assert entry["certified"] == other[name]["certified"] and entry["falsified"] == other[name]["falsified"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "place",
     [
@@ -337,11 +347,13 @@ def test_interrupted_before_the_first_block(
         assert cells(folder) == cells(finished)
 
 
+@pytest.mark.slow
 def test_ended_while_kernels_are_compiled(edge: Course, tmp_path: Path) -> None:
     folder = tmp_path / "out"
     check_ended_in_a_library_call(MODULE, "ns_abstract.api.compiling.compile_beside", edge.options(folder), folder)
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(importlib.util.find_spec("distributed") is None, reason="dask is not installed")
 def test_two_dask_workers_equal_one_process(edge: Course, finished: Path, tmp_path: Path) -> None:
     process = start(edge.options(tmp_path / "out", workers=2, engine="dask"))
@@ -350,6 +362,7 @@ def test_two_dask_workers_equal_one_process(edge: Course, finished: Path, tmp_pa
     assert cells(tmp_path / "out") == cells(finished)
 
 
+@pytest.mark.slow
 def test_resume_refuses_another_loop(course: Course, finished: Path, call: Callable[..., tuple[int, str]]) -> None:
     code, said = call(course.options(finished, resume=True))
     assert code == 2 and said.count("\n") == 1 and "--resume" in said
@@ -391,6 +404,7 @@ def learned(course: Course, name: str = "law.onnx") -> Path:
     return f.write(course.loop.with_name(name))
 
 
+@pytest.mark.slow
 def test_dynamics_in_a_file(course: Course, call: Callable[..., tuple[int, str]], tmp_path: Path) -> None:
     """The demo's law as a file is certified by two processes, and another file is not mixed in."""
     file = learned(course)

@@ -162,6 +162,7 @@ ALTERED = {
 }
 
 
+@pytest.mark.slow_cases
 @pytest.mark.parametrize("rule", ALTERED)
 def test_every_rule_shows(rule: str) -> None:
     """A reference with one rule altered is not the renderer; the comparison above would notice."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from fnmatch import fnmatch
 from importlib.metadata import entry_points
 from pathlib import Path
 
@@ -40,3 +41,28 @@ def test_versions_agree() -> None:
     version = re.escape(ns_abstract.__version__)
     assert re.search(rf"^version: {version}$", (ROOT / "CITATION.cff").read_text(encoding="utf-8"), re.M)
     assert re.search(rf"^## \[?({version}|Unreleased)", (ROOT / "CHANGELOG.md").read_text(encoding="utf-8"), re.M)
+
+
+def unpackaged(files: list[str], patterns: list[str]) -> list[str]:
+    """Files, relative to the package, that are neither sources nor of the package data."""
+    # as setuptools has it: a star stops at a folder
+    depth = [(pattern, pattern.count("/")) for pattern in patterns]
+    return [f for f in files if not any(fnmatch(f, pattern) and f.count("/") == d for pattern, d in depth)]
+
+
+def test_everything_that_is_read_is_installed() -> None:
+    """Scripts, templates, weights and schemas beside the sources are in a wheel."""
+    tomllib = pytest.importorskip("tomllib", reason="tomllib comes with Python 3.11")
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
+    patterns = project["tool"]["setuptools"]["package-data"]["ns_abstract"]
+    package = ROOT / "ns_abstract"
+    there = [path for path in package.rglob("*") if path.is_file() and "__pycache__" not in path.parts]
+    files = [path.relative_to(package).as_posix() for path in there if path.suffix != ".py"]
+    assert "py.typed" in files and unpackaged(files, patterns) == []
+    # every folder is a package, and every pattern has its files
+    assert all((path.parent / "__init__.py").exists() for path in there)
+    assert all(unpackaged(files, [pattern]) != files for pattern in patterns)
+
+
+def test_what_is_not_installed_is_noticed() -> None:
+    assert unpackaged(["a/b.js", "a/b/c.js", "d.html"], ["a/*.js"]) == ["a/b/c.js", "d.html"]

@@ -52,7 +52,7 @@ FLAT = {"log_scales": [((slice(0, 10), 0), -INF), ((slice(10, 14), slice(0, 2)),
 SURE = {"opacity_logits": [(slice(0, 4), INF), (slice(4, 9), -INF)]}
 
 
-@pytest.mark.slow_cases
+@pytest.mark.slow
 @pytest.mark.parametrize("mode", ["classic", "antialiased"])
 @pytest.mark.parametrize("values", [FLAT, SURE, {**FLAT, **SURE}], ids=["flat", "sure", "both"])
 def test_flat_gaussians_and_opacities_of_0_and_1_are_bounded(tmp_path: Path, values: Any, mode: str) -> None:
@@ -77,7 +77,7 @@ NEVER = {
 }
 
 
-@pytest.mark.slow_cases
+@pytest.mark.slow
 @pytest.mark.parametrize("mode", ["classic", "antialiased"])
 @pytest.mark.parametrize("case", NEVER)
 def test_gaussians_that_gsplat_never_draws_are_left_out_and_counted(tmp_path: Path, case: str, mode: str) -> None:
@@ -185,7 +185,7 @@ def test_other_kinds_are_refused_by_name(tmp_path: Path, name: str) -> None:
     assert "UTF-8" not in message and "header" not in message
 
 
-@pytest.mark.slow_cases
+@pytest.mark.slow
 @pytest.mark.parametrize(("content", "name"), [(LFS, "Git LFS pointer"), (PAGE, "web page")])
 def test_a_checkpoint_that_was_not_fetched(tmp_path: Path, content: bytes, name: str) -> None:
     run = two_steps(tmp_path)

@@ -123,6 +123,7 @@ class Forgetful(WatchedFrame):
         self.bounds = SplatBounds(replace(splats, **rest), rasteriser, arithmetic)
 
 
+@pytest.mark.slow_cases
 @pytest.mark.parametrize("arithmetic", ARITHMETICS)
 @pytest.mark.parametrize("name", ["one pose", "one ulp", "width 1e-9"])
 def test_low_bounds_fail(name: str, arithmetic: str) -> None:

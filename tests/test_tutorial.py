@@ -36,6 +36,7 @@ def run(command: list[str], folder: Path) -> str:
     return done.stdout
 
 
+@pytest.mark.slow
 def test_tutorial(tmp_path: Path) -> None:
     """Every command ends well, and what the text says of the results is true of them."""
     found = blocks(DOCS / "tutorial.md", ("sh", "python"))
@@ -60,6 +61,7 @@ assert all(cell.lower[0] > -0.01 for cell in cert.cells if cell.verdict == "cert
     assert report["state"] in ("done", "budget")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["bound_a_scene", "certify_a_classifier"])
 def test_notebook(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A notebook runs from top to bottom in an empty folder, and was stored with its results."""

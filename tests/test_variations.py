@@ -225,6 +225,7 @@ def direction_case(dimensions: int) -> Case:
     return Case(scene, POSES[dimensions] | {"scene": scene_of(mean=0.1)})
 
 
+@pytest.mark.slow_cases
 @pytest.mark.parametrize("dimensions", [0, 1])
 def test_directions(dimensions: int, monkeypatch: pytest.MonkeyPatch) -> None:
     """A mean that moves changes the direction it is seen from; colours that ignore it are found."""
@@ -406,6 +407,7 @@ def render(options: list[str], monkeypatch: pytest.MonkeyPatch) -> int:
     return leave.value.code
 
 
+@pytest.mark.slow_cases
 @pytest.mark.parametrize("poses", [{}, SHIFT])
 def test_command(poses: dict, make_blobs, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Alone and with poses: the command's result contains members of the set, and the report counts them."""

@@ -119,6 +119,7 @@ def violations(snapshot: Snapshot, view: View, count: int = 30) -> int:
     return sum(int(((p < snapshot.lower) | (p > snapshot.upper)).sum()) for p in pictures)
 
 
+@pytest.mark.slow
 def test_pictures_grow_and_hold(background: Callable[..., Background]) -> None:
     one, asked = background(), view(width=160, height=120)
     seen: dict[tuple[int, int], Snapshot] = {}
@@ -142,6 +143,7 @@ def test_pictures_grow_and_hold(background: Callable[..., Background]) -> None:
         assert violations(low, asked) > 0
 
 
+@pytest.mark.slow
 def test_a_view_is_remembered(background: Callable[..., Background]) -> None:
     one = background()
     first = answer(one, view())
@@ -158,6 +160,7 @@ def test_a_view_is_remembered(background: Callable[..., Background]) -> None:
     assert one.best(view(), 1.0) is None
 
 
+@pytest.mark.slow
 def test_more_goes_on_with_the_last_view(background: Callable[..., Background]) -> None:
     # the goal takes hundreds of cells: no machine gets there in the first time
     one, wide = background(), View(camera(), perturbation_of({"x": 0.05, "y": 0.05}))
@@ -174,6 +177,7 @@ def odd_view() -> View:
     return View(camera(), perturbation_of({"y": 0.01}))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("odd", "said"),
     [("dies", "ended with code 9"), ("fails", "no such frame"), ("unsound", "not sound")],
@@ -189,6 +193,7 @@ def test_trouble_is_told_and_over(background: Callable[..., Background], odd: st
     assert violations(answer(one, view()), view()) == 0
 
 
+@pytest.mark.slow
 def test_a_worker_that_is_stuck_is_replaced(background: Callable[..., Background]) -> None:
     one = background("hangs")
     until(lambda: [w.scene for w in one._workers] == [0, 0], "two workers")
@@ -200,6 +205,7 @@ def test_a_worker_that_is_stuck_is_replaced(background: Callable[..., Background
     assert stuck.process.wait(30) != 0
 
 
+@pytest.mark.slow
 def test_asking_never_waits(background: Callable[..., Background]) -> None:
     one = background("hangs")
     until(lambda: [w.scene for w in one._workers] == [0, 0], "two workers")
@@ -211,6 +217,7 @@ def test_asking_never_waits(background: Callable[..., Background]) -> None:
     assert answer(one, view(x=0.1)).final
 
 
+@pytest.mark.slow
 def test_who_looks_may_be_gone(background: Callable[..., Background], capfd: pytest.CaptureFixture[str]) -> None:
     def gone() -> None:
         raise KeyError("client")
@@ -220,6 +227,7 @@ def test_who_looks_may_be_gone(background: Callable[..., Background], capfd: pyt
     assert "the viewer was not told of new bounds: KeyError" in capfd.readouterr().err
 
 
+@pytest.mark.slow
 def test_close_ends_the_workers(background: Callable[..., Background]) -> None:
     one = background()
     processes = [worker.process for worker in one._workers]
@@ -291,6 +299,7 @@ def outside(snapshot: Snapshot, view: View, count: int = 24) -> int:
     return found
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("quantity", ["mean", "opacity", "color"])
 def test_a_variation_slider_widens_the_abstract_image(background: Callable[..., Background], quantity: str) -> None:
     one = background()
@@ -307,6 +316,7 @@ def test_a_variation_slider_widens_the_abstract_image(background: Callable[..., 
     assert one.best(View(camera(), perturbation_of({quantity: 0.0})), 1.0) is still
 
 
+@pytest.mark.slow
 def test_variations_and_poses_together(background: Callable[..., Background]) -> None:
     asked = varied_view(x=0.005, color=0.02, mean=0.002)
     found = answer(background(), asked, 2.0)
@@ -342,6 +352,7 @@ def test_selections_that_cannot_be_read(text: str) -> None:
     assert perturbation_of({"x": 0.1, "mean": 0.0}, text) == perturbation_of({"x": 0.1})
 
 
+@pytest.mark.slow
 def test_an_empty_selection_is_told(background: Callable[..., Background]) -> None:
     one = background()
     nothing = varied_view('{"box": [[8, 8, 8], [9, 9, 9]]}', mean=0.1)
@@ -353,6 +364,7 @@ def test_an_empty_selection_is_told(background: Callable[..., Background]) -> No
 # ---------------------------------------------------------------- NeRFs
 
 
+@pytest.mark.slow
 def test_bounds_of_a_nerf_ray_by_ray(background: Callable[..., Background]) -> None:
     scene = NerfSource(tiny_scene(3))
     asked = View(nerf_camera(6, 5), perturbation_of({"x": 0.002}))

@@ -51,6 +51,7 @@ def moving(scripts: Any, side: int = 16) -> tuple[SplatMethod, PoseSet]:
     return SplatMethod(scripts.objects.scene(things, seed), None, None), PoseSet.around(camera, perturbation)
 
 
+@pytest.mark.slow
 def test_ranges_hold_what_the_network_gives(scripts: Any) -> None:
     """Outputs on members of random sets lie in the ranges, also at their ends, and the ranges are no wider than plain
     interval arithmetic makes them."""
@@ -84,6 +85,7 @@ def test_cells_hold_their_renders(scripts: Any) -> None:
     assert float(sets.radius.mean()) < 0.02
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("certified", [0.0, 0.5])
 def test_training_learns(scripts: Any, certified: float, tmp_path: Path) -> None:
     """A few steps on pictures of a car, with and without cells; the file gives what the trained network gives."""

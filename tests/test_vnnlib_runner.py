@@ -101,6 +101,7 @@ def test_boxes_of_cases(tmp_path: Path) -> None:
     assert found == {"reached": "sat", "missed": "unsat"}
 
 
+@pytest.mark.slow
 def test_unsafe_instances_are_never_proved(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """What one input reaches exactly is unsafe: found or unknown, never proved; counterexamples are re-run."""
     # a second passes whenever somebody looks

@@ -24,6 +24,7 @@ def test_no_entry_point_is_called_by_other_packages(tmp_path: Path) -> None:
     assert set(project["entry-points"]) == {"nerfstudio.method_configs"}
 
 
+@pytest.mark.slow
 def test_importing_torch_changes_no_import(tmp_path: Path) -> None:
     """Also where an older editable install still names `autoload` to PyTorch."""
     code = (
@@ -36,6 +37,7 @@ def test_importing_torch_changes_no_import(tmp_path: Path) -> None:
     assert done.returncode == 0, done.stderr
 
 
+@pytest.mark.slow
 @needs_nerfstudio
 def test_torchvision_imports_once_the_operators_are_declared(tmp_path: Path) -> None:
     code = (
@@ -46,6 +48,7 @@ def test_torchvision_imports_once_the_operators_are_declared(tmp_path: Path) -> 
     assert done.returncode == 0, done.stderr
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", [(), ("ns-trian",), ("python",), ("--help",)])
 def test_wrapper_refuses_what_is_no_command_in_one_line(tmp_path: Path, name: tuple[str, ...]) -> None:
     done = run("-m", "ns_abstract.nerfstudio", *name, folder=tmp_path)

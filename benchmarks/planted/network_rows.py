@@ -24,15 +24,7 @@ NETWORK_ROWS = (
         "Rounding.charge",
         "gamma(count) * (peak + gamma(count + FOLDING + 1) * size) + few",
         "few",
-        _PAYS + "[layer of sums: fully connected, (transposed) convolution, mean, average pooling]",
-    ),
-    Fault(
-        "charges: a folded bias is its float64 value",
-        _NETWORK + "rounding.py",
-        "Rounding.shifted",
-        "gamma(layer.terms + FOLDING + 1) * (FOLDED_SHIFT * moved + bias)",
-        "0.0 * moved",
-        _TESTS + "test_shifts_that_are_folded_forwards[scale]",
+        "test_network_rounding.py::test_sums_that_lose_as_much_as_they_can[1]",
     ),
     Fault(
         "charges: a shift loses nothing of its own",
@@ -48,7 +40,7 @@ NETWORK_ROWS = (
         "Rounding.charge",
         "few + (torch.maximum(*charges) if len(charges) == 2 else sum(charges))",
         "0.0 * size",
-        _PAYS + "[sum of nodes]",
+        "test_network_rounding.py::test_sums_that_start_with_what_is_added",
     ),
     Fault(
         "charges: a product of values is exact",

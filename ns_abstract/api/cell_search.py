@@ -6,23 +6,27 @@ A `CellQuestion` says what is claimed, with a margin that is positive where it h
 from __future__ import annotations
 
 import io
+import os
+import tempfile
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Generic, Protocol, TypeVar
 
 import numpy as np
 
+from ns_abstract.api.bounding import listener
 from ns_abstract.api.margins import NOT_ASKED, SHARE, Margins, certified_cells
 from ns_abstract.api.searching import paced, search_blocks
 from ns_abstract.execution.ending import Deadline
 from ns_abstract.execution.engines import Engine
 from ns_abstract.execution.opening import Recipe, opened
-from ns_abstract.execution.stopping import StopRequest
+from ns_abstract.execution.stopping import StopRequest, interruptible
 from ns_abstract.execution.threads import use_threads
 from ns_abstract.geometry.box import ParameterBox
+from ns_abstract.io.errors import InputError
 from ns_abstract.report.certificate import LastReport
 from ns_abstract.verify.cells import Cell, Grid
 from ns_abstract.verify.scene_margin import Kind, SceneMargin, Settle
@@ -314,7 +318,6 @@ class CellSearch(Generic[P]):
             waits=question.waits,
         )
         store.trace()
-        request.on_progress(question.progress(store))
 
     def _keep_counterexamples(self, block: Block, findings: Findings) -> None:
         """Store what breaks the claim before the cells are said to be falsified."""
@@ -338,6 +341,43 @@ class CellSearch(Generic[P]):
         finally:
             margins.keep()
             self.scene_margin = {**about, **margins.entry}
+
+
+def check_arguments(request: Request, workers: int, output_dir: str | os.PathLike[str] | None) -> None:
+    """Refuse arguments of `ns_abstract.certify` and its kin that cannot be used.
+
+    Raises:
+        InputError: One of them.
+    """
+    if not 0.0 < request.budget < float("inf"):
+        raise InputError(f"found {request.budget}", field="time_budget", fix="give a positive number")
+    if workers < 1:
+        raise InputError(f"found {workers}", field="workers", fix="give a number of at least 1")
+    if request.resume and output_dir is None:
+        raise InputError("given without output_dir", field="resume", fix="give the folder to go on with")
+
+
+def answered(
+    question: CellQuestion[P],
+    request: Request,
+    engine: Callable[[ExitStack], Engine],
+    output_dir: str | os.PathLike[str] | None,
+) -> tuple[dict[int, list[Row]], dict[str, Any]]:
+    """The cells by number and the content of report.json, of a search that Ctrl-C or its listener may end.
+
+    Args:
+        question: What is claimed.
+        request: How much is to be done.
+        engine: See `CellSearch.run`.
+        output_dir: Output folder; None: nothing is kept on disk.
+    """
+    with ExitStack() as stack:
+        if output_dir is None:
+            output_dir = stack.enter_context(tempfile.TemporaryDirectory(prefix="ns-abstract-"))
+        stop = stack.enter_context(interruptible())
+        search = CellSearch(question, Path(output_dir))
+        document = search.run(engine, stop, replace(request, on_progress=listener(stop, request.on_progress)))
+        return search.rows, document
 
 
 def cell_place(cell: Cell, otherwise: str) -> str:

@@ -4,17 +4,22 @@ from __future__ import annotations
 
 import math
 import os
-import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import ExitStack
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 
-from ns_abstract.api.bounding import listener
-from ns_abstract.api.cell_search import CellQuestion, CellSearch, Request, Row, cell_place
+from ns_abstract.api.cell_search import (
+    CellQuestion,
+    CellSearch,
+    Request,
+    Row,
+    answered,
+    cell_place,
+    check_arguments,
+)
 from ns_abstract.api.certificate_report import CertificateReport
 from ns_abstract.api.certification import MEMORY, Certification, PropertySource, Question
 from ns_abstract.api.job import Job
@@ -22,7 +27,6 @@ from ns_abstract.api.poses import PoseSet
 from ns_abstract.api.scenes import Scene
 from ns_abstract.execution.ending import Deadline
 from ns_abstract.execution.engines import EngineName, started
-from ns_abstract.execution.stopping import interruptible
 from ns_abstract.geometry.box import ParameterBox
 from ns_abstract.io.assumptions import Assumption
 from ns_abstract.io.errors import InputError
@@ -296,14 +300,10 @@ def certify(
     Raises:
         InputError: An argument cannot be used.
     """
-    if not 0.0 < time_budget < float("inf"):
-        raise InputError(f"found {time_budget}", field="time_budget", fix="give a positive number")
-    if workers < 1:
-        raise InputError(f"found {workers}", field="workers", fix="give a number of at least 1")
+    request = Request(time_budget, resume, output_dir is not None, scene_margin)
+    check_arguments(request, workers, output_dir)
     if picture not in ("float", "8-bit"):
         raise InputError(f"found {picture}", field="picture", fix="use float or 8-bit")
-    if resume and output_dir is None:
-        raise InputError("given without output_dir", field="resume", fix="give the folder to go on with")
     sets = [poses] if isinstance(poses, PoseSet) else list(poses)
     if not sets:
         raise InputError("found no set", field="poses", fix="give at least one PoseSet")
@@ -321,24 +321,13 @@ def certify(
         "workers": workers,
         "engine": engine,
     }
-    with ExitStack() as stack:
-        folder = Path(output_dir) if output_dir is not None else Path(
-            stack.enter_context(tempfile.TemporaryDirectory(prefix="ns-abstract-"))
-        )  # fmt: skip
-        stop = stack.enter_context(interruptible())
-        search = CellSearch(CertificateQuestion(found, range(len(drawn)), settings, ("ns_abstract.certify",)), folder)
-        document = search.run(
-            lambda engines: engines.enter_context(started(engine, scheduler_address, 1 if scene.rays else workers)),
-            stop,
-            Request(
-                time_budget,
-                resume,
-                report=output_dir is not None,
-                scene_margin=scene_margin,
-                on_progress=listener(stop, on_progress),
-            ),
-        )
-    return certificate(found, search.rows, document)
+    rows, document = answered(
+        CertificateQuestion(found, range(len(drawn)), settings, ("ns_abstract.certify",)),
+        request if on_progress is None else replace(request, on_progress=on_progress),
+        lambda engines: engines.enter_context(started(engine, scheduler_address, 1 if scene.rays else workers)),
+        output_dir,
+    )
+    return certificate(found, rows, document)
 
 
 def certificate(job: Certification, rows: Mapping[int, list[Row]], document: Mapping[str, Any]) -> Certificate:

@@ -20,9 +20,9 @@ from ns_abstract.refine.protocol import Frame
 
 #: Seconds between two lines on progress, and between two times that kernels are published.
 _PACE = 5.0
-#: Kernels of a stage and the seconds that one core took for them; measured for one parameter (docs/benchmarks.md).
+#: Functions of a stage and the seconds that one core took for them; measured for one parameter (docs/benchmarks.md).
 _MEASURED = {
-    "pixel_stage": (115, 70.0), "gaussian_stage": (118, 38.0), "moving_colors": (32, 14.0), "render": (8, 6.0),
+    "pixel_stage": (233, 30.0), "gaussian_stage": (111, 18.0), "moving_colors": (33, 8.0), "render": (9, 3.0),
 }  # fmt: skip
 #: The same of a stage that was not measured.
 _UNMEASURED = (50, 20.0)
@@ -53,20 +53,22 @@ class _Progress:
 
     def __init__(self, parts: Sequence[Sequence[str]]) -> None:
         measured = [[_MEASURED.get(stage, _UNMEASURED) for stage in part] for part in parts]
-        self.kernels = sum(count for part in measured for count, _ in part)
+        self.functions = sum(count for part in measured for count, _ in part)
         self.seconds = max(sum(seconds for _, seconds in part) for part in measured)
         self.begin = time.monotonic()
         self.said = self.begin
         self.say(0)
 
     def say(self, done: int) -> None:
-        """Say it, with an estimate by the measured times and by the kernels that are done, whichever is later."""
+        """Say it, with an estimate by the measured times and by the functions that are done, whichever is later."""
         used = time.monotonic() - self.begin
-        done = min(done, self.kernels)
-        # the first kernels say little about the others
-        by_count = used * (self.kernels - done) / done if done > self.kernels // 3 else 0.0
+        done = min(done, self.functions)
+        # the first ones say little about the others
+        by_count = used * (self.functions - done) / done if done > self.functions // 3 else 0.0
         left = max(self.seconds - used, by_count, 1.0)
-        _log.info("compiling kernels (first use only): %d of %d, about %.0f s left", done, self.kernels, left)
+        _log.info(
+            "compiling kernels (first use only): %d of %d functions, about %.0f s left", done, self.functions, left
+        )
 
     def due(self) -> bool:
         """Whether it is time for the next line."""

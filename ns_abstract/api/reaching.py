@@ -3,25 +3,28 @@
 from __future__ import annotations
 
 import os
-import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import ExitStack
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from ns_abstract.api.bounding import listener
-from ns_abstract.api.cell_search import CellQuestion, CellSearch, Request, Row, cell_place
+from ns_abstract.api.cell_search import (
+    CellQuestion,
+    CellSearch,
+    Request,
+    Row,
+    answered,
+    cell_place,
+    check_arguments,
+)
 from ns_abstract.api.loop_job import LoopJob, open_loop
 from ns_abstract.api.loop_report import LoopReport
 from ns_abstract.api.scenes import Scene
 from ns_abstract.execution.ending import Deadline
 from ns_abstract.execution.engines import EngineName, started
-from ns_abstract.execution.stopping import interruptible
 from ns_abstract.io.assumptions import Assumption
-from ns_abstract.io.errors import InputError
 from ns_abstract.reach.search import QUESTIONS
 from ns_abstract.verify.cells import Grid
 from ns_abstract.verify.network import NetworkArithmetic
@@ -87,6 +90,7 @@ class LoopQuestion(CellQuestion[ReachProgress]):
         self.reports.simulate_runs(deadline.within(_RUNS_SHARE * deadline.left))
 
     def after(self, search: CellSearch[ReachProgress], deadline: Deadline) -> None:
+        search.request.on_progress(self.progress(search.store))
         filming = _FILM_SHARE / self.reserved(1.0) * deadline.left if self.film else 0.0
         self.reports.show_tubes(search.store, deadline.before(filming))
         if self.film:
@@ -201,26 +205,17 @@ def reach(
     Raises:
         InputError: An argument cannot be used.
     """
-    if not 0.0 < time_budget < float("inf"):
-        raise InputError(f"found {time_budget}", field="time_budget", fix="give a positive number")
-    if workers < 1:
-        raise InputError(f"found {workers}", field="workers", fix="give a number of at least 1")
-    if resume and output_dir is None:
-        raise InputError("given without output_dir", field="resume", fix="give the folder to go on with")
+    request = Request(time_budget, resume, scene_margin=scene_margin)
+    check_arguments(request, workers, output_dir)
     job = open_loop(scene, Path(loop), arithmetic, network_arithmetic, workers)
     settings = {"time_budget": time_budget, "arithmetic": arithmetic, "workers": workers, "engine": engine}
-    with ExitStack() as stack:
-        folder = Path(output_dir) if output_dir is not None else Path(
-            stack.enter_context(tempfile.TemporaryDirectory(prefix="ns-abstract-"))
-        )  # fmt: skip
-        stop = stack.enter_context(interruptible())
-        search = CellSearch(LoopQuestion(job, settings, ("ns_abstract.reach",), film=film), folder)
-        document = search.run(
-            lambda engines: engines.enter_context(started(engine, scheduler_address, workers)),
-            stop,
-            Request(time_budget, resume, scene_margin=scene_margin, on_progress=listener(stop, on_progress)),
-        )
-    return result(job, search.rows, document)
+    rows, document = answered(
+        LoopQuestion(job, settings, ("ns_abstract.reach",), film=film),
+        request if on_progress is None else replace(request, on_progress=on_progress),
+        lambda engines: engines.enter_context(started(engine, scheduler_address, workers)),
+        output_dir,
+    )
+    return result(job, rows, document)
 
 
 def result(job: LoopJob, rows: Mapping[int, list[Row]], document: Mapping[str, Any]) -> ReachResult:

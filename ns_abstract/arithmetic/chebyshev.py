@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ns_abstract.arithmetic.forms import Float64Array
-from ns_abstract.arithmetic.rounding import GRID_UP
+from ns_abstract.arithmetic.rounding import GRID_UP, INTERPOLATION_ROUNDINGS, gamma
 
 
 def chebyshev_values(points: Float64Array, degree: int) -> Float64Array:
@@ -83,6 +83,12 @@ class ChebyshevBasis:
         kept = [places[tuple(k)] for k in self.indices.tolist()]
         rest = [i for k, i in places.items() if sum(k) > self.degree]
         return matrix[kept], matrix[rest]
+
+    @cached_property
+    def interpolation_rounding(self) -> float:
+        """What an interpolant's coefficients are off by together, in parts of the largest value at a node (F3)."""
+        size = sum(float(np.abs(matrix).sum()) for matrix in self.interpolation)
+        return gamma(len(self.nodes) + INTERPOLATION_ROUNDINGS) * size * GRID_UP
 
     @property
     def lebesgue(self) -> float:

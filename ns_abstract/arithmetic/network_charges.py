@@ -168,7 +168,7 @@ WRITTEN_TERMS, WRITTEN_FLUSH = 8, 64.0 * FLUSH
 
 
 def gamma(count: Any, unit: float | None = None) -> Any:
-    """What ``count`` roundings (a number or a tensor), in float32 unless said otherwise, may change, relatively.
+    """Return the relative error of ``count`` roundings (a number or a tensor), in float32 by default.
 
     Raises:
         InputError: They leave no digit.

@@ -47,6 +47,7 @@ class _Recorder:
     _running: list[_Running] = field(default_factory=list)
     _own: dict[str, float] = field(default_factory=dict)
     _llvm: float = 0.0
+    _locked: list[float] = field(default_factory=list)
 
     def start(self, event: Any) -> None:
         """A function's turn begins."""
@@ -74,25 +75,41 @@ class _Recorder:
         })  # fmt: skip
         self._own, self._llvm = {}, 0.0
 
-    def llvm(self, seconds: float) -> None:
-        """So long LLVM held its lock."""
-        self._llvm += seconds
+    def lock(self, _: Any) -> None:
+        """LLVM's lock is taken, once more where it is held."""
+        self._locked.append(time.perf_counter())
+
+    def unlock(self, _: Any) -> None:
+        """It is given back."""
+        since = self._locked.pop()
+        if not self._locked:
+            self._llvm += time.perf_counter() - since
 
 
-def _measured(recipe: Recipe[Any], poses: PoseSet) -> list[dict[str, Any]]:
-    """The rows of one process, which has no kernel."""
+@contextmanager
+def recording() -> Iterator[_Recorder]:
+    """What is compiled inside becomes rows."""
     from numba.core import event
 
     found = _Recorder()
 
     class Listener(event.Listener):
-        on_start: Callable[[Any], None] = staticmethod(found.start)
-        on_end: Callable[[Any], None] = staticmethod(found.end)
+        def __init__(self, start: Callable[[Any], None], end: Callable[[Any], None]) -> None:
+            self.on_start, self.on_end = start, end  # pyright: ignore[reportAttributeAccessIssue]
 
-    job = opened(recipe)
-    view = job.method.frame(poses)
-    listener = Listener()
-    with event.install_listener("numba:compile", listener), event.install_timer("numba:llvm_lock", found.llvm):
+        def on_start(self, event: Any) -> None: ...
+
+        def on_end(self, event: Any) -> None: ...
+
+    compiled, locked = Listener(found.start, found.end), Listener(found.lock, found.unlock)
+    with event.install_listener("numba:compile", compiled), event.install_listener("numba:llvm_lock", locked):
+        yield found
+
+
+def _measured(recipe: Recipe[Any], poses: PoseSet) -> list[dict[str, Any]]:
+    """The rows of one process, which has no kernel."""
+    view = opened(recipe).method.frame(poses)
+    with recording() as found:
         for stage in (*view.stages, None):
             found.stage = stage or "the rest"
             view.warm_up(stage)

@@ -1,4 +1,4 @@
-"""What the plan of a scene and set saves: each omission is taken back, and the bounds are compared."""
+"""Measure what the omissions of a plan save: each is reverted, and the bounds are compared."""
 
 from __future__ import annotations
 

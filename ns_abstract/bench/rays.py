@@ -1,4 +1,4 @@
-"""What bounding some random rays of a NeRF costs, how tight it is, and attacks on the result."""
+"""Measure the cost and tightness of random rays of a NeRF, and attack the bounds."""
 
 from __future__ import annotations
 

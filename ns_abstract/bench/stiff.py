@@ -1,4 +1,4 @@
-"""Tiny scenes at the ends of what can be loaded and asked, each bounded and then attacked.
+"""Stiff cases: tiny scenes at the limits of what can be loaded, each bounded and then attacked.
 
 Every scene is what a run could hold (finite parameters, scales and quaternion lengths that are normal
 float32), and every set what a perturbation file could say. A case passes if no image of three renderers

@@ -1,4 +1,4 @@
-"""Runs folders of instances as the verification competitions publish them: networks, properties, time limits."""
+"""Run folders of instances in the format of the verification competitions: networks, properties, time limits."""
 
 from __future__ import annotations
 

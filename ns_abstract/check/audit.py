@@ -35,6 +35,7 @@ class Audit:
         uniform: Claims and proofs of the uniform sample, and the least part of all claims that holds, at 95 %.
         structure: What is wrong with the cells; empty: they tile every set, every pixel is bounded, counts are right.
         seconds, median_seconds: Of all claims, and of one.
+        picture: What all proved claims hold of: "real numbers", or "every float32 evaluation".
     """
 
     claims: int = 0
@@ -47,6 +48,7 @@ class Audit:
     structure: list[str] = field(default_factory=list)
     seconds: float = 0.0
     median_seconds: float = 0.0
+    picture: str = "real numbers"
 
     @property
     def exit_code(self) -> int:
@@ -104,6 +106,7 @@ def run(
     audit.uniform = {"claims": uniform[0], "proved": uniform[1], "holds_at_least": least_part(uniform[1], uniform[0])}
     audit.uniform |= {"float32": sure, "float32_at_least": least_part(sure, uniform[0])}
     audit.seconds, audit.median_seconds = time.monotonic() - begin, statistics.median(spent) if spent else 0.0
+    audit.picture = "every float32 evaluation" if audit.proved == audit.float32 > 0 else audit.picture
     (folder / "check.json").write_text(
         json.dumps({"version": 1, "seed": seed, **vars(audit)}, indent=1, allow_nan=False)
     )

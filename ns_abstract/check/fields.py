@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+import torch
 
 from ns_abstract.check.forms import Form, U, total
 from ns_abstract.check.poses import Camera, View
@@ -61,7 +62,8 @@ class Field:
         parts = []
         for k in range(0, len(ray[0]), TOGETHER):
             some = [[e.of(lambda a, k=k: a[..., k : k + TOGETHER, :]) for e in es] for es in (places, along)]
-            parts.append(self._ray(some[0], some[1], lengths))
+            with np.errstate(all="ignore"):
+                parts.append(self._ray(some[0], some[1], lengths))
         return Form(*(np.concatenate([getattr(p, name) for p in parts], axis=-2) for name in ("c", "g", "r")))
 
     def _ray(self, places: list[Form], along: list[Form], lengths: Array) -> Form:
@@ -98,8 +100,9 @@ class Field:
 
 def _encoded(x: list[Form], count: int, most: float) -> Form:
     """Sines and cosines of three coordinates [B, S], coordinate outside and frequency inside, and the coordinates."""
-    exponents = np.linspace(0.0, np.float32(most), count, dtype=np.float32)
-    angles = [wide(e) * (2.0 * np.pi * np.float64(np.exp2(v))) for e in x for v in exponents]
+    # the float32 powers that nerfstudio computes
+    frequencies = (2.0 ** torch.linspace(0.0, most, count)).double().tolist()
+    angles = [wide(e) * (2.0 * np.pi * f) for e in x for f in frequencies]
     waves = [e.sine() for e in angles]
     parts = [*(s for s, _ in waves), *(c for _, c in waves), *(wide(e) for e in x)]
     return Form(*(np.concatenate([getattr(p, name) for p in parts], axis=-1) for name in ("c", "g", "r")))

@@ -184,11 +184,7 @@ def _lines(low: Tensor, high: Tensor) -> tuple[Tensor, Tensor, Tensor]:
 def _layer(kind: str, options: dict[str, Any], constants: list[Tensor], inputs: int, first: bool) -> Any:
     """Map, map of absolute weights, bias and number of terms of an operator; sums and ReLU have no map.
 
-    Args:
-        kind, options: Operator and its attributes.
-        constants: The inputs that are constants.
-        inputs: Number of the others.
-        first: Whether the first input is a constant.
+    Its inputs are ``constants`` and ``inputs`` others; ``first``: the first one is a constant.
     """
     none = torch.zeros(1, dtype=torch.float64)
     values = [v.double() for v in constants if v.is_floating_point()]

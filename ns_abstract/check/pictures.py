@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ns_abstract.check.forms import Form
-from ns_abstract.check.poses import Poses, View
+from ns_abstract.check.poses import Poses
 from ns_abstract.check.results import Cells
 from ns_abstract.check.splats import FLOAT, Splats, meeting, pixels, reaches
 
@@ -77,7 +77,7 @@ class Picture:
 
     def __init__(self, cells: Cells, scene: Any, poses: Poses, report: dict[str, Any]) -> None:
         self.cells, self.scene, self.poses = cells, scene, poses
-        self.units = units(scene, report)
+        self.units, self.together = units(scene, report), 64 if isinstance(scene, Splats) else 4
 
     @property
     def count(self) -> int:
@@ -136,7 +136,7 @@ class Picture:
                 return None, {}
             batch = [stack.pop()]
             index = batch[0][2]
-            while stack and len(batch) < 64 and (len(batch) + 1) * max(len(index), 1) <= BATCH:
+            while stack and len(batch) < self.together and (len(batch) + 1) * max(len(index), 1) <= BATCH:
                 index = np.union1d(index, stack[-1][2])
                 batch.append(stack.pop())
             first, last = (np.stack([b[k] for b in batch]) for k in (0, 1))
@@ -211,6 +211,3 @@ def divided(low: Array, high: Array, motion: Array, full: Array) -> list[tuple[A
         parts.append((rest[0], top))
         rest = (bottom, rest[1])
     return [*parts, rest]
-
-
-__all__ = ["Picture", "View", "divided", "units"]

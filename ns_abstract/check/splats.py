@@ -100,8 +100,11 @@ def reaches(splats: Splats, cam: Camera, view: View, unit: float) -> Array:
     zl = np.where(near, 1.0, zl)
     hidden = ~((zh >= NEAR * (1.0 - ROOM)) & ~(zl > FAR * (1.0 + ROOM)))
     found = []
+    # in float32 a compensation may exceed 1 by rounding, and what is large may be drawn whatever its opacity
+    opacity = splats.opacity * (1.0 + ROOM + 64.0 * unit) * (1.2 if unit and splats.antialiased else 1.0)
+    faint = opacity < LEAST_ALPHA
     with np.errstate(all="ignore"):
-        reach = np.sqrt(2.0 * np.log(np.maximum(splats.opacity * (1.0 + ROOM + 64.0 * unit) * 255.0, 1.0)))
+        reach = np.sqrt(2.0 * np.log(np.maximum(opacity * 255.0, 1.0)))
         for t, f, centre, side in ((x, cam.fx, cam.cx, cam.width), (y, cam.fy, cam.cy, cam.height)):
             a, b = (v[0] for v in t.range())
             least, most = np.minimum(a / zl, a / zh), np.maximum(b / zl, b / zh)
@@ -110,13 +113,13 @@ def reaches(splats: Splats, cam: Camera, view: View, unit: float) -> Array:
             spread = 1.05 * f / zl * splats.scales.max(axis=1) * np.sqrt(1.0 + limit * limit)
             room = reach * np.sqrt(spread * spread + BLUR) * (1.0 + 1e-9) + 1e-9 * (np.abs(least) + np.abs(most)) * f
             if unit:
+                faint &= spread < 4.0
                 # exponents of small ones err by less than a tenth; those of large ones may be anything in their tiles
                 room = np.where(spread < 4.0, 1.06 * room, np.maximum(1.06 * room, 3.3 * spread) + 2.0 * TILE)
             open_ = near | ~np.isfinite(room)
             found += [np.where(open_, -np.inf, f * least + centre - room - 1e-9)]
             found += [np.where(open_, np.inf, f * most + centre + room + 1e-9)]
-    hidden |= splats.opacity * (1.0 + ROOM + 64.0 * unit) < LEAST_ALPHA
-    found[0] = np.where(hidden, np.inf, found[0])
+    found[0] = np.where(hidden | faint, np.inf, found[0])
     return np.stack(found, axis=1)
 
 

@@ -99,6 +99,7 @@ def certify(options: Certify) -> int:
     if options.time_budget is not None and not 0.0 < options.time_budget < float("inf"):
         raise InputError(f"found {options.time_budget}", field="--time-budget", fix="give a positive number")
     options.where.check()
+    given_set(options)
     stop = Stop()
     with stop.installed():
         with stop.at_once():

@@ -158,6 +158,7 @@ def render(options: Render) -> int:
     if options.seed < 0:
         raise InputError(f"found {options.seed}", field="--seed", fix="give a number of at least 0")
     options.where.check()
+    given_set(options)
     stop = Stop()
     with stop.installed():
         with stop.at_once():

@@ -23,7 +23,7 @@ _FIX_FILE = "give the camera path that Nerfstudio's viewer saved"
 
 
 class Intrinsics(NamedTuple):
-    """What kernels need of a camera: focal lengths, principal point and picture size, pixels."""
+    """Camera intrinsics for kernels: focal lengths, principal point and picture size, pixels."""
 
     fx: float
     fy: float
@@ -262,7 +262,7 @@ _OTHERS: dict[str, tuple[str, str]] = {
 
 
 def _refuse_others(root: Any) -> None:
-    """Refuse what is no camera path by the name of what it is."""
+    """Raise InputError for other kinds of files, naming the kind."""
     if isinstance(root, list) and root and all(isinstance(e, dict) and "transform" in e for e in root):
         raise InputError("poses of photos as ns-export cameras writes them, not a camera path", fix=_FIX_FILE)
     if not isinstance(root, dict):

@@ -371,6 +371,6 @@ class PoseSet:
 
 
 def translation_only(forms: PoseForms) -> bool:
-    """Whether the depth direction is the same for every pose, up to rounding: no depth order changes."""
+    """Return whether the depth direction is the same for every pose, up to rounding, so that no depth order changes."""
     row = forms.rotation[2]
     return bool(np.all(row.linear == 0.0) and np.all(row.radius < STILL_ROOM))

@@ -1,4 +1,4 @@
-"""Where a choice that shapes the picture came from."""
+"""Assumptions: choices that shape the picture, with their origin."""
 
 from dataclasses import dataclass
 

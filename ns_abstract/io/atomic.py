@@ -1,4 +1,4 @@
-"""Files that are seen whole or not at all."""
+"""Atomic writes: other programs see a file whole or not at all."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Errors that a user can mend. Command lines print them as one line and exit with 2."""
+"""Errors that a user can fix; command lines print them as one line and exit with 2."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ def visible(text: str) -> str:
 
 
 def first_line(error: BaseException) -> str:
-    """An error's text in one line that is not long, or its type where it says nothing."""
+    """Return an error's text as one short line, or its type where the text is empty."""
     text = " ".join(str(error).split()) or type(error).__name__
     return text if len(text) <= 160 else f"{text[:157]}..."
 

@@ -1,4 +1,4 @@
-"""Folders that commands write results into: one command at a time, and nothing of others is touched."""
+"""Result folders: used by one command at a time, and foreign files in them are never touched."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ _FIXES = {
 
 
 def claim(folder: Path) -> BinaryIO:
-    """Make a folder of results, or take one over, for one command.
+    """Create a result folder, or take one over, for one command.
 
     Returns:
         An open file; the folder is locked until it is closed, or its process ends.
@@ -93,14 +93,14 @@ def _locked(folder: Path) -> BinaryIO:
 
 
 def remove_parts(folder: Path) -> None:
-    """Remove what killed commands left of unfinished results; the folder, or the one above it, must be locked."""
+    """Remove unfinished results of killed commands; the folder, or the one above it, must be locked."""
     for entry in list(os.scandir(folder)):
         if _PART.fullmatch(entry.name) and stat.S_ISREG(entry.stat(follow_symlinks=False).st_mode):
             Path(entry.path).unlink(missing_ok=True)
 
 
 def unwritable(folder: Path, error: OSError) -> InputError:
-    """What a user is told when results cannot be written."""
+    """Return the error for results that cannot be written."""
     return InputError(
         f"cannot be written: {error.strerror or type(error).__name__}",
         file=folder,

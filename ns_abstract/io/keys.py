@@ -1,4 +1,4 @@
-"""Tables of the keys that other programs' files hold: used, irrelevant to the picture, or refused."""
+"""Tables of the keys in other programs' files: used, irrelevant to the picture, or refused."""
 
 from __future__ import annotations
 
@@ -113,7 +113,7 @@ def _among(value: Any, values: Sequence[Any]) -> bool:
 
 
 def sentence(names: Sequence[str], file: str) -> tuple[str, ...]:
-    """A note that ``file`` holds unknown keys, which are not used; none where there are none."""
+    """Return a note that ``file`` holds unknown keys, which are not used; no note without such keys."""
     if not names:
         return ()
     found = sorted(dict.fromkeys(names))

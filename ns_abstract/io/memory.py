@@ -1,4 +1,4 @@
-"""Memory that is left, asked before anything large is allocated."""
+"""Available memory, checked before large allocations."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ _SHARE, _USUAL = 0.8, 8 << 30
 
 
 def available_memory() -> int | None:
-    """Bytes of memory this process may still take, or None where the system does not say."""
+    """Return the bytes that this process may still allocate, or None where the system does not tell."""
     amounts = []
     try:
         for line in Path("/proc/meminfo").read_text().splitlines():

@@ -1,4 +1,4 @@
-"""The version and the rules that a result was computed with, and how results of other ones are recognised."""
+"""The version and rules that a result was computed with, and the check for results of other versions."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def computed_by() -> dict[str, Any]:
 
 
 def stale(stored: Mapping[str, Any], current: Mapping[str, Any]) -> str | None:
-    """How ``stored`` was computed, if that was by another version or by other rules than ``current`` names.
+    """Return a note if ``stored`` was computed by another version or other rules than ``current`` names.
 
     Args:
         stored: Fingerprint of a result that was found.

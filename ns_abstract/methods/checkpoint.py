@@ -138,7 +138,7 @@ def require_finite(array: NDArray[np.float32], file: Path, field: str) -> None:
 
 
 def read_checkpoint(path: Path) -> Any:
-    """What ``torch.save`` was given: mappings, lists and plain values with `StoredTensor` in them.
+    """Return the content of a checkpoint: mappings, lists and plain values with `StoredTensor` in them.
 
     Checksums of all members are compared first. What else torch and numpy put there (random states, devices) is None.
 
@@ -265,7 +265,7 @@ class _Mapping(dict[Any, Any]):
 
 
 class _Nothing:
-    """Stands for an object in a checkpoint that nobody here asks for."""
+    """A placeholder for an object of a checkpoint that is never used."""
 
     __slots__ = ()
 

@@ -1,4 +1,4 @@
-"""What stands between nerfstudio 1.1.5 and opening a run on a machine without CUDA or network."""
+"""Work-arounds that let nerfstudio 1.1.5 open a run on a machine without CUDA or network."""
 
 from __future__ import annotations
 

@@ -73,7 +73,7 @@ class Figures(ViewerElement[str]):
 
 
 class Attached(ViewerControl):
-    """Tells when a viewer has taken the model up, and lets it draw anew.
+    """Notices when a viewer has attached to the model, and triggers a redraw.
 
     Args:
         attached: Called once, when the viewer is there.
@@ -112,7 +112,7 @@ class Attached(ViewerControl):
 
 
 class Insistent:
-    """Draws again until what is on screen is what is known.
+    """Redraws until the screen shows the latest snapshot.
 
     nerfstudio's render thread loses a request that comes while it takes up another (render_state_machine.py, run:
     ``next_action`` is read and then cleared).

@@ -20,7 +20,7 @@ class AbstractPipelineConfig(VanillaPipelineConfig):
 
 
 class AbstractPipeline(VanillaPipeline):
-    """nerfstudio's pipeline; where a checkpoint follows, nothing is fetched or read that it replaces."""
+    """nerfstudio's pipeline, which skips downloads and reads that a checkpoint replaces."""
 
     def __init__(
         self,

@@ -1,4 +1,4 @@
-"""The affine face of the rules: forms that carry their range.
+"""The affine version of the paper's rules: forms with their ranges.
 
 An `Enclosure` is a `FormArray` together with an `Interval` that holds the same quantity. Each
 operation is carried out on both, and each narrows the other: the range never exceeds what interval

@@ -90,7 +90,7 @@ def sumcumprod(alphas: Face, colors: Interval | Float64Array, behind: float = 0.
 
 
 def convex_combination(weights: Interval, values: Interval | Float64Array) -> Interval:
-    """Bounds of ``sum_i w_i v_i`` for weights in boxes that add up to 1.
+    """Return bounds of ``sum_i w_i v_i`` for weights in boxes that add up to 1.
 
     The greatest sum fills the largest values first; by duality it is at most
     ``m + sum_i max over w_i of w_i (v_i - m)`` for every ``m``, and equal to it for the value at which

@@ -219,5 +219,5 @@ Face = TypeVar("Face", Interval, Enclosure, LinearBounds)
 
 
 def constant_like(like: Face, values: Interval) -> Face:
-    """Quantities of which nothing but ``values`` is known, of the face and basis of ``like``."""
+    """Return constants that enclose ``values``, in the arithmetic and basis of ``like``."""
     return type(like).lift(values) if isinstance(like, Interval) else type(like).of(like.basis, values)

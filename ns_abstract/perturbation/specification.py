@@ -152,7 +152,7 @@ def parse_perturbation(
 
 
 def perturbation_object(perturbation: Perturbation) -> dict[str, Any]:
-    """What a perturbation file holds for a set: `parse_perturbation` reads it back as the same set."""
+    """Return the content of a perturbation file for a set; `parse_perturbation` reads it back as the same set."""
 
     def ranges(limits: Mapping[str, Range]) -> dict[str, list[float]]:
         return {name: list(ends) for name, ends in limits.items()}

@@ -1,4 +1,4 @@
-"""Which Gaussians of a scene vary, and how far: the ``"scene"`` key of the perturbation file."""
+"""Variations of a scene's Gaussians: the key ``"scene"`` of the perturbation file."""
 
 from __future__ import annotations
 
@@ -96,7 +96,7 @@ def parse_selection(value: object, name: str, fail: Fail, folder: Path | None) -
 
 
 def selection_object(select: Selection) -> dict[str, Any]:
-    """What a file holds for a selection: `parse_selection` reads it back as the same one."""
+    """Return the content of a file for a selection; `parse_selection` reads it back as the same one."""
     found: dict[str, Any] = {}
     if select.box is not None:
         found["box"] = [list(corner) for corner in select.box]

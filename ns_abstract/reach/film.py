@@ -79,7 +79,7 @@ def film_size(size: tuple[int, int]) -> tuple[int, int]:
 
 
 def along(reacher: Reacher, method: Method, size: tuple[int, int], tube: Tube) -> Iterator[FrameResult]:
-    """Bounds of all pictures that the camera may take at a step of a tube, and the one at its middle, step by step.
+    """Yield, step by step, bounds of all pictures that the camera may take, and the picture at the middle pose.
 
     The bounds are those of one cell, as tubes have them.
 

@@ -70,7 +70,7 @@ def number(value: float | None, digits: int = 4) -> str:
 
 
 def percent(part: float | None) -> str:
-    """A fraction for people; never 100 % or 0 % where it is not."""
+    """Format a fraction for people; 100 % and 0 % are shown only where exact."""
     if part is None:
         return "–"
     text = f"{100.0 * part:.2f}"

@@ -282,6 +282,7 @@ class Report:
     Args:
         output_dir: Made if it is absent.
         run: What is computed.
+        keep_stored: See `resume`.
 
     Attributes:
         kept: Numbers of the frames taken over from an earlier run.
@@ -291,8 +292,10 @@ class Report:
         InputError: The folder cannot be written.
     """
 
-    def __init__(self, output_dir: str | os.PathLike[str], run: Run) -> None:
+    def __init__(self, output_dir: str | os.PathLike[str], run: Run, *, keep_stored: bool = False) -> None:
         self._start(Path(output_dir), run)
+        if keep_stored:
+            self._keep()
         self._publish(page=True)
 
     @classmethod
@@ -305,11 +308,7 @@ class Report:
         Raises:
             InputError: The folder's report has another fingerprint, or the folder cannot be written.
         """
-        report = cls.__new__(cls)
-        report._start(Path(output_dir), run)
-        report._keep()
-        report._publish(page=True)
-        return report
+        return cls(output_dir, run, keep_stored=True)
 
     def _start(self, folder: Path, run: Run) -> None:
         self.folder, self.run = folder, run

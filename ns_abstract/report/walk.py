@@ -1,4 +1,4 @@
-"""Poses along a set, one after another, with the verdict and a picture of each: a slider of the certificate's page."""
+"""A slider of the certificate's page: poses along a set, each with its verdict and picture."""
 
 from __future__ import annotations
 

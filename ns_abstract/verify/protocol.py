@@ -61,7 +61,7 @@ class Model(Protocol):
 
 
 class SharedBounds(Protocol):
-    """Bounds of a cell, and of others with its coefficients (`verify.network.family.Family`)."""
+    """Bounds of a cell, and of others with its coefficients (`Family`)."""
 
     def first(self, query: Query) -> OutputBounds:
         """Bounds of the query's rows over the cell."""

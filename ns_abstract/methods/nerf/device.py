@@ -32,7 +32,7 @@ def check_device(device: str | None) -> str:
 
 @cache
 def processes_that_fit(needed: int, most: int) -> int:
-    """Processes, at most so many, that may take ``needed`` bytes of a GPU's memory each.
+    """Return how many processes, at most ``most``, fit into a GPU's memory at ``needed`` bytes each.
 
     Found once: what they hold afterwards is no longer free.
 

@@ -185,7 +185,7 @@ class Paths:
         kept, rest = field.basis.interpolation
         poly = kept @ nodes
         spread = np.abs(poly[:, 1:]).sum(axis=1) + np.abs(rest @ nodes).sum(axis=1) + radius
-        spread = spread + field.interpolated * (np.abs(poly[:, 0]) + spread)
+        spread = spread + field.basis.interpolation_rounding * (np.abs(poly[:, 0]) + spread)
         empty, sure = self.occupancy.look(poly[:, 0] - spread, poly[:, 0] + spread)
         return ~empty, sure
 

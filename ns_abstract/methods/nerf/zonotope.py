@@ -28,7 +28,6 @@ from ns_abstract.arithmetic.rounding import (
     CHEBYSHEV_ROUNDING,
     ELLIPSE_UP,
     FIELD_UP,
-    INTERPOLATION_ROUNDING,
     LEAST_SLOPE,
     NARROW_ROUNDING,
     RELU_ROUNDING,
@@ -224,8 +223,6 @@ class FieldBounds:
         )
         # [ellipses, d] the same of the highest power that an encoded vector has
         self._steepest = self._imaginary.masked_fill(degrees.T > VECTOR_DEGREE, 0.0).amax(dim=2)
-        #: What interpolation errs by in all coefficients together, as a part of the largest value at a node.
-        self.interpolated = basis.lebesgue**basis.dimensions * INTERPOLATION_ROUNDING
         self._decay = 4.0 * ellipses**-basis.degree / (ellipses - 1.0) * ELLIPSE_UP
 
         self._bernstein: dict[tuple[int, ...], Tensor] = {}
@@ -274,16 +271,16 @@ class FieldBounds:
             # the parts of x above the degree belong to the highest power that the basis has
             tops = self._imaginary[:, j].max(dim=1).values
             phase = torch.einsum("em,bmi->bie", self._imaginary[:, j], x.abs()) + rest[..., None] * tops
-            rounded = self.interpolated * largest[..., None] * self._steepest[:, j]
+            rounded = self.basis.interpolation_rounding * largest[..., None] * self._steepest[:, j]
             exponent = omega[:, None] * (phase * ELLIPSE_UP + rounded)[..., None, :]
             growth = torch.where(exponent < 600.0, torch.cosh(exponent.clamp(max=600.0)), torch.inf)
             error = (growth * self._decay).amin(dim=-1).clamp(max=1.0 + lebesgue)
             remainder = remainder + lebesgue**j * error
         # the vector's own radius; the argument's and the functions' rounding, seen through the interpolation
         argument = lebesgue**self.basis.dimensions * WAVE_ROUNDING * (omega * (largest[..., None] + 1.0))
-        rounding = argument + self.interpolated
+        rounding = argument + self.basis.interpolation_rounding
         waves = (remainder + omega * radius[..., None] + rounding).flatten(-2)
-        plain = radius + rest + self.interpolated * (1.0 + largest)
+        plain = radius + rest + self.basis.interpolation_rounding * (1.0 + largest)
         return poly, (torch.cat([waves, waves, plain], dim=-1) + dropped) * FIELD_UP
 
     # --- layers --------------------------------------------------------------------------------

@@ -129,7 +129,7 @@ def rasteriser_named(renderer: str | None = None, version: str | None = None) ->
 
 
 def installed_gsplat() -> Rasteriser:
-    """The rules of the gsplat that is installed; of 1.4.0 where none is, or one whose rules are not known."""
+    """Return the rules of the installed gsplat; those of 1.4.0 without one, or for unknown versions."""
     try:
         numbers = importlib.metadata.version("gsplat").split(".")
         return _RELEASES.get((int(numbers[0]), int(numbers[1])), GSPLAT_1_4_0)

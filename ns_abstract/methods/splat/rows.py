@@ -39,7 +39,7 @@ class StoredRows:
 def drawable(
     rows: StoredRows, file: Path, fields: dict[str, str], drop_nan: bool = False
 ) -> tuple[StoredRows, dict[str, Any]]:
-    """The Gaussians that gsplat may draw, and what a `SplatScene` says about those left out.
+    """Return the Gaussians that gsplat may draw, and the notes about those left out.
 
     gsplat's kernels never draw a Gaussian of which the mean or the quaternion is not finite, or a scale is NaN: its
     depth is then infinite, and culled, or its projected covariance is NaN in every entry. The radius, a function of

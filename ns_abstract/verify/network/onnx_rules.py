@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import onnx
 
+from ns_abstract.arithmetic.network_charges import LEAST_DIVISOR
 from ns_abstract.io.errors import InputError
 from ns_abstract.verify.network import curves
 from ns_abstract.verify.network.compose import Composer, interpolation
@@ -196,8 +197,8 @@ def _gelu(b: Composer, x: int, a: Attributes) -> int:
 
 def _positive(a: Attributes, name: str, default: float) -> float:
     value = float(a.get(name, default))
-    if not 0.0 < value < 2.0**20:
-        raise InputError(f"attribute {name} = {value} is not supported", fix="it must be positive")
+    if not LEAST_DIVISOR < value < 2.0**20:
+        raise InputError(f"attribute {name} = {value} is not supported", fix="between 1e-30 and 1e6 expected")
     return value
 
 
