@@ -24,7 +24,7 @@ _Codegen: Any = codegen.Codegen
 _Library: Any = codegen.CPUCodeLibrary
 _Context: Any = cpu.CPUContext
 
-#: What numba has in all versions that this was tried with (0.62 to 0.68).
+#: What numba has in the version that this was tried with (0.68).
 _NEEDED = (
     (_Compiler, "_compile_core"), (_Compiler, "_customize_flags"), (_Dispatcher, "compile"), (_Base, "add_overload"),
     (_Codegen, "create_library"), (_Library, "finalize"), (_Context, "get_executable"),
