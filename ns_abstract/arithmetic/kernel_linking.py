@@ -14,17 +14,21 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
+import numba
 from numba.core import codegen, cpu, dispatcher, sigutils
 from numba.core.compiler_lock import global_compiler_lock
 
-_Compiler: Any = dispatcher._FunctionCompiler  # pyright: ignore[reportAttributeAccessIssue]
-_Dispatcher: Any = dispatcher.Dispatcher
-_Base: Any = dispatcher._DispatcherBase
-_Codegen: Any = codegen.Codegen
-_Library: Any = codegen.CPUCodeLibrary
-_Context: Any = cpu.CPUContext
+# other versions may lack them
+_Compiler: Any = getattr(dispatcher, "_FunctionCompiler", None)
+_Dispatcher: Any = getattr(dispatcher, "Dispatcher", None)
+_Base: Any = getattr(dispatcher, "_DispatcherBase", None)
+_Codegen: Any = getattr(codegen, "Codegen", None)
+_Library: Any = getattr(codegen, "CPUCodeLibrary", None)
+_Context: Any = getattr(cpu, "CPUContext", None)
 
-#: What numba has in the version that this was tried with (0.68).
+#: The versions of numba whose parts are replaced: those that this was tried with.
+_TRIED = "0.68."
+#: What they have.
 _NEEDED = (
     (_Compiler, "_compile_core"), (_Compiler, "_customize_flags"), (_Dispatcher, "compile"), (_Base, "add_overload"),
     (_Codegen, "create_library"), (_Library, "finalize"), (_Context, "get_executable"),
@@ -62,7 +66,7 @@ def _linked_only(result: Any) -> bool:
 
 def install(done: Callable[[], object]) -> None:
     """Have numba compile so, and call ``done`` after each function, where it has the parts that this replaces."""
-    if not all(hasattr(owner, name) for owner, name in _NEEDED):
+    if not numba.__version__.startswith(_TRIED) or not all(hasattr(owner, name) for owner, name in _NEEDED):
         return
     _compilation.done = done
     originals = {(owner, name): getattr(owner, name) for owner, name in _NEEDED}
