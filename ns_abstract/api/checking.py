@@ -32,8 +32,8 @@ def check(
         claims: Number of claims to draw; a claim is one channel of a pixel over one cell, or one certified cell.
         seconds: Time for all of them.
         seed: Of the draws.
-        load_config, camera_path, perturbation, model, loop: Where files lie that have been moved since; None: where
-            the report says.
+        load_config, camera_path, perturbation, model, loop: Where files lie that have been moved since; None: where the
+            report says.
         on_progress: Called after every claim; returning False ends the audit.
 
     Raises:

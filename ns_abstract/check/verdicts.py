@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import time
+from abc import ABC, abstractmethod
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +26,7 @@ Array = Any
 BATCH = 8
 
 
-class _Verdicts:
+class _Verdicts(ABC):
     """What certificates and loops share: cells that are drawn, and pictures that go through a network."""
 
     kinds: tuple[str, ...] = ("certified",)
@@ -113,13 +114,13 @@ class _Verdicts:
                 return True, "float32" if unit and self.network.unit else "real", {}
         return None, "", {}
 
+    @abstractmethod
     def margins(self, low: Array, high: Array, unit: float) -> Array:
         """Lower bounds [B] of how far boxes are from failing."""
-        raise NotImplementedError
 
+    @abstractmethod
     def most(self, point: Array) -> float:
         """An upper bound of that at one point [1, d]."""
-        raise NotImplementedError
 
 
 class Certificate(_Verdicts):
