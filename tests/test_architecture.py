@@ -285,7 +285,7 @@ def test_every_import_is_a_dependency() -> None:
     about = project()
     extras = about["optional-dependencies"]
     declared = required(about["dependencies"])
-    optional = required(extras["nerfstudio"] + extras["cluster"] + extras["video"])
+    optional = required(extras["nerfstudio"] + extras["cluster"] + extras["formats"] + extras["video"])
     used: set[str] = set()
     for file in sources():
         for _, name in imports(file.read_text(encoding="utf-8")):

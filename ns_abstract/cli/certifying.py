@@ -21,7 +21,7 @@ from ns_abstract.report.figures import percent
 from ns_abstract.verify.store import Store
 
 if TYPE_CHECKING:
-    from ns_abstract.cli.certify import Certify
+    from ns_abstract.cli.commands import Certify
 
 #: Seconds where no time budget is given.
 _SECONDS = 1800.0

@@ -2,93 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
-from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from dataclasses import replace
 
 import tyro
 
+from ns_abstract.cli.commands import Render
 from ns_abstract.cli.common import DONE, INTERRUPTED, Stop, run
-from ns_abstract.cli.options import EngineOptions, Overrides, Program, ProgramOptions, SceneOverrides, Where
-from ns_abstract.cli.sets import GivenSet, given_set
+from ns_abstract.cli.sets import given_set
 from ns_abstract.io.errors import InputError
-
-if TYPE_CHECKING:
-    from ns_abstract.api.files import Settings
 
 #: Seconds by frame where --explain is given none.
 _EXPLAINED_S = 30.0
-
-
-@dataclass
-class Render(GivenSet):
-    """Bound every image that Nerfstudio would show, for every pose in a set around each keyframe.
-
-    Writes frame_00000.npz and .png by keyframe, report.json and report.html. Exit codes: 0 done;
-    2 bad input; 3 interrupted, or the time budget ended before every frame had a result.
-    """
-
-    load_config: Path
-    """config.yml of a Splatfacto or vanilla-nerf run, or a standard 3DGS .ply."""
-    camera_path_filename: Path
-    """Camera path as Nerfstudio's viewer writes it."""
-    output_dir: Path | None = None
-    """Folder for the results; made if missing. Required, but for --describe and --explain."""
-    time_budget: float | None = None
-    """Seconds for all frames together. Default: 60 per frame."""
-    target_ratio: float = 1.05
-    """A frame is done when its mean pixel gap is at most this many times the one of real renders."""
-    frames: tuple[int, ...] | None = None
-    """Entries of the camera path, counted from 0. Default: all."""
-    downscale_factor: float = 1.0
-    """Images become this many times smaller."""
-    arithmetic: Literal["float32", "real"] | None = None
-    """float32: enclose every float32 evaluation (splats, the default for them). real: the real-number renderer and
-    its float64 evaluation."""
-    outputs: tuple[Literal["rgb", "depth", "accumulation"], ...] = ("rgb",)
-    """What is bounded. rgb is always; depth: gsplat's expected depth, normalised units (splats). accumulation: the part
-    of the light that the scene takes."""
-    seed: int = 0
-    """Seed of the random witnesses."""
-    resume: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
-    """Keep the frames that an interrupted run with the same inputs has finished."""
-    save_cells: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
-    """Store every leaf cell's box and linear sets in the npz files."""
-    memory_limit: float | None = None
-    """GiB that may be used. Default: 80 % of what is free."""
-    describe: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
-    """Only tell what cameras, units and set mean, in pixels and distances, and do nothing else; needs no
-    --output-dir."""
-    explain: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
-    """Splats: also tell why bounds are wider than renders, where, and what would help, in words and in the report.
-    Without --output-dir nothing is written."""
-    program: Program = field(default_factory=ProgramOptions)
-    where: Where = field(default_factory=EngineOptions)
-    overrides: SceneOverrides = field(default_factory=Overrides)
-
-    @property
-    def settings(self) -> Settings:
-        """The files, and what is bounded.
-
-        Raises:
-            InputError: Options do not go together.
-        """
-        from ns_abstract.api.files import Settings
-
-        return Settings(
-            self.load_config,
-            self.camera_path_filename,
-            self.perturbation_filename,
-            downscale_factor=self.downscale_factor,
-            arithmetic=self.arithmetic,
-            seed=self.seed,
-            memory_limit=self.memory_limit,
-            workers=self.where.ray_processes,
-            given_set=given_set(self),
-            outputs=self.outputs,
-            program=self.program,
-            overrides=self.overrides,
-        )
 
 
 def explain(options: Render) -> int:

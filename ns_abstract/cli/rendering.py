@@ -23,7 +23,7 @@ from ns_abstract.report.figures import listed
 from ns_abstract.report.record import Report, Run, failed_self_check
 
 if TYPE_CHECKING:
-    from ns_abstract.cli.render import Render
+    from ns_abstract.cli.commands import Render
 
 #: Seconds by frame where no time budget is given.
 _SECONDS_BY_FRAME = 60.0
