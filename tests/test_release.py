@@ -59,8 +59,8 @@ def test_everything_that_is_read_is_installed() -> None:
     there = [path for path in package.rglob("*") if path.is_file() and "__pycache__" not in path.parts]
     files = [path.relative_to(package).as_posix() for path in there if path.suffix != ".py"]
     assert "py.typed" in files and unpackaged(files, patterns) == []
-    # every folder is a package, and every pattern has its files
-    assert all((path.parent / "__init__.py").exists() for path in there)
+    # every folder of sources is a package, and every pattern has its files
+    assert all((path.parent / "__init__.py").exists() for path in there if path.suffix == ".py")
     assert all(unpackaged(files, [pattern]) != files for pattern in patterns)
 
 

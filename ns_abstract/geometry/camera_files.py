@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ns_abstract.io.errors import InputError
-from ns_abstract.io.jsonio import is_number, show
+from ns_abstract.io.jsonio import InputTuning, is_number, show
 
 #: OpenCV axes (x right, y down, z forward) as OpenGL axes (x right, y up, z back).
 _OPENGL = np.diag([1.0, -1.0, -1.0])
@@ -96,7 +96,7 @@ def transforms_cameras(root: Mapping[str, Any], frame: RunFrame | None) -> Itera
     applied = np.eye(4)
     if "applied_transform" in root:
         applied[:3] = _matrix(root["applied_transform"], 3, 4, "applied_transform")
-    if not abs(np.linalg.det(applied)) > 1e-12:
+    if not abs(np.linalg.det(applied)) > InputTuning.nothing:
         raise InputError("a matrix that cannot be inverted", field="applied_transform", fix="write a rotation")
     applied_scale = _number(root.get("applied_scale", 1.0), "applied_scale")
     if not applied_scale > 0:
